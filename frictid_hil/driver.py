@@ -1,0 +1,403 @@
+"""The driver protocol: the least that a bus or controller must bring so that the runner can move its joints.
+
+A driver owns three things the runner must not guess: the wire, the units of the drive, and **time**. The runner asks
+``capabilities`` what the hardware can do and never tries what it was not promised.
+
+Life cycle::
+
+    open -> identify -> check(plan) -> configure(rate) -> lock / enable -> start_cycling
+                                                            exchange, exchange, ...      (once per cycle)
+    stop_cycling -> unlock -> close                         quick_stop at any moment, close always
+
+Positions, velocities and torques are on the joint side of the gear, in rad, rad/s and N m. A driver counts its own
+raw units (encoder counts, pulses, per mille of rated torque) and keeps the conversion to itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from frictid_hil.errors import FieldProblem, InvalidFields
+
+if TYPE_CHECKING:
+    from frictid_hil.plan import JointPlan, Plan
+
+NAN = float("nan")
+
+
+class Mode(IntEnum):
+    """How a joint is commanded; values are those of CiA-402 object 6060."""
+
+    NONE = 0
+    POSITION = 8
+    """Cyclic synchronous position (CSP)."""
+    VELOCITY = 9
+    """Cyclic synchronous velocity (CSV)."""
+    TORQUE = 10
+    """Cyclic synchronous torque (CST)."""
+
+
+class JointState(Enum):
+    """What a joint's power stage is doing, whatever the wire calls it."""
+
+    UNKNOWN = "unknown"
+    DISABLED = "disabled"
+    ENABLED = "enabled"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, slots=True)
+class JointSetup:
+    """One joint as a driver needs to know it; values of the robot file, joint side of the gear.
+
+    Attributes:
+        name: the joint's name in the robot file ("0".."5").
+        address: node id (CAN) or axis index (serial).
+        gear_ratio: motor revolutions per joint revolution.
+        direction: +1 or -1, sign of joint motion for positive motor motion.
+        max_velocity_rad_s: limit of the joint.
+        max_torque_nm: limit of the joint.
+        rated_torque_nm: joint-side torque that the drive calls 1000 per mille (motor rated torque times gear ratio).
+        position_min_rad: software limit.
+        position_max_rad: software limit.
+        start_position_rad: where its identification starts; the travel goes to start + A.
+        locked_position_rad: where it is held while another joint moves.
+        options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
+        simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
+    """
+
+    name: str
+    address: int
+    gear_ratio: float
+    direction: int
+    max_velocity_rad_s: float
+    max_torque_nm: float
+    rated_torque_nm: float
+    position_min_rad: float
+    position_max_rad: float
+    start_position_rad: float
+    locked_position_rad: float
+    options: Mapping[str, Any] = field(default_factory=dict)
+    simulated: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSetup:
+    """A robot as a driver needs to know it.
+
+    Attributes:
+        name: the robot's name.
+        bus: ``interface:channel`` as typed (``socketcan:can0``, ``virtual:hp3j``, ``serial:/dev/ttyUSB0``).
+        cycle_hz: requested cycle rate.
+        joints: in the order of the robot file.
+        options: driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
+        realtime: run on the wall clock even where lock-step is possible.
+        seed: seed of every simulated noise; ignored by real hardware.
+    """
+
+    name: str
+    bus: str
+    cycle_hz: float
+    joints: tuple[JointSetup, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    realtime: bool = False
+    seed: int = 0
+
+    def joint(self, name: str) -> JointSetup:
+        """The joint of that name.
+
+        Raises:
+            InvalidFields: no such joint; the message lists the joints there are.
+        """
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        known = ", ".join(j.name for j in self.joints)
+        raise InvalidFields([FieldProblem(("joints", name), f"no such joint; this robot has {known}")])
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """When a row's figures were true, relative to the row's time stamp (declared by the drive or its robot file).
+
+    A delay of 2 ms says that the value reported at t was true at t - 2 ms.
+
+    Attributes:
+        position_delay_s: of the reported position.
+        velocity_delay_s: of the reported velocity, filters included.
+        torque_delay_s: of the reported torque, filters and zero-order hold included.
+        uncertainty_s: one standard deviation of the torque-to-velocity skew that remains.
+        source: where these figures come from (``drive``, ``robot file``, ``assumed``).
+    """
+
+    position_delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    torque_delay_s: float = 0.0
+    uncertainty_s: float = 0.0002
+    source: str = "assumed"
+
+
+@dataclass(frozen=True, slots=True)
+class JointIdentity:
+    """What a drive says of itself; recorded in every profile as provenance.
+
+    Attributes:
+        joint: name.
+        serial: the drive's serial number ("" where it has none).
+        firmware: its version.
+        product: vendor and product codes or names.
+        rated_torque_nm: joint side, as read back from the drive (object 6076 times gear ratio).
+        gear_ratio: as read back, or as configured where the drive does not know it.
+        position_resolution_rad: one count.
+        torque_resolution_nm: one step of the reported torque.
+        torque_source: what the reported torque is (``6077 actual torque``, ``mpSvsGetVelTrqFb``, ``simulated``).
+        timing: when reported figures were true.
+        settings: friction compensation, feed-forward, filters, as far as objects are known; values as read.
+    """
+
+    joint: str
+    serial: str = ""
+    firmware: str = ""
+    product: str = ""
+    rated_torque_nm: float = NAN
+    gear_ratio: float = NAN
+    position_resolution_rad: float = NAN
+    torque_resolution_nm: float = NAN
+    torque_source: str = ""
+    timing: Timing = Timing()
+    settings: Mapping[str, str | float | int | bool] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What this driver can do with this hardware; the runner asks rather than tries.
+
+    Attributes:
+        max_cycle_hz: highest cycle rate of the configured layout.
+        modes: set-point modes that every joint supports.
+        torque_offset: a torque can be added on top of position or velocity control (60B2).
+        drive_watchdog: the drive stops by itself when the host dies.
+        batch_only: no cyclic exchange; ``run_batch`` instead.
+        lock_step: virtual time: cycles run as fast as the processor allows and never late.
+        cycle_quantum_s: durations of motions are rounded to multiples of this (0: no rounding); 4 ms ticks on serial.
+        external_torque: feedback carries a force sensor's torque.
+        temperature: feedback carries a motor or gear temperature.
+        table_download: a friction table can be compensated on the controller's own tick.
+    """
+
+    max_cycle_hz: float
+    modes: frozenset[Mode]
+    torque_offset: bool = False
+    drive_watchdog: bool = False
+    batch_only: bool = False
+    lock_step: bool = False
+    cycle_quantum_s: float = 0.0
+    external_torque: bool = False
+    temperature: bool = False
+    table_download: bool = False
+
+
+@dataclass(slots=True)
+class SetPoint:
+    """What one joint shall do in the coming cycle; reused from cycle to cycle, never reallocated."""
+
+    position_rad: float = 0.0
+    velocity_rad_s: float = 0.0
+    torque_nm: float = 0.0
+    torque_offset_nm: float = 0.0
+
+
+@dataclass(slots=True)
+class Feedback:
+    """What one joint reported last; reused from cycle to cycle, never reallocated.
+
+    Attributes:
+        t_ns: run time of the sample (the SYNC that latched it), integer nanoseconds.
+        position_rad: actual position.
+        velocity_rad_s: the drive's own velocity.
+        torque_nm: the drive's own torque.
+        external_torque_nm: force sensor, NaN where there is none.
+        temperature_c: NaN where unknown.
+        state: of the power stage.
+        mode: as displayed by the drive (6061), NONE where not yet reported.
+        status_raw: statusword or controller status as sent.
+        error_code: 603F or alarm number; 0 when healthy.
+        age_cycles: cycles since this joint last reported; 0 = this cycle.
+        valid: False until the first report, and when the report could not be decoded.
+    """
+
+    t_ns: int = 0
+    position_rad: float = NAN
+    velocity_rad_s: float = NAN
+    torque_nm: float = NAN
+    external_torque_nm: float = NAN
+    temperature_c: float = NAN
+    state: JointState = JointState.UNKNOWN
+    mode: Mode = Mode.NONE
+    status_raw: int = 0
+    error_code: int = 0
+    age_cycles: int = 0
+    valid: bool = False
+
+
+class Severity(Enum):
+    """How bad a finding of ``check`` is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of ``frictid-hil check``.
+
+    Attributes:
+        severity: an ``error`` forbids motion.
+        subject: joint, object or setting (``joint 1``, ``bus``).
+        message: what was found, with numbers and units.
+        next_step: what to do about it ("" when nothing).
+    """
+
+    severity: Severity
+    subject: str
+    message: str
+    next_step: str = ""
+
+
+FrameSink = Callable[[int, int, bytes, bool], None]
+"""Called for every frame on the wire: run time in ns, CAN id (bit 31 set: extended), data, True when we sent it."""
+
+
+class Clock(Protocol):
+    """Run time: integer nanoseconds since ``start_cycling``. Wall clock or lock-step, the loop cannot tell."""
+
+    def now_ns(self) -> int:
+        """Run time now."""
+        ...
+
+    def wait_until(self, deadline_ns: int) -> None:
+        """Return at the deadline (or at once if it has passed)."""
+        ...
+
+
+class WallClock:
+    """Run time on the machine's monotonic clock, by absolute deadlines."""
+
+    def __init__(self) -> None:
+        self._origin_ns = time.monotonic_ns()
+
+    def restart(self) -> None:
+        """Make now the zero of run time."""
+        self._origin_ns = time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Run time now."""
+        return time.monotonic_ns() - self._origin_ns
+
+    def wait_until(self, deadline_ns: int) -> None:
+        """Sleep to the deadline; returns at once if it has passed."""
+        remaining_ns = deadline_ns - self.now_ns()
+        if remaining_ns > 0:
+            time.sleep(remaining_ns * 1e-9)
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """See the module's first page. Constructed as ``DriverClass(setup: RobotSetup)``; construction touches nothing.
+
+    Every method raises ``HardwareError`` when the hardware does not answer, naming node, object and what was expected.
+    """
+
+    clock: Clock
+
+    def open(self, frame_sink: FrameSink | None = None) -> None:
+        """Take the bus exclusively and reach every joint; nothing is enabled. ``HardwareBusy`` when held by another."""
+        ...
+
+    def identify(self) -> dict[str, JointIdentity]:
+        """Read what every drive says of itself; reads only."""
+        ...
+
+    def capabilities(self) -> Capabilities:
+        """What this hardware can do; after ``open``."""
+        ...
+
+    def check(self, plan: Plan | None) -> list[Finding]:
+        """Everything that can be said without moving or writing: drives, modes, limits, bus load at the plan's rate."""
+        ...
+
+    def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
+        """Write and read back mapping, timing, watchdogs and limits for this rate; ``active`` report every cycle."""
+        ...
+
+    def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
+        """Set and read back the drive's own limits (6072, 607D); before cycling."""
+        ...
+
+    def start_cycling(self) -> None:
+        """Begin cyclic traffic; run time starts at zero. From here until ``stop_cycling`` no SDO is sent."""
+        ...
+
+    def enable(self, joint: str, mode: Mode) -> None:
+        """Ask for power in ``mode`` with a bumpless set-point; progress is seen in the feedback of later exchanges."""
+        ...
+
+    def disable(self, joint: str) -> None:
+        """Ask for power off (after standstill); progress is seen in the feedback."""
+        ...
+
+    def lock(self, joint: str) -> None:
+        """Hold the joint where it stands, tightly; it is watched on every report."""
+        ...
+
+    def unlock(self, joint: str) -> None:
+        """End ``lock``; the joint stays enabled and follows its set-point again."""
+        ...
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """Send one cycle's set-points (order of ``setup.joints``) and return all joints' feedback.
+
+        The returned objects are the driver's own and change with the next call. A joint that did not report this
+        cycle keeps its last figures with ``age_cycles`` counted up.
+        """
+        ...
+
+    def run_batch(self, plan: JointPlan) -> Mapping[str, Any]:
+        """Drivers with ``batch_only``: run one joint's whole motion on the controller, return the columns logged."""
+        ...
+
+    def quick_stop(self) -> None:
+        """Stop every joint by the fastest safe way, from any state; never raises, never waits for an answer."""
+        ...
+
+    def stop_cycling(self) -> None:
+        """End cyclic traffic after standstill; SDO is possible again."""
+        ...
+
+    def close(self) -> None:
+        """Bring everything to rest and release the bus; safe to call twice and after errors."""
+        ...
+
+
+def known_drivers() -> list[str]:
+    """Names of the installed drivers, sorted."""
+    return sorted(point.name for point in entry_points(group="frictid_hil.drivers"))
+
+
+def load_driver(name: str) -> type[Driver]:
+    """The driver class registered under ``name``.
+
+    Raises:
+        InvalidFields: no such driver; the message lists the installed ones.
+    """
+    for point in entry_points(group="frictid_hil.drivers", name=name):
+        loaded: type[Driver] = point.load()
+        return loaded
+    raise InvalidFields([FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")])

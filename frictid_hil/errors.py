@@ -1,0 +1,133 @@
+"""Every error a user can meet: what went wrong, where, the likely cause, the next step.
+
+Each branch of the tree carries the exit code of the command line and the ``outcome`` word of its JSON:
+
+==================  ====  ===========  ==========================================================
+branch              exit  outcome      meaning
+==================  ====  ===========  ==========================================================
+FrictidError        1     aborted      the run failed
+UsageError          2     refused      arguments, configuration, or an unusable input file
+HardwareError       3     aborted      hardware unreachable or held by another process
+SafetyAbort         4     aborted      motion was stopped because something unexpected happened
+GateFailed          5     gate_failed  measured, but not good enough to be promoted
+Interrupted         130   interrupted  a person or the system asked to stop
+==================  ====  ===========  ==========================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+
+class FrictidError(Exception):
+    """The run failed.
+
+    Args:
+        what: one sentence saying what went wrong, with the numbers.
+        where: the object it happened to (``node 3, object 6041``; ``hp3j.yaml:8:14``; ``joint 1``).
+        cause: the likely cause, when one is known.
+        next_step: what the reader should do now.
+    """
+
+    exit_code: ClassVar[int] = 1
+    outcome: ClassVar[str] = "aborted"
+
+    def __init__(self, what: str, *, where: str = "", cause: str = "", next_step: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.cause = cause
+        self.next_step = next_step
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}" if self.where else self.what
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Errors cross process borders (the cyclic loop is a process of its own).
+        return (_rebuild, (type(self), self.what, self.where, self.cause, self.next_step))
+
+
+def _rebuild(kind: type[FrictidError], what: str, where: str, cause: str, next_step: str) -> FrictidError:
+    return kind(what, where=where, cause=cause, next_step=next_step)
+
+
+class UsageError(FrictidError):
+    """An argument, a unit, a combination of options that cannot work."""
+
+    exit_code = 2
+    outcome = "refused"
+
+
+class ConfigError(UsageError):
+    """A robot, profile or column-map file is wrong; ``where`` is file:line:column."""
+
+
+class InputFileError(UsageError):
+    """A recording or other input file is unreadable or unusable; ``where`` is the file, with a line where known."""
+
+
+class PlanRefused(UsageError):
+    """The plan breaks a limit of position, velocity, torque or bus load; nothing moved."""
+
+
+class ProfileMismatch(UsageError):
+    """A friction profile belongs to another robot, drive, gear ratio or schema."""
+
+
+class IdentificationError(FrictidError):
+    """A friction curve cannot be formed from these samples (empty window, F_0 <= 0, ...)."""
+
+
+class HardwareError(FrictidError):
+    """Hardware is unreachable, silent, or not what the robot file says."""
+
+    exit_code = 3
+
+
+class HardwareBusy(HardwareError):
+    """The bus or port is held by another process."""
+
+
+class SafetyAbort(FrictidError):
+    """Motion was stopped because a supervised quantity left its bounds."""
+
+    exit_code = 4
+
+
+class GateFailed(FrictidError):
+    """A quality gate failed; results are kept, nothing was promoted."""
+
+    exit_code = 5
+    outcome = "gate_failed"
+
+
+class Interrupted(FrictidError):
+    """Ctrl-C, SIGTERM, or a vanished parent; the joint was brought to rest."""
+
+    exit_code = 130
+    outcome = "interrupted"
+
+
+@dataclass(frozen=True, slots=True)
+class FieldProblem:
+    """One thing wrong with one field of a mapping; the loader adds file:line:column.
+
+    Attributes:
+        path: keys and indices from the root of the mapping, e.g. ``("joints", "1", "gear_ratio")``.
+        message: what was expected and what was found.
+    """
+
+    path: tuple[str | int, ...]
+    message: str
+
+
+class InvalidFields(UsageError):
+    """A mapping failed validation; ``problems`` lists every field that is wrong."""
+
+    def __init__(self, problems: list[FieldProblem]) -> None:
+        self.problems = problems
+        super().__init__("; ".join(f"{'.'.join(map(str, p.path))}: {p.message}" for p in problems))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (InvalidFields, (self.problems,))
