@@ -400,4 +400,6 @@ def load_driver(name: str) -> type[Driver]:
     for point in entry_points(group="frictid_hil.drivers", name=name):
         loaded: type[Driver] = point.load()
         return loaded
-    raise InvalidFields([FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")])
+    raise InvalidFields(
+        [FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")]
+    )

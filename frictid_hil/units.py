@@ -45,12 +45,17 @@ def parse_quantity(text: str, dimension: str) -> float:
     known = ", ".join(units)
     match = _QUANTITY.match(text)
     if match is None:
-        raise UsageError(f"{text!r} is not a number with a unit; {dimension} takes {known}", next_step=_example(dimension))
+        raise UsageError(
+            f"{text!r} is not a number with a unit; {dimension} takes {known}", next_step=_example(dimension)
+        )
     number, unit = match.groups()
     if not unit:
         raise UsageError(f"{text!r} has no unit; {dimension} takes {known}", next_step=_example(dimension))
     if unit not in units:
-        raise UsageError(f"{text!r}: {unit!r} is not a unit of {dimension}; it takes {known}", next_step=_example(dimension))
+        raise UsageError(
+            f"{text!r}: {unit!r} is not a unit of {dimension}; it takes {known}",
+            next_step=_example(dimension),
+        )
     value = float(number) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{text!r} is not a finite number")

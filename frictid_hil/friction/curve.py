@@ -42,7 +42,9 @@ class FrictionCurve:
         v = np.asarray(velocity_rad_s, dtype=np.float64)
         f = np.asarray(torque_nm, dtype=np.float64)
         if v.ndim != 1 or v.shape != f.shape:
-            raise IdentificationError(f"velocities {v.shape} and torques {f.shape} must be equal 1-D shapes", where=where)
+            raise IdentificationError(
+                f"velocities {v.shape} and torques {f.shape} must be equal 1-D shapes", where=where
+            )
         if v.size < 2:
             raise IdentificationError(f"a curve needs at least 2 pairs, got {v.size}", where=where)
         if not (np.all(np.isfinite(v)) and np.all(np.isfinite(f))):
@@ -97,7 +99,8 @@ class FrictionCurve:
         knots = np.concatenate([[0.0], self.velocity_rad_s])
         levels = np.concatenate([[self.coulomb_nm], self.torque_nm])
         n = np.clip(np.searchsorted(knots, speed, side="right") - 1, 0, len(knots) - 1)
-        return levels[n] + self.slopes_nm_s_per_rad[n] * (speed - knots[n])
+        torque: Array = levels[n] + self.slopes_nm_s_per_rad[n] * (speed - knots[n])
+        return torque
 
     def rate_part(self, velocity_rad_s: Array) -> Array:
         """phi_0(v) = phi(v) - F_0 sgn(v) of (17): continuous through zero, N m."""

@@ -97,7 +97,7 @@ class Samples:
 
     def select(self, keep: NDArray[np.bool_] | slice) -> Samples:
         """The rows chosen by a mask or slice; marks are kept as they are."""
-        chosen = {name: column[keep] for name, column in self.columns().items()}
+        chosen: dict[str, Any] = {name: column[keep] for name, column in self.columns().items()}
         return replace(self, time_ns=self.time_ns[keep], **chosen)
 
     def during(self, mark: Mark) -> Samples:
@@ -133,6 +133,7 @@ def checked(samples: Samples, *, where: str = "") -> Samples:
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size and name not in ("external_torque_nm", "temperature_c"):
             raise InputFileError(
-                f"column {name} has {bad.size} values that are not finite, the first at row {int(bad[0])}", where=where
+                f"column {name} has {bad.size} values that are not finite, the first at row {int(bad[0])}",
+                where=where,
             )
     return samples
