@@ -77,7 +77,8 @@ class Move:
     def position_rad(self, time_s: Array) -> Array:
         """Quintic blend."""
         u = np.clip(np.asarray(time_s) / self.duration_s, 0.0, 1.0)
-        return self.from_rad + (self.to_rad - self.from_rad) * u**3 * (10 - 15 * u + 6 * u**2)
+        blend: Array = u**3 * (10 - 15 * u + 6 * u**2)
+        return self.from_rad + (self.to_rad - self.from_rad) * blend
 
     def details(self) -> Mapping[str, Any]:
         """From where to where."""
@@ -131,7 +132,8 @@ class Sine:
     def position_rad(self, time_s: Array) -> Array:
         """start + A/2 (1 - cos)."""
         phase = 2.0 * self.peak_velocity_rad_s / self.amplitude_rad * np.asarray(time_s)
-        return self.start_rad + self.amplitude_rad / 2 * (1.0 - np.cos(phase))
+        travelled: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase))
+        return self.start_rad + travelled
 
     def details(self) -> Mapping[str, Any]:
         """Travel, speed, repeats."""

@@ -1,0 +1,226 @@
+"""The cyclic loop: one exchange per period on absolute deadlines, every sample supervised and recorded.
+
+Nothing here allocates per cycle beyond small floats, waits for a file, or catches up by bursts: a cycle that comes late
+is counted, and cycles that were missed altogether are skipped on the clock while the set-points go on one by one, so
+that the joint never sees a jump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from frictid_hil.driver import Driver, Feedback, SetPoint
+from frictid_hil.errors import Interrupted, SafetyAbort
+from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.supervisor import Supervisor
+
+NOTHING_ASKED, DECELERATE, QUICK_STOP = 0, 1, 2
+
+
+class StopRequest(Protocol):
+    """Who may ask the loop to end: Ctrl-C, SIGTERM, a vanished parent."""
+
+    @property
+    def level(self) -> int:
+        """NOTHING_ASKED, DECELERATE or QUICK_STOP; read once per cycle."""
+        ...
+
+
+class SetPointSource(Protocol):
+    """Fills in the next set-point of the moving joint."""
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """Write the coming cycle's set-point from the last feedback; False when the motion is over."""
+        ...
+
+
+class Stream:
+    """Set-points computed beforehand, one per cycle."""
+
+    def __init__(self, positions_rad: Sequence[float]) -> None:
+        self._next = iter(positions_rad)
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """The next position of the list."""
+        position = next(self._next, None)
+        if position is None:
+            return False
+        set_point.position_rad = position
+        return True
+
+
+@dataclass(slots=True)
+class CycleCount:
+    """How well the loop kept its deadlines.
+
+    Attributes:
+        cycles: exchanges made.
+        late: cycles that began later than half a period after their deadline.
+        missed: deadlines that passed without an exchange.
+        worst_ns: largest lateness.
+        first_ns: run time of the first exchange.
+        last_ns: run time of the last exchange.
+    """
+
+    cycles: int = 0
+    late: int = 0
+    missed: int = 0
+    worst_ns: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Achieved rate."""
+        span_ns = self.last_ns - self.first_ns
+        return (self.cycles - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+
+
+class CyclicLoop:
+    """Exchanges, supervises, records; owns the set-points of all joints.
+
+    Args:
+        driver: cycling (``start_cycling`` was called).
+        supervisor: passes every cycle.
+        samples: ring for every new report of every joint.
+        cycle_hz: rate.
+        stop: read once per cycle.
+        joints: how many the driver has.
+        offset_ns: added to run time, so that it goes on from one stretch of cyclic traffic to the next.
+        pump: called every ``PUMP_CYCLES`` cycles where files are written by this same process (lock-step).
+    """
+
+    PUMP_CYCLES = 2048
+
+    def __init__(
+        self,
+        driver: Driver,
+        supervisor: Supervisor,
+        samples: Ring,
+        cycle_hz: float,
+        stop: StopRequest,
+        *,
+        joints: int,
+        offset_ns: int = 0,
+        pump: Callable[[], None] | None = None,
+    ) -> None:
+        self._driver = driver
+        self._supervisor = supervisor
+        self._samples = samples
+        self._period_ns = round(1e9 / cycle_hz)
+        self._stop = stop
+        self._pump = pump
+        self._offset_ns = offset_ns
+        self._deadline_ns = driver.clock.now_ns() + self._period_ns
+        self.set_points = [SetPoint() for _ in range(joints)]
+        self.feedback: Sequence[Feedback] = ()
+        self.count = CycleCount()
+
+    @property
+    def period_s(self) -> float:
+        """The cycle period."""
+        return self._period_ns * 1e-9
+
+    def now_ns(self) -> int:
+        """Run time of the coming exchange."""
+        return self._deadline_ns + self._offset_ns
+
+    def cycle(self, *, supervised: bool = True) -> Sequence[Feedback]:
+        """One exchange at the next deadline.
+
+        Raises:
+            SafetyAbort: by the supervisor.
+        """
+        clock, count, deadline_ns = self._driver.clock, self.count, self._deadline_ns
+        clock.wait_until(deadline_ns)
+        late_ns = clock.now_ns() - deadline_ns
+        period_ns = self._period_ns
+        if late_ns > period_ns // 2:
+            count.late += 1
+            count.worst_ns = max(count.worst_ns, late_ns)
+            if late_ns >= period_ns:
+                skipped = late_ns // period_ns
+                count.missed += skipped
+                deadline_ns += skipped * period_ns
+        self._deadline_ns = deadline_ns + period_ns
+
+        feedback = self.feedback = self._driver.exchange(self.set_points)
+        append = self._samples.append
+        for index, (report, set_point) in enumerate(zip(feedback, self.set_points, strict=True)):
+            if report.age_cycles == 0 and report.valid:
+                append(
+                    report.t_ns + self._offset_ns,
+                    report.position_rad,
+                    report.velocity_rad_s,
+                    report.torque_nm,
+                    set_point.position_rad,
+                    set_point.torque_nm + set_point.torque_offset_nm,
+                    report.external_torque_nm,
+                    report.temperature_c,
+                    report.status_raw,
+                    index,
+                    report.error_code,
+                )
+        if not count.cycles:
+            count.first_ns = deadline_ns
+        count.last_ns = deadline_ns
+        count.cycles += 1
+        if supervised:
+            self._supervisor.check(self.set_points, feedback)
+        if self._pump is not None and count.cycles % self.PUMP_CYCLES == 0:
+            self._pump()
+        return feedback
+
+    def run(self, source: SetPointSource, joint: int) -> None:
+        """Stream one motion of one joint to its end.
+
+        Raises:
+            SafetyAbort: by the supervisor.
+            Interrupted: asked to stop; the joint has been decelerated to rest first unless a quick stop was asked.
+        """
+        set_point = self.set_points[joint]
+        previous_rad = set_point.position_rad
+        while True:
+            level = self._stop.level
+            if level:
+                self._end_early(joint, set_point.position_rad - previous_rad, level)
+            previous_rad = set_point.position_rad
+            if not source.update(self.feedback[joint], set_point):
+                return
+            self.cycle()
+
+    def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
+        """Keep cycling with unchanged set-points until ``done(feedback)``.
+
+        Raises:
+            SafetyAbort: not done in time; ``what`` says what was awaited.
+            Interrupted: asked to stop.
+        """
+        for _ in range(max(1, round(timeout_s / self.period_s))):
+            if self._stop.level:
+                raise Interrupted("stopped on request before the motion began")
+            if done(self.cycle(supervised=False)):
+                return
+        raise SafetyAbort(f"{what} not seen within {timeout_s:g} s", next_step="run `frictid-hil check`")
+
+    def settle(self, cycles: int) -> None:
+        """Cycle with unchanged set-points, unsupervised and uninterruptible (used while ending)."""
+        for _ in range(cycles):
+            self.cycle(supervised=False)
+
+    def _end_early(self, joint: int, step_rad: float, level: int) -> None:
+        """Bring the commanded position to rest at constant deceleration within a tenth of a second."""
+        set_point = self.set_points[joint]
+        if level < QUICK_STOP and step_rad:
+            steps = max(2, round(0.1 / self.period_s))
+            for k in range(steps):
+                if self._stop.level >= QUICK_STOP:
+                    break
+                set_point.position_rad += step_rad * (1.0 - (k + 1) / steps)
+                self.cycle()
+        raise Interrupted(
+            "stopped on request; the joint was brought to rest",
+            next_step="continue with `--resume RUN`, or start again",
+        )

@@ -1,0 +1,75 @@
+"""What the scheduler tells whoever watches: plain values that cross process borders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from frictid_hil.driver import Capabilities, Finding, JointIdentity
+from frictid_hil.recording.samples import Mark
+
+
+@dataclass(frozen=True, slots=True)
+class Preflight:
+    """Hardware was reached and read; nothing has moved or been written yet.
+
+    Attributes:
+        identities: per joint name.
+        capabilities: of the driver.
+        findings: of ``check``; none is an error, or this event would not have come.
+    """
+
+    identities: dict[str, JointIdentity]
+    capabilities: Capabilities
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseStarted:
+    """A joint begins a stretch of its plan.
+
+    Attributes:
+        joint: name.
+        phase: ``configure``, ``enable``, ``move``, ``rehearsal``, ``hold``, ``cycles``, ``drift``, ``reversal``, ...
+        duration_s: planned, 0 where not known.
+    """
+
+    joint: str
+    phase: str
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class JointRun:
+    """A joint's motions are over and it is locked again.
+
+    Attributes:
+        joint: name.
+        session: number of the stretch of cyclic traffic; run time starts at zero in each.
+        marks: what it did, on the run time of the samples.
+        rate_hz: achieved cycle rate.
+        cycles: exchanges.
+        late_cycles: began later than half a period.
+        missed_cycles: deadlines without exchange.
+        worst_lateness_s: largest.
+        duration_s: run time of the whole session.
+    """
+
+    joint: str
+    session: int
+    marks: tuple[Mark, ...]
+    rate_hz: float
+    cycles: int
+    late_cycles: int
+    missed_cycles: int
+    worst_lateness_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """Something a person should know that does not end the run."""
+
+    message: str
+
+
+Event = Preflight | PhaseStarted | JointRun | Warned

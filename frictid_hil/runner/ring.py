@@ -1,0 +1,129 @@
+"""Preallocated rings between the cyclic loop and whoever writes files: samples and frames.
+
+One process appends, another (or the same, in lock-step) drains. The loop never waits for a file: where the reader falls
+a whole ring behind, rows are dropped and **counted**, and the count fails the run's quality gate.
+
+Layout of the memory: ``head`` (i64, rows ever appended), ``tail`` (i64, rows ever drained), ``dropped`` (i64), padding
+to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed on machines that store 8 bytes at once.
+"""
+
+from __future__ import annotations
+
+import struct
+from multiprocessing import shared_memory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SAMPLE_ROW = np.dtype(
+    [
+        ("t_ns", "<i8"),
+        ("position_rad", "<f8"),
+        ("velocity_rad_s", "<f8"),
+        ("torque_nm", "<f8"),
+        ("position_command_rad", "<f8"),
+        ("torque_command_nm", "<f8"),
+        ("external_torque_nm", "<f8"),
+        ("temperature_c", "<f8"),
+        ("status", "<u4"),
+        ("joint", "<u2"),
+        ("error_code", "<u2"),
+    ]
+)
+FRAME_ROW = np.dtype(
+    [("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("sent", "u1"), ("pad", "<u2"), ("data", "V64")]
+)
+PACK_SAMPLE = struct.Struct("<q7dIHH")
+PACK_FRAME = struct.Struct("<qIBBH64s")
+
+_HEADER_BYTES = 64
+_COUNTER = struct.Struct("<q")
+
+Rows = NDArray[np.void]
+
+
+class Ring:
+    """A single-producer single-consumer ring of fixed-size rows.
+
+    Args:
+        row: dtype of a row; ``pack`` must produce exactly these bytes.
+        pack: the compiled form of the same row.
+        capacity: rows held.
+        shared: live in shared memory, so that another process can attach by ``name``.
+        name: attach to this existing shared memory instead of creating it.
+    """
+
+    def __init__(
+        self, row: np.dtype[Any], pack: struct.Struct, capacity: int, *, shared: bool = False, name: str | None = None
+    ) -> None:
+        assert row.itemsize == pack.size, f"row of {row.itemsize} bytes, packed {pack.size}"
+        size = _HEADER_BYTES + capacity * row.itemsize
+        self._memory: shared_memory.SharedMemory | None = None
+        if shared or name is not None:
+            self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=0 if name else size)
+        self._buffer = memoryview(bytearray(size)) if self._memory is None else self._memory.buf
+        assert self._buffer is not None
+        buffer = self._buffer
+        self._owner = name is None
+        self._pack_into = pack.pack_into
+        self._row = row
+        self._capacity = capacity
+        self._head = 0
+        self._counters = np.frombuffer(buffer, dtype="<i8", count=3)
+
+    @property
+    def name(self) -> str:
+        """Name of the shared memory."""
+        assert self._memory is not None, "this ring is private to its process"
+        return self._memory.name
+
+    @property
+    def dropped(self) -> int:
+        """Rows lost because the reader fell behind."""
+        return int(self._counters[2])
+
+    def append(self, *values: Any) -> None:
+        """Pack one row; drops and counts it where the ring is full."""
+        head = self._head
+        if head - _COUNTER.unpack_from(self._buffer, 8)[0] >= self._capacity:
+            self._counters[2] += 1
+            return
+        self._pack_into(self._buffer, _HEADER_BYTES + (head % self._capacity) * self._row.itemsize, *values)
+        self._head = head + 1
+        _COUNTER.pack_into(self._buffer, 0, head + 1)
+
+    def drain(self) -> Rows:
+        """All rows since the last drain, in order, as a copy."""
+        head, tail = int(self._counters[0]), int(self._counters[1])
+        rows = np.frombuffer(self._buffer, dtype=self._row, count=self._capacity, offset=_HEADER_BYTES)
+        first, last = tail % self._capacity, head % self._capacity
+        if head == tail:
+            taken = rows[:0].copy()
+        elif first < last:
+            taken = rows[first:last].copy()
+        else:
+            taken = np.concatenate([rows[first:], rows[:last]])
+        self._counters[1] = head
+        return taken
+
+    def close(self) -> None:
+        """Let go of the memory; the creator also removes it."""
+        if self._memory is None:
+            return
+        del self._counters
+        self._buffer.release()
+        self._memory.close()
+        if self._owner:
+            self._memory.unlink()
+        self._memory = None
+
+
+def sample_ring(capacity: int = 1 << 16, *, shared: bool = False, name: str | None = None) -> Ring:
+    """A ring of ``SAMPLE_ROW``; the default holds a minute of one joint at 1 kHz."""
+    return Ring(SAMPLE_ROW, PACK_SAMPLE, capacity, shared=shared, name=name)
+
+
+def frame_ring(capacity: int = 1 << 18, *, shared: bool = False, name: str | None = None) -> Ring:
+    """A ring of ``FRAME_ROW``; the default holds half a minute of a 1 kHz bus."""
+    return Ring(FRAME_ROW, PACK_FRAME, capacity, shared=shared, name=name)

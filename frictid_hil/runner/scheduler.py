@@ -1,0 +1,393 @@
+"""The scheduler: reach the hardware, check, lock every joint except one, move it, lock it again, next joint.
+
+The order is always the same, and nothing in it is optional::
+
+    open, identify, check         reads only; an error ends here
+    proceed?                      a person (or --yes) has seen plan, identities and findings
+    per joint:
+        configure, limits         written and read back
+        position reference        every joint reports, inside its limits, near where the plan expects it
+        enable, lock others       and see them stand still
+        motions                   each streamed, supervised and marked
+        unlock, disable
+    whatever happens              quick stop, standstill, power off, bus released
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode, RobotSetup, SetPoint, Severity
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.plan import Hold, JointPlan, Motion, Move, Plan
+from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, StopRequest, Stream
+from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
+from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.units import degrees, format_angle
+
+_POWER_TIMEOUT_S = 3.0
+_STANDSTILL_S = 0.2
+_SESSION_GAP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Care:
+    """How careful the scheduler is; the defaults suit an arm of a few kilograms.
+
+    Attributes:
+        reference_tolerance_rad: a joint further than this from its planned locked position means that the position
+            reference is wrong, or that somebody moved the arm: refused.
+        approach_rad_s: speed of moves to locked and start positions.
+        still_rad: how far a joint may be from where it was locked.
+        still_rad_s: speed below which a joint stands.
+        following_error_rad: bound on the following error.
+        velocity_margin: measured speed may exceed the planned peak by this factor ...
+        velocity_slack_rad_s: ... plus this.
+        travel_slack_rad: measured position may leave the planned travel by this.
+    """
+
+    reference_tolerance_rad: float = math.radians(10.0)
+    approach_rad_s: float = math.radians(20.0)
+    still_rad: float = math.radians(0.25)
+    still_rad_s: float = math.radians(0.5)
+    following_error_rad: float = math.radians(5.0)
+    velocity_margin: float = 1.25
+    velocity_slack_rad_s: float = math.radians(10.0)
+    travel_slack_rad: float = math.radians(2.0)
+
+
+class Recorder:
+    """The two rings, and the run time that goes on from one stretch of cyclic traffic to the next."""
+
+    def __init__(self, samples: Ring, frames: Ring) -> None:
+        self.samples = samples
+        self.frames = frames
+        self.offset_ns = 0
+
+    def frame(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
+        """A frame on the wire (``driver.FrameSink``)."""
+        self.frames.append(t_ns + self.offset_ns, can_id, len(data), sent, 0, data)
+
+
+class Scheduler:
+    """Runs one plan on one driver.
+
+    Args:
+        driver: not yet opened.
+        setup: the robot, as the driver knows it.
+        plan: checked against limits.
+        recorder: rings.
+        notify: told what happens.
+        proceed: asked once after the preflight; False ends the run before anything moves.
+        stop: read once per cycle.
+        pump: see ``CyclicLoop``.
+        care: bounds.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        setup: RobotSetup,
+        plan: Plan,
+        recorder: Recorder,
+        *,
+        notify: Callable[[Event], None],
+        proceed: Callable[[Preflight], bool],
+        stop: StopRequest,
+        pump: Callable[[], None] | None = None,
+        care: Care | None = None,
+    ) -> None:
+        self._driver = driver
+        self._setup = setup
+        self._plan = plan
+        self._recorder = recorder
+        self._notify = notify
+        self._proceed = proceed
+        self._stop = stop
+        self._pump = pump
+        self._care = care or Care()
+        self._names = [joint.name for joint in setup.joints]
+
+    def run(self) -> None:
+        """The whole plan.
+
+        Raises:
+            HardwareError: hardware unreachable, or not what the robot file says.
+            PlanRefused: the person said no.
+            SafetyAbort: something unexpected; everything was stopped.
+            Interrupted: asked to stop; everything was stopped.
+        """
+        driver = self._driver
+        try:
+            driver.open(self._recorder.frame)
+            preflight = self._preflight()
+            self._notify(preflight)
+            if not self._proceed(preflight):
+                raise PlanRefused("not confirmed; nothing has moved")
+            for session, joint_plan in enumerate(self._plan.joints):
+                self._notify(self._run_joint(session, joint_plan))
+        finally:
+            driver.close()
+
+    def _preflight(self) -> Preflight:
+        identities = self._driver.identify()
+        findings = self._driver.check(self._plan)
+        errors = [finding for finding in findings if finding.severity is Severity.ERROR]
+        if errors:
+            raise HardwareError(
+                "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
+                next_step=errors[0].next_step or "run `frictid-hil check`",
+            )
+        return Preflight(identities, self._driver.capabilities(), tuple(findings))
+
+    # -- one joint ----------------------------------------------------------------------------------------------
+
+    def _run_joint(self, session: int, plan: JointPlan) -> JointRun:
+        driver = self._driver
+        moving = self._names.index(plan.joint)
+        self._notify(PhaseStarted(plan.joint, "configure", 0.0))
+        driver.configure(self._plan.cycle_hz, [plan.joint])
+        for joint in self._setup.joints:
+            driver.set_limits(
+                joint.name,
+                torque_nm=joint.max_torque_nm,
+                position_min_rad=joint.position_min_rad,
+                position_max_rad=joint.position_max_rad,
+            )
+        supervisor = Supervisor(self._names, [self._limits(joint, plan) for joint in self._setup.joints])
+        driver.start_cycling()
+        loop = CyclicLoop(
+            driver,
+            supervisor,
+            self._recorder.samples,
+            self._plan.cycle_hz,
+            self._stop,
+            joints=len(self._names),
+            offset_ns=self._recorder.offset_ns,
+            pump=self._pump,
+        )
+        try:
+            marks = self._motions(loop, supervisor, moving, plan)
+            self._power_off(loop)
+        except BaseException:
+            self._stop_everything(loop)
+            raise
+        driver.stop_cycling()
+        self._recorder.offset_ns = loop.now_ns() + _SESSION_GAP_NS
+        count = loop.count
+        return JointRun(
+            joint=plan.joint,
+            session=session,
+            marks=tuple(marks),
+            rate_hz=count.rate_hz,
+            cycles=count.cycles,
+            late_cycles=count.late,
+            missed_cycles=count.missed,
+            worst_lateness_s=count.worst_ns * 1e-9,
+            duration_s=(count.last_ns - count.first_ns) * 1e-9,
+        )
+
+    def _limits(self, joint: JointSetup, plan: JointPlan) -> JointLimits:
+        care = self._care
+        low, high = joint.position_min_rad, joint.position_max_rad
+        velocity = joint.max_velocity_rad_s
+        if joint.name == plan.joint:
+            velocity = min(velocity * 1.05, plan.peak_velocity_rad_s * care.velocity_margin + care.velocity_slack_rad_s)
+            low = max(low, min(plan.travel_rad[0], joint.locked_position_rad) - care.travel_slack_rad)
+            high = min(high, max(plan.travel_rad[1], joint.locked_position_rad) + care.travel_slack_rad)
+        return JointLimits(
+            position_min_rad=low,
+            position_max_rad=high,
+            velocity_rad_s=velocity,
+            torque_nm=joint.max_torque_nm * 1.05,
+            following_error_rad=care.following_error_rad,
+            still_rad=care.still_rad,
+        )
+
+    def _motions(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan) -> list[Mark]:
+        self._notify(PhaseStarted(plan.joint, "reference", 0.0))
+        self._verify_reference(loop, plan)
+        self._notify(PhaseStarted(plan.joint, "enable", 0.0))
+        self._enable_all(loop)
+        marks: list[Mark] = []
+        # Joints that are near, but not at, their planned locked position are brought there one by one.
+        for index, joint in enumerate(self._setup.joints):
+            target_rad = plan.locked.get(joint.name)
+            here_rad = loop.set_points[index].position_rad
+            if index != moving and target_rad is not None and abs(target_rad - here_rad) > 1e-4:
+                approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
+                self._lock_all_but(index, loop, supervisor)
+                self._stream(loop, index, approach)
+        self._lock_all_but(moving, loop, supervisor)
+        self._see_standstill(loop)
+        start_rad = loop.set_points[moving].position_rad
+        first = float(plan.motions[0].position_rad(np.zeros(1))[0])
+        if abs(first - start_rad) > 1e-4:
+            marks.append(
+                self._stream(loop, moving, Move.within(start_rad, first, self._care.approach_rad_s, name="approach"))
+            )
+        for motion in plan.motions:
+            self._notify(PhaseStarted(plan.joint, motion.name, motion.duration_s))
+            if motion.name == "rehearsal":
+                marks.append(self._rehearse(loop, supervisor, moving, plan, motion))
+            else:
+                marks.append(self._stream(loop, moving, motion))
+        home_rad = self._setup.joints[moving].locked_position_rad
+        back_rad = loop.set_points[moving].position_rad
+        if abs(home_rad - back_rad) > 1e-4:
+            self._notify(PhaseStarted(plan.joint, "return", 0.0))
+            marks.append(
+                self._stream(loop, moving, Move.within(back_rad, home_rad, self._care.approach_rad_s, name="return"))
+            )
+        marks.append(self._stream(loop, moving, Hold(home_rad, 0.2)))
+        return marks
+
+    def _stream(self, loop: CyclicLoop, index: int, motion: Motion) -> Mark:
+        steps = max(1, math.ceil(motion.duration_s / loop.period_s))
+        times_s = np.arange(steps) * loop.period_s
+        start_ns = loop.now_ns()
+        loop.run(Stream(motion.position_rad(times_s).tolist()), index)
+        return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+
+    def _rehearse(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan, motion: Motion) -> Mark:
+        """The full travel, slowly, with the torque bound at half; the sign of friction must be right."""
+        joint = self._setup.joints[moving]
+        normal = self._limits(joint, plan)
+        supervisor.set_limits(moving, replace(normal, torque_nm=0.5 * joint.max_torque_nm))
+        steps = max(1, math.ceil(motion.duration_s / loop.period_s))
+        positions = motion.position_rad(np.arange(steps) * loop.period_s)
+        watch = _SignWatch(Stream(positions.tolist()))
+        start_ns = loop.now_ns()
+        loop.run(watch, moving)
+        supervisor.set_limits(moving, normal)
+        half_difference_nm = watch.half_difference_nm()
+        if half_difference_nm is not None and half_difference_nm <= 0:
+            raise SafetyAbort(
+                f"moving forward took {-2 * half_difference_nm:.3g} N m less torque than moving back; "
+                "friction must oppose motion",
+                where=f"joint {joint.name}",
+                cause="the torque sign or the joint's direction is wrong, or the drive compensates friction itself",
+                next_step="check `direction` in the robot file and the drive's own friction compensation",
+            )
+        return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+
+    # -- power and locks ----------------------------------------------------------------------------------------
+
+    def _verify_reference(self, loop: CyclicLoop, plan: JointPlan) -> None:
+        loop.wait_for(lambda feedback: all(report.valid for report in feedback), 1.0, "a first report of every joint")
+        for joint, report, set_point in zip(self._setup.joints, loop.feedback, loop.set_points, strict=True):
+            expected_rad = plan.locked.get(joint.name, joint.locked_position_rad)
+            off_rad = report.position_rad - expected_rad
+            if not abs(off_rad) <= self._care.reference_tolerance_rad:
+                raise SafetyAbort(
+                    f"stands at {degrees(report.position_rad):.2f} deg, expected {degrees(expected_rad):.2f} deg "
+                    f"(within {format_angle(self._care.reference_tolerance_rad)})",
+                    where=f"joint {joint.name}",
+                    cause="the position reference is lost, or the arm was moved",
+                    next_step="home the robot or bring the joint to its locked_position_rad, then start again",
+                )
+            if not joint.position_min_rad <= report.position_rad <= joint.position_max_rad:
+                raise SafetyAbort(
+                    f"stands at {degrees(report.position_rad):.2f} deg, outside its limits", where=f"joint {joint.name}"
+                )
+            set_point.position_rad = report.position_rad
+
+    def _enable_all(self, loop: CyclicLoop) -> None:
+        for joint in self._setup.joints:
+            self._driver.enable(joint.name, Mode.POSITION)
+        loop.wait_for(
+            lambda feedback: all(report.state is JointState.ENABLED or report.error_code for report in feedback),
+            _POWER_TIMEOUT_S,
+            "power on every joint",
+        )
+        for joint, report in zip(self._setup.joints, loop.feedback, strict=True):
+            if report.error_code or report.state is not JointState.ENABLED:
+                raise SafetyAbort(
+                    f"could not be enabled: state {report.state.value}, error {report.error_code:#06x}",
+                    where=f"joint {joint.name}",
+                    next_step="clear the drive's fault, then start again",
+                )
+        # The bumpless set-point is where the drive stood when it was enabled.
+        for set_point, report in zip(loop.set_points, loop.feedback, strict=True):
+            set_point.position_rad = report.position_rad
+
+    def _lock_all_but(self, moving: int, loop: CyclicLoop, supervisor: Supervisor) -> None:
+        locked_at: dict[int, float] = {}
+        for index, joint in enumerate(self._setup.joints):
+            if index == moving:
+                self._driver.unlock(joint.name)
+            else:
+                self._driver.lock(joint.name)
+                locked_at[index] = loop.set_points[index].position_rad
+        supervisor.watch(moving, Mode.POSITION, locked_at)
+
+    def _see_standstill(self, loop: CyclicLoop) -> None:
+        need = max(2, round(_STANDSTILL_S / loop.period_s))
+        still = 0
+
+        def standing(feedback: Sequence[Feedback]) -> bool:
+            nonlocal still
+            quiet = all(
+                abs(report.position_rad - set_point.position_rad) <= self._care.still_rad
+                and abs(report.velocity_rad_s if math.isfinite(report.velocity_rad_s) else 0.0)
+                <= self._care.still_rad_s
+                for report, set_point in zip(feedback, loop.set_points, strict=True)
+            )
+            still = still + 1 if quiet else 0
+            return still >= need
+
+        loop.wait_for(standing, 2.0 + _STANDSTILL_S, "standstill of every locked joint")
+
+    def _power_off(self, loop: CyclicLoop) -> None:
+        for joint in self._setup.joints:
+            self._driver.unlock(joint.name)
+            self._driver.disable(joint.name)
+        loop.wait_for(
+            lambda feedback: all(report.state is JointState.DISABLED for report in feedback),
+            _POWER_TIMEOUT_S,
+            "power off on every joint",
+        )
+
+    def _stop_everything(self, loop: CyclicLoop) -> None:
+        """Quick stop, a moment of cycles so that it is seen, power off. Never hides the error that led here."""
+        self._driver.quick_stop()
+        try:
+            loop.settle(round(0.3 / loop.period_s))
+            for joint in self._setup.joints:
+                self._driver.disable(joint.name)
+            loop.settle(round(0.1 / loop.period_s))
+        except FrictidError:
+            # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
+            self._driver.quick_stop()
+
+
+class _SignWatch:
+    """Passes a stream on and keeps the mean torque of both directions."""
+
+    _MOVING_RAD_S = math.radians(2.0)
+
+    def __init__(self, source: SetPointSource) -> None:
+        self._source = source
+        self._sum = [0.0, 0.0]
+        self._count = [0, 0]
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """Count the report, then pass the next set-point on."""
+        if abs(feedback.velocity_rad_s) > self._MOVING_RAD_S and math.isfinite(feedback.torque_nm):
+            backward = feedback.velocity_rad_s < 0
+            self._sum[backward] += feedback.torque_nm
+            self._count[backward] += 1
+        return self._source.update(feedback, set_point)
+
+    def half_difference_nm(self) -> float | None:
+        """(mean forward - mean backward) / 2, None where one direction was never seen."""
+        if not all(self._count):
+            return None
+        forward, backward = (total / count for total, count in zip(self._sum, self._count, strict=True))
+        return 0.5 * (forward - backward)
