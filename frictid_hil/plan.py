@@ -8,12 +8,14 @@ back by the identification.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
+from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import PlanRefused
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 
@@ -146,7 +148,7 @@ class Sine:
 
 
 @dataclass(frozen=True, slots=True)
-class Sequence:
+class Corners:
     """Set-points through given corners, joined by straight lines of constant speed (triangles, dwells, steps).
 
     Attributes:
@@ -168,7 +170,7 @@ class Sequence:
         return np.interp(time_s, self.times_s, self.positions_rad)
 
     def details(self) -> Mapping[str, Any]:
-        """Number of corners."""
+        """How many."""
         return {"corners": len(self.times_s)}
 
 
@@ -218,3 +220,80 @@ class Plan:
     def duration_s(self) -> float:
         """Sum over joints."""
         return sum(joint.duration_s for joint in self.joints)
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What is expected of a joint before it was measured; enough to predict its peak torque.
+
+    Attributes:
+        inertia_kg_m2: in the posture of the run.
+        gravity_nm: largest holding torque over the travel.
+        friction_nm: at the highest planned speed.
+        source: where these figures come from (``robot file``, ``active profile``), named in a refusal.
+    """
+
+    inertia_kg_m2: float
+    gravity_nm: float
+    friction_nm: float
+    source: str = "robot file"
+
+
+def joint_plan(
+    joint: JointSetup, motions: Sequence[Motion], locked: Mapping[str, float], expected: Expected | None
+) -> JointPlan:
+    """The plan of one joint with its peaks filled in by sampling every motion at 1 ms.
+
+    Corners of straight-line motions are left out of the torque: the drive rounds them.
+    """
+    travel = [math.inf, -math.inf]
+    peak_rad_s = peak_rad_s2 = 0.0
+    for motion in motions:
+        step_s = min(1e-3, motion.duration_s / 2)
+        positions = motion.position_rad(np.arange(0.0, motion.duration_s + step_s / 2, step_s))
+        travel = [min(travel[0], float(positions.min())), max(travel[1], float(positions.max()))]
+        speeds = np.diff(positions) / step_s
+        peak_rad_s = max(peak_rad_s, float(np.abs(speeds).max(initial=0.0)))
+        if not isinstance(motion, Corners):
+            peak_rad_s2 = max(peak_rad_s2, float(np.abs(np.diff(speeds)).max(initial=0.0)) / step_s)
+    torque_nm = 0.0
+    if expected is not None:
+        torque_nm = expected.inertia_kg_m2 * peak_rad_s2 + abs(expected.gravity_nm) + abs(expected.friction_nm)
+    return JointPlan(joint.name, tuple(motions), dict(locked), peak_rad_s, torque_nm, (travel[0], travel[1]))
+
+
+def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, Expected]) -> None:
+    """Check the whole plan against the joints' limits, before anything is opened.
+
+    Raises:
+        PlanRefused: naming every joint whose planned position, speed or predicted torque exceeds a limit.
+    """
+    problems: list[str] = []
+    for entry in plan.joints:
+        joint = setup.joint(entry.joint)
+        low, high = entry.travel_rad
+        if low < joint.position_min_rad or high > joint.position_max_rad:
+            problems.append(
+                f"joint {joint.name}: planned travel {math.degrees(low):.1f}..{math.degrees(high):.1f} deg leaves its "
+                f"limits {math.degrees(joint.position_min_rad):.1f}..{math.degrees(joint.position_max_rad):.1f} deg"
+            )
+        if entry.peak_velocity_rad_s > joint.max_velocity_rad_s:
+            problems.append(
+                f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its limit "
+                f"{math.degrees(joint.max_velocity_rad_s):.1f} deg/s"
+            )
+        if entry.predicted_torque_nm > joint.max_torque_nm:
+            source = expected[joint.name].source if joint.name in expected else "robot file"
+            problems.append(
+                f"joint {joint.name}: predicted torque {entry.predicted_torque_nm:.1f} N m above the limit "
+                f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source})"
+            )
+        for name, locked_rad in entry.locked.items():
+            other = setup.joint(name)
+            if not other.position_min_rad <= locked_rad <= other.position_max_rad:
+                problems.append(f"joint {name}: locked position {math.degrees(locked_rad):.1f} deg outside its limits")
+    if problems:
+        raise PlanRefused(
+            "; ".join(dict.fromkeys(problems)),
+            next_step="raise the amplitude (peak torque grows as V^2 / A), lower the velocity, or move the start position",
+        )

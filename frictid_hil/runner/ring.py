@@ -4,7 +4,7 @@ One process appends, another (or the same, in lock-step) drains. The loop never 
 a whole ring behind, rows are dropped and **counted**, and the count fails the run's quality gate.
 
 Layout of the memory: ``head`` (i64, rows ever appended), ``tail`` (i64, rows ever drained), ``dropped`` (i64), padding
-to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed on machines that store 8 bytes at once.
+to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed where 8 bytes are stored at once.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ class Ring:
         self._memory: shared_memory.SharedMemory | None = None
         if shared or name is not None:
             self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=0 if name else size)
-        self._buffer = memoryview(bytearray(size)) if self._memory is None else self._memory.buf
-        assert self._buffer is not None
-        buffer = self._buffer
+        whole = memoryview(bytearray(size)) if self._memory is None else self._memory.buf
+        assert whole is not None, "shared memory is open"
+        self._buffer: memoryview[int] = whole
         self._owner = name is None
         self._pack_into = pack.pack_into
         self._row = row
         self._capacity = capacity
         self._head = 0
-        self._counters = np.frombuffer(buffer, dtype="<i8", count=3)
+        self._counters = np.frombuffer(whole, dtype="<i8", count=3)
 
     @property
     def name(self) -> str:
