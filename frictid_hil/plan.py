@@ -279,8 +279,8 @@ def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, E
             )
         if entry.peak_velocity_rad_s > joint.max_velocity_rad_s:
             problems.append(
-                f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its limit "
-                f"{math.degrees(joint.max_velocity_rad_s):.1f} deg/s"
+                f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its "
+                f"limit {math.degrees(joint.max_velocity_rad_s):.1f} deg/s"
             )
         if entry.predicted_torque_nm > joint.max_torque_nm:
             source = expected[joint.name].source if joint.name in expected else "robot file"
@@ -295,5 +295,5 @@ def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, E
     if problems:
         raise PlanRefused(
             "; ".join(dict.fromkeys(problems)),
-            next_step="raise the amplitude (peak torque grows as V^2 / A), lower the velocity, or move the start position",
+            next_step="raise the amplitude (peak torque grows as V^2/A), lower the velocity, or shift the start",
         )

@@ -1,0 +1,148 @@
+"""One way to speak: results on stdout, everything else on stderr, one JSON object with ``--json``, honest exit codes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+
+from frictid_hil.errors import FrictidError, UsageError
+from frictid_hil.units import parse_quantity
+
+EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
+
+Result = Mapping[str, Any]
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout, nothing else.")]
+YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, errors only.")]
+RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Robot file, by path or by name (hp3j.yaml).")]
+BusOption = Annotated[
+    str | None,
+    typer.Option("--bus", help="interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0)."),
+]
+
+
+def quantity(dimension: str) -> Callable[[str], float]:
+    """A parser for options typed with a unit, e.g. ``20deg``."""
+
+    def parse(text: str) -> float:
+        try:
+            return parse_quantity(text, dimension)
+        except UsageError as error:
+            hint = f"; {error.next_step}" if error.next_step else ""
+            raise typer.BadParameter(f"{error}{hint}") from None
+
+    parse.__name__ = dimension.upper().replace(" ", "-")
+    return parse
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """How this call was asked to speak.
+
+    Attributes:
+        as_json: one object on stdout.
+        quiet: no progress.
+    """
+
+    as_json: bool = False
+    quiet: bool = False
+
+    @property
+    def err(self) -> Console:
+        """For people, on stderr; plain without a TTY."""
+        return Console(
+            stderr=True, quiet=self.quiet or self.as_json, highlight=False, soft_wrap=not sys.stderr.isatty()
+        )
+
+    @property
+    def out(self) -> Console:
+        """For results, on stdout; silent with ``--json``."""
+        width = None if sys.stdout.isatty() else 120
+        return Console(quiet=self.as_json, highlight=False, width=width)
+
+    def run(self, verb: str, job: Callable[[], Result], show: Callable[[Result], None] | None = None) -> NoReturn:
+        """Call a job, print its result, leave with its exit code.
+
+        Args:
+            verb: names the schema (``frictid.<verb>/1``).
+            job: returns a mapping with ``outcome``; may raise ``FrictidError``.
+            show: prints the result for a person.
+        """
+        try:
+            result = dict(job())
+        except FrictidError as error:
+            self._fail(verb, error)
+        except BrokenPipeError:
+            os._exit(1)
+        except KeyboardInterrupt:
+            from frictid_hil.errors import Interrupted
+
+            self._fail(verb, Interrupted("interrupted before anything moved"))
+        result.setdefault("outcome", "ok")
+        code = int(result.pop("exit_code", EXIT_OF_OUTCOME[str(result["outcome"])]))
+        if self.as_json:
+            _print_json({"schema": f"frictid.{verb}/1", **result})
+        elif show is not None:
+            show(result)
+        error_text = result.get("error")
+        if code and isinstance(error_text, Mapping) and not self.as_json:
+            self._explain(error_text)
+        raise typer.Exit(code)
+
+    def _fail(self, verb: str, error: FrictidError) -> NoReturn:
+        described = describe(error)
+        if self.as_json:
+            _print_json({"schema": f"frictid.{verb}/1", "outcome": error.outcome, "error": described})
+        self._explain(described)
+        raise typer.Exit(error.exit_code)
+
+    def _explain(self, error: Mapping[str, Any]) -> None:
+        # Errors are never quiet, and never wrapped in the middle of a path.
+        console = Console(stderr=True, highlight=False, soft_wrap=True)
+        where = f"{error['where']}: " if error.get("where") else ""
+        console.print(f"[bold red]error:[/] {_plain(where)}{_plain(str(error.get('what', '')))}")
+        if error.get("cause"):
+            console.print(f"  likely cause: {_plain(str(error['cause']))}")
+        if error.get("next_step"):
+            console.print(f"  next step: {_plain(str(error['next_step']))}")
+
+
+def describe(error: FrictidError) -> dict[str, str]:
+    """The four sentences of an error, as they stand in JSON."""
+    return {"what": error.what, "where": error.where, "cause": error.cause, "next_step": error.next_step}
+
+
+def _plain(text: str) -> str:
+    return text.replace("[", "\\[")
+
+
+def _print_json(value: Mapping[str, Any]) -> None:
+    json.dump(_finite(value), sys.stdout, indent=None, separators=(", ", ": "), default=_jsonable)
+    sys.stdout.write("\n")
+    sys.stdout.flush()
+
+
+def _finite(value: Any) -> Any:
+    """NaN and infinities become null: JSON has neither."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value
+
+
+def _jsonable(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        return _finite(value.tolist())
+    return str(value)

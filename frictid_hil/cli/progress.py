@@ -1,0 +1,152 @@
+"""Watching a run: one row per joint with phase and ETA on a terminal, plain lines without one."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from frictid_hil.cli.output import Output
+from frictid_hil.driver import RobotSetup, Severity
+from frictid_hil.errors import UsageError
+from frictid_hil.plan import Plan
+from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
+from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity
+
+
+def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
+    """Joint order, travel, peaks, locked joints and duration, as a technician reads them."""
+    table = Table(title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz")
+    for heading in ("joint", "travel", "peak speed", "predicted torque", "limit", "time", "others locked at"):
+        table.add_column(heading)
+    for joint in plan.joints:
+        low, high = joint.travel_rad
+        limit = setup.joint(joint.joint).max_torque_nm
+        predicted = format_torque(joint.predicted_torque_nm) if joint.predicted_torque_nm else "unknown"
+        locked = " ".join(f"{name}:{degrees(at):.0f}" for name, at in joint.locked.items())
+        table.add_row(
+            joint.joint,
+            f"{degrees(low):.1f} .. {degrees(high):.1f} deg",
+            format_velocity(joint.peak_velocity_rad_s),
+            predicted,
+            format_torque(limit),
+            format_duration(joint.duration_s),
+            f"{locked} deg",
+        )
+    console.print(table)
+    for note in plan.notes:
+        console.print(f"note: {note}")
+
+
+class TerminalWatcher:
+    """The watcher of the command line.
+
+    Args:
+        output: how to speak.
+        yes: the person has said yes beforehand.
+    """
+
+    def __init__(self, output: Output, *, yes: bool) -> None:
+        self._console = output.err
+        self._silent = output.as_json or output.quiet
+        self._yes = yes
+        self._progress: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._planned: dict[str, float] = {}
+        self._done_s: dict[str, float] = {}
+        self._phase_s = 0.0
+        self._joint = ""
+        self._phase_began = time.monotonic()
+
+    def plan(self, plan: Plan, setup: RobotSetup) -> None:
+        """Print it, remember the durations."""
+        self._planned = {joint.joint: joint.duration_s for joint in plan.joints}
+        if not self._silent:
+            print_plan(self._console, plan, setup)
+
+    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+        """Ask on a TTY; without one ``--yes`` is needed."""
+        for finding in preflight.findings:
+            if finding.severity is not Severity.OK:
+                self.note(f"{finding.severity.value}: {finding.subject}: {finding.message}")
+        if self._yes:
+            return True
+        if not sys.stdin.isatty():
+            raise UsageError(
+                "motion needs a yes, and there is no terminal to ask on",
+                next_step="add --yes once the plan is right (see --dry-run)",
+            )
+        joints = ", ".join(joint.joint for joint in plan.joints)
+        return typer.confirm(
+            f"{plan.robot}: joints {joints} will move, one at a time, all others locked. Is the cell clear?", err=True
+        )
+
+    def event(self, event: Event) -> None:
+        """Follow the phases."""
+        if isinstance(event, PhaseStarted):
+            self._start_phase(event)
+        elif isinstance(event, JointRun):
+            self._finish(event)
+        elif isinstance(event, Warned):
+            self.note(f"warning: {event.message}")
+
+    def at(self, run_time_s: float) -> None:
+        """Advance the bar of the current phase."""
+        if self._progress is not None and self._joint in self._tasks:
+            done = self._done_s.get(self._joint, 0.0)
+            self._progress.update(self._tasks[self._joint], completed=min(run_time_s, done + self._phase_s))
+
+    def joint(self, joint: str, summary: str, ok: bool) -> None:
+        """A line per finished joint."""
+        self.note(f"joint {joint}: {summary}")
+
+    def note(self, message: str) -> None:
+        """A line above the bars."""
+        if not self._silent:
+            (self._progress.console if self._progress else self._console).print(message, markup=False)
+
+    def close(self) -> None:
+        """End the bars."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def _start_phase(self, event: PhaseStarted) -> None:
+        if self._silent:
+            return
+        if event.joint != self._joint:
+            self._joint = event.joint
+            self._done_s[event.joint] = 0.0
+        else:
+            self._done_s[event.joint] = self._done_s.get(event.joint, 0.0) + self._phase_s
+        self._phase_s = event.duration_s
+        if not self._console.is_terminal:
+            if event.duration_s >= 1.0 or event.phase == "configure":
+                self._console.print(f"joint {event.joint}: {event.phase} {format_duration(event.duration_s)}")
+            return
+        if self._progress is None:
+            self._progress = Progress(
+                TextColumn("joint {task.description}"),
+                BarColumn(),
+                TextColumn("{task.fields[phase]:<10}"),
+                TimeRemainingColumn(),
+                console=self._console,
+            )
+            self._progress.start()
+            for joint, planned_s in self._planned.items():
+                self._tasks[joint] = self._progress.add_task(joint, total=planned_s, phase="waiting")
+        task = self._tasks.get(event.joint)
+        if task is not None:
+            self._progress.update(task, completed=self._done_s[event.joint], phase=event.phase)
+
+    def _finish(self, event: JointRun) -> None:
+        if self._progress is not None and event.joint in self._tasks:
+            total = self._planned[event.joint]
+            self._progress.update(self._tasks[event.joint], completed=total, phase="done")
+
+
+__all__ = ["TerminalWatcher", "format_angle", "print_plan"]

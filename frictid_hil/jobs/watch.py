@@ -1,0 +1,60 @@
+"""Who watches a job: shows the plan, asks the person, follows its phases. The command line is one watcher."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from frictid_hil.driver import RobotSetup
+from frictid_hil.plan import Plan
+from frictid_hil.runner.events import Event, Preflight
+
+
+class Watcher(Protocol):
+    """Everything a job says while it works; nothing here decides a result except ``confirm``."""
+
+    def plan(self, plan: Plan, setup: RobotSetup) -> None:
+        """The plan, before anything is opened."""
+        ...
+
+    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+        """Ask the person, with the hardware read and the plan shown."""
+        ...
+
+    def event(self, event: Event) -> None:
+        """Something happened on the hardware."""
+        ...
+
+    def at(self, run_time_s: float) -> None:
+        """Run time of the newest sample; advances the progress of the current phase."""
+        ...
+
+    def joint(self, joint: str, summary: str, ok: bool) -> None:
+        """A joint's result in a line."""
+        ...
+
+    def note(self, message: str) -> None:
+        """A line a person should see."""
+        ...
+
+
+class Silent:
+    """Watches nothing and says yes; for scheduled jobs and tests."""
+
+    def plan(self, plan: Plan, setup: RobotSetup) -> None:
+        """Ignore."""
+
+    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+        """Yes."""
+        return True
+
+    def event(self, event: Event) -> None:
+        """Ignore."""
+
+    def at(self, run_time_s: float) -> None:
+        """Ignore."""
+
+    def joint(self, joint: str, summary: str, ok: bool) -> None:
+        """Ignore."""
+
+    def note(self, message: str) -> None:
+        """Ignore."""
