@@ -1,4 +1,4 @@
-"""One way to speak: results on stdout, everything else on stderr, one JSON object with ``--json``, honest exit codes."""
+"""One way to speak: results on stdout, the rest on stderr, one JSON object with ``--json``, honest exit codes."""
 
 from __future__ import annotations
 
