@@ -33,6 +33,8 @@ from frictid_hil.units import degrees, format_angle
 
 _POWER_TIMEOUT_S = 3.0
 _STANDSTILL_S = 0.2
+_LOCKED_REPORT_S = 0.010
+"""Locked joints report at least this often, whatever the layout of the bus."""
 _SESSION_GAP_NS = 1_000_000_000
 
 
@@ -161,6 +163,9 @@ class Scheduler:
                 position_max_rad=joint.position_max_rad,
             )
         supervisor = Supervisor(self._names, [self._limits(joint, plan) for joint in self._setup.joints])
+        for index in range(len(self._names)):
+            if index != moving:
+                supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
         driver.start_cycling()
         loop = CyclicLoop(
             driver,

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+
+from frictid_hil.runner.ring import FRAME_ROW, PACK_FRAME, PACK_SAMPLE, SAMPLE_ROW, Ring, frame_ring
+
+
+def fill(ring: Ring, first: int, count: int) -> None:
+    for k in range(first, first + count):
+        ring.append(k, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8, 9, 10)
+
+
+def test_packed_rows_are_what_the_dtype_says() -> None:
+    assert PACK_SAMPLE.size == SAMPLE_ROW.itemsize
+    assert PACK_FRAME.size == FRAME_ROW.itemsize
+
+
+def test_rows_come_out_in_order_across_the_wrap() -> None:
+    ring = Ring(SAMPLE_ROW, PACK_SAMPLE, 8)
+    seen: list[int] = []
+    for first in range(0, 60, 6):
+        fill(ring, first, 6)
+        seen.extend(ring.drain()["t_ns"].tolist())
+    assert seen == list(range(60))
+    assert ring.dropped == 0
+
+
+def test_a_full_ring_drops_and_counts_instead_of_overwriting() -> None:
+    ring = Ring(SAMPLE_ROW, PACK_SAMPLE, 8)
+    fill(ring, 0, 11)
+    assert ring.dropped == 3
+    assert ring.drain()["t_ns"].tolist() == list(range(8))
+    fill(ring, 20, 2)
+    assert ring.drain()["t_ns"].tolist() == [20, 21]
+
+
+def test_columns_keep_their_values() -> None:
+    ring = Ring(SAMPLE_ROW, PACK_SAMPLE, 8)
+    fill(ring, 0, 1)
+    (row,) = ring.drain()
+    assert list(row.item())[1:] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8, 9, 10]
+
+
+def test_another_process_could_attach_by_name() -> None:
+    ours = Ring(SAMPLE_ROW, PACK_SAMPLE, 16, shared=True)
+    theirs = Ring(SAMPLE_ROW, PACK_SAMPLE, 16, name=ours.name)
+    fill(theirs, 0, 3)
+    assert ours.drain()["t_ns"].tolist() == [0, 1, 2]
+    theirs.close()
+    ours.close()
+    with pytest.raises(FileNotFoundError):
+        Ring(SAMPLE_ROW, PACK_SAMPLE, 16, name="psm_no_such_ring")
+
+
+def test_frames_keep_their_bytes() -> None:
+    ring = frame_ring(4)
+    ring.append(5, 0x181, 3, True, 0, b"\x01\x02\x03")
+    (row,) = ring.drain()
+    assert (int(row["can_id"]), int(row["length"]), int(row["sent"])) == (0x181, 3, 1)
+    assert bytes(row["data"])[:3] == b"\x01\x02\x03"
+    assert np.dtype(FRAME_ROW).itemsize == 80
