@@ -1,0 +1,92 @@
+"""The policy of a robot file: what counts as drift, what may be promoted, and what may move with nobody watching."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from frictid_hil.config.schema import Strict
+
+
+class WarmUp(Strict):
+    """How a joint is brought to its working temperature before it is measured.
+
+    Attributes:
+        settled_percent_per_min: one cycle is repeated until its friction changes by less than this.
+        max_s: give up waiting for that after this time, and say so.
+        fixed_s: warm up for exactly this long instead; 0 for not at all.
+    """
+
+    settled_percent_per_min: float = Field(default=1.0, gt=0)
+    max_s: float = Field(default=900.0, ge=0)
+    fixed_s: float | None = Field(default=None, ge=0)
+
+
+class InterlockInput(Strict):
+    """The digital input that says the robot's cell is closed and empty.
+
+    Attributes:
+        joint: whose drive carries the input.
+        bit: of the drive's digital inputs (object 60FD), or the number of the controller's input.
+        closed_when: level of that bit when the interlock is closed.
+    """
+
+    joint: str
+    bit: int = Field(ge=0, le=31)
+    closed_when: Literal[0, 1] = 1
+
+
+class Unattended(Strict):
+    """The permission to move a real robot with nobody asked.
+
+    Attributes:
+        allowed_by: the person who takes the responsibility.
+        date: when, YYYY-MM-DD.
+        interlock_input: must be closed before and during motion.
+    """
+
+    allowed_by: str = Field(min_length=1)
+    date: str
+    interlock_input: InterlockInput
+
+    @field_validator("date")
+    @classmethod
+    def _is_a_day(cls, value: str) -> str:
+        try:
+            date.fromisoformat(value)
+        except ValueError:
+            raise ValueError(f"expected a date like 2026-11-21, found {value!r}") from None
+        return value
+
+
+class Policy(Strict):
+    """Limits are distances (15) between curves in percent of the reference curve's mean.
+
+    Attributes:
+        drift_percent: a joint further than this from the reference has drifted; reported, not refused.
+        drift_reference: ``baseline`` (the first profile promoted, or the one pinned since) sees slow drift that
+            night-by-night comparison with the ``active`` profile would not.
+        refuse_percent: a joint further than this from the active profile is taken as broken: nothing is promoted.
+        promotion: ``automatic`` within these limits, or only ``by_person``.
+        max_age_days: an older profile is not used for compensation unless forced.
+        max_temperature_difference_c: nor one identified at a temperature further away than this.
+        warm_up: before measuring.
+        unattended: absent, a real robot is moved only after a person said yes.
+    """
+
+    drift_percent: float = Field(default=10.0, gt=0)
+    drift_reference: Literal["baseline", "active"] = "baseline"
+    refuse_percent: float = Field(default=30.0, gt=0)
+    promotion: Literal["automatic", "by_person"] = "automatic"
+    max_age_days: float = Field(default=180.0, gt=0)
+    max_temperature_difference_c: float = Field(default=20.0, gt=0)
+    warm_up: WarmUp = WarmUp()
+    unattended: Unattended | None = None
+
+    @model_validator(mode="after")
+    def _drift_before_refusal(self) -> Policy:
+        if self.refuse_percent <= self.drift_percent and self.drift_reference == "active":
+            raise ValueError("refuse_percent must be above drift_percent, or no drift is ever reported")
+        return self

@@ -1,0 +1,350 @@
+"""The robot file: what the robot is, where it is reached, what may be done with it. ``schema: frictid.robot/1``.
+
+A *site file* says only what differs on one machine and extends the shipped file::
+
+    schema: frictid.robot/1
+    extends: hp3j.yaml
+    name: hp3j-lab-2
+    bus: socketcan:can0
+    driver: cia402
+
+Mappings merge key by key, everything else is replaced; errors point into the file that holds the value.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from frictid_hil.config.policy import Policy
+from frictid_hil.config.schema import Pair, Strict, schema_version, validated
+from frictid_hil.config.search import find
+from frictid_hil.config.yaml import Document, KeyPath, merge, read
+from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import ConfigError, FieldProblem, UsageError
+from frictid_hil.friction.trajectory import Procedure
+
+KIND = "frictid.robot"
+NEWEST = 1
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class ProcedureFile(Strict):
+    """V, A, N, c of the paper's procedure; A is peak-to-peak."""
+
+    amplitude_rad: Positive = 0.3490658503988659
+    velocity_rad_s: Positive = 2.007128639793479
+    cycles: int = Field(default=10, ge=2, le=1000)
+    ratio: float = Field(default=0.8, ge=0, lt=1)
+
+
+class JointProcedureFile(Strict):
+    """What differs for one joint (a shorter travel, a lower speed)."""
+
+    amplitude_rad: Positive | None = None
+    velocity_rad_s: Positive | None = None
+    cycles: int | None = Field(default=None, ge=2, le=1000)
+    ratio: float | None = Field(default=None, ge=0, lt=1)
+
+
+class JointFile(Strict):
+    """One joint; torque and position on the joint side of the gear."""
+
+    node: int | None = Field(default=None, ge=1, le=127)
+    axis: int | None = Field(default=None, ge=0, le=63)
+    gear_ratio: Positive
+    max_velocity_rad_s: Positive
+    max_torque_nm: Positive
+    rated_torque_nm: Positive
+    position_min_rad: float
+    position_max_rad: float
+    start_position_rad: float
+    locked_position_rad: float
+    direction: Literal[-1, 1] = 1
+    procedure: JointProcedureFile = JointProcedureFile()
+    options: dict[str, Any] = Field(default_factory=dict)
+    simulated: dict[str, Any] = Field(default_factory=dict)
+
+
+class WorkspaceFile(Strict):
+    """A box in the robot's base frame that no link may leave when several joints move together."""
+
+    x_m: Pair
+    y_m: Pair
+    z_m: Pair
+
+    @field_validator("x_m", "y_m", "z_m")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] >= value[1]:
+            raise ValueError(f"the first number must be below the second, found {list(value)}")
+        return value
+
+
+class RobotFile(Strict):
+    """The whole file."""
+
+    schema_: str = Field(alias="schema")
+    extends: str | None = None
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    driver: str
+    bus: str
+    cycle_hz: float = Field(gt=0, le=20_000)
+    options: dict[str, Any] = Field(default_factory=dict)
+    procedure: ProcedureFile = ProcedureFile()
+    policy: Policy = Policy()
+    workspace: WorkspaceFile | None = None
+    joints: dict[str, JointFile] = Field(min_length=1)
+
+    @field_validator("bus")
+    @classmethod
+    def _has_interface(cls, value: str) -> str:
+        interface_of(value)
+        return value
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot file, read and checked.
+
+    Attributes:
+        path: of the file named by the person (a site file, where there is one).
+        file: its values.
+        document: where they stand.
+    """
+
+    path: Path
+    file: RobotFile
+    document: Document
+
+    @property
+    def name(self) -> str:
+        """The robot's name."""
+        return self.file.name
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """In the order of the file."""
+        return tuple(self.file.joints)
+
+    @property
+    def policy(self) -> Policy:
+        """What may happen without a person."""
+        return self.file.policy
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the values (comments and layout do not count), hexadecimal."""
+        values = {key: value for key, value in self.document.data.items() if key != "extends"}
+        canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(canonical.encode()).hexdigest()
+
+    def driver(self, bus: str | None = None) -> str:
+        """The driver for a bus: the file's own, unless the bus given is of a kind that needs another.
+
+        Args:
+            bus: ``interface:channel`` as typed with ``--bus``; None for the file's own.
+
+        Raises:
+            UsageError: no ``interface:`` in ``bus``.
+        """
+        if bus is None:
+            return self.file.driver
+        interface = interface_of(bus)
+        if interface == interface_of(self.file.bus):
+            return self.file.driver
+        if interface == "virtual":
+            return "virtual"
+        if interface == "serial":
+            return "motoman" if self.file.driver in ("virtual", "cia402") else self.file.driver
+        return "cia402" if self.file.driver in ("virtual", "motoman") else self.file.driver
+
+    def procedure(
+        self,
+        joint: str,
+        *,
+        amplitude_rad: float | None = None,
+        velocity_rad_s: float | None = None,
+        cycles: int | None = None,
+        ratio: float | None = None,
+    ) -> Procedure:
+        """The procedure of one joint: what is given here, else the joint's own, else the robot's.
+
+        Raises:
+            UsageError: no such joint, or values that make no procedure.
+        """
+        self.check_joints([joint])
+        own, common = self.file.joints[joint].procedure, self.file.procedure
+        given = {
+            "amplitude_rad": amplitude_rad,
+            "velocity_rad_s": velocity_rad_s,
+            "cycles": cycles,
+            "ratio": ratio,
+        }
+        for name, value in given.items():
+            if value is None:
+                override = getattr(own, name)
+                given[name] = getattr(common, name) if override is None else override
+        try:
+            return Procedure(**given)  # type: ignore[arg-type]  # cycles is an int in the model and in the argument
+        except ValueError as error:
+            raise UsageError(str(error), where=f"joint {joint}") from None
+
+    def check_joints(self, names: Sequence[str]) -> None:
+        """Raise ``UsageError`` for a joint that this robot has not."""
+        for name in names:
+            if name not in self.file.joints:
+                raise UsageError(
+                    f"no joint named {name!r}; {self.name} has {', '.join(self.joint_names)}", where=str(self.path)
+                )
+
+    def to_setup(self, bus: str | None = None, *, realtime: bool = False, seed: int = 0) -> RobotSetup:
+        """The robot as a driver needs to know it.
+
+        Args:
+            bus: ``interface:channel`` instead of the file's own.
+            realtime: wall clock even where lock-step is possible.
+            seed: of simulated noise.
+
+        Raises:
+            ConfigError: a joint has no address of the kind that the driver of this bus needs.
+        """
+        driver = self.driver(bus)
+        addresses = {name: _address(joint, driver) for name, joint in self.file.joints.items()}
+        missing = [
+            FieldProblem(
+                ("joints", name), f"has no `{_ADDRESSED_BY[driver]}`, by which driver {driver} finds its joints"
+            )
+            for name, address in addresses.items()
+            if address is None
+        ]
+        if missing:
+            raise self.document.error(missing, at_key=[problem.path for problem in missing])
+        return RobotSetup(
+            name=self.name,
+            bus=bus or self.file.bus,
+            cycle_hz=self.file.cycle_hz,
+            joints=tuple(
+                _joint_setup(name, self.file.joints[name], address)
+                for name, address in addresses.items()
+                if address is not None
+            ),
+            options=self.file.options,
+            realtime=realtime,
+            seed=seed,
+        )
+
+    def problems_at(self, problems: Sequence[FieldProblem], under: KeyPath = ()) -> ConfigError:
+        """Problems found later by someone else (the simulation), with their places in the file.
+
+        Args:
+            problems: with paths relative to ``under``.
+            under: e.g. ``("joints", "1", "simulated")``.
+        """
+        return self.document.error([FieldProblem(under + p.path, p.message) for p in problems])
+
+
+_ADDRESSED_BY = {"virtual": "node", "cia402": "node", "motoman": "axis"}
+
+
+def load_robot(name: str | Path) -> Robot:
+    """Read and check a robot file.
+
+    Args:
+        name: a path, or a name on the search path (``hp3j.yaml``, ``hp3j``).
+
+    Raises:
+        ConfigError: not found, or wrong; the message lists every problem with file:line:column.
+    """
+    path = find(name)
+    document = _extended(path, ())
+    file = validated(document, RobotFile)
+    problems = _contradictions(file)
+    if problems:
+        raise document.error(problems, at_key=[("joints", name) for name in file.joints])
+    return Robot(path, file, document)
+
+
+def interface_of(bus: str) -> str:
+    """The interface part of ``interface:channel``.
+
+    Raises:
+        UsageError, which is also fit for a validator: no interface or no channel.
+    """
+    interface, colon, channel = bus.partition(":")
+    if not (interface and colon and channel):
+        raise BusSyntaxError(f"expected interface:channel (socketcan:can0, serial:/dev/ttyUSB0), found {bus!r}")
+    return interface
+
+
+class BusSyntaxError(UsageError, ValueError):
+    """A bus that is not ``interface:channel``; a ValueError too, so that validators can let it through."""
+
+
+def _extended(path: Path, seen: tuple[Path, ...]) -> Document:
+    if path.resolve() in seen:
+        raise ConfigError("extends itself, directly or through others", where=str(path))
+    document = read(path)
+    schema_version(document, KIND, NEWEST)
+    base = document.root.content.get("extends")
+    if base is None or not isinstance(base.content, str):
+        return document
+    try:
+        base_path = find(base.content, beside=path.parent)
+    except ConfigError as error:
+        raise ConfigError(
+            f"extends: {error.what}", where=str(base.place), cause=error.cause, next_step=error.next_step
+        ) from None
+    below = _extended(base_path, (*seen, path.resolve()))
+    return Document(path, merge(below.root, document.root))
+
+
+def _contradictions(file: RobotFile) -> list[FieldProblem]:
+    """What is wrong between fields that are each right by themselves."""
+    problems = []
+    taken: dict[tuple[str, int], str] = {}
+    for name, joint in file.joints.items():
+        at = ("joints", name)
+        low, high = joint.position_min_rad, joint.position_max_rad
+        if low >= high:
+            problems.append(FieldProblem((*at, "position_max_rad"), f"must be above position_min_rad = {low}"))
+        for key in ("start_position_rad", "locked_position_rad"):
+            value = getattr(joint, key)
+            if low < high and not low <= value <= high:
+                problems.append(FieldProblem((*at, key), f"{value} lies outside the limits [{low}, {high}]"))
+        if joint.node is None and joint.axis is None:
+            problems.append(FieldProblem(at, "has neither `node` (CAN) nor `axis` (serial)"))
+        for kind, address in (("node", joint.node), ("axis", joint.axis)):
+            if address is None:
+                continue
+            first = taken.setdefault((kind, address), name)
+            if first != name:
+                problems.append(FieldProblem((*at, kind), f"{kind} {address} is already that of joint {first}"))
+    interlock = file.policy.unattended.interlock_input if file.policy.unattended else None
+    if interlock and interlock.joint not in file.joints:
+        at_joint = ("policy", "unattended", "interlock_input", "joint")
+        problems.append(FieldProblem(at_joint, f"no such joint; this robot has {', '.join(file.joints)}"))
+    return problems
+
+
+def _address(joint: JointFile, driver: str) -> int | None:
+    """A driver of another maker takes whichever address the file gives."""
+    match _ADDRESSED_BY.get(driver):
+        case "node":
+            return joint.node
+        case "axis":
+            return joint.axis
+        case _:
+            return joint.axis if joint.node is None else joint.node
+
+
+def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
+    values = joint.model_dump(exclude={"node", "axis", "procedure", "options", "simulated"})
+    return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, **values)

@@ -1,0 +1,187 @@
+"""From a document to a validated model: all problems at once, in words a person can act on.
+
+Models forbid unknown keys, refuse text where a number belongs, and accept finite numbers only. What pydantic finds is
+re-told with the file's own places, the value found, and the nearest known key where one was misspelt.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from frictid_hil.config.yaml import Document, KeyPath
+from frictid_hil.errors import ConfigError, FieldProblem, UsageError
+from frictid_hil.units import parse_quantity
+
+
+class Strict(BaseModel):
+    """Base of everything that comes from a file: no unknown keys, no coercion, finite numbers, immutable."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+Model = TypeVar("Model", bound=Strict)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_as_tuple)]
+Pair = Annotated[tuple[float, float], BeforeValidator(_as_tuple)]
+Pairs = Annotated[tuple[Pair, ...], BeforeValidator(_as_tuple)]
+Names = Annotated[tuple[str, ...], BeforeValidator(_as_tuple)]
+
+
+def schema_version(document: Document, kind: str, newest: int) -> int:
+    """The major version a document declares by ``schema: <kind>/<major>``.
+
+    Raises:
+        ConfigError: no schema, one of another kind, or a newer major than this program knows.
+    """
+    declared = document.root.content.get("schema")
+    expected = f"{kind}/{newest}"
+    if declared is None:
+        raise ConfigError(
+            f"the file does not say what it is; expected `schema: {expected}`",
+            where=str(document.root.place),
+            next_step=f"add the line `schema: {expected}` if it is one",
+        )
+    where = str(declared.place)
+    found_kind, _, major = str(declared.content).partition("/")
+    if found_kind != kind:
+        raise ConfigError(f"this is a {declared.content}, not a {kind}", where=where, next_step=_right_verb(kind))
+    if not major.isascii() or not major.isdigit() or int(major) < 1:
+        raise ConfigError(f"schema: expected {expected}, found {declared.content!r}", where=where)
+    if int(major) > newest:
+        raise ConfigError(
+            f"schema: {declared.content} is newer than this program, which knows {expected}",
+            where=where,
+            next_step="update frictid-hil",
+        )
+    return int(major)
+
+
+def _right_verb(kind: str) -> str:
+    return f"give a file that starts with `schema: {kind}/...`"
+
+
+def validated(document: Document, model: type[Model], data: Mapping[str, Any] | None = None) -> Model:
+    """The document as a model.
+
+    Args:
+        document: gives the places for errors.
+        model: what it should be.
+        data: the values, where they were changed (migrated, renamed) since reading.
+
+    Raises:
+        ConfigError: every field that is wrong, with file:line:column.
+    """
+    try:
+        return model.model_validate(document.data if data is None else data)
+    except ValidationError as invalid:
+        errors = invalid.errors(include_url=False)
+    unknown = {
+        path: _nearest(model, path)
+        for path in (_existing(document, error["loc"]) for error in errors if error["type"] == "extra_forbidden")
+    }
+    # A misspelt key is one mistake, though it is also a missing one.
+    meant = {(*path[:-1], near) for path, near in unknown.items() if near}
+    problems = [FieldProblem(path, _unknown(model, path, near)) for path, near in unknown.items()]
+    for error in errors:
+        path = _existing(document, error["loc"])
+        if error["type"] != "extra_forbidden" and not (error["type"] == "missing" and path in meant):
+            problems.append(FieldProblem(path, _message(path, error)))
+    raise document.error(problems, at_key=unknown)
+
+
+def _nearest(model: type[Strict], path: KeyPath) -> str | None:
+    near = difflib.get_close_matches(str(path[-1]), _known_keys(model, path[:-1]), n=1, cutoff=0.5)
+    return near[0] if near else None
+
+
+def _unknown(model: type[Strict], path: KeyPath, near: str | None) -> str:
+    known = ", ".join(_known_keys(model, path[:-1]))
+    return f"unknown key; did you mean {near}?" if near else f"unknown key; known here: {known}"
+
+
+def _message(path: KeyPath, error: ErrorDetails) -> str:
+    kind = error["type"]
+    if kind == "missing":
+        return "missing"
+    message = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
+    if kind in ("value_error", "assertion_error"):
+        return message
+    return f"{message}, found {_shown(error['input'])}{_unit_hint(path, error['input'])}"
+
+
+def _existing(document: Document, loc: tuple[int | str, ...]) -> KeyPath:
+    """``loc`` without the words pydantic adds (names of validators and of union members)."""
+    _, found = document.deepest(loc)
+    return loc[: len(found) + 1]
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "a mapping"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    return "nothing" if value is None else repr(value)[:60]
+
+
+_DIMENSIONS = {
+    "_rad_s": "angular velocity",
+    "_rad": "angle",
+    "_m_s": "speed",
+    "_nm_per_rad": "stiffness",
+    "_nm": "torque",
+    "_n": "force",
+    "_hz": "frequency",
+    "_s": "duration",
+    "_m": "length",
+}
+
+
+def _unit_hint(path: KeyPath, value: Any) -> str:
+    """For ``20deg`` typed at ``start_position_rad``: the number that belongs there."""
+    if not isinstance(value, str) or not re.search(r"\d", value) or not path:
+        return ""
+    name = next((str(key) for key in reversed(path) if isinstance(key, str)), "")
+    for suffix, dimension in _DIMENSIONS.items():
+        if name.endswith(suffix):
+            try:
+                return f"; files hold plain numbers: write {parse_quantity(value, dimension)!r}"
+            except UsageError:
+                return f"; files hold plain numbers in the unit that ends the key ({suffix[1:]})"
+    return ""
+
+
+def _known_keys(model: type[Strict], path: KeyPath) -> list[str]:
+    """The keys a mapping at ``path`` may hold."""
+    kind: Any = model
+    for key in path:
+        kind = _inside(kind)
+        if _is_model(kind):
+            field = kind.model_fields.get(str(key))
+            kind = field.annotation if field else None
+        else:
+            kind = get_args(kind)[-1] if get_args(kind) else None
+    kind = _inside(kind)
+    return [field.alias or name for name, field in kind.model_fields.items()] if _is_model(kind) else []
+
+
+def _inside(kind: Any) -> Any:
+    """The first model or container inside an optional or annotated type."""
+    while get_origin(kind) in (Union, UnionType, Annotated):
+        kind = next(option for option in get_args(kind) if option is not type(None))
+    return kind
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
