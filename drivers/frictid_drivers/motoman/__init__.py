@@ -1,0 +1,1 @@
+"""MOTOMAN-class controllers on a serial line: host control, batch jobs, streaming."""

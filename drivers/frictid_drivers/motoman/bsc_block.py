@@ -1,0 +1,143 @@
+"""Blocks of the BSC-like link: how a message is cut into them, and how one is read back from bytes.
+
+``SOH hh,sss STX data (CR ETX | ETB) BCC`` comes first, ``STX data (CR ETX | ETB) BCC`` continues it. The block check is
+a 16-bit **sum** of everything after the leading SOH (STX in a continuation) up to and including ETX or ETB, low byte
+first. Its two bytes may look like any control code, so the reader goes to ETX or ETB and then takes exactly two raw
+bytes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+SOH: Final = 0x01
+STX: Final = 0x02
+ETX: Final = 0x03
+EOT: Final = 0x04
+ENQ: Final = 0x05
+CR: Final = 0x0D
+DLE: Final = 0x10
+NAK: Final = 0x15
+ETB: Final = 0x17
+
+MAX_DATA_BYTES: Final = 256
+_HEADER_BYTES: Final = 6
+_LONGEST: Final = 1 + _HEADER_BYTES + 1 + MAX_DATA_BYTES + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One whole message.
+
+    Attributes:
+        header: ``hh,sss``, e.g. ``01,000``.
+        text: the data without the CR that ends it; printable ASCII.
+    """
+
+    header: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One block, read and checked.
+
+    Attributes:
+        header: ``hh,sss`` on a first block, "" on a continuation.
+        text: its data, without the final CR.
+        last: it ended in ETX.
+    """
+
+    header: str
+    text: str
+    last: bool
+
+
+def block_check(covered: bytes) -> bytes:
+    """The 16-bit sum of the covered bytes, low byte first."""
+    return (sum(covered) & 0xFFFF).to_bytes(2, "little")
+
+
+def encode_blocks(message: Message) -> list[bytes]:
+    """The blocks of a message, at most 256 data bytes each (the final CR counts), the first with the header.
+
+    Raises:
+        ValueError: header not ``hh,sss``, or text that is not printable ASCII.
+    """
+    header, data = message.header.encode("ascii"), message.text.encode("ascii")
+    if len(header) != _HEADER_BYTES or header[2:3] != b",":
+        raise ValueError(f"header {message.header!r} is not hh,sss")
+    if not _printable(data):
+        raise ValueError("the text of a block may hold printable ASCII only")
+    data += bytes([CR])
+    blocks = []
+    for start in range(0, len(data), MAX_DATA_BYTES):
+        end_code = ETX if start + MAX_DATA_BYTES >= len(data) else ETB
+        lead, covered = (SOH, header + bytes([STX])) if start == 0 else (STX, b"")
+        covered += data[start : start + MAX_DATA_BYTES] + bytes([end_code])
+        blocks.append(bytes([lead]) + covered + block_check(covered))
+    return blocks
+
+
+def decode_block(raw: bytes) -> Block | None:
+    """The block in these bytes, from SOH or STX to the end of the block check; None where anything is wrong with it."""
+    covered, check = raw[1:-2], raw[-2:]
+    if len(covered) < 1 or check != block_check(covered):
+        return None
+    header, data, last = b"", covered[:-1], covered[-1] == ETX
+    if raw[0] == SOH:
+        header, stx, data = data[:_HEADER_BYTES], data[_HEADER_BYTES : _HEADER_BYTES + 1], data[_HEADER_BYTES + 1 :]
+        if stx != bytes([STX]):
+            return None
+    if last:
+        if data[-1:] != bytes([CR]):
+            return None
+        data = data[:-1]
+    if not (_printable(header) and _printable(data)):
+        return None
+    return Block(header.decode("ascii"), data.decode("ascii"), last)
+
+
+class BlockReader:
+    """Collects the bytes of one block; ``open`` from its SOH or STX until it is whole or broken."""
+
+    def __init__(self) -> None:
+        self._raw = bytearray()
+        self._check_bytes_left = 0
+
+    @property
+    def open(self) -> bool:
+        """A block has begun."""
+        return bool(self._raw)
+
+    def clear(self) -> None:
+        """Forget the block."""
+        self._raw.clear()
+        self._check_bytes_left = 0
+
+    def take(self, byte: int) -> bytes | None:
+        """One more byte; the raw block when this byte completes it.
+
+        Raises:
+            ValueError: this byte cannot stand in a block.
+        """
+        raw = self._raw
+        raw.append(byte)
+        if self._check_bytes_left:
+            self._check_bytes_left -= 1
+            if not self._check_bytes_left:
+                whole = bytes(raw)
+                self.clear()
+                return whole
+        elif byte in (ETX, ETB):
+            self._check_bytes_left = 2
+        elif len(raw) > 1 and not (0x20 <= byte < 0x7F or byte in (CR, STX)):
+            raise ValueError(f"control code {byte:02x} inside a block")
+        elif len(raw) >= _LONGEST:
+            raise ValueError(f"a block longer than {_LONGEST} bytes")
+        return None
+
+
+def _printable(data: bytes) -> bool:
+    return all(0x20 <= byte < 0x7F for byte in data)

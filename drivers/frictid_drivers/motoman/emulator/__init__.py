@@ -1,0 +1,5 @@
+"""A serial controller that is not there: bytes in, bytes out, six simulated joints behind it.
+
+Written against the bytes of the documentation, not against the driver: no codec is shared, so that the two can only
+agree by both being right. The core runs in any time it is given (``Emulator``); ``pty`` puts it on a real terminal.
+"""
