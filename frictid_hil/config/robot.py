@@ -54,6 +54,20 @@ class JointProcedureFile(Strict):
     ratio: float | None = Field(default=None, ge=0, lt=1)
 
 
+class ExpectedFile(Strict):
+    """What is expected of a joint before it was measured; predicts the peak torque of a plan.
+
+    Attributes:
+        inertia_kg_m2: in the posture of the run.
+        gravity_nm: largest holding torque over the travel.
+        friction_nm: at the highest planned speed.
+    """
+
+    inertia_kg_m2: float = Field(ge=0)
+    gravity_nm: float = Field(ge=0)
+    friction_nm: float = Field(ge=0)
+
+
 class JointFile(Strict):
     """One joint; torque and position on the joint side of the gear."""
 
@@ -68,6 +82,7 @@ class JointFile(Strict):
     start_position_rad: float
     locked_position_rad: float
     direction: Literal[-1, 1] = 1
+    expected: ExpectedFile | None = None
     procedure: JointProcedureFile = JointProcedureFile()
     options: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
