@@ -1,0 +1,1 @@
+"""One geared joint with its servo loop, and every physical effect defined once, one file each."""

@@ -1,0 +1,178 @@
+"""From the bare joint and the effects that exist, one compiled kernel.
+
+``plant.py`` is read as text, its marked lines are replaced by calls of the effects' hooks, and the result is written as
+a module of its own, named by a hash of everything in it, into the user's cache folder. So numba's on-disk cache
+works (it needs a file), and never serves a kernel built from an older effect.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.simulation import plant
+from frictid_hil.simulation.effect import Effect
+from frictid_hil.simulation.effects import all_effects
+
+_MARKER = re.compile(r"^(?P<indent> *)# effects at (?P<stage>\w+) (?:transform (?P<name>\w+)|update)$")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where every effect's numbers live in the kernel's flat vectors.
+
+    Attributes:
+        parameters: first parameter slot by effect.
+        states: first state slot by effect.
+        curve_at: slot of the rate curve's first knot.
+        state_size: length of the state vector.
+    """
+
+    parameters: Mapping[str, int]
+    states: Mapping[str, int]
+    curve_at: int
+    state_size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """The compiled functions of ``plant.py``, effects included; see there for their arguments."""
+
+    run: Callable[..., None]
+    steady: Callable[..., None]
+    place: Callable[..., None]
+    settle: Callable[..., None]
+    gravity_torque: Callable[..., float]
+
+
+@functools.cache
+def layout() -> Layout:
+    """The layout of all effects there are."""
+    parameters: dict[str, int] = {}
+    states: dict[str, int] = {}
+    next_parameter, next_state = plant.CORE_PARAMETERS, plant.CORE_STATES
+    for effect in all_effects().values():
+        parameters[effect.name] = next_parameter
+        states[effect.name] = next_state
+        next_parameter += len(effect.parameters)
+        next_state += effect.state_size
+    return Layout(parameters, states, next_parameter, next_state)
+
+
+@functools.cache
+def kernel() -> Kernel:
+    """The compiled kernel with every effect there is; the first call on a machine compiles for some seconds."""
+    module = _load(kernel_source())
+    return Kernel(module.run, module.steady, module.place, module.settle, module.gravity_torque)
+
+
+def kernel_source() -> str:
+    """The text of the composed module."""
+    effects = all_effects()
+    where = layout()
+    template = Path(plant.__file__).read_text(encoding="utf-8")
+    known = _locals_by_stage(template)
+    used: dict[str, Callable[..., Any]] = {}
+    lines: list[str] = []
+    for line in template.splitlines():
+        marker = _MARKER.match(line)
+        if marker is None:
+            if line.startswith("def "):
+                lines.append("@njit(error_model='numpy', cache=True)")
+            lines.append(line)
+            continue
+        stage = marker["stage"]
+        for effect, hook in _hooks_at(effects, stage):
+            name = f"{effect.name}_{hook.function.__name__}"
+            used[name] = hook.function
+            call = f"{name}({_arguments(effect, hook.function, where, known[stage])})"
+            lines.append(marker["indent"] + (f"{marker['name']} = {call}" if marker["name"] else call))
+    imports = ["from numba import njit"]
+    for name, function in used.items():
+        # The digest makes this text, and with it the file's name, change with the hook.
+        imports.append(f"from {function.__module__} import {function.__name__} as _{name}")
+        imports.append(f"{name} = njit(error_model='numpy')(_{name})  # {_digest(inspect.getsource(function))}")
+    text = "\n".join(["# Composed from plant.py and the effects; do not edit.", *lines, ""])
+    return text.replace("import math\n", "\n".join(["import math", *imports, ""]), 1)
+
+
+def _hooks_at(effects: Mapping[str, Effect], stage: str) -> list[tuple[Effect, Any]]:
+    found = [(effect, hook) for effect in effects.values() for hook in effect.hooks if hook.stage == stage]
+    return sorted(found, key=lambda pair: pair[1].order)
+
+
+def _arguments(effect: Effect, function: Callable[..., Any], where: Layout, known: frozenset[str]) -> str:
+    """The call's arguments: each by the name the hook gave it."""
+    slots = {parameter.name: where.parameters[effect.name] + k for k, parameter in enumerate(effect.parameters)}
+    arguments: list[str] = []
+    for name in inspect.signature(function).parameters:
+        if name in slots:
+            arguments.append(f"parameters[{slots[name]}]")
+        elif name == "at":
+            arguments.append(str(where.states[effect.name]))
+        elif name in known:
+            arguments.append(name)
+        else:
+            raise RuntimeError(
+                f"effect {effect.name}: {function.__name__} asks for {name!r}, which is neither one of its parameters "
+                f"nor known at its stage ({', '.join(sorted(known))})"
+            )
+    return ", ".join(arguments)
+
+
+def _locals_by_stage(template: str) -> dict[str, frozenset[str]]:
+    """Names that each stage's hooks may use: arguments and variables of the function that holds the marker."""
+    stages: dict[str, frozenset[str]] = {}
+    functions = [node for node in ast.parse(template).body if isinstance(node, ast.FunctionDef)]
+    lines = template.splitlines()
+    ends = [node.lineno for node in functions[1:]] + [len(lines)]
+    for node, end in zip(functions, ends, strict=True):
+        names = {argument.arg for argument in node.args.args}
+        names |= {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        for line in lines[node.lineno - 1 : end]:
+            if marker := _MARKER.match(line):
+                stages[marker["stage"]] = frozenset(names)
+    return stages
+
+
+def _load(source: str) -> Any:
+    """Import the text as a module from a file named by its hash."""
+    name = f"frictid_hil_kernel_{_digest(source)}"
+    path = _cache_folder() / f"{name}.py"
+    if not path.exists():
+        # Another process may write the same file at this moment: make the complete file appear at once.
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as file:
+            file.write(source)
+        Path(file.name).replace(path)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _cache_folder() -> Path:
+    """``$XDG_CACHE_HOME/frictid-hil`` or its default; a private temporary folder where that cannot be written."""
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "frictid-hil"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="frictid-hil-"))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,154 @@
+"""What a physical effect is: a name, parameters with units and bounds, where it shows, and two forms of one formula.
+
+The **forward** form is a set of hooks: plain scalar functions that the joint's kernel calls at named places (*stages*)
+of ``plant.py``. A hook names what it needs in its own signature: parameters of its effect, ``state`` and ``at`` (the
+flat state vector and the effect's first slot in it), or any quantity the stage knows (``velocity_rad_s``, ``step_s``).
+The **inverse** form turns a recording into regressors for the diagnosis. Nothing outside an effect's file lists it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from frictid_hil.friction.trajectory import Array
+
+
+class Channel(Enum):
+    """Which residual of a recording an effect can show in."""
+
+    KINEMATIC = "K"
+    """Reported velocity against differenced position, the position steps themselves."""
+    ACTUATION = "A"
+    """Reported torque against the controller's demand."""
+    PLANT = "P"
+    """Reported torque against the joint's equation of motion."""
+
+
+class Region(Enum):
+    """Where in a recording an effect shows."""
+
+    VELOCITY_BAND = "velocity band"
+    POSITION = "position"
+    REVERSAL = "reversal"
+    STANDSTILL = "standstill"
+    ACCELERATION = "acceleration"
+    LOAD = "load"
+    TEMPERATURE = "time and temperature"
+    FREQUENCY = "frequency"
+    ACTUATION = "actuation"
+    KINEMATICS = "kinematics"
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number of an effect.
+
+    Attributes:
+        name: with its unit as suffix; ``_share`` is a fraction of the joint's Coulomb level unless described otherwise.
+        lower: bound of what a file may say and a fit may find.
+        upper: bound.
+        typical: a size met on real joints; the default of a parameter that a file leaves out.
+        description: what it is.
+        off: the value that makes the whole effect vanish, or None where the parameter only shapes it.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    typical: float
+    description: str
+    off: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """Where an effect shows.
+
+    Attributes:
+        channels: residuals it appears in, the clearest first.
+        regions: parts of a recording it appears in, the clearest first.
+    """
+
+    channels: tuple[Channel, ...]
+    regions: tuple[Region, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Illustration:
+    """Data of one small plot; each curve is (label, x, y).
+
+    Attributes:
+        x_label: with unit.
+        y_label: with unit.
+        curves: equal-length arrays of shape (k,) each.
+    """
+
+    x_label: str
+    y_label: str
+    curves: tuple[tuple[str, Array, Array], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Hook:
+    """One function at one stage of the kernel.
+
+    Attributes:
+        stage: name of the stage in ``plant.py``.
+        function: scalars in, the transformed scalar out (nothing for stages that only update ``state``).
+        order: hooks of a stage run by rising order.
+    """
+
+    stage: str
+    function: Callable[..., Any]
+    order: int = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One physical effect; see the module's first page.
+
+    Attributes:
+        name: as in robot files and diagnoses; the name of its file.
+        summary: one line.
+        documentation: a paragraph: formula, when it appears, source.
+        parameters: in the order of its files.
+        signature: where it shows.
+        hooks: the forward form.
+        illustrate: a plot of the effect at given parameters (``typical`` ones when empty).
+        inverse: the inverse form, ``regressors(view, ...)``; its protocol belongs to the diagnosis.
+        state_size: number of slots in the state vector.
+        carried: its state survives from one recording to the next (temperature).
+    """
+
+    name: str
+    summary: str
+    documentation: str
+    parameters: tuple[Parameter, ...]
+    signature: Signature
+    hooks: tuple[Hook, ...]
+    illustrate: Callable[[Mapping[str, float]], Illustration]
+    inverse: Callable[..., Any] | None = None
+    state_size: int = 0
+    carried: bool = False
+
+    @property
+    def typical(self) -> dict[str, float]:
+        """Parameters of a typical size."""
+        return {parameter.name: parameter.typical for parameter in self.parameters}
+
+    @property
+    def off(self) -> dict[str, float]:
+        """Parameters at which the effect vanishes; shapes keep their typical value."""
+        return {p.name: p.typical if p.off is None else p.off for p in self.parameters}
+
+    @property
+    def strengths(self) -> tuple[Parameter, ...]:
+        """The parameters whose ``off`` value makes the effect vanish."""
+        return tuple(parameter for parameter in self.parameters if parameter.off is not None)
+
+    def complete(self, given: Mapping[str, float]) -> dict[str, float]:
+        """All parameters: the given ones, typical values for shapes left out, off for strengths left out."""
+        return {**self.off, **given}

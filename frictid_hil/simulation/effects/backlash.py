@@ -1,0 +1,71 @@
+"""Play between motor and link: a dead zone in the transmission."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def play(play_rad: float, gap_rad: float) -> float:
+    """Whole gap of the transmission."""
+    return play_rad + gap_rad
+
+
+def coupling(coupling_nm_per_rad: float, gap_rad: float, contact_stiffness_nm_per_rad: float) -> float:
+    """Stiffness in contact; 0 stands for a rigid joint."""
+    if gap_rad == 0.0 or coupling_nm_per_rad > 0.0:
+        return coupling_nm_per_rad
+    return contact_stiffness_nm_per_rad
+
+
+def coupling_damping(
+    coupling_nm_s_per_rad: float, coupling_nm_per_rad: float, gap_rad: float, contact_relaxation_s: float
+) -> float:
+    """Damping in contact."""
+    if gap_rad == 0.0:
+        return coupling_nm_s_per_rad
+    return max(coupling_nm_s_per_rad, contact_relaxation_s * coupling_nm_per_rad)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Transmitted torque over the angle between motor and link."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    half = p["gap_rad"] / 2
+    twist = np.linspace(-4.0 * half, 4.0 * half, 201)
+    torque = p["contact_stiffness_nm_per_rad"] * (twist - np.clip(twist, -half, half))
+    return Illustration("motor minus link (rad)", "transmitted torque (N m)", (("with play", twist, torque),))
+
+
+EFFECT = Effect(
+    name="backlash",
+    summary="Play between motor and link.",
+    documentation=(
+        "Worn or unpreloaded gears leave a gap: the motor turns through it without moving the link, then meets it "
+        "with the contact stiffness. Transmitted torque = stiffness * deadzone(q_m - q_l, gap / 2) plus damping "
+        "while in contact; the contact stiffness counts only where the joint is not elastic anyway. It shows at "
+        "reversals of the *load*, as motor motion without load torque followed by a knock. Source: M. Nordin, "
+        "P.-O. Gutman, 'Controlling mechanical systems with backlash - a survey', Automatica 38, 2002."
+    ),
+    parameters=(
+        Parameter("gap_rad", 0.0, 0.05, 1e-3, "whole play, joint side", off=0.0),
+        Parameter("contact_stiffness_nm_per_rad", 1e3, 1e6, 2e4, "stiffness of the closed contact"),
+        Parameter("contact_relaxation_s", 0.0, 0.02, 1e-3, "damping over stiffness of the closed contact"),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.REVERSAL, Region.ACCELERATION, Region.FREQUENCY)),
+    hooks=(
+        Hook("play", play),
+        Hook("coupling", coupling, order=60),
+        Hook("coupling_damping", coupling_damping, order=60),
+    ),
+    illustrate=illustrate,
+)

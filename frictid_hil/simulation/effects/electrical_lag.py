@@ -1,0 +1,63 @@
+"""A current loop of finite bandwidth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def current(current_nm: float, state: Any, at: int, step_s: float, time_constant_s: float) -> float:
+    """Mean of the lagging current over one sub-step; exact for a held demand."""
+    if time_constant_s <= 0.0:
+        return current_nm
+    rest = state[at] - current_nm
+    decay = math.exp(-step_s / time_constant_s)
+    state[at] = current_nm + rest * decay
+    return float(current_nm + rest * time_constant_s / step_s * (1.0 - decay))
+
+
+def settle(state: Any, at: int, torque_nm: float) -> None:
+    """Caught up."""
+    state[at] = torque_nm
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """A step of demand and the current that follows."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    constant = max(p["time_constant_s"], 1e-5)
+    time = np.linspace(-1.0, 5.0, 601) * constant
+    demand = np.where(time >= 0.0, 1.0, 0.0)
+    current_nm = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
+    return Illustration("time (s)", "torque (N m)", (("demand", time, demand), ("current", time, current_nm)))
+
+
+EFFECT = Effect(
+    name="electrical_lag",
+    summary="The current follows its demand with a lag.",
+    documentation=(
+        "Winding inductance and the current controller let the current follow the demand as a first-order lag, "
+        "time_constant * d(current)/dt = demand - current. It shows between the controller's demand and the "
+        "reported torque, more at high frequency than a delay of the same size at low frequency. Source: W. "
+        "Leonhard, 'Control of Electrical Drives', 3rd ed., 2001, chapter 7."
+    ),
+    parameters=(Parameter("time_constant_s", 0.0, 0.05, 0.002, "of the closed current loop", off=0.0),),
+    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.FREQUENCY)),
+    hooks=(
+        Hook("current", current, order=40),
+        Hook("settle", settle),
+    ),
+    illustrate=illustrate,
+    state_size=1,
+)

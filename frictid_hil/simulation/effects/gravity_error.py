@@ -1,0 +1,46 @@
+"""Gravity larger or smaller than the model says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def gravity(gravity_nm: float, error_share: float) -> float:
+    """True gravity."""
+    return gravity_nm * (1.0 + error_share)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Gravity over position, in units of the stated amplitude."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    position = np.linspace(-np.pi, np.pi, 301)
+    stated = np.cos(position)
+    true = (1.0 + p["error_share"]) * stated
+    return Illustration("position (rad)", "gravity / stated", (("stated", position, stated), ("true", position, true)))
+
+
+EFFECT = Effect(
+    name="gravity_error",
+    summary="Gravity is larger or smaller than stated.",
+    documentation=(
+        "The mass or its lever is not what the model has: gravity is (1 + error) times the stated torque, payload "
+        "included. It shows wherever the joint stands or moves slowly, in proportion to cos q. Source: the "
+        "standard rigid-body model, W. Khalil, E. Dombre, 'Modeling, Identification and Control of Robots', 2002, "
+        "chapter 12."
+    ),
+    parameters=(Parameter("error_share", -0.9, 2.0, 0.05, "true over stated gravity, minus 1", off=0.0),),
+    signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
+    hooks=(Hook("gravity", gravity),),
+    illustrate=illustrate,
+)

@@ -1,0 +1,63 @@
+"""An elastic transmission: motor and link swing against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def coupling(coupling_nm_per_rad: float, compliance_rad_per_nm: float) -> float:
+    """Stiffness of the transmission; 0 stands for a rigid joint."""
+    return 1.0 / compliance_rad_per_nm if compliance_rad_per_nm > 0.0 else coupling_nm_per_rad
+
+
+def coupling_damping(
+    coupling_nm_s_per_rad: float, coupling_nm_per_rad: float, compliance_rad_per_nm: float, relaxation_s: float
+) -> float:
+    """Damping of the transmission."""
+    return relaxation_s * coupling_nm_per_rad if compliance_rad_per_nm > 0.0 else coupling_nm_s_per_rad
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Link motion over motor motion, against frequency, for a link of 1 kg m2."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    stiffness = 1.0 / max(p["compliance_rad_per_nm"], 1e-9)
+    resonance_hz = np.sqrt(stiffness) / (2.0 * np.pi)
+    frequency = np.linspace(0.05, 2.0, 300) * resonance_hz
+    laplace = 2j * np.pi * frequency
+    spring = stiffness * (1.0 + p["relaxation_s"] * laplace)
+    ratio = np.abs(spring / (laplace**2 + spring))
+    return Illustration("frequency (Hz)", "link motion / motor motion", (("elastic", frequency, ratio),))
+
+
+EFFECT = Effect(
+    name="joint_elasticity",
+    summary="Motor and link are joined by a spring.",
+    documentation=(
+        "Harmonic drives twist under load: torque = (q_m - q_l) / compliance plus damping, with the link behind "
+        "the spring. An encoder on the motor then does not see the link, gravity reaches the motor a moment "
+        "later, and the link resonates at sqrt(1 / (compliance * J_link)). It shows at high frequency, in chirps "
+        "and at hard reversals. Source: M. W. Spong, 'Modeling and control of elastic joint robots', J. Dyn. "
+        "Syst. Meas. Control 109, 1987; Tuttle and Seering 1996."
+    ),
+    parameters=(
+        Parameter("compliance_rad_per_nm", 0.0, 5e-3, 1e-4, "twist per torque; 0 is rigid", off=0.0),
+        Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness"),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
+    hooks=(
+        Hook("coupling", coupling),
+        Hook("coupling_damping", coupling_damping),
+    ),
+    illustrate=illustrate,
+)

@@ -1,0 +1,54 @@
+"""Friction that grows with the torque the gear transmits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def level(level_nm: float, load_nm: float, linear_share: float, quadratic_per_nm: float) -> float:
+    """The level that multiplies the slip spring, raised by load."""
+    return level_nm + linear_share * abs(load_nm) + quadratic_per_nm * load_nm * load_nm
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Added friction over transmitted torque."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    load = np.linspace(-50.0, 50.0, 201)
+    added = p["linear_share"] * np.abs(load) + p["quadratic_per_nm"] * load**2
+    flat = np.zeros_like(load)
+    return Illustration(
+        "transmitted torque (N m)", "added friction (N m)", (("without", load, flat), ("with", load, added))
+    )
+
+
+EFFECT = Effect(
+    name="load_dependent_friction",
+    summary="Friction grows with the transmitted torque.",
+    documentation=(
+        "Tooth and bearing friction grow with the load they carry: the sliding level rises by linear * |tau_L| + "
+        "quadratic * tau_L^2, where tau_L is the torque passed on to the link (gravity, payload, link inertia, "
+        "outside forces). It shows as friction that changes with posture and payload. Sources: Bittencourt and "
+        "Gunnarsson 2012 (linear); P. Hamon, M. Gautier, P. Garrec, 'Dynamic identification of robots with a dry "
+        "friction model depending on load and velocity', IROS 2010."
+    ),
+    parameters=(
+        Parameter("linear_share", 0.0, 0.8, 0.05, "friction per transmitted torque, N m per N m", off=0.0),
+        Parameter(
+            "quadratic_per_nm", 0.0, 0.1, 0.0, "friction per squared transmitted torque, N m per N^2 m^2", off=0.0
+        ),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.ACCELERATION)),
+    hooks=(Hook("level", level, order=60),),
+    illustrate=illustrate,
+)

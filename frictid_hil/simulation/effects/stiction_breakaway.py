@@ -1,0 +1,75 @@
+"""Break-away friction that grows while the joint rests and is spent by the first motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def level(level_nm: float, coulomb_nm: float, state: Any, at: int, share: float) -> float:
+    """The level that multiplies the slip spring, raised by the time at rest."""
+    return float(level_nm + share * coulomb_nm * state[at])
+
+
+def remember(
+    state: Any, at: int, velocity_rad_s: float, step_s: float, share: float, dwell_time_s: float, travel_rad: float
+) -> None:
+    """Fill at rest, wipe out in motion; exact for a constant speed."""
+    if share == 0.0:
+        return
+    rate_per_s = 1.0 / dwell_time_s + abs(velocity_rad_s) / travel_rad
+    rest = 1.0 / (dwell_time_s * rate_per_s)
+    state[at] = rest + (state[at] - rest) * math.exp(-rate_per_s * step_s)
+
+
+def settle(state: Any, at: int, velocity_rad_s: float, dwell_time_s: float, travel_rad: float) -> None:
+    """What a constant speed leaves of it."""
+    state[at] = 1.0 / (1.0 + dwell_time_s * abs(velocity_rad_s) / travel_rad)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Rise of the break-away level with the dwell."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    dwell = np.linspace(0.0, 5.0 * p["dwell_time_s"], 200)
+    rise = p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))
+    return Illustration("dwell (s)", "rise of break-away / Coulomb level", (("break-away", dwell, rise),))
+
+
+EFFECT = Effect(
+    name="stiction_breakaway",
+    summary="Friction grows while the joint rests and is spent by the first motion.",
+    documentation=(
+        "Contacts creep and bond while they rest: the break-away torque exceeds the sliding level, by more the "
+        "longer the dwell. A memory u with du/dt = (1 - u) / dwell_time - |v| u / travel raises the sliding level "
+        "by share * F_0 * u: it fills at rest and is wiped out by motion. It shows as a peak at the start of "
+        "motion that grows with the dwell, and, because slow motion never quite empties u, as a rise below about "
+        "travel / dwell_time. Sources: E. Rabinowicz, 'The intrinsic variables affecting the stick-slip process', "
+        "Proc. Phys. Soc. 71, 1958; J. H. Dieterich, 'Modeling of rock friction', J. Geophys. Res. 84, 1979; "
+        "Armstrong-Helouvry et al. 1994 (rising static friction)."
+    ),
+    parameters=(
+        Parameter("share", 0.0, 2.0, 0.3, "rise after a long rest, fraction of the Coulomb level", off=0.0),
+        Parameter("dwell_time_s", 0.01, 30.0, 1.0, "time constant of the rise"),
+        Parameter("travel_rad", 1e-5, 0.1, 2e-3, "travel that wipes it out"),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.REVERSAL)),
+    hooks=(
+        Hook("level", level),
+        Hook("remember", remember),
+        Hook("settle", settle),
+    ),
+    illustrate=illustrate,
+    state_size=1,
+)

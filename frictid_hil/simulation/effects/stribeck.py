@@ -1,0 +1,63 @@
+"""Stribeck effect: sliding friction falls with speed near standstill, before viscosity raises it again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def level(
+    level_nm: float,
+    coulomb_nm: float,
+    velocity_rad_s: float,
+    share: float,
+    stribeck_velocity_rad_s: float,
+    exponent: float,
+) -> float:
+    """The level that multiplies the slip spring, raised at low speed."""
+    if share == 0.0:
+        return level_nm
+    return level_nm + share * coulomb_nm * math.exp(-((abs(velocity_rad_s) / stribeck_velocity_rad_s) ** exponent))
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Friction over speed, in units of the Coulomb level."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    speed = np.linspace(0.0, 6.0 * p["stribeck_velocity_rad_s"], 200)
+    raised = 1.0 + p["share"] * np.exp(-((speed / p["stribeck_velocity_rad_s"]) ** p["exponent"]))
+    flat = np.ones_like(speed)
+    return Illustration(
+        "speed (rad/s)", "friction / Coulomb level", (("without", speed, flat), ("with", speed, raised))
+    )
+
+
+EFFECT = Effect(
+    name="stribeck",
+    summary="Friction falls with speed just above standstill.",
+    documentation=(
+        "Between break-away and full sliding the lubricant film builds up and friction falls: "
+        "F_0 * share * exp(-(|v| / v_s)^exponent) is added to the Coulomb level F_0. An exponent of 2 is the Gaussian "
+        "form, 1 the exponential one. It shows below a few times v_s, as a dip in the friction curve and as "
+        "stick-slip at creep speed. Source: B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, 'A survey of models, "
+        "analysis tools and compensation methods for the control of machines with friction', Automatica 30(7), 1994."
+    ),
+    parameters=(
+        Parameter("share", -0.5, 2.0, 0.2, "rise of friction at standstill, fraction of the Coulomb level", off=0.0),
+        Parameter("stribeck_velocity_rad_s", 1e-3, 2.0, 0.05, "speed at which the rise has fallen to 1/e"),
+        Parameter("exponent", 0.5, 3.0, 2.0, "shape: 1 exponential, 2 Gaussian"),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
+    hooks=(Hook("level", level),),
+    illustrate=illustrate,
+)

@@ -1,0 +1,47 @@
+"""A constant torque that no model explains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def shaft(torque_nm: float, bias_nm: float) -> float:
+    """What is left of the motor's torque."""
+    return torque_nm - bias_nm
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Measured torque of slow motion both ways, around a Coulomb level of 1 N m."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    velocity = np.linspace(-1.0, 1.0, 201)
+    level = np.sign(velocity)
+    return Illustration(
+        "velocity (rad/s)", "torque (N m)", (("without", velocity, level), ("with", velocity, level + p["bias_nm"]))
+    )
+
+
+EFFECT = Effect(
+    name="torque_bias",
+    summary="A constant torque is missing in the model.",
+    documentation=(
+        "A current-sensor offset, a preloaded cable or a spring adds a constant that the drive must hold against. "
+        "The measured torque is higher by the bias in both directions and at rest. An asymmetry of friction looks "
+        "the same in motion; rest and small reversals part them. Source: the offset column of every robot "
+        "identification, Swevers, Verdonck and De Schutter 2007."
+    ),
+    parameters=(Parameter("bias_nm", -50.0, 50.0, 0.3, "measured minus modelled torque", off=0.0),),
+    signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.VELOCITY_BAND)),
+    hooks=(Hook("shaft", shaft),),
+    illustrate=illustrate,
+)

@@ -1,0 +1,69 @@
+"""A delay from the command to its effect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def current(current_nm: float, state: Any, at: int, step_s: float, delay_s: float) -> float:
+    """The demand of ``delay_s`` ago, from a ring of past demands (slot ``at`` holds where the newest goes)."""
+    if delay_s <= 0.0:
+        return current_nm
+    size = 1024
+    newest = int(state[at])
+    state[at + 1 + newest] = current_nm
+    state[at] = (newest + 1) % size
+    steps = min(delay_s / step_s, size - 2.0)
+    whole = int(steps)
+    part = steps - whole
+    late = state[at + 1 + (newest - whole + size) % size]
+    later = state[at + 1 + (newest - whole - 1 + size) % size]
+    return float((1.0 - part) * late + part * later)
+
+
+def settle(state: Any, at: int, torque_nm: float) -> None:
+    """A ring full of the holding torque."""
+    size = 1024
+    for k in range(size):
+        state[at + 1 + k] = torque_nm
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """A step and its delayed copy."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    time = np.linspace(-1.0, 4.0, 501) * max(p["delay_s"], 1e-4)
+    demand = np.where(time >= 0.0, 1.0, 0.0)
+    late = np.where(time >= p["delay_s"], 1.0, 0.0)
+    return Illustration("time (s)", "torque (N m)", (("demand", time, demand), ("torque", time, late)))
+
+
+EFFECT = Effect(
+    name="torque_delay",
+    summary="The torque acts later than commanded.",
+    documentation=(
+        "Buses, cycles and computing add a pure delay between the demand and the current: tau(t) = demand(t - "
+        "delay). It costs phase in the loop and shows as a shift between the controller's demand and the reported "
+        "torque, at every frequency alike in time. Source: K. J. Astrom, B. Wittenmark, 'Computer-Controlled "
+        "Systems', 3rd ed., 1997, section 2."
+    ),
+    parameters=(Parameter("delay_s", 0.0, 0.05, 0.002, "from demand to current", off=0.0),),
+    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.FREQUENCY)),
+    hooks=(
+        Hook("current", current, order=20),
+        Hook("settle", settle),
+    ),
+    illustrate=illustrate,
+    state_size=1025,
+)

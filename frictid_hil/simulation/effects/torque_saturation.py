@@ -1,0 +1,48 @@
+"""A torque limit below the stated one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def current(current_nm: float, limit_nm: float, limit_share: float) -> float:
+    """The demand, clipped."""
+    if limit_share >= 1.0:
+        return current_nm
+    return min(limit_share * limit_nm, max(-limit_share * limit_nm, current_nm))
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Torque over demand, in units of the stated limit."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    demand = np.linspace(-1.0, 1.0, 201)
+    clipped = np.clip(demand, -p["limit_share"], p["limit_share"])
+    return Illustration("demand / limit", "torque / limit", (("stated", demand, demand), ("with", demand, clipped)))
+
+
+EFFECT = Effect(
+    name="torque_saturation",
+    summary="The torque is clipped below the stated limit.",
+    documentation=(
+        "Current limits, thermal derating or a sagging supply clip the torque before the limit that the "
+        "controller knows of: |tau| <= share * limit. The controller's integral keeps working against a demand "
+        "that is never met. It shows only where the demand is high, as a flat top. Source: the drive's limits "
+        "(CiA 402-2, objects 6072 and 6073); L. Zaccarian, A. R. Teel, 'Modern Anti-windup Synthesis', 2011, for "
+        "what follows in the loop."
+    ),
+    parameters=(Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0),),
+    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.ACCELERATION)),
+    hooks=(Hook("current", current, order=30),),
+    illustrate=illustrate,
+)

@@ -1,0 +1,63 @@
+"""Viscous friction that bends: it saturates or stiffens with speed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def rate(
+    rate_nm: float, coulomb_nm: float, velocity_rad_s: float, share: float, knee_rad_s: float, bend: float
+) -> float:
+    """The rate-dependent part, bent."""
+    if share == 0.0:
+        return rate_nm
+    relative = 1.0 + abs(velocity_rad_s) / knee_rad_s
+    shape = math.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
+    return rate_nm + math.copysign(share * coulomb_nm * shape, velocity_rad_s)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Added friction over speed, in units of the Coulomb level."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    speed = np.linspace(0.0, 8.0 * p["knee_rad_s"], 200)
+    added = np.array([rate(0.0, 1.0, v, p["share"], p["knee_rad_s"], p["bend"]) for v in speed])
+    line = added[-1] * speed / speed[-1]
+    return Illustration(
+        "speed (rad/s)", "added friction / Coulomb level", (("line", speed, line), ("bent", speed, added))
+    )
+
+
+EFFECT = Effect(
+    name="viscous_nonlinearity",
+    summary="Viscous friction bends: it saturates or stiffens with speed.",
+    documentation=(
+        "Viscous friction of greased gears is seldom a straight line: shear-thinning and warming grease "
+        "saturates, churning grows faster than speed. F_0 * share * ((1 + |v| / v_k)^p - 1) / p is added with the "
+        "sign of v: p below 1 saturates (p = 0 is a logarithm), p = 1 is linear and indistinguishable from "
+        "viscosity, 2 and 3 bend upwards. It shows at high speed as a curve where the model has a line. The form "
+        "is the Box-Cox family, chosen because one exponent covers the square-root, asinh, quadratic and cubic "
+        "laws of A. C. Bittencourt, S. Gunnarsson, 'Static friction in a robot joint - modeling and "
+        "identification of load and temperature effects', ASME J. Dyn. Syst. Meas. Control 134(5), 2012, and of "
+        "Armstrong-Helouvry et al. 1994."
+    ),
+    parameters=(
+        Parameter("share", -3.0, 3.0, 0.4, "size, fraction of the Coulomb level", off=0.0),
+        Parameter("knee_rad_s", 0.02, 5.0, 0.4, "speed at which the bend sets in"),
+        Parameter("bend", 0.0, 3.0, 0.2, "exponent p: below 1 saturates, above 1 stiffens"),
+    ),
+    signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
+    hooks=(Hook("rate", rate),),
+    illustrate=illustrate,
+)

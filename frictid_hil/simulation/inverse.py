@@ -1,0 +1,89 @@
+"""What the inverse form of an effect is: a recording turned into regressors of the joint's torque balance.
+
+The diagnosis explains ``measured torque - nominal model`` by columns. A form has a grid of *shapes* (the parameters
+that enter nonlinearly, e.g. a Stribeck velocity); for each shape it gives a few columns whose coefficients enter
+linearly, and knows how to read the effect's own parameters from shape and coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from frictid_hil.friction.trajectory import Array
+
+Shape = Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One recording on a uniform clock, with what the nominal joint makes of it; arrays have shape (n,).
+
+    Attributes:
+        step_s: sampling step.
+        start_s: time since the first experiment of the set began.
+        position_rad: measured.
+        velocity_rad_s: central difference of position.
+        acceleration_rad_s2: second difference of position.
+        torque_nm: measured, centred on the position sample.
+        slip: state of the slip spring (20) driven by the measured motion, -1..1.
+        rate_nm: nominal phi_0(v).
+        gravity_nm: nominal gravity torque of the joint without payload.
+        payload_gravity_nm: of the payload, 0 where none is mounted.
+        gravity_slope_nm_per_rad: derivative of the whole gravity torque by position.
+        load_nm: torque through the transmission: gravity and link inertia, payload included.
+        coulomb_nm: F_0.
+        stiffness_nm_per_rad: of the slip spring.
+        motor_inertia_kg_m2: motor side.
+        link_inertia_kg_m2: link side without payload.
+        payload_inertia_kg_m2: 0 where none is mounted.
+        gear_ratio: motor turns per joint turn; 1 where unknown.
+        gravity_cos_nm: of joint and payload: gravity is ``cos*cos(q) + sin*sin(q)``.
+        gravity_sin_nm: see there.
+    """
+
+    step_s: float
+    start_s: float
+    position_rad: Array
+    velocity_rad_s: Array
+    acceleration_rad_s2: Array
+    torque_nm: Array
+    slip: Array
+    rate_nm: Array
+    gravity_nm: Array
+    payload_gravity_nm: Array
+    gravity_slope_nm_per_rad: Array
+    load_nm: Array
+    coulomb_nm: float
+    stiffness_nm_per_rad: float
+    motor_inertia_kg_m2: float
+    link_inertia_kg_m2: float
+    payload_inertia_kg_m2: float
+    gear_ratio: float
+    gravity_cos_nm: float
+    gravity_sin_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class InverseForm:
+    """Columns that an effect adds to the torque balance.
+
+    Attributes:
+        shapes: grid of the nonlinear parameters; ``({},)`` where there are none.
+        regressors: (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
+        parameters: (shape, coefficients (k,)) -> the effect's own parameters.
+        refinable: names of the shape's parameters that may be refined between grid points.
+    """
+
+    shapes: tuple[Shape, ...]
+    regressors: Callable[[Sequence[View], Shape], list[Array]]
+    parameters: Callable[[Shape, Array], dict[str, float]]
+    refinable: tuple[str, ...] = ()
+
+
+def grid(**axes: Sequence[float]) -> tuple[Shape, ...]:
+    """All combinations of the named values."""
+    shapes: list[dict[str, float]] = [{}]
+    for name, values in axes.items():
+        shapes = [{**shape, name: value} for shape in shapes for value in values]
+    return tuple(shapes)

@@ -1,0 +1,347 @@
+"""One geared joint as a value: what a robot file's ``simulated`` mapping says, checked.
+
+The torque that moves it obeys torque = inertia * acceleration + gravity + friction, all on the joint side of the gear;
+friction is a rate curve behind an elasto-plastic presliding spring, and everything beyond that is an effect by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.fields import Fields
+
+PRESLIDING_TRAVEL_RAD = 5e-4
+"""Travel from rest to full sliding where a file gives no presliding stiffness."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoulombViscous:
+    """The simplest friction: a level and a slope."""
+
+    coulomb_nm: float
+    viscous_nm_s_per_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """What can be mounted on the link; added to its inertia and gravity."""
+
+    inertia_kg_m2: float
+    gravity_cos_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """Where the position comes from.
+
+    Attributes:
+        side: ``motor`` or ``link``.
+        counts_per_revolution: of the shaft it sits on; 0 is continuous.
+    """
+
+    side: str = "motor"
+    counts_per_revolution: float = 131072.0
+
+    def step_rad(self, gear_ratio: float) -> float:
+        """One count as an angle of the joint; 0 where continuous."""
+        if self.counts_per_revolution <= 0:
+            return 0.0
+        return 2 * math.pi / self.counts_per_revolution / (gear_ratio if self.side == "motor" else 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """The power stage and what it reports.
+
+    Attributes:
+        rated_torque_nm: 1000 per mille, joint side.
+        torque_limit_nm: the largest torque it gives, joint side.
+        torque_quantum_per_mille: step of the reported torque.
+        torque_noise_per_mille: standard deviation of the reported torque.
+        velocity_filter_s: first-order smoothing of differenced position, in its own loop and in its report.
+    """
+
+    rated_torque_nm: float
+    torque_limit_nm: float
+    torque_quantum_per_mille: float = 1.0
+    torque_noise_per_mille: float = 5.0
+    velocity_filter_s: float = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class ServoGains:
+    """The drive's position loop: kp * error + integral(ki * error) + kd * (velocity command - velocity)."""
+
+    kp_nm_per_rad: float
+    ki_nm_per_rad_s: float
+    kd_nm_s_per_rad: float
+
+    @staticmethod
+    def for_inertia(inertia_kg_m2: float, bandwidth_rad_s: float = 100.0) -> ServoGains:
+        """Well-damped gains for a rigid joint and about 2 ms of delay in the loop."""
+        return ServoGains(
+            kp_nm_per_rad=inertia_kg_m2 * bandwidth_rad_s**2,
+            ki_nm_per_rad_s=inertia_kg_m2 * bandwidth_rad_s**3 / 5.0,
+            kd_nm_s_per_rad=inertia_kg_m2 * bandwidth_rad_s * 1.6,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HandImpedance:
+    """A person's arm that guides the joint: torque = stiffness * (q_hand - q) + damping * (dq_hand - dq)."""
+
+    stiffness_nm_per_rad: float
+    damping_nm_s_per_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class JointModel:
+    """One joint; see the module's first page. Built by ``from_mapping``.
+
+    Attributes:
+        inertia_kg_m2: whole inertia, motor's part included, payload excluded.
+        motor_inertia_share: the motor's part, 0..1.
+        gravity_cos_nm: gravity = gravity_cos * cos(q) + gravity_sin * sin(q).
+        gravity_sin_nm: see there.
+        gear_ratio: motor revolutions per joint revolution.
+        friction: rate-dependent friction in steady sliding, before effects.
+        presliding_stiffness_nm_per_rad: of the slip spring.
+        encoder: position sensor.
+        drive: power stage.
+        servo: gains of the drive's position loop.
+        payload: mounted on request.
+        hand: the simulated person.
+        effects: parameters by effect name; complete.
+    """
+
+    inertia_kg_m2: float
+    motor_inertia_share: float
+    gravity_cos_nm: float
+    gravity_sin_nm: float
+    gear_ratio: float
+    friction: FrictionCurve | CoulombViscous
+    presliding_stiffness_nm_per_rad: float
+    encoder: Encoder
+    drive: Drive
+    servo: ServoGains
+    payload: Payload | None = None
+    hand: HandImpedance | None = None
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @staticmethod
+    def from_mapping(
+        mapping: Mapping[str, Any], *, gear_ratio: float, rated_torque_nm: float, max_torque_nm: float
+    ) -> JointModel:
+        """The joint that a robot file's ``simulated`` mapping describes.
+
+        Args:
+            mapping: plain values as read from YAML.
+            gear_ratio: of the robot file's joint.
+            rated_torque_nm: of the robot file's joint.
+            max_torque_nm: of the robot file's joint; the drive's torque limit unless ``servo`` lowers it.
+
+        Raises:
+            InvalidFields: every unknown key or effect, missing or out-of-range value, with its path.
+        """
+        top = Fields(mapping)
+        inertia = top.number("inertia_kg_m2", low=1e-6, high=1e6)
+        friction = _read_friction(top.part("friction"), required="friction" in top, top=top)
+        level = friction.coulomb_nm
+        model = JointModel(
+            inertia_kg_m2=inertia,
+            motor_inertia_share=top.number("motor_inertia_share", 0.3, low=0.01, high=0.99),
+            gravity_cos_nm=top.number("gravity_cos_nm", 0.0, low=-1e6, high=1e6),
+            gravity_sin_nm=top.number("gravity_sin_nm", 0.0, low=-1e6, high=1e6),
+            gear_ratio=gear_ratio,
+            friction=friction,
+            presliding_stiffness_nm_per_rad=top.number(
+                "presliding_stiffness_nm_per_rad", max(level, 1e-3) / PRESLIDING_TRAVEL_RAD, low=1e-3, high=1e9
+            ),
+            encoder=_read_encoder(top.part("encoder")),
+            drive=_read_drive(top.part("drive"), rated_torque_nm),
+            servo=ServoGains.for_inertia(inertia),
+            payload=_read_payload(top.part("payload")) if "payload" in top else None,
+            hand=_read_hand(top.part("hand")) if "hand" in top else None,
+            effects=_read_effects(top.part("effects")),
+        )
+        gains, limit = _read_servo(top.part("servo"), model.servo, max_torque_nm)
+        top.part("payload"), top.part("hand")
+        top.no_others()
+        top.finish()
+        return replace(model, servo=gains, drive=replace(model.drive, torque_limit_nm=limit))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The robot file's ``simulated`` form: plain values; ``from_mapping`` of it gives an equal joint."""
+        mapping: dict[str, Any] = {
+            "inertia_kg_m2": self.inertia_kg_m2,
+            "motor_inertia_share": self.motor_inertia_share,
+            "gravity_cos_nm": self.gravity_cos_nm,
+            "gravity_sin_nm": self.gravity_sin_nm,
+            "friction": _friction_mapping(self.friction),
+            "presliding_stiffness_nm_per_rad": self.presliding_stiffness_nm_per_rad,
+        }
+        if self.payload is not None:
+            mapping["payload"] = {
+                "inertia_kg_m2": self.payload.inertia_kg_m2,
+                "gravity_cos_nm": self.payload.gravity_cos_nm,
+            }
+        mapping["encoder"] = {
+            "side": self.encoder.side,
+            "counts_per_revolution": self.encoder.counts_per_revolution,
+        }
+        mapping["drive"] = {
+            "torque_quantum_per_mille": self.drive.torque_quantum_per_mille,
+            "torque_noise_per_mille": self.drive.torque_noise_per_mille,
+            "velocity_filter_s": self.drive.velocity_filter_s,
+        }
+        mapping["servo"] = {
+            "kp_nm_per_rad": self.servo.kp_nm_per_rad,
+            "ki_nm_per_rad_s": self.servo.ki_nm_per_rad_s,
+            "kd_nm_s_per_rad": self.servo.kd_nm_s_per_rad,
+            "torque_limit_nm": self.drive.torque_limit_nm,
+        }
+        if self.hand is not None:
+            mapping["hand"] = {
+                "stiffness_nm_per_rad": self.hand.stiffness_nm_per_rad,
+                "damping_nm_s_per_rad": self.hand.damping_nm_s_per_rad,
+            }
+        mapping["effects"] = {name: dict(parameters) for name, parameters in self.effects.items()}
+        return mapping
+
+    def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
+        """The same joint with these effects instead of its own.
+
+        Raises:
+            InvalidFields: an unknown effect or parameter, or a value out of bounds.
+        """
+        fields = Fields(effects, ("effects",))
+        complete = _read_effects(fields)
+        fields.finish()
+        return replace(self, effects=complete)
+
+    def steady_friction_nm(self, velocity_rad_s: Array, *, position_rad: float = 0.0) -> Array:
+        """Friction of steady sliding with all effects, cold, without ripple, N m.
+
+        Args:
+            velocity_rad_s: signed, any shape; 0 gives 0.
+            position_rad: where the joint slides; matters where friction depends on load.
+        """
+        from frictid_hil.simulation import packing
+        from frictid_hil.simulation.compose import kernel
+
+        velocity = np.ascontiguousarray(velocity_rad_s, dtype=np.float64)
+        torque = np.zeros(velocity.size)
+        kernel().steady(packing.parameters(self), packing.state(), velocity.ravel(), torque, float(position_rad))
+        return torque.reshape(velocity.shape)
+
+    def true_curve_nm(self, speed_rad_s: Array, *, position_rad: float = 0.0) -> Array:
+        """The odd part of steady sliding friction: what a symmetric curve can know of this joint, N m.
+
+        Args:
+            speed_rad_s: positive, any shape.
+            position_rad: see ``steady_friction_nm``.
+        """
+        speed = np.abs(np.asarray(speed_rad_s, dtype=np.float64))
+        # At standstill the curve continues its limit from motion.
+        speed = np.maximum(speed, 1e-9)
+        forward = self.steady_friction_nm(speed, position_rad=position_rad)
+        backward = self.steady_friction_nm(-speed, position_rad=position_rad)
+        return (forward - backward) / 2
+
+
+def _read_friction(fields: Fields, *, required: bool, top: Fields) -> FrictionCurve | CoulombViscous:
+    if not required:
+        top.problem("friction", "is required: coulomb_nm and viscous_nm_s_per_rad, or velocity_rad_s and torque_nm")
+        return CoulombViscous(0.0)
+    if "velocity_rad_s" in fields or "torque_nm" in fields:
+        velocity, torque = fields.numbers("velocity_rad_s"), fields.numbers("torque_nm")
+        fields.no_others()
+        try:
+            return FrictionCurve.through(np.array(velocity), np.array(torque))
+        except IdentificationError as error:
+            fields.problem("velocity_rad_s", error.what)
+            return CoulombViscous(0.0)
+    coulomb = fields.number("coulomb_nm", low=0.0, high=1e6)
+    viscous = fields.number("viscous_nm_s_per_rad", 0.0, low=0.0, high=1e6)
+    fields.no_others()
+    return CoulombViscous(coulomb, viscous)
+
+
+def _read_encoder(fields: Fields) -> Encoder:
+    encoder = Encoder(
+        side=fields.choice("side", "motor", ("motor", "link")),
+        counts_per_revolution=fields.number("counts_per_revolution", 131072.0, low=0.0, high=1e12),
+    )
+    fields.no_others()
+    return encoder
+
+
+def _read_drive(fields: Fields, rated_torque_nm: float) -> Drive:
+    drive = Drive(
+        rated_torque_nm=rated_torque_nm,
+        torque_limit_nm=math.inf,
+        torque_quantum_per_mille=fields.number("torque_quantum_per_mille", 1.0, low=0.0, high=1000.0),
+        torque_noise_per_mille=fields.number("torque_noise_per_mille", 5.0, low=0.0, high=1000.0),
+        velocity_filter_s=fields.number("velocity_filter_s", 0.001, low=0.0, high=1.0),
+    )
+    fields.no_others()
+    return drive
+
+
+def _read_servo(fields: Fields, default: ServoGains, max_torque_nm: float) -> tuple[ServoGains, float]:
+    gains = ServoGains(
+        kp_nm_per_rad=fields.number("kp_nm_per_rad", default.kp_nm_per_rad, low=0.0, high=1e9),
+        ki_nm_per_rad_s=fields.number("ki_nm_per_rad_s", default.ki_nm_per_rad_s, low=0.0, high=1e12),
+        kd_nm_s_per_rad=fields.number("kd_nm_s_per_rad", default.kd_nm_s_per_rad, low=0.0, high=1e9),
+    )
+    limit = fields.number("torque_limit_nm", max_torque_nm, low=0.0, high=max_torque_nm * (1 + 1e-9))
+    fields.no_others()
+    return gains, limit
+
+
+def _read_payload(fields: Fields) -> Payload:
+    payload = Payload(
+        inertia_kg_m2=fields.number("inertia_kg_m2", low=0.0, high=1e6),
+        gravity_cos_nm=fields.number("gravity_cos_nm", low=-1e6, high=1e6),
+    )
+    fields.no_others()
+    return payload
+
+
+def _read_hand(fields: Fields) -> HandImpedance:
+    hand = HandImpedance(
+        stiffness_nm_per_rad=fields.number("stiffness_nm_per_rad", low=0.0, high=1e6),
+        damping_nm_s_per_rad=fields.number("damping_nm_s_per_rad", low=0.0, high=1e6),
+    )
+    fields.no_others()
+    return hand
+
+
+def _read_effects(fields: Fields) -> dict[str, dict[str, float]]:
+    known = all_effects()
+    effects: dict[str, dict[str, float]] = {}
+    for name in fields.keys():  # noqa: SIM118 - Fields is no mapping
+        effect = known.get(name)
+        if effect is None:
+            fields.problem(name, f"is no known effect; known are {', '.join(known)}")
+            continue
+        part = fields.part(name)
+        off = effect.off
+        effects[name] = {p.name: part.number(p.name, off[p.name], low=p.lower, high=p.upper) for p in effect.parameters}
+        part.no_others()
+    return effects
+
+
+def _friction_mapping(friction: FrictionCurve | CoulombViscous) -> dict[str, Any]:
+    if isinstance(friction, CoulombViscous):
+        return {"coulomb_nm": friction.coulomb_nm, "viscous_nm_s_per_rad": friction.viscous_nm_s_per_rad}
+    return {"velocity_rad_s": list(friction.velocity_rad_s), "torque_nm": list(friction.torque_nm)}

@@ -1,0 +1,361 @@
+"""One joint and its controller, stepped through time: the bare equations, with marked places for effects.
+
+This module is plain Python and simulates a bare joint. ``compose`` turns it into the compiled kernel: each line
+``# effects at STAGE transform NAME`` becomes the calls of the effects that have a hook there. A hook may use any name
+that is local at its stage.
+
+The friction of the bare joint is s * F_0 + phi_0(v): the elasto-plastic spring of equation (20) with Coulomb level F_0
+and the rate-dependent remainder (17). The spring is far stiffer than anything else here (1e4 N m/rad and more), so a
+sub-step solves it by the implicit midpoint rule, whose slip condition has a closed form; everything soft is explicit
+at the midpoint, extrapolated with the last acceleration. Second order, and stable whatever the stiffness.
+
+Everything is on the joint side of the gear.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+# Slots of the parameter vector; effects' parameters follow, the rate curve's knots come last.
+INERTIA = 0
+MOTOR_SHARE = 1
+GRAVITY_COS = 2
+GRAVITY_SIN = 3
+GEAR_RATIO = 4
+COULOMB = 5
+STIFFNESS = 6
+PAYLOAD_INERTIA = 7
+PAYLOAD_GRAVITY_COS = 8
+ENCODER_STEP = 9
+ENCODER_ON_MOTOR = 10
+KP = 11
+KI = 12
+KD = 13
+CONTROL_FILTER_S = 14
+REPORT_FILTER_S = 15
+TORQUE_LIMIT = 16
+HAND_STIFFNESS = 17
+HAND_DAMPING = 18
+HAND_CENTRE = 19
+HAND_AMPLITUDE = 20
+HAND_FREQUENCY = 21
+POWERED = 22
+BRAKED = 23
+CURVE_AT = 24
+CURVE_KNOTS = 25
+CORE_PARAMETERS = 26
+
+# Slots of the state vector; effects' states follow.
+TIME = 0
+MOTOR_POSITION = 1
+MOTOR_VELOCITY = 2
+MOTOR_ACCELERATION = 3
+LINK_POSITION = 4
+LINK_VELOCITY = 5
+LINK_ACCELERATION = 6
+SLIP = 7
+INTEGRAL = 8
+MEASURED = 9
+CONTROL_VELOCITY = 10
+REPORT_VELOCITY = 11
+FRICTION = 12
+CORE_STATES = 13
+
+# Columns of what a call is told for every control period ...
+POSITION_COMMAND = 0
+VELOCITY_COMMAND = 1
+TORQUE_COMMAND = 2
+TORQUE_OFFSET = 3
+COMMANDS = 4
+
+# ... and of what it reads at the end of every control period.
+READ_POSITION = 0
+READ_VELOCITY = 1
+READ_TORQUE = 2
+READ_TRUE_POSITION = 3
+READ_TRUE_VELOCITY = 4
+READ_EXTERNAL = 5
+READ_SATURATED = 6
+READ_TEMPERATURE = 7
+READ_FRICTION = 8
+READINGS = 9
+
+POSITION_MODE = 8
+VELOCITY_MODE = 9
+TORQUE_MODE = 10
+
+Vector = Any
+"""A flat float64 array; typed loosely because the compiled kernel replaces this module's functions."""
+
+
+def rate_torque(parameters: Vector, velocity_rad_s: float) -> float:
+    """phi_0(v) of the bare curve: lines through the knots from (0, 0), extended with the last slope."""
+    speed = abs(velocity_rad_s)
+    at = int(parameters[CURVE_AT])
+    last = at + 2 * int(parameters[CURVE_KNOTS]) - 4
+    while at < last and speed > parameters[at + 2]:
+        at += 2
+    low, high = parameters[at], parameters[at + 2]
+    slope = (parameters[at + 3] - parameters[at + 1]) / (high - low)
+    torque = parameters[at + 1] + slope * (speed - low)
+    return float(torque if velocity_rad_s >= 0.0 else -torque)
+
+
+def friction(
+    parameters: Vector, state: Vector, velocity_rad_s: float, position_rad: float, slip: float, load_nm: float
+) -> tuple[float, float, float]:
+    """The three parts of friction: the level that multiplies the slip spring, the rate part, and any other torque."""
+    coulomb_nm = parameters[COULOMB]
+    level_nm = coulomb_nm
+    # effects at level transform level_nm
+    level_nm = max(level_nm, 0.0)
+    rate_nm = rate_torque(parameters, velocity_rad_s)
+    # effects at rate transform rate_nm
+    other_nm = 0.0
+    # effects at friction transform other_nm
+    return level_nm, rate_nm, other_nm
+
+
+def settle(parameters: Vector, state: Vector, velocity_rad_s: float, torque_nm: float) -> None:
+    """Bring the memory of every effect to what it is after long motion at constant velocity and torque (0: at rest)."""
+    # effects at settle update
+
+
+def remember(parameters: Vector, state: Vector, velocity_rad_s: float, friction_nm: float, step_s: float) -> None:
+    """Carry the memory of every effect over one sub-step that moved with this velocity against this friction."""
+    # effects at remember update
+    state[TIME] += step_s
+
+
+def steady(
+    parameters: Vector, state: Vector, velocities_rad_s: Vector, torques_nm: Vector, position_rad: float
+) -> None:
+    """Friction of steady sliding at each velocity, at one position."""
+    for k in range(velocities_rad_s.shape[0]):
+        velocity_rad_s = velocities_rad_s[k]
+        slip = math.copysign(1.0, velocity_rad_s) if velocity_rad_s != 0.0 else 0.0
+        gravity = gravity_torque(parameters, position_rad)
+        settle(parameters, state, velocity_rad_s, 0.0)
+        level, rate, other = friction(parameters, state, velocity_rad_s, position_rad, slip, gravity)
+        torques_nm[k] = level * slip + rate + other
+
+
+def gravity_torque(parameters: Vector, position_rad: float) -> float:
+    """Torque that holds the link and its payload at rest."""
+    cos_nm = parameters[GRAVITY_COS] + parameters[PAYLOAD_GRAVITY_COS]
+    gravity_nm = cos_nm * math.cos(position_rad) + parameters[GRAVITY_SIN] * math.sin(position_rad)
+    # effects at gravity transform gravity_nm
+    return float(gravity_nm)
+
+
+def shaft_torque(parameters: Vector, torque_nm: float, position_rad: float, gear_ratio: float) -> float:
+    """What the motor's torque leaves for the joint."""
+    # effects at shaft transform torque_nm
+    return torque_nm
+
+
+def encoder_angle(parameters: Vector, position_rad: float) -> float:
+    """The angle under the encoder's reading head at a true position."""
+    measured_rad = position_rad
+    # effects at encoder transform measured_rad
+    return float(measured_rad)
+
+
+def measure(parameters: Vector, position_rad: float) -> float:
+    """What the encoder says of a true position."""
+    measured_rad = encoder_angle(parameters, position_rad)
+    resolution_rad = parameters[ENCODER_STEP]
+    # effects at resolution transform resolution_rad
+    if resolution_rad > 0.0:
+        measured_rad = math.floor(measured_rad / resolution_rad + 0.5) * resolution_rad
+    return float(measured_rad)
+
+
+def place(parameters: Vector, state: Vector, position_rad: float, torque_nm: float) -> None:
+    """Put the joint at rest where its encoder reads ``position_rad``, held by ``torque_nm``."""
+    true_rad = 2.0 * position_rad - encoder_angle(parameters, position_rad)
+    state[MOTOR_POSITION] = true_rad
+    state[LINK_POSITION] = true_rad
+    state[MOTOR_VELOCITY] = 0.0
+    state[LINK_VELOCITY] = 0.0
+    state[MOTOR_ACCELERATION] = 0.0
+    state[LINK_ACCELERATION] = 0.0
+    state[SLIP] = 0.0
+    state[INTEGRAL] = torque_nm
+    state[MEASURED] = measure(parameters, true_rad)
+    state[CONTROL_VELOCITY] = 0.0
+    state[REPORT_VELOCITY] = 0.0
+    settle(parameters, state, 0.0, torque_nm)
+
+
+def run(
+    parameters: Vector,
+    state: Vector,
+    commands: Vector,
+    readings: Vector,
+    mode: int,
+    substeps: int,
+    step_s: float,
+) -> None:
+    """Advance through ``len(commands)`` control periods of ``substeps`` steps each; reads after each period."""
+    period_s = substeps * step_s
+    control_share = _filter_share(period_s, parameters[CONTROL_FILTER_S])
+    report_share = _filter_share(period_s, parameters[REPORT_FILTER_S])
+    limit_nm = parameters[TORQUE_LIMIT]
+    coulomb_nm = parameters[COULOMB]
+    powered = parameters[POWERED] != 0.0
+    braked = parameters[BRAKED] != 0.0
+
+    inertia_kg_m2 = parameters[INERTIA]
+    motor_kg_m2 = parameters[MOTOR_SHARE] * inertia_kg_m2
+    link_kg_m2 = inertia_kg_m2 - motor_kg_m2
+    # effects at inertia transform link_kg_m2
+    link_kg_m2 += parameters[PAYLOAD_INERTIA]
+
+    coupling_nm_per_rad = 0.0
+    # effects at coupling transform coupling_nm_per_rad
+    coupling_nm_s_per_rad = 0.0
+    # effects at coupling_damping transform coupling_nm_s_per_rad
+    play_rad = 0.0
+    # effects at play transform play_rad
+    rigid = coupling_nm_per_rad <= 0.0
+    body_kg_m2 = motor_kg_m2 + link_kg_m2 if rigid else motor_kg_m2
+
+    slip_per_rad = parameters[STIFFNESS] / coulomb_nm if coulomb_nm > 0.0 else 0.0
+
+    for tick in range(commands.shape[0]):
+        velocity_measured = state[CONTROL_VELOCITY]
+        error_rad = commands[tick, POSITION_COMMAND] - state[MEASURED]
+        saturated = False
+        if mode == TORQUE_MODE:
+            demand_nm = commands[tick, TORQUE_COMMAND]
+            integral_step_nm = 0.0
+        elif mode == VELOCITY_MODE:
+            error_rad_s = commands[tick, VELOCITY_COMMAND] - velocity_measured
+            demand_nm = state[INTEGRAL] + parameters[KD] * error_rad_s
+            integral_step_nm = parameters[KP] * error_rad_s * period_s
+        else:
+            demand_nm = parameters[KP] * error_rad + state[INTEGRAL]
+            demand_nm += parameters[KD] * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
+            integral_step_nm = parameters[KI] * error_rad * period_s
+        demand_nm += commands[tick, TORQUE_OFFSET]
+        if abs(demand_nm) > limit_nm:
+            demand_nm = math.copysign(limit_nm, demand_nm)
+            saturated = True
+        else:
+            # Frozen while the limit is active, so that it cannot wind up.
+            state[INTEGRAL] += integral_step_nm
+        if not powered:
+            demand_nm = 0.0
+
+        current_sum_nm = 0.0
+        external_nm = 0.0
+        friction_nm = state[FRICTION]
+        load_nm = 0.0
+        for _ in range(substeps):
+            current_nm = demand_nm
+            # effects at current transform current_nm
+            current_sum_nm += current_nm
+            if braked:
+                remember(parameters, state, 0.0, 0.0, step_s)
+                continue
+
+            # Midpoint estimates for everything soft.
+            half_s = 0.5 * step_s
+            velocity_rad_s = state[MOTOR_VELOCITY] + half_s * state[MOTOR_ACCELERATION]
+            position_rad = state[MOTOR_POSITION] + half_s * state[MOTOR_VELOCITY]
+            link_velocity = state[LINK_VELOCITY] + half_s * state[LINK_ACCELERATION]
+            link_rad = state[LINK_POSITION] + half_s * state[LINK_VELOCITY]
+
+            torque_nm = shaft_torque(parameters, current_nm, position_rad, parameters[GEAR_RATIO])
+            gravity_nm = gravity_torque(parameters, link_rad)
+            if parameters[HAND_STIFFNESS] > 0.0 or parameters[HAND_DAMPING] > 0.0:
+                rate = 2.0 * math.pi * parameters[HAND_FREQUENCY]
+                phase = rate * (state[TIME] + half_s)
+                hand_rad = parameters[HAND_CENTRE] + parameters[HAND_AMPLITUDE] * math.sin(phase)
+                hand_rad_s = parameters[HAND_AMPLITUDE] * rate * math.cos(phase)
+                external_nm = parameters[HAND_STIFFNESS] * (hand_rad - link_rad)
+                external_nm += parameters[HAND_DAMPING] * (hand_rad_s - link_velocity)
+            load_nm = gravity_nm - external_nm + link_kg_m2 * state[LINK_ACCELERATION]
+
+            slip = state[SLIP]
+            level_nm, rate_nm, other_nm = friction(parameters, state, velocity_rad_s, position_rad, slip, load_nm)
+
+            # Motor side: body * dv/step = drive - level * sat(slip + ...); the link, if any, is eliminated first.
+            drive_nm = torque_nm - rate_nm - other_nm
+            half_mobility = half_s / body_kg_m2
+            spring_nm = 0.0
+            link_gain = 0.0
+            link_free = 0.0
+            pull = 0.0
+            if rigid:
+                drive_nm += external_nm - gravity_nm
+            else:
+                stretch_rad = state[MOTOR_POSITION] - state[LINK_POSITION]
+                if abs(stretch_rad) > 0.5 * play_rad:
+                    spring_nm = coupling_nm_per_rad * (stretch_rad - math.copysign(0.5 * play_rad, stretch_rad))
+                    pull = coupling_nm_per_rad * half_s + coupling_nm_s_per_rad
+                half_link = half_s / link_kg_m2
+                link_gain = half_link * pull / (1.0 + half_link * pull)
+                link_free = state[LINK_VELOCITY] + half_link * (spring_nm + external_nm - gravity_nm)
+                link_free /= 1.0 + half_link * pull
+                drive_nm -= spring_nm - pull * link_free
+            effective = 1.0 + half_mobility * pull * (1.0 - link_gain)
+
+            turn = slip_per_rad * half_s
+            start = state[MOTOR_VELOCITY] + half_mobility * drive_nm
+            mean = (start - half_mobility * level_nm * slip) / (effective + half_mobility * level_nm * turn)
+            slip_mid = slip + turn * mean
+            if abs(slip_mid) > 1.0:
+                slip_mid = math.copysign(1.0, slip_mid)
+                mean = (start - half_mobility * level_nm * slip_mid) / effective
+            slip += 2.0 * turn * mean
+            state[SLIP] = min(1.0, max(-1.0, slip))
+            friction_nm = level_nm * slip_mid + rate_nm + other_nm
+
+            state[MOTOR_POSITION] += step_s * mean
+            state[MOTOR_ACCELERATION] = (mean - state[MOTOR_VELOCITY]) / half_s
+            state[MOTOR_VELOCITY] = 2.0 * mean - state[MOTOR_VELOCITY]
+            if rigid:
+                state[LINK_POSITION] = state[MOTOR_POSITION]
+                state[LINK_VELOCITY] = state[MOTOR_VELOCITY]
+                state[LINK_ACCELERATION] = state[MOTOR_ACCELERATION]
+            else:
+                link_mean = link_free + link_gain * mean
+                state[LINK_POSITION] += step_s * link_mean
+                state[LINK_ACCELERATION] = (link_mean - state[LINK_VELOCITY]) / half_s
+                state[LINK_VELOCITY] = 2.0 * link_mean - state[LINK_VELOCITY]
+            remember(parameters, state, mean, friction_nm, step_s)
+
+        state[FRICTION] = friction_nm
+        if braked:
+            state[MOTOR_VELOCITY] = 0.0
+            state[MOTOR_ACCELERATION] = 0.0
+            state[LINK_VELOCITY] = 0.0
+            state[LINK_ACCELERATION] = 0.0
+        position_true = state[MOTOR_POSITION] if parameters[ENCODER_ON_MOTOR] != 0.0 else state[LINK_POSITION]
+        measured = measure(parameters, position_true)
+        difference = (measured - state[MEASURED]) / period_s
+        state[MEASURED] = measured
+        state[CONTROL_VELOCITY] += control_share * (difference - state[CONTROL_VELOCITY])
+        state[REPORT_VELOCITY] += report_share * (difference - state[REPORT_VELOCITY])
+        reported_rad_s = state[REPORT_VELOCITY]
+        # effects at report_velocity transform reported_rad_s
+        temperature_c = 25.0
+        # effects at temperature transform temperature_c
+
+        readings[tick, READ_POSITION] = measured
+        readings[tick, READ_VELOCITY] = reported_rad_s
+        readings[tick, READ_TORQUE] = current_sum_nm / substeps
+        readings[tick, READ_TRUE_POSITION] = state[LINK_POSITION]
+        readings[tick, READ_TRUE_VELOCITY] = state[LINK_VELOCITY]
+        readings[tick, READ_EXTERNAL] = external_nm
+        readings[tick, READ_SATURATED] = 1.0 if saturated else 0.0
+        readings[tick, READ_TEMPERATURE] = temperature_c
+        readings[tick, READ_FRICTION] = friction_nm
+
+
+def _filter_share(period_s: float, time_constant_s: float) -> float:
+    """How much of its input a first-order filter takes in one period, exact for a held input."""
+    return 1.0 - math.exp(-period_s / time_constant_s) if time_constant_s > 0.0 else 1.0

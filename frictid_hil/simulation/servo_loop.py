@@ -1,0 +1,235 @@
+"""A simulated drive around one simulated joint: its position, velocity and torque loops, its brake and its sensors.
+
+It knows nothing of buses or object dictionaries: joint-side numbers in, joint-side numbers out. A reading is latched at
+the end of every ``advance``; the torque is the mean of what was applied during it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from frictid_hil.errors import UsageError
+from frictid_hil.simulation import packing, plant
+from frictid_hil.simulation.compose import kernel
+from frictid_hil.simulation.joint import HandImpedance, JointModel
+
+SUBSTEP_S = 1e-4
+"""Longest sub-step of the physics."""
+
+_NOISE_BLOCK = 4096
+
+
+class ServoLoop:
+    """One joint under its drive.
+
+    Args:
+        model: the joint.
+        period_s: of the drive's control loop.
+        seed: of the noise on the reported torque.
+        position_rad: where the joint stands at first, as its encoder reads it; unpowered, brake engaged.
+    """
+
+    def __init__(self, model: JointModel, *, period_s: float = 0.001, seed: int = 0, position_rad: float = 0.0) -> None:
+        self.model = model
+        self._kernel = kernel()
+        self._parameters = packing.parameters(model)
+        self._state = packing.state()
+        self._step_rad = model.encoder.step_rad(model.gear_ratio)
+        self._mode = plant.POSITION_MODE
+        self._target_rad = position_rad
+        self._noise_nm = model.drive.torque_noise_per_mille * 1e-3 * model.drive.rated_torque_nm
+        self._random = np.random.default_rng(seed)
+        self._noise: list[float] = []
+        self._torque_noise_nm = 0.0
+        self._payload = False
+        self.period_s = period_s
+        self._kernel.place(self._parameters, self._state, float(position_rad), 0.0)
+        self._parameters[plant.POWERED] = 0.0
+        self._parameters[plant.BRAKED] = 1.0
+        self._commands = np.zeros((0, plant.COMMANDS))
+        self._readings = np.zeros((0, plant.READINGS))
+        self._duration_s = 0.0
+        self._row: list[float] = [
+            self._state[plant.MEASURED],
+            0.0,
+            0.0,
+            self._state[plant.LINK_POSITION],
+            0.0,
+            0.0,
+            0.0,
+            25.0,
+            0.0,
+        ]
+
+    @property
+    def period_s(self) -> float:
+        """Period of the control loop; may be set between two calls of ``advance``."""
+        return self._period_s
+
+    @period_s.setter
+    def period_s(self, period_s: float) -> None:
+        if not (math.isfinite(period_s) and period_s > 0):
+            raise UsageError(f"a control period must be positive, got {period_s} s")
+        self._period_s = period_s
+        self._duration_s = 0.0
+
+    def power(self, on: bool) -> None:
+        """Switch the power stage; switched on, the loop starts with the torque that holds the joint."""
+        was_on = self._parameters[plant.POWERED] != 0.0
+        self._parameters[plant.POWERED] = float(on)
+        if on and not was_on:
+            self._take_over(self._kernel.gravity_torque(self._parameters, self._state[plant.LINK_POSITION]))
+
+    def brake(self, engaged: bool) -> None:
+        """Close or open the holding brake."""
+        self._parameters[plant.BRAKED] = float(engaged)
+
+    def set_mode(self, mode: int) -> None:
+        """8 position, 9 velocity, 10 torque (values of CiA-402 object 6060), without a jump of torque.
+
+        Raises:
+            UsageError: another mode.
+        """
+        if mode not in (plant.POSITION_MODE, plant.VELOCITY_MODE, plant.TORQUE_MODE):
+            raise UsageError(f"no such mode: {mode}; there are 8 (position), 9 (velocity), 10 (torque)")
+        if mode != self._mode:
+            self._mode = mode
+            self._take_over(self._row[plant.READ_TORQUE])
+
+    def limits(self, torque_nm: float) -> None:
+        """Lower the torque limit; never above what the drive can give."""
+        self._parameters[plant.TORQUE_LIMIT] = min(max(torque_nm, 0.0), self.model.drive.torque_limit_nm)
+
+    def mount_payload(self, on: bool) -> None:
+        """Mount or take off the payload, if the joint has one."""
+        self._payload = on
+        packing.mount(self._parameters, self.model, on)
+
+    def hold_hand(
+        self,
+        hand: HandImpedance | None,
+        *,
+        centre_rad: float = 0.0,
+        amplitude_rad: float = 0.0,
+        frequency_hz: float = 0.0,
+    ) -> None:
+        """Let a person guide the link along centre + amplitude * sin(2 pi frequency t), t from now; None lets go."""
+        vector = self._parameters
+        self._state[plant.TIME] = 0.0
+        vector[plant.HAND_STIFFNESS] = 0.0 if hand is None else hand.stiffness_nm_per_rad
+        vector[plant.HAND_DAMPING] = 0.0 if hand is None else hand.damping_nm_s_per_rad
+        vector[plant.HAND_CENTRE] = centre_rad
+        vector[plant.HAND_AMPLITUDE] = amplitude_rad
+        vector[plant.HAND_FREQUENCY] = frequency_hz
+
+    def advance(
+        self,
+        duration_s: float,
+        *,
+        position_rad: float = 0.0,
+        velocity_rad_s: float = 0.0,
+        torque_nm: float = 0.0,
+        torque_offset_nm: float = 0.0,
+    ) -> None:
+        """Let time pass.
+
+        Args:
+            duration_s: rounded to whole control periods, at least one.
+            position_rad: position mode: target at the end, approached linearly from the previous one.
+            velocity_rad_s: velocity mode: target.
+            torque_nm: torque mode: target.
+            torque_offset_nm: added in every mode.
+        """
+        if duration_s != self._duration_s:
+            self._prepare(duration_s)
+        commands = self._commands
+        if self._mode == plant.POSITION_MODE:
+            velocity_rad_s = (position_rad - self._target_rad) / duration_s
+            self._target_rad = position_rad
+            if len(commands) > 1:
+                commands[:, 0] = position_rad + (self._ramp - 1.0) * (velocity_rad_s * duration_s)
+                commands[:, 1:] = velocity_rad_s, torque_nm, torque_offset_nm
+        elif len(commands) > 1:
+            commands[:] = position_rad, velocity_rad_s, torque_nm, torque_offset_nm
+        if len(commands) == 1:
+            row = commands[0]
+            row[0] = position_rad
+            row[1] = velocity_rad_s
+            row[2] = torque_nm
+            row[3] = torque_offset_nm
+        self._kernel.run(
+            self._parameters, self._state, commands, self._readings, self._mode, self._substeps, self._step_s
+        )
+        self._row = self._readings[-1].tolist()
+        if len(commands) > 1:
+            self._row[plant.READ_TORQUE] = float(self._readings[:, plant.READ_TORQUE].mean())
+        if not self._noise:
+            self._noise = (self._random.standard_normal(_NOISE_BLOCK) * self._noise_nm).tolist()
+        self._torque_noise_nm = self._noise.pop()
+
+    @property
+    def position_counts(self) -> int:
+        """Encoder counts, zero at joint position 0; micro-radians where the encoder is continuous."""
+        return round(self._row[plant.READ_POSITION] / (self._step_rad or 1e-6))
+
+    @property
+    def measured_position_rad(self) -> float:
+        """The encoder's position."""
+        return self._row[plant.READ_POSITION]
+
+    @property
+    def position_rad(self) -> float:
+        """True position of the link."""
+        return self._row[plant.READ_TRUE_POSITION]
+
+    @property
+    def true_velocity_rad_s(self) -> float:
+        """True velocity of the link."""
+        return self._row[plant.READ_TRUE_VELOCITY]
+
+    @property
+    def velocity_rad_s(self) -> float:
+        """The drive's own estimate."""
+        return self._row[plant.READ_VELOCITY]
+
+    @property
+    def torque_nm(self) -> float:
+        """Torque as reported: mean of the last ``advance``, with noise, not rounded to the drive's steps."""
+        return self._row[plant.READ_TORQUE] + self._torque_noise_nm
+
+    @property
+    def external_torque_nm(self) -> float:
+        """What a person applies to the link."""
+        return self._row[plant.READ_EXTERNAL]
+
+    @property
+    def temperature_c(self) -> float:
+        """At the gear."""
+        return self._row[plant.READ_TEMPERATURE]
+
+    @property
+    def following_error_rad(self) -> float:
+        """Last position target minus encoder position; 0 outside position mode."""
+        return self._target_rad - self._row[plant.READ_POSITION] if self._mode == plant.POSITION_MODE else 0.0
+
+    @property
+    def saturated(self) -> bool:
+        """The torque limit was active at the end of the last ``advance``."""
+        return self._row[plant.READ_SATURATED] != 0.0
+
+    def _take_over(self, torque_nm: float) -> None:
+        """Continue from here with this torque."""
+        self._target_rad = self._row[plant.READ_POSITION]
+        self._state[plant.INTEGRAL] = torque_nm
+
+    def _prepare(self, duration_s: float) -> None:
+        """Sizes of one call of the kernel for this duration."""
+        periods = max(1, round(duration_s / self._period_s))
+        self._substeps = max(1, math.ceil(duration_s / periods / SUBSTEP_S - 1e-6))
+        self._step_s = duration_s / periods / self._substeps
+        self._ramp = np.arange(1, periods + 1) / periods
+        self._commands = np.zeros((periods, plant.COMMANDS))
+        self._readings = np.zeros((periods, plant.READINGS))
+        self._duration_s = duration_s
