@@ -361,5 +361,5 @@ def _address(joint: JointFile, driver: str) -> int | None:
 
 
 def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
-    values = joint.model_dump(exclude={"node", "axis", "procedure", "options", "simulated"})
+    values = joint.model_dump(exclude={"node", "axis", "procedure", "expected", "options", "simulated"})
     return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, **values)

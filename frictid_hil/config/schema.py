@@ -30,6 +30,9 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def _as_tuple(value: Any) -> Any:
+    """Lists (as files hold them) and arrays (as the mathematics returns them) alike."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     return tuple(value) if isinstance(value, list) else value
 
 

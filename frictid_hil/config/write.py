@@ -1,6 +1,7 @@
 """YAML out, for people and for bytes that repeat: block style, keys in the order given, shortest exact floats.
 
-A list of plain values stays on one line, so that a curve reads as a row. Files are replaced whole or not at all.
+A list of plain values stays on one line, so that a curve reads as a row; so does ``{value: .., low: .., high: ..}``.
+Files are replaced whole or not at all.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ def _represent_list(writer: Any, value: list[Any]) -> Any:
 
 
 def _represent_dict(writer: Any, value: dict[str, Any]) -> Any:
-    return writer.represent_mapping("tag:yaml.org,2002:map", value.items(), flow_style=False)
+    on_one_line = not value or (next(iter(value)) == "value" and _on_one_line(value.values()))
+    return writer.represent_mapping("tag:yaml.org,2002:map", value.items(), flow_style=on_one_line)
 
 
 _Writer.add_representer(list, _represent_list)
@@ -48,7 +50,7 @@ def dump(values: Mapping[str, Any]) -> str:
         ValueError: a number that is not finite, or a value that is no mapping, list, text, number, truth or None.
     """
     text: str = yaml.dump(
-        plain(values), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=110, default_flow_style=False
+        plain(values), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=100, default_flow_style=False
     )
     return text
 

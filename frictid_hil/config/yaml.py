@@ -7,7 +7,7 @@ nested, aliases of aliases) are refused before they cost memory.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,10 +77,12 @@ class Document:
     Attributes:
         path: of the file.
         root: its values; always a mapping.
+        spelled: from a path of ``root`` to the keys as the file spells them, where the loader renamed some.
     """
 
     path: Path
     root: Node
+    spelled: Callable[[KeyPath], KeyPath] = tuple
 
     @property
     def data(self) -> dict[str, Any]:
@@ -112,7 +114,10 @@ class Document:
         """
         placed = [(self.place(p.path, of_key=p.path in at_key), p) for p in problems]
         placed.sort(key=lambda one: (one[0].path.name, one[0].line, one[0].column))
-        lines = [(str(place), f"{_dotted(p.path)}: {p.message}" if p.path else p.message) for place, p in placed]
+        lines = [
+            (str(place), f"{_dotted(self.spelled(p.path))}: {p.message}" if p.path else p.message)
+            for place, p in placed
+        ]
         (where, what), *others = lines
         return ConfigError("\n".join([what, *(f"{w}: {m}" for w, m in others)]), where=where)
 

@@ -1,0 +1,81 @@
+"""Where a profile comes from: everything that a later reader needs to trust it, or to find out why not."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+import frictid_hil
+from frictid_hil.config.schema import Strict
+
+
+class Provenance(Strict):
+    """Of one profile.
+
+    Attributes:
+        created_utc: ``2026-11-21T05:15:00Z``.
+        tool_version: of frictid-hil.
+        git_revision: of the checkout it ran from; "" from an installed wheel.
+        robot_file: name of the robot file.
+        config_sha256: ``Robot.digest``.
+        driver: name.
+        bus: ``interface:channel``; "" where a recording was identified.
+        settings: of driver and bus (bitrate, cycle rate, time-outs, ...).
+        realtime: wall clock.
+        seed: of simulated noise; None on real hardware.
+        run: the run folder, or the recordings.
+        log_sha256: of each recording, by file name.
+        temperatures_c: by name of the place measured.
+        command: the command line.
+        notes: anything else worth a line.
+    """
+
+    created_utc: str = Field(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")
+    tool_version: str = frictid_hil.__version__
+    git_revision: str = ""
+    robot_file: str = ""
+    config_sha256: str = ""
+    driver: str = ""
+    bus: str = ""
+    settings: dict[str, Any] = Field(default_factory=dict)
+    realtime: bool = False
+    seed: int | None = None
+    run: str = ""
+    log_sha256: dict[str, str] = Field(default_factory=dict)
+    temperatures_c: dict[str, float] = Field(default_factory=dict)
+    command: str = ""
+    notes: list[str] = Field(default_factory=list)
+
+
+def utc_now() -> str:
+    """Now, as provenance writes it."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def git_revision() -> str:
+    """Revision of the checkout this program runs from, with ``+`` where files differ from it; "" outside a checkout."""
+    checkout = Path(frictid_hil.__file__).parent.parent
+    if not (checkout / ".git").exists():
+        return ""
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(checkout), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return answer.stdout.strip()
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
