@@ -91,7 +91,8 @@ class FrictionCurve:
     def torque(self, velocity_rad_s: Array) -> Array:
         """phi(v) of (8), N m, any shape; 0 at v = 0. Uses abs(v) in (9g)."""
         v = np.asarray(velocity_rad_s, dtype=np.float64)
-        return np.sign(v) * self.magnitude(np.abs(v))
+        torque: Array = np.sign(v) * self.magnitude(np.abs(v))
+        return torque
 
     def magnitude(self, speed_rad_s: Array) -> Array:
         """phi(abs(v)) with phi(0) = F_0, N m, any shape."""
@@ -105,7 +106,8 @@ class FrictionCurve:
     def rate_part(self, velocity_rad_s: Array) -> Array:
         """phi_0(v) = phi(v) - F_0 sgn(v) of (17): continuous through zero, N m."""
         v = np.asarray(velocity_rad_s, dtype=np.float64)
-        return np.sign(v) * (self.magnitude(np.abs(v)) - self.coulomb_nm)
+        torque: Array = np.sign(v) * (self.magnitude(np.abs(v)) - self.coulomb_nm)
+        return torque
 
     def extrapolated(self, velocity_rad_s: Array) -> NDArray[np.bool_]:
         """True where abs(v) lies outside [V_1, V_N]."""

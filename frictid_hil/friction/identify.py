@@ -1,0 +1,163 @@
+"""Function A (7): from the samples of N cycles to N velocity-force pairs, exactly as published.
+
+Cycle n contributes the samples near its velocity peaks, abs(v) >= c n V / N, forwards and backwards. Half the
+difference of the two mean torques is F_n: inertia and gravity act alike in both windows and cancel (10)-(14).
+
+Errata of the paper that this file answers:
+
+* (5) I = T_{N+1} / dt is not an integer: windows are half-open in the *recorded* time, not in sample numbers.
+* (7f) averages positive velocities only. V_n keeps that meaning; the mean speed backwards is reported beside it.
+* (11)-(13) flip the sign of the velocity and swap (13a) with (13b); the conclusion (14) holds, and (7i) follows it.
+* an empty window has no average: it is an error that names the cycle and the direction, never NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array, Procedure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IdentifiedPairs:
+    """The set S of (1) with both directions kept; every array has shape (N,), order of the cycles.
+
+    Attributes:
+        velocity_rad_s: V_n of (7f): mean of the positive velocities.
+        torque_nm: F_n of (7i): half the difference of the two mean torques.
+        velocity_minus_rad_s: mean speed of the backward window, as a positive number.
+        torque_plus_nm: F_sn+ of (7g), gravity and bias included.
+        torque_minus_nm: F_sn- of (7h), signed as measured.
+        samples_plus: samples in the forward window.
+        samples_minus: samples in the backward window.
+    """
+
+    velocity_rad_s: Array
+    torque_nm: Array
+    velocity_minus_rad_s: Array
+    torque_plus_nm: Array
+    torque_minus_nm: Array
+    samples_plus: NDArray[np.int64]
+    samples_minus: NDArray[np.int64]
+
+    @property
+    def velocity_plus_rad_s(self) -> Array:
+        """Mean speed of the forward window; the same as V_n (7f)."""
+        return self.velocity_rad_s
+
+    @property
+    def mean_speed_rad_s(self) -> Array:
+        """Mean speed of both windows, for those who do not want (7f)'s one-sided V_n."""
+        return (self.velocity_rad_s + self.velocity_minus_rad_s) / 2
+
+    def curve(self, *, where: str = "") -> FrictionCurve:
+        """phi of (8) through the pairs; raises as ``FrictionCurve.through``."""
+        return FrictionCurve.through(self.velocity_rad_s, self.torque_nm, where=where)
+
+
+def function_a(
+    time_s: Array, velocity_rad_s: Array, torque_nm: Array, procedure: Procedure, *, where: str = ""
+) -> IdentifiedPairs:
+    """Algorithm (7) as published: thresholds on the measured velocity, plain averages.
+
+    Args:
+        time_s: increasing, 0 at the start of cycle 1, shape (n,). Samples outside [0, T_{N+1}) are ignored.
+        velocity_rad_s: measured velocity, shape (n,).
+        torque_nm: applied torque, shape (n,).
+        procedure: V, A, N and c.
+        where: what to name in an error (``joint 1``).
+
+    Raises:
+        IdentificationError: shapes differ, a value is not finite, or a window is empty (cycle and direction named).
+    """
+    time = np.asarray(time_s, dtype=np.float64)
+    velocity = np.asarray(velocity_rad_s, dtype=np.float64)
+    torque = np.asarray(torque_nm, dtype=np.float64)
+    if time.ndim != 1 or not time.shape == velocity.shape == torque.shape:
+        raise IdentificationError(
+            f"time {time.shape}, velocity {velocity.shape} and torque {torque.shape} must be equal 1-D shapes",
+            where=where,
+        )
+    starts_s, thresholds = _windows(procedure)
+    bounds = time.searchsorted(starts_s)
+    lengths = bounds[1:] - bounds[:-1]
+    if not lengths.all():
+        cycle = int(np.flatnonzero(lengths == 0)[0])
+        raise IdentificationError(
+            f"cycle {cycle + 1} of {procedure.cycles} has no sample at all",
+            where=where,
+            cause="the recording ends early, starts late, or its time does not start with cycle 1",
+        )
+    velocity, torque = velocity[bounds[0] : bounds[-1]], torque[bounds[0] : bounds[-1]]
+    bounds = bounds - bounds[0]
+    threshold = thresholds.repeat(lengths)
+    (v_plus, f_plus, n_plus), (v_minus, f_minus, n_minus) = _means(
+        (velocity >= threshold, velocity <= -threshold), velocity, torque, bounds, where
+    )
+    if not (n_plus.all() and n_minus.all()):
+        raise _empty_window(velocity, bounds, thresholds, n_plus, where)
+    return IdentifiedPairs(v_plus, (f_plus - f_minus) / 2, -v_minus, f_plus, f_minus, n_plus, n_minus)
+
+
+@lru_cache(maxsize=16)
+def _windows(procedure: Procedure) -> tuple[Array, Array]:
+    return procedure.cycle_starts_s, procedure.ratio * procedure.peak_velocities_rad_s
+
+
+def _means(
+    windows: tuple[NDArray[np.bool_], ...], velocity: Array, torque: Array, bounds: NDArray[np.int64], where: str
+) -> list[tuple[Array, Array, NDArray[np.int64]]]:
+    """Mean velocity, mean torque and count of the samples in each window, cycle by cycle.
+
+    The samples are split into stretches that lie wholly inside or outside every window of one cycle. There are a few
+    dozen of them, so each column is summed once and nothing of its length is copied.
+    """
+    splits = np.zeros(velocity.size + 1, dtype=np.bool_)
+    splits[bounds] = True
+    for inside in windows:
+        splits[1:-1] |= inside[1:] != inside[:-1]
+    edges = splits.nonzero()[0]
+    first = edges[:-1]
+    sums = np.add.reduceat(velocity, first), np.add.reduceat(torque, first), edges[1:] - first
+    for name, column in zip(("velocity", "torque"), sums, strict=False):
+        if not np.isfinite(column).all():  # a NaN would fail every comparison above and vanish without a word
+            raise IdentificationError(f"the {name} holds a value that is not finite", where=where)
+    cycle = bounds.searchsorted(first, side="right") - 1
+    cycles = bounds.size - 1
+    means: list[tuple[Array, Array, NDArray[np.int64]]] = []
+    for inside in windows:
+        kept = inside[first]
+        of = cycle[kept]
+        v, f, count = (np.bincount(of, column[kept], cycles) for column in sums)
+        some = np.maximum(count, 1)  # an empty window is the caller's to report
+        means.append((v / some, f / some, count.astype(np.int64)))
+    return means
+
+
+def _empty_window(
+    velocity: Array, bounds: NDArray[np.int64], thresholds: Array, n_plus: NDArray[np.int64], where: str
+) -> IdentificationError:
+    cycles = len(thresholds)
+    peaks = [velocity[a:b] for a, b in pairwise(bounds)]
+    for n in range(cycles):
+        forward, backward = float(peaks[n].max()), float(-peaks[n].min())
+        for direction, reached, empty in (
+            ("forward", forward, n_plus[n] == 0),
+            ("backward", backward, backward < thresholds[n]),
+        ):
+            if empty:
+                return IdentificationError(
+                    f"cycle {n + 1} of {cycles} has no sample in its {direction} window: the speed reached "
+                    f"{max(reached, 0.0):.4g} and the window begins at {thresholds[n]:.4g} rad/s",
+                    where=where,
+                    cause="poor tracking or torque saturation",
+                    next_step="lower the peak velocity, raise the travel, or tune the position loop",
+                )
+    raise AssertionError("no window is empty")  # pragma: no cover - the caller saw an empty one

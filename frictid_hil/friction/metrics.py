@@ -1,0 +1,81 @@
+"""Distances and effort: (15) between two curves, (25) and (28) over a recording.
+
+Each is a root of a mean square. (15) is integrated exactly: the difference of two piecewise-linear curves is linear
+between the union of their knots; the integral of its square over a stretch h with end values a, b is h (a^2+ab+b^2)/3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CurveDistance:
+    """How far a curve is from a reference, over [0, V] and over the curve's own measured range [V_1, V_N].
+
+    Attributes:
+        e_nm: E of (15) over [0, V].
+        e_percent: in percent of the reference's mean over [0, V].
+        e_measured_nm: the same integral over [V_1, V_N].
+        e_percent_measured_range: in percent of the reference's mean over [V_1, V_N].
+    """
+
+    e_nm: float
+    e_percent: float
+    e_measured_nm: float
+    e_percent_measured_range: float
+
+
+def curve_distance(curve: FrictionCurve, reference: FrictionCurve, velocity_rad_s: float) -> CurveDistance:
+    """E(curve, reference) of (15) and its percentages.
+
+    Args:
+        curve: the identified curve; its measured range is the second interval, cut at V.
+        reference: the curve to be reached (truth, A = 50 deg, another profile).
+        velocity_rad_s: V, upper end of the first interval.
+    """
+    low, high = curve.measured_range_rad_s
+    high = min(high, velocity_rad_s)
+    whole, whole_mean = _rms_and_mean(curve, reference, 0.0, velocity_rad_s)
+    inner, inner_mean = _rms_and_mean(curve, reference, low, high)
+    return CurveDistance(whole, 100 * whole / whole_mean, inner, 100 * inner / inner_mean)
+
+
+def curve_mean(curve: FrictionCurve, low_rad_s: float, high_rad_s: float) -> float:
+    """Mean of phi over [low, high], N m, exactly."""
+    return _rms_and_mean(curve, curve, low_rad_s, high_rad_s)[1]
+
+
+def _rms_and_mean(
+    curve: FrictionCurve, reference: FrictionCurve, low_rad_s: float, high_rad_s: float
+) -> tuple[float, float]:
+    knots = np.concatenate([curve.velocity_rad_s, reference.velocity_rad_s])
+    inner = knots[(knots > low_rad_s) & (knots < high_rad_s)]
+    grid = np.unique(np.concatenate([[low_rad_s], inner, [high_rad_s]]))
+    step = np.diff(grid)
+    level = reference.magnitude(grid)
+    gap = curve.magnitude(grid) - level
+    square = np.sum(step * (gap[:-1] ** 2 + gap[:-1] * gap[1:] + gap[1:] ** 2)) / 3
+    mean = np.sum(step * (level[:-1] + level[1:])) / 2
+    width = high_rad_s - low_rad_s
+    return float(np.sqrt(square / width)), float(mean / width)
+
+
+def rms(time_s: Array, values: Array) -> float:
+    """sqrt(1/T_e integral x^2 dt) of (25), by trapezoids on the recorded time; unit of ``values``.
+
+    V_s is this of the velocity, F_s of the external torque.
+    """
+    square = np.asarray(values, dtype=np.float64) ** 2
+    step_s = np.diff(time_s)
+    return float(np.sqrt(np.sum(step_s * (square[1:] + square[:-1])) / (2 * np.sum(step_s))))
+
+
+def tracking_rms(time_s: Array, command_rad: Array, position_rad: Array) -> float:
+    """E_s of (28): rms of p_d - p_s, rad."""
+    return rms(time_s, np.asarray(command_rad) - np.asarray(position_rad))

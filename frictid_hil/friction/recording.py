@@ -1,0 +1,164 @@
+"""What an estimator is given: one joint's samples on the time of its cycles, and how they were made.
+
+The columns may begin before cycle 1 and end after cycle N (holds, the repeated cycle, a slow reversal): time 0 is the
+start of cycle 1. Nothing here is fitted; timing, quanta and limits are declared by whoever recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.filtering import Gaussian, uniform
+from frictid_hil.friction.trajectory import Array, Procedure
+
+
+@dataclass(frozen=True, slots=True)
+class Skew:
+    """By how much each column is late: a delay of 2 ms says that the value reported at t was true at t - 2 ms.
+
+    Attributes:
+        position_delay_s: of the position.
+        velocity_delay_s: of the drive's own velocity, filters included.
+        torque_delay_s: of the torque, filters and half a step of zero-order hold included.
+        uncertainty_s: one standard deviation of torque delay minus position delay.
+    """
+
+    position_delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    torque_delay_s: float = 0.0
+    uncertainty_s: float = 0.0002
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """One cycle of the procedure run again at the end, to see drift.
+
+    Attributes:
+        cycle: which, 1..N.
+        start_s: when it starts again.
+    """
+
+    cycle: int
+    start_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleRecording:
+    """One joint's recording of the procedure; every column has shape (n,).
+
+    Attributes:
+        time_s: strictly increasing, 0 at the start of cycle 1.
+        position_rad: measured; radians or metres.
+        torque_nm: as the drive reports it.
+        procedure: V, A, N, c.
+        velocity_rad_s: the drive's own velocity, where it has one.
+        command_rad: position set-points, where recorded.
+        skew: declared timing of the columns.
+        gear_ratio: motor revolutions per joint revolution; NaN where unknown (torque ripple is then not modelled).
+        prismatic: a linear axis: gravity does not depend on the position.
+        torque_limit_nm: at which the drive saturates.
+        torque_quantum_nm: one step of the reported torque.
+        repeat: the repeated cycle, where there is one.
+        late_cycles: control cycles that were late or missed while recording.
+        where: what to name in errors (``joint 1``).
+    """
+
+    time_s: Array
+    position_rad: Array
+    torque_nm: Array
+    procedure: Procedure
+    velocity_rad_s: Array | None = None
+    command_rad: Array | None = None
+    skew: Skew = Skew()
+    gear_ratio: float = math.nan
+    prismatic: bool = False
+    torque_limit_nm: float = math.inf
+    torque_quantum_nm: float = 0.0
+    repeat: Repeat | None = None
+    late_cycles: int = 0
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Position, its derivatives and the torque, lightly smoothed, all true at the same instants.
+
+    Attributes:
+        time_s: uniform grid, time of the cycles, shape (n,).
+        position_rad: shape (n,).
+        velocity_rad_s: shape (n,).
+        acceleration_rad_s2: shape (n,).
+        torque_nm: shape (n,).
+        smoother: the kernel that all four columns went through.
+    """
+
+    time_s: Array
+    position_rad: Array
+    velocity_rad_s: Array
+    acceleration_rad_s2: Array
+    torque_nm: Array
+    smoother: Gaussian
+
+
+def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -> Motion:
+    """Zero-phase velocity and acceleration from the position, torque brought to the instants of the position.
+
+    Only the declared skew is used; it is never searched for in the data, where unmodelled ripple would drag it by
+    milliseconds.
+
+    Args:
+        recording: the samples.
+        extra_torque_delay_s: added to the declared torque delay, to see what a wrong declaration would do.
+
+    Raises:
+        IdentificationError: shapes differ, time does not increase, or a value is not finite.
+    """
+    _check(recording)
+    time, (position, torque) = uniform(recording.time_s, recording.position_rad, recording.torque_nm)
+    smoother = Gaussian(step_s=float(np.median(np.diff(time))), width_s=_width_s(recording, position))
+    skew = recording.skew
+    advance_s = skew.torque_delay_s + extra_torque_delay_s - skew.position_delay_s
+    return Motion(
+        time_s=time - skew.position_delay_s,
+        position_rad=smoother.smooth(position),
+        velocity_rad_s=smoother.rate(position),
+        acceleration_rad_s2=smoother.curvature(position),
+        torque_nm=smoother.smooth(torque, advance_s),
+        smoother=smoother,
+    )
+
+
+def _check(recording: CycleRecording) -> None:
+    shape = np.shape(recording.time_s)
+    for name in ("position_rad", "torque_nm"):
+        column = getattr(recording, name)
+        if np.shape(column) != shape or len(shape) != 1:
+            raise IdentificationError(f"{name} {np.shape(column)} and time {shape} differ", where=recording.where)
+        if not np.all(np.isfinite(column)):
+            raise IdentificationError(f"{name} holds a value that is not finite", where=recording.where)
+    if shape[0] < 100 or not np.all(np.diff(recording.time_s) > 0):
+        raise IdentificationError("time must increase strictly over at least 100 samples", where=recording.where)
+
+
+_VELOCITY_NOISE = 0.002
+"""Tolerated noise of the velocity from encoder counts, as a share of the first cycle's peak."""
+
+
+def _width_s(recording: CycleRecording, position: Array) -> float:
+    """The narrowest kernel that keeps encoder counts out of the velocity, but never one that flattens the peaks."""
+    step_s = float(np.median(np.diff(recording.time_s)))
+    moves = np.abs(np.diff(position[: 1 << 16]))
+    quantum = float(np.min(moves[moves > 1e-12], initial=np.inf))
+    peaks = recording.procedure.peak_velocities_rad_s
+    narrow = 1.5 * step_s
+    widest = max(narrow, 0.08 / recording.procedure.angular_frequencies_rad_s[-1])
+    if not math.isfinite(quantum):
+        return narrow
+    # Noise of a derivative: counts / sqrt(12), times 0.531 (step / width)^1.5 / step.
+    noise = quantum / math.sqrt(12.0) * 0.531 / step_s
+    needed = (noise / (_VELOCITY_NOISE * peaks[0])) ** (2.0 / 3.0) * step_s
+    return float(min(max(narrow, needed), widest))

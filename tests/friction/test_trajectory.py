@@ -1,0 +1,97 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from frictid_hil.friction import trajectory
+from frictid_hil.friction.trajectory import Procedure
+
+DEG = math.pi / 180
+
+
+def procedure(amplitude_deg=20.0, velocity_deg_s=115.0, cycles=10):
+    return Procedure(amplitude_deg * DEG, velocity_deg_s * DEG, cycles)
+
+
+def test_amplitude_is_peak_to_peak_and_the_run_takes_sixteen_seconds():
+    p = procedure()
+    time = np.linspace(0, p.duration_s, 200_001)
+    path = trajectory.position(p, time)
+    assert path.min() == 0.0
+    assert path.max() == pytest.approx(20 * DEG, rel=1e-8)
+    assert p.duration_s == pytest.approx(16.003, abs=5e-4)
+
+
+@pytest.mark.parametrize(("amplitude", "duration"), [(5, 4.0), (10, 8.0), (50, 40.0)])
+def test_duration_is_proportional_to_the_travel(amplitude, duration):
+    assert procedure(amplitude).duration_s == pytest.approx(duration, abs=0.05)
+
+
+def test_each_cycle_reaches_its_own_peak_speed_both_ways():
+    p = procedure()
+    time = np.linspace(0, p.duration_s, 400_001)
+    speed = trajectory.velocity(p, time)
+    for n, peak in enumerate(p.peak_velocities_rad_s):
+        inside = p.cycle_of(time) == n
+        assert speed[inside].max() == pytest.approx(peak, rel=1e-6)
+        assert speed[inside].min() == pytest.approx(-peak, rel=1e-6)
+
+
+def test_cycles_are_half_open_and_the_outside_is_marked():
+    p = procedure()
+    starts = p.cycle_starts_s
+    assert list(p.cycle_of(starts)) == [*range(10), 10]
+    assert p.cycle_of(np.array([-1e-9]))[0] == -1
+    assert p.cycle_of(np.nextafter(starts[1:], 0.0)).tolist() == list(range(10))
+
+
+def test_velocity_is_continuous_at_the_joins_and_acceleration_jumps_as_predicted():
+    p = procedure()
+    eps = 1e-9
+    for n, join in enumerate(p.cycle_starts_s[1:-1], start=1):
+        before, after = trajectory.velocity(p, np.array([join - eps, join + eps]))
+        assert abs(after - before) < 1e-6
+        low, high = trajectory.acceleration(p, np.array([join - eps, join + eps]))
+        jump = 2 * p.velocity_rad_s**2 * (2 * n + 1) / (p.amplitude_rad * p.cycles**2)
+        assert high - low == pytest.approx(jump, rel=1e-5)
+
+
+@given(
+    amplitude=st.floats(1, 90),
+    velocity=st.floats(1, 400),
+    cycles=st.integers(2, 20),
+    share=st.floats(0.01, 0.99),
+)
+def test_velocity_and_acceleration_are_the_derivatives(amplitude, velocity, cycles, share):
+    p = procedure(amplitude, velocity, cycles)
+    n = int(share * cycles)
+    middle = p.cycle_starts_s[n] + (p.cycle_starts_s[n + 1] - p.cycle_starts_s[n]) * np.linspace(0.05, 0.95, 20)
+    h = 1e-5 / p.angular_frequencies_rad_s[-1]
+    numeric = (trajectory.position(p, middle + h) - trajectory.position(p, middle - h)) / (2 * h)
+    assert np.allclose(numeric, trajectory.velocity(p, middle), atol=1e-4 * p.velocity_rad_s)
+    numeric = (trajectory.velocity(p, middle + h) - trajectory.velocity(p, middle - h)) / (2 * h)
+    assert np.allclose(numeric, trajectory.acceleration(p, middle), atol=1e-4 * trajectory.peak_acceleration(p))
+
+
+def test_sample_times_cover_the_run_although_their_number_is_no_integer():
+    p = procedure()
+    time = trajectory.sample_times(p, 0.001)
+    assert p.duration_s / 0.001 != int(p.duration_s / 0.001)
+    assert p.duration_s - 0.001 <= time[-1] < p.duration_s
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"amplitude_rad": 0.0, "velocity_rad_s": 1.0},
+        {"amplitude_rad": math.nan, "velocity_rad_s": 1.0},
+        {"amplitude_rad": 1.0, "velocity_rad_s": -1.0},
+        {"amplitude_rad": 1.0, "velocity_rad_s": 1.0, "cycles": 1},
+        {"amplitude_rad": 1.0, "velocity_rad_s": 1.0, "ratio": 1.0},
+    ],
+)
+def test_a_procedure_that_cannot_work_is_refused(wrong):
+    with pytest.raises(ValueError):
+        Procedure(**wrong)
