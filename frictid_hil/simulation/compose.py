@@ -51,9 +51,8 @@ class Kernel:
 
     run: Callable[..., None]
     steady: Callable[..., None]
-    place: Callable[..., None]
-    settle: Callable[..., None]
-    gravity_torque: Callable[..., float]
+    place: Callable[..., float]
+    holding_torque: Callable[..., float]
 
 
 @functools.cache
@@ -74,7 +73,7 @@ def layout() -> Layout:
 def kernel() -> Kernel:
     """The compiled kernel with every effect there is; the first call on a machine compiles for some seconds."""
     module = _load(kernel_source())
-    return Kernel(module.run, module.steady, module.place, module.settle, module.gravity_torque)
+    return Kernel(module.run, module.steady, module.place, module.holding_torque)
 
 
 def kernel_source() -> str:

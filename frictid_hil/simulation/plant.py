@@ -172,21 +172,61 @@ def measure(parameters: Vector, position_rad: float) -> float:
     return float(measured_rad)
 
 
-def place(parameters: Vector, state: Vector, position_rad: float, torque_nm: float) -> None:
-    """Put the joint at rest where its encoder reads ``position_rad``, held by ``torque_nm``."""
+def transmission(parameters: Vector) -> tuple[float, float, float]:
+    """Stiffness, damping and play between motor and link; stiffness 0 stands for a rigid joint."""
+    coupling_nm_per_rad = 0.0
+    # effects at coupling transform coupling_nm_per_rad
+    coupling_nm_s_per_rad = 0.0
+    # effects at coupling_damping transform coupling_nm_s_per_rad
+    play_rad = 0.0
+    # effects at play transform play_rad
+    return coupling_nm_per_rad, coupling_nm_s_per_rad, play_rad
+
+
+def place(parameters: Vector, state: Vector, position_rad: float) -> float:
+    """Put the joint at rest where its encoder reads ``position_rad``, friction relaxed; returns the holding torque."""
     true_rad = 2.0 * position_rad - encoder_angle(parameters, position_rad)
+    stiffness, _, play_rad = transmission(parameters)
+    stretch_rad = 0.0
+    gravity_nm = gravity_torque(parameters, true_rad)
+    if stiffness > 0.0:
+        # Three rounds settle how far the link sags under its own weight.
+        on_motor = parameters[ENCODER_ON_MOTOR] != 0.0
+        for _ in range(3):
+            gravity_nm = gravity_torque(parameters, true_rad - stretch_rad if on_motor else true_rad)
+            stretch_rad = gravity_nm / stiffness
+            if gravity_nm != 0.0:
+                stretch_rad += math.copysign(0.5 * play_rad, gravity_nm)
+        if not on_motor:
+            true_rad += stretch_rad
     state[MOTOR_POSITION] = true_rad
-    state[LINK_POSITION] = true_rad
+    state[LINK_POSITION] = true_rad - stretch_rad
     state[MOTOR_VELOCITY] = 0.0
     state[LINK_VELOCITY] = 0.0
     state[MOTOR_ACCELERATION] = 0.0
     state[LINK_ACCELERATION] = 0.0
     state[SLIP] = 0.0
+    torque_nm = holding_torque(parameters, state)
     state[INTEGRAL] = torque_nm
-    state[MEASURED] = measure(parameters, true_rad)
+    state[MEASURED] = measure(parameters, encoder_position(parameters, state))
     state[CONTROL_VELOCITY] = 0.0
     state[REPORT_VELOCITY] = 0.0
     settle(parameters, state, 0.0, torque_nm)
+    return torque_nm
+
+
+def holding_torque(parameters: Vector, state: Vector) -> float:
+    """The motor torque that holds the link against gravity where it is, without the help of friction."""
+    gravity_nm = gravity_torque(parameters, state[LINK_POSITION])
+    # What reaches the shaft is an affine function of the motor's torque.
+    nothing = shaft_torque(parameters, 0.0, state[MOTOR_POSITION], parameters[GEAR_RATIO])
+    one = shaft_torque(parameters, 1.0, state[MOTOR_POSITION], parameters[GEAR_RATIO])
+    return float((gravity_nm - nothing) / (one - nothing))
+
+
+def encoder_position(parameters: Vector, state: Vector) -> float:
+    """True position of the shaft that the encoder sits on."""
+    return float(state[MOTOR_POSITION] if parameters[ENCODER_ON_MOTOR] != 0.0 else state[LINK_POSITION])
 
 
 def run(
@@ -213,12 +253,7 @@ def run(
     # effects at inertia transform link_kg_m2
     link_kg_m2 += parameters[PAYLOAD_INERTIA]
 
-    coupling_nm_per_rad = 0.0
-    # effects at coupling transform coupling_nm_per_rad
-    coupling_nm_s_per_rad = 0.0
-    # effects at coupling_damping transform coupling_nm_s_per_rad
-    play_rad = 0.0
-    # effects at play transform play_rad
+    coupling_nm_per_rad, coupling_nm_s_per_rad, play_rad = transmission(parameters)
     rigid = coupling_nm_per_rad <= 0.0
     body_kg_m2 = motor_kg_m2 + link_kg_m2 if rigid else motor_kg_m2
 
@@ -334,8 +369,7 @@ def run(
             state[MOTOR_ACCELERATION] = 0.0
             state[LINK_VELOCITY] = 0.0
             state[LINK_ACCELERATION] = 0.0
-        position_true = state[MOTOR_POSITION] if parameters[ENCODER_ON_MOTOR] != 0.0 else state[LINK_POSITION]
-        measured = measure(parameters, position_true)
+        measured = measure(parameters, encoder_position(parameters, state))
         difference = (measured - state[MEASURED]) / period_s
         state[MEASURED] = measured
         state[CONTROL_VELOCITY] += control_share * (difference - state[CONTROL_VELOCITY])

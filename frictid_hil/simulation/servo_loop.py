@@ -45,7 +45,7 @@ class ServoLoop:
         self._torque_noise_nm = 0.0
         self._payload = False
         self.period_s = period_s
-        self._kernel.place(self._parameters, self._state, float(position_rad), 0.0)
+        self._kernel.place(self._parameters, self._state, float(position_rad))
         self._parameters[plant.POWERED] = 0.0
         self._parameters[plant.BRAKED] = 1.0
         self._commands = np.zeros((0, plant.COMMANDS))
@@ -80,7 +80,7 @@ class ServoLoop:
         was_on = self._parameters[plant.POWERED] != 0.0
         self._parameters[plant.POWERED] = float(on)
         if on and not was_on:
-            self._take_over(self._kernel.gravity_torque(self._parameters, self._state[plant.LINK_POSITION]))
+            self._take_over(self._kernel.holding_torque(self._parameters, self._state))
 
     def brake(self, engaged: bool) -> None:
         """Close or open the holding brake."""

@@ -1,0 +1,199 @@
+"""A whole recording simulated again: the same commands, the same controller, a modelled joint.
+
+Rows follow one timing rule: position k is sampled at t_k; torque k is the mean of what was applied since t_(k-1);
+command k acts from t_k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation import packing, plant
+from frictid_hil.simulation.compose import kernel, layout
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.joint import JointModel
+
+SUBSTEP_S = 1e-4
+"""Longest sub-step of the physics."""
+
+
+@dataclass(frozen=True, slots=True)
+class Controller:
+    """A digital position controller: kp*(cmd - q) + integral(ki*(cmd - q)) + kd*(d cmd/dt - filtered v).
+
+    Its integral starts at the static holding torque and is frozen while the limit is active; v is the backward
+    difference of the measured position behind a first-order filter.
+
+    Attributes:
+        kp_nm_per_rad: proportional gain.
+        ki_nm_per_rad_s: integral gain.
+        kd_nm_s_per_rad: derivative gain.
+        rate_hz: of the loop.
+        velocity_filter_s: time constant of the filter.
+        torque_limit_nm: of the demand.
+    """
+
+    kp_nm_per_rad: float
+    ki_nm_per_rad_s: float
+    kd_nm_s_per_rad: float
+    rate_hz: float
+    velocity_filter_s: float = 0.0
+    torque_limit_nm: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class CarryOver:
+    """What the joint remembers from one recording to the next (its warmth), by effect."""
+
+    memory: Mapping[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """The rows of a simulated recording; every array has the shape of its time.
+
+    Attributes:
+        position_rad: as the encoder reports it.
+        velocity_rad_s: the drive's estimate.
+        torque_nm: as reported.
+        state: to hand to the next recording in order.
+    """
+
+    position_rad: Array
+    velocity_rad_s: Array
+    torque_nm: Array
+    state: CarryOver
+
+
+def closed_loop(
+    model: JointModel,
+    controller: Controller,
+    time_s: Array,
+    position_command_rad: Array,
+    *,
+    payload: bool = False,
+    seed: int | None = None,
+    state: CarryOver | None = None,
+    start_rad: float | None = None,
+) -> Simulated:
+    """The joint under a controller that follows the recorded commands.
+
+    Args:
+        model: the joint; its own servo gains are not used.
+        controller: the control law.
+        time_s: increasing, shape (n,); need not be evenly spaced.
+        position_command_rad: shape (n,).
+        payload: the payload is mounted.
+        seed: of the noise on the reported torque, which is then rounded as the drive does; None for neither.
+        state: warmth left by the recording before; None for a cold joint.
+        start_rad: where the joint rests at the first row; None for its first command.
+    """
+    time = np.asarray(time_s, dtype=np.float64)
+    command = np.asarray(position_command_rad, dtype=np.float64)
+    period_s = 1.0 / controller.rate_hz
+    ticks = max(1, math.ceil((time[-1] - time[0]) / period_s - 1e-6))
+    commands = np.zeros((ticks, plant.COMMANDS))
+    tick_times = time[0] + period_s * np.arange(ticks)
+    commands[:, plant.POSITION_COMMAND] = np.interp(tick_times, time, command)
+    # The controller knows its command as a function of time: a central difference is its derivative.
+    after = np.interp(tick_times + period_s, time, command)
+    before = np.interp(tick_times - period_s, time, command)
+    commands[:, plant.VELOCITY_COMMAND] = (after - before) / (2 * period_s)
+
+    parameters = packing.parameters(model, payload=payload)
+    parameters[plant.KP] = controller.kp_nm_per_rad
+    parameters[plant.KI] = controller.ki_nm_per_rad_s
+    parameters[plant.KD] = controller.kd_nm_s_per_rad
+    parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
+    parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
+    start = float(command[0]) if start_rad is None else start_rad
+    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start, state, time)
+    return rows if seed is None else _noisy(rows, model, seed)
+
+
+def open_loop(
+    model: JointModel,
+    time_s: Array,
+    torque_nm: Array,
+    *,
+    payload: bool = False,
+    state: CarryOver | None = None,
+    start_rad: float = 0.0,
+) -> Simulated:
+    """The joint driven by the recorded torque; nothing pulls it back, so it drifts from the recording.
+
+    Effects between command and current (delay, lag, limit) have already shaped a reported torque and are left out.
+
+    Args:
+        model: the joint.
+        time_s: increasing, evenly spaced, shape (n,).
+        torque_nm: as reported, shape (n,).
+        payload: the payload is mounted.
+        state: warmth left by the recording before.
+        start_rad: where the joint rests at the first row.
+    """
+    time = np.asarray(time_s, dtype=np.float64)
+    period_s = float((time[-1] - time[0]) / max(1, time.size - 1))
+    shaped = {effect.name for effect in all_effects().values() if any(h.stage == "current" for h in effect.hooks)}
+    kept = {name: values for name, values in model.effects.items() if name not in shaped}
+    parameters = packing.parameters(replace(model, effects=kept), payload=payload)
+    parameters[plant.TORQUE_LIMIT] = math.inf
+    commands = np.zeros((max(1, time.size - 1), plant.COMMANDS))
+    commands[:, plant.TORQUE_COMMAND] = np.asarray(torque_nm, dtype=np.float64)[1:] if time.size > 1 else 0.0
+    return _simulate(parameters, commands, period_s, plant.TORQUE_MODE, start_rad, state, time)
+
+
+def _simulate(
+    parameters: packing.Vector,
+    commands: packing.Vector,
+    period_s: float,
+    mode: int,
+    start_rad: float,
+    carried: CarryOver | None,
+    time: Array,
+) -> Simulated:
+    vector = packing.state()
+    functions = kernel()
+    holding_nm = functions.place(parameters, vector, float(start_rad))
+    _restore(vector, carried)
+    first_rad = vector[plant.MEASURED]
+    substeps = max(1, math.ceil(period_s / SUBSTEP_S - 1e-6))
+    readings = np.empty((len(commands), plant.READINGS))
+    functions.run(parameters, vector, commands, readings, mode, substeps, period_s / substeps)
+
+    ticks = time[0] + period_s * np.arange(len(commands) + 1)
+    position = np.interp(time, ticks, np.concatenate([[first_rad], readings[:, plant.READ_POSITION]]))
+    velocity = np.interp(time, ticks, np.concatenate([[0.0], readings[:, plant.READ_VELOCITY]]))
+    # The mean torque of a row, whatever its length: difference of the torque's integral.
+    integral = np.interp(time, ticks, np.concatenate([[0.0], np.cumsum(readings[:, plant.READ_TORQUE]) * period_s]))
+    torque = np.concatenate([[holding_nm], np.diff(integral) / np.diff(time)])
+    return Simulated(position, velocity, torque, _carry(vector))
+
+
+def _noisy(rows: Simulated, model: JointModel, seed: int) -> Simulated:
+    """The torque as the drive reports it: noise, then steps."""
+    per_mille_nm = model.drive.rated_torque_nm * 1e-3
+    noise = np.random.default_rng(seed).standard_normal(rows.torque_nm.size)
+    torque = rows.torque_nm + noise * model.drive.torque_noise_per_mille * per_mille_nm
+    quantum = model.drive.torque_quantum_per_mille * per_mille_nm
+    return replace(rows, torque_nm=np.round(torque / quantum) * quantum if quantum > 0 else torque)
+
+
+def _carry(vector: packing.Vector) -> CarryOver:
+    return CarryOver({name: tuple(vector[at : at + size].tolist()) for name, at, size in _carried_slots()})
+
+
+def _restore(vector: packing.Vector, carried: CarryOver | None) -> None:
+    for name, at, size in _carried_slots():
+        if carried is not None and name in carried.memory:
+            vector[at : at + size] = carried.memory[name]
+
+
+def _carried_slots() -> list[tuple[str, int, int]]:
+    states = layout().states
+    return [(e.name, states[e.name], e.state_size) for e in all_effects().values() if e.carried]
