@@ -1,0 +1,40 @@
+"""The ``frictid-hil`` command: its verbs, in groups, each group a module that is loaded with its verbs."""
+
+from __future__ import annotations
+
+import typer
+
+from frictid_hil import __version__
+from frictid_hil.cli import calibrate, profiles
+
+app = typer.Typer(
+    name="frictid-hil",
+    help="Identify, compensate and explain the friction of a robot joint on a CAN or serial bus.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+calibrate.register(app)
+app.add_typer(profiles.app, name="profile")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"frictid-hil {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
+    """Identify, compensate and explain the friction of a robot joint on a CAN or serial bus."""
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""``check``, ``calibrate``, ``identify``, ``compare``: from a robot on a bus, or a recording, to a friction profile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from frictid_hil.cli.output import (
+    BusOption,
+    JsonOption,
+    Output,
+    QuietOption,
+    Result,
+    RobotOption,
+    YesOption,
+    quantity,
+)
+from frictid_hil.units import degrees, format_duration
+
+JointOption = Annotated[
+    list[str] | None, typer.Option("--joint", "-j", help="Only this joint; repeat for several. Default: all.")
+]
+AmplitudeOption = Annotated[
+    float | None,
+    typer.Option("--amplitude", "-A", parser=quantity("angle"), help="Peak-to-peak travel A, e.g. 20deg."),
+]
+VelocityOption = Annotated[
+    float | None,
+    typer.Option("--velocity", "-V", parser=quantity("angular velocity"), help="Peak speed V, e.g. 115deg/s."),
+]
+CyclesOption = Annotated[int | None, typer.Option("--cycles", "-N", min=2, help="Number of cycles N.")]
+RatioOption = Annotated[float | None, typer.Option("--ratio", "-c", min=0.0, max=0.999, help="Window ratio c.")]
+MethodOption = Annotated[
+    str, typer.Option("--method", help="function-a (as published), aligned (default), least-squares.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write to.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's verbs."""
+    app.command("check")(check)
+    app.command("calibrate")(calibrate)
+    app.command("identify")(identify)
+    app.command("compare")(compare)
+
+
+def check(
+    robot: RobotOption,
+    bus: BusOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Look at bus, drives, modes, limits and bus load. Reads only; nothing moves, nothing is written."""
+    from frictid_hil.jobs.check import check as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
+        table = Table("", "subject", "finding", "next step")
+        for finding in result["findings"]:
+            table.add_row(
+                marks[finding["severity"]], finding["subject"], finding["message"], finding.get("next_step", "")
+            )
+        output.out.print(table)
+        output.out.print("ready" if result["ok"] else "not ready: see the errors above")
+
+    output.run("check", lambda: job(robot, bus=bus), show)
+
+
+def calibrate(
+    robot: RobotOption,
+    joint: JointOption = None,
+    amplitude: AmplitudeOption = None,
+    velocity: VelocityOption = None,
+    cycles: CyclesOption = None,
+    ratio: RatioOption = None,
+    method: MethodOption = "aligned",
+    bus: BusOption = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Continue this run folder with the joints it still lacks.")
+    ] = None,
+    out: OutOption = None,
+    yes: YesOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Identify the friction of every joint, one at a time, and write a friction profile."""
+    from frictid_hil.cli.progress import TerminalWatcher, print_plan
+    from frictid_hil.jobs.calibrate import CalibrateOptions
+    from frictid_hil.jobs.calibrate import calibrate as job
+
+    output = Output(as_json, quiet)
+    options = CalibrateOptions(
+        robot=robot,
+        bus=bus,
+        joints=tuple(joint or ()),
+        amplitude_rad=amplitude,
+        velocity_rad_s=velocity,
+        cycles=cycles,
+        ratio=ratio,
+        method=method,
+        dry_run=dry_run,
+        realtime=realtime,
+        seed=seed,
+        resume=resume,
+        out=out,
+    )
+    watcher = TerminalWatcher(output, yes=yes)
+
+    def run() -> Result:
+        try:
+            return job(options, watcher)
+        finally:
+            watcher.close()
+
+    def show(result: Result) -> None:
+        if "plan" in result:
+            print_plan(output.out, result["plan"], result["setup"])
+            return
+        print_joints(output, result)
+
+    output.run("calibrate", run, show)
+
+
+def identify(
+    log: Annotated[
+        list[Path], typer.Argument(help="Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them.")
+    ],
+    robot: Annotated[str | None, typer.Option("--robot", "-r", help="Robot file (limits, gear, timing).")] = None,
+    joint: JointOption = None,
+    amplitude: AmplitudeOption = None,
+    velocity: VelocityOption = None,
+    cycles: CyclesOption = None,
+    ratio: RatioOption = None,
+    method: MethodOption = "aligned",
+    columns: Annotated[str | None, typer.Option("--columns", help="Column map of a foreign file (emps.yaml).")] = None,
+    executor: Annotated[
+        str | None, typer.Option("--executor", help="processes:N, or dask://host:port, for many recordings.")
+    ] = None,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Identify friction from recorded data, by the same mathematics as a live run."""
+    from frictid_hil.jobs.identify import IdentifyOptions
+    from frictid_hil.jobs.identify import identify as job
+
+    output = Output(as_json, quiet)
+    options = IdentifyOptions(
+        logs=tuple(log),
+        robot=robot,
+        joints=tuple(joint or ()),
+        amplitude_rad=amplitude,
+        velocity_rad_s=velocity,
+        cycles=cycles,
+        ratio=ratio,
+        method=method,
+        columns=columns,
+        executor=executor,
+        out=out,
+    )
+    output.run("identify", lambda: job(options, note=output.err.print), lambda result: print_joints(output, result))
+
+
+def compare(
+    profile: Annotated[Path, typer.Argument(help="Profile, or a run folder that holds one.")],
+    other: Annotated[Path | None, typer.Argument(help="Reference profile.")] = None,
+    truth: Annotated[
+        str | None, typer.Option("--truth", help="Robot file whose simulated joints are the reference.")
+    ] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Distance between two profiles, equation (15), or between a profile and the simulated joints' own curves."""
+    from frictid_hil.jobs.compare import compare as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        table = Table("joint", "E [N m]", "percent of mean, [0, V]", "percent, measured range")
+        for name, figures in result["joints"].items():
+            table.add_row(
+                name,
+                f"{figures['e_nm']:.4f}",
+                f"{figures['e_percent']:.2f}",
+                f"{figures['e_percent_measured_range']:.2f}",
+            )
+        output.out.print(table)
+
+    output.run("compare", lambda: job(profile, other, truth), show)
+
+
+def print_joints(output: Output, result: Result) -> None:
+    """The table a technician reads after a calibration or an identification."""
+    table = Table(title=f"Friction of {result.get('robot') or 'the recording'}")
+    for heading in ("joint", "outcome", "F_0", "F at V", "measured range", "inertia", "time", "remarks"):
+        table.add_column(heading)
+    for name, joint in result["joints"].items():
+        table.add_row(name, *_row(joint))
+    output.out.print(table)
+    for key in ("profile", "run", "report"):
+        if result.get(key):
+            output.out.print(f"{key}: {result[key]}", soft_wrap=True)
+
+
+def _row(joint: dict[str, Any]) -> tuple[str, ...]:
+    outcome = joint["outcome"]
+    shown = "[green]ok[/]" if outcome == "ok" else f"[red]{outcome}[/]"
+    prismatic = bool(joint.get("prismatic"))
+    force = "N" if prismatic else "N m"
+    speeds = joint.get("velocity_rad_s") or []
+    torques = joint.get("torque_nm") or []
+    measured = ""
+    if speeds:
+        low, high = (speeds[0], speeds[-1]) if prismatic else (degrees(speeds[0]), degrees(speeds[-1]))
+        measured = f"{low:.3g} .. {high:.3g} {'m/s' if prismatic else 'deg/s'}"
+    inertia = joint.get("inertia_kg_m2")
+    return (
+        shown,
+        f"{joint['coulomb_nm']:.3f} {force}" if joint.get("coulomb_nm") is not None else "",
+        f"{torques[-1]:.3f} {force}" if torques else "",
+        measured,
+        f"{inertia:.3f} {'kg' if prismatic else 'kg m2'}" if isinstance(inertia, (int, float)) else "",
+        format_duration(joint["duration_s"]) if joint.get("duration_s") else "",
+        "; ".join(joint.get("remarks") or []),
+    )

@@ -1,0 +1,108 @@
+"""``frictid-hil compare``: how far a profile is from another one, or from the simulated joints' own curves (15)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.errors import InvalidFields, ProfileMismatch, UsageError
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.metrics import curve_distance
+
+_TRUTH_POINTS = 4000
+
+
+def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> dict[str, Any]:
+    """Distances of every joint that both sides have.
+
+    Args:
+        profile_path: a profile, or a run folder that holds one.
+        other_path: the reference profile, or run folder.
+        truth: a robot file instead, whose ``simulated`` joints are the reference.
+
+    Raises:
+        UsageError: not exactly one reference.
+        ProfileMismatch: no joint in common.
+    """
+    if (other_path is None) == (truth is None):
+        raise UsageError(
+            "compare needs one reference: a second profile, or --truth with a robot file",
+            next_step="frictid-hil compare profile.yaml --truth hp3j.yaml",
+        )
+    profile = load_profile(_profile_in(profile_path))
+    if truth is not None:
+        references = _true_curves(load_robot(truth), profile)
+        named = f"truth of {truth}"
+    else:
+        assert other_path is not None  # by the check above
+        other = load_profile(_profile_in(other_path))
+        references = {name: joint.curve() for name, joint in other.joints.items()}
+        named = str(_profile_in(other_path).resolve())
+    common = [name for name in profile.joints if name in references]
+    if not common:
+        raise ProfileMismatch(
+            f"no joint in common: {', '.join(profile.joints)} and {', '.join(references) or 'none'}",
+            where=str(profile_path),
+        )
+    joints = {}
+    for name in common:
+        velocity = _upper_velocity(profile.joints[name])
+        distance = curve_distance(profile.joints[name].curve(), references[name], velocity)
+        joints[name] = {
+            "e_nm": distance.e_nm,
+            "e_percent": distance.e_percent,
+            "e_percent_measured_range": distance.e_percent_measured_range,
+            "velocity_rad_s": velocity,
+        }
+    return {
+        "outcome": "ok",
+        "profile": str(_profile_in(profile_path).resolve()),
+        "reference": named,
+        "joints": joints,
+        "not_compared": [name for name in profile.joints if name not in common],
+    }
+
+
+def true_curve(robot: Robot, name: str, velocity_rad_s: float) -> FrictionCurve:
+    """The odd part of a simulated joint's steady sliding friction, as a dense curve up to ``velocity_rad_s``.
+
+    Raises:
+        ConfigError: the robot file's ``simulated`` mapping is wrong; with its place.
+    """
+    from frictid_hil.simulation.joint import JointModel  # loads numba; only truth needs it
+
+    joint = robot.file.joints[name]
+    try:
+        model = JointModel.from_mapping(
+            joint.simulated,
+            gear_ratio=joint.gear_ratio,
+            rated_torque_nm=joint.rated_torque_nm,
+            max_torque_nm=joint.max_torque_nm,
+        )
+    except InvalidFields as invalid:
+        raise robot.problems_at(invalid.problems, ("joints", name, "simulated")) from None
+    speeds = np.linspace(0.0, velocity_rad_s, _TRUTH_POINTS + 1)[1:]
+    return FrictionCurve.through(speeds, model.true_curve_nm(speeds), where=f"truth of joint {name}")
+
+
+def _true_curves(robot: Robot, profile: FrictionProfile) -> dict[str, FrictionCurve]:
+    return {
+        name: true_curve(robot, name, _upper_velocity(joint))
+        for name, joint in profile.joints.items()
+        if name in robot.file.joints and robot.file.joints[name].simulated
+    }
+
+
+def _upper_velocity(joint: JointProfile) -> float:
+    """V of the procedure, or the highest identified velocity."""
+    velocity = joint.procedure.velocity_rad_s if joint.procedure else joint.velocity_rad_s[-1]
+    return velocity if math.isfinite(velocity) else joint.velocity_rad_s[-1]
+
+
+def _profile_in(path: Path) -> Path:
+    return path / "profile.yaml" if path.is_dir() else path
