@@ -143,9 +143,9 @@ def steady(
 
 def gravity_torque(parameters: Vector, position_rad: float) -> float:
     """Torque that holds the link and its payload at rest."""
-    cos_nm = parameters[GRAVITY_COS] + parameters[PAYLOAD_GRAVITY_COS]
-    gravity_nm = cos_nm * math.cos(position_rad) + parameters[GRAVITY_SIN] * math.sin(position_rad)
+    gravity_nm = parameters[GRAVITY_COS] * math.cos(position_rad) + parameters[GRAVITY_SIN] * math.sin(position_rad)
     # effects at gravity transform gravity_nm
+    gravity_nm += parameters[PAYLOAD_GRAVITY_COS] * math.cos(position_rad)
     return float(gravity_nm)
 
 

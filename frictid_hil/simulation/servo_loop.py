@@ -50,7 +50,6 @@ class ServoLoop:
         self._parameters[plant.BRAKED] = 1.0
         self._commands = np.zeros((0, plant.COMMANDS))
         self._readings = np.zeros((0, plant.READINGS))
-        self._duration_s = 0.0
         self._row: list[float] = [
             self._state[plant.MEASURED],
             0.0,
@@ -73,7 +72,7 @@ class ServoLoop:
         if not (math.isfinite(period_s) and period_s > 0):
             raise UsageError(f"a control period must be positive, got {period_s} s")
         self._period_s = period_s
-        self._duration_s = 0.0
+        self._duration_s = math.nan
 
     def power(self, on: bool) -> None:
         """Switch the power stage; switched on, the loop starts with the torque that holds the joint."""
@@ -128,7 +127,7 @@ class ServoLoop:
         self,
         duration_s: float,
         *,
-        position_rad: float = 0.0,
+        position_rad: float | None = None,
         velocity_rad_s: float = 0.0,
         torque_nm: float = 0.0,
         torque_offset_nm: float = 0.0,
@@ -136,14 +135,18 @@ class ServoLoop:
         """Let time pass.
 
         Args:
-            duration_s: rounded to whole control periods, at least one.
-            position_rad: position mode: target at the end, approached linearly from the previous one.
+            duration_s: divided into control periods as near to ``period_s`` as goes; nothing happens for 0 or less.
+            position_rad: position mode: target at the end, approached linearly from the previous one; None keeps it.
             velocity_rad_s: velocity mode: target.
             torque_nm: torque mode: target.
             torque_offset_nm: added in every mode.
         """
-        if duration_s != self._duration_s:
+        if not abs(duration_s - self._duration_s) <= 1e-12:
+            if duration_s <= 0.0:
+                return
             self._prepare(duration_s)
+        if position_rad is None:
+            position_rad = self._target_rad
         commands = self._commands
         if self._mode == plant.POSITION_MODE:
             velocity_rad_s = (position_rad - self._target_rad) / duration_s

@@ -34,12 +34,12 @@ EFFECT = Effect(
     name="gravity_error",
     summary="Gravity is larger or smaller than stated.",
     documentation=(
-        "The mass or its lever is not what the model has: gravity is (1 + error) times the stated torque, payload "
-        "included. It shows wherever the joint stands or moves slowly, in proportion to cos q. Source: the "
+        "The mass or its lever is not what the model has: gravity of the link, without payload, is (1 + error) times "
+        "the stated torque. It shows wherever the joint stands or moves slowly, in proportion to cos q. Source: the "
         "standard rigid-body model, W. Khalil, E. Dombre, 'Modeling, Identification and Control of Robots', 2002, "
         "chapter 12."
     ),
-    parameters=(Parameter("error_share", -0.9, 2.0, 0.05, "true over stated gravity, minus 1", off=0.0),),
+    parameters=(Parameter("error_share", -0.9, 2.0, 0.05, "true over stated gravity of the link, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
     illustrate=illustrate,
