@@ -1,0 +1,136 @@
+"""The ``virtual`` driver: simulated drives behind a bus, spoken to by the very driver that real drives get.
+
+In lock-step the drives live in this process and run time is theirs; with ``setup.realtime`` they live in a process of
+their own and the wall clock rules. Everything a run asks for is forwarded to ``Cia402Driver``, which cannot tell the
+difference; this class only builds the bus, takes it exclusively and tears it down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import can
+
+from frictid_drivers.virtual import channel
+from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
+from frictid_drivers.virtual.rack import Rack
+from frictid_hil.driver import (
+    Capabilities,
+    Driver,
+    Feedback,
+    Finding,
+    FrameSink,
+    JointIdentity,
+    Mode,
+    RobotSetup,
+    SetPoint,
+    WallClock,
+)
+
+if TYPE_CHECKING:
+    import filelock
+
+    from frictid_hil.plan import JointPlan, Plan
+
+
+class VirtualDriver:
+    """See the module's first page and ``frictid_hil.driver.Driver``."""
+
+    def __init__(self, setup: RobotSetup) -> None:
+        # Late, because the drives' own process imports this package and has no use for the host.
+        from frictid_drivers.cia402 import Cia402Driver
+
+        self._setup = setup
+        self._channel = channel.channel_name(setup.bus)
+        self._lock: filelock.BaseFileLock | None = None
+        self._rack = Rack()
+        self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._rack)
+        self._host: Driver = Cia402Driver(setup, bus_factory=self._open_bus, clock=self.clock)
+
+    def _open_bus(self) -> can.BusABC:
+        bus = LockStepBus(self._rack, self._channel)
+        self._rack.power_on()
+        return bus
+
+    # -- life cycle ----------------------------------------------------------------------------------------------------
+
+    def open(self, frame_sink: FrameSink | None = None) -> None:
+        """Take the channel, power the drives and reach them."""
+        self._lock = channel.take(self._channel)
+        try:
+            self._rack.install(self._setup)
+            self._host.open(frame_sink)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Bring everything to rest and let go of the channel."""
+        try:
+            self._host.close()
+        finally:
+            if self._lock is not None:
+                self._lock.release()
+                self._lock = None
+
+    def capabilities(self) -> Capabilities:
+        """What the host driver says of these drives, and whether time is theirs."""
+        return replace(self._host.capabilities(), lock_step=not self._setup.realtime)
+
+    # -- forwarded -----------------------------------------------------------------------------------------------------
+
+    def identify(self) -> dict[str, JointIdentity]:
+        """As ``Driver.identify``."""
+        return self._host.identify()
+
+    def check(self, plan: Plan | None) -> list[Finding]:
+        """As ``Driver.check``."""
+        return self._host.check(plan)
+
+    def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
+        """As ``Driver.configure``."""
+        self._host.configure(cycle_hz, active)
+
+    def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
+        """As ``Driver.set_limits``."""
+        self._host.set_limits(
+            joint, torque_nm=torque_nm, position_min_rad=position_min_rad, position_max_rad=position_max_rad
+        )
+
+    def start_cycling(self) -> None:
+        """As ``Driver.start_cycling``."""
+        self._host.start_cycling()
+
+    def enable(self, joint: str, mode: Mode) -> None:
+        """As ``Driver.enable``."""
+        self._host.enable(joint, mode)
+
+    def disable(self, joint: str) -> None:
+        """As ``Driver.disable``."""
+        self._host.disable(joint)
+
+    def lock(self, joint: str) -> None:
+        """As ``Driver.lock``."""
+        self._host.lock(joint)
+
+    def unlock(self, joint: str) -> None:
+        """As ``Driver.unlock``."""
+        self._host.unlock(joint)
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """As ``Driver.exchange``."""
+        return self._host.exchange(set_points)
+
+    def run_batch(self, plan: JointPlan) -> Mapping[str, Any]:
+        """As ``Driver.run_batch``."""
+        return self._host.run_batch(plan)
+
+    def quick_stop(self) -> None:
+        """As ``Driver.quick_stop``."""
+        self._host.quick_stop()
+
+    def stop_cycling(self) -> None:
+        """As ``Driver.stop_cycling``."""
+        self._host.stop_cycling()

@@ -1,0 +1,371 @@
+"""Process data: which objects travel in which frame, and when (CiA 301, 7.2.2).
+
+The communication and mapping parameters live in the object dictionary and are written by SDO; this file guards that
+protocol (make the PDO invalid, set the count to zero, write the entries, set the count, make it valid again), compiles
+a valid PDO to one ``struct`` and keeps the counters and timers that decide when it is sent.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import cast
+
+from frictid_drivers.virtual.object_dictionary import (
+    DEVICE_STATE,
+    INCOMPATIBLE,
+    INVALID_VALUE,
+    MAPPING_TOO_LONG,
+    NO_OBJECT,
+    NOT_MAPPABLE,
+    ObjectDictionary,
+    SdoAbort,
+)
+from frictid_drivers.virtual.objects import (
+    DUMMIES,
+    MAX_MAPPED,
+    PDO_COUNT,
+    PDO_NO_RTR,
+    PDO_NOT_VALID,
+    SIZE_BYTES,
+    DataType,
+    Key,
+    key,
+)
+
+_CODES = {
+    DataType.I8: "b",
+    DataType.I16: "h",
+    DataType.I32: "i",
+    DataType.U8: "B",
+    DataType.U16: "H",
+    DataType.U32: "I",
+}
+_EXTENDED = 1 << 29
+_WAITING_FOR_START = -1
+_SYNC_MAX = 240
+_MS = 1_000_000
+NEVER_NS = 1 << 62
+LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074, 0x6077, 0x60F4))
+"""Actual values: what changes by itself from moment to moment."""
+
+
+def _usable_cob_id(cob_id: int) -> bool:
+    """Identifiers that CiA 301 leaves to PDOs (table of restricted COB-IDs)."""
+    restricted = (
+        range(0x000, 0x080),
+        range(0x101, 0x181),
+        range(0x581, 0x600),
+        range(0x601, 0x680),
+        range(0x6E0, 0x700),
+    )
+    return cob_id <= 0x6FF and cob_id != 0x080 and not any(cob_id in taken for taken in restricted)
+
+
+@dataclass(slots=True)
+class ReceivePdo:
+    """A valid RPDO, compiled.
+
+    Attributes:
+        cob_id: of the frame.
+        on_sync: values count from the next SYNC on; else at once.
+        keys: objects in order; dummies have key 0.
+        layout: of the frame.
+        pending: the latest frame, not yet applied.
+    """
+
+    cob_id: int
+    on_sync: bool
+    keys: tuple[Key, ...]
+    layout: struct.Struct
+    pending: bytes | None = None
+
+
+@dataclass(slots=True)
+class TransmitPdo:
+    """A valid TPDO, compiled.
+
+    Attributes:
+        cob_id: of the frame.
+        kind: transmission type.
+        keys: objects in order.
+        layout: of the frame.
+        start: SYNC counter value that counts as the first, 0 for any.
+        inhibit_ns: least time between two event-driven frames.
+        event_ns: longest time between two event-driven frames, 0 for none.
+        rtr: answers remote frames.
+        countdown: SYNCs until it is sent; -1 while waiting for ``start``.
+        last: what was sent last.
+        quiet_until_ns: end of the inhibit time.
+        timer_ns: when the event timer sends it.
+    """
+
+    cob_id: int
+    kind: int
+    keys: tuple[Key, ...]
+    layout: struct.Struct
+    start: int
+    inhibit_ns: int
+    event_ns: int
+    rtr: bool
+    countdown: int = 0
+    last: bytes | None = None
+    quiet_until_ns: int = 0
+    timer_ns: int = NEVER_NS
+
+    def pack(self, values: dict[Key, int]) -> bytes:
+        """The frame's data now."""
+        return self.layout.pack(*[values[k] for k in self.keys])
+
+
+@dataclass(slots=True)
+class _Compiled:
+    receive: list[ReceivePdo] = field(default_factory=list)
+    cyclic: list[TransmitPdo] = field(default_factory=list)
+    event: list[TransmitPdo] = field(default_factory=list)
+
+
+class ProcessData:
+    """All PDOs of one node.
+
+    Args:
+        dictionary: holds the parameters and the values.
+        send: puts a frame on the bus.
+        changed: called after a parameter was written.
+
+    Attributes:
+        pending: some RPDO waits for SYNC.
+        event_driven: some TPDO is sent on change or by timer.
+        live: some of those carries an actual value, which changes all the time.
+        acyclic: some TPDO is sent at the next SYNC after a change (type 0).
+        next_timer_ns: when ``send_events`` has something to send by itself.
+    """
+
+    def __init__(
+        self, dictionary: ObjectDictionary, send: Callable[[int, bytes], None], changed: Callable[[], None]
+    ) -> None:
+        self._dictionary = dictionary
+        # Mapped objects are numbers; the strings among the values are never looked up here.
+        self._values = cast("dict[Key, int]", dictionary.values)
+        self._send = send
+        self._changed = changed
+        self._compiled = _Compiled()
+        self._running = False
+        self.pending = False
+        self.event_driven = self.live = self.acyclic = False
+        self.next_timer_ns = NEVER_NS
+        for number in range(PDO_COUNT):
+            self._guard(0x1400 + number, 0x1600 + number, receive=True)
+            self._guard(0x1800 + number, 0x1A00 + number, receive=False)
+
+    @property
+    def receive(self) -> list[ReceivePdo]:
+        """Valid RPDOs."""
+        return self._compiled.receive
+
+    @property
+    def transmit(self) -> list[TransmitPdo]:
+        """Valid TPDOs."""
+        return self._compiled.cyclic + self._compiled.event
+
+    # -- life cycle ----------------------------------------------------------------------------------------------------
+
+    def start(self, now_ns: int) -> None:
+        """Entering NMT operational: counters restart, event-driven PDOs announce themselves."""
+        self._running = True
+        self.recompile(now_ns)
+        for pdo in self._compiled.event:
+            if pdo.kind >= 254:
+                self._transmit(pdo, now_ns)
+        self.send_events(now_ns)
+
+    def stop(self) -> None:
+        """Leaving NMT operational."""
+        self._running = False
+        self.pending = False
+        self.next_timer_ns = NEVER_NS
+        for pdo in self._compiled.receive:
+            pdo.pending = None
+
+    def recompile(self, now_ns: int) -> None:
+        """Read the parameters anew; counters and timers of all PDOs restart."""
+        number = self._dictionary.number
+        compiled = _Compiled()
+        counted = number(key(0x1019)) > 1
+        for i in range(PDO_COUNT):
+            cob_id = number(key(0x1400 + i, 1))
+            keys, layout = self._mapping(0x1600 + i)
+            if not cob_id & PDO_NOT_VALID and 0x1400 + i in self._dictionary.indices:
+                on_sync = number(key(0x1400 + i, 2)) <= _SYNC_MAX
+                compiled.receive.append(ReceivePdo(cob_id & 0x7FF, on_sync, keys, layout))
+        for i in range(PDO_COUNT):
+            com = 0x1800 + i
+            cob_id = number(key(com, 1))
+            keys, layout = self._mapping(0x1A00 + i)
+            if cob_id & PDO_NOT_VALID or com not in self._dictionary.indices:
+                continue
+            kind = number(key(com, 2))
+            pdo = TransmitPdo(
+                cob_id & 0x7FF, kind, keys, layout,
+                start=number(key(com, 6)) if counted else 0,
+                inhibit_ns=number(key(com, 3)) * 100_000,
+                event_ns=number(key(com, 5)) * _MS if kind >= 254 else 0,
+                rtr=not cob_id & PDO_NO_RTR,
+            )  # fmt: skip
+            pdo.countdown = _WAITING_FOR_START if pdo.start else kind
+            if pdo.event_ns:
+                pdo.timer_ns = now_ns + pdo.event_ns
+            (compiled.cyclic if 1 <= kind <= _SYNC_MAX else compiled.event).append(pdo)
+        self._compiled = compiled
+        self.pending = False
+        self.event_driven = any(pdo.kind >= 254 for pdo in compiled.event)
+        self.acyclic = any(pdo.kind == 0 for pdo in compiled.event)
+        self.live = any(pdo.kind >= 254 and LIVE.intersection(pdo.keys) for pdo in compiled.event)
+        self.next_timer_ns = NEVER_NS
+
+    def _mapping(self, index: int) -> tuple[tuple[Key, ...], struct.Struct]:
+        keys: list[Key] = []
+        codes = "<"
+        for sub in range(1, self._dictionary.number(key(index)) + 1):
+            entry = self._dictionary.number(key(index, sub))
+            dummy = DUMMIES.get(entry >> 16)
+            codes += _CODES[dummy or self._dictionary.entries[entry >> 8].kind]
+            keys.append(0 if dummy else entry >> 8)
+        return tuple(keys), struct.Struct(codes)
+
+    # -- traffic -------------------------------------------------------------------------------------------------------
+
+    def due_on_sync(self, counter: int | None) -> list[TransmitPdo]:
+        """Count one SYNC; the cyclic TPDOs to send now."""
+        due = []
+        for pdo in self._compiled.cyclic:
+            if pdo.countdown == _WAITING_FOR_START:
+                if counter != pdo.start:
+                    continue
+            else:
+                pdo.countdown -= 1
+                if pdo.countdown > 0:
+                    continue
+            pdo.countdown = pdo.kind
+            due.append(pdo)
+        return due
+
+    def send_due(self, due: list[TransmitPdo]) -> None:
+        """Send cyclic TPDOs with the values of this moment."""
+        values, send = self._values, self._send
+        for pdo in due:
+            send(pdo.cob_id, pdo.layout.pack(*[values[k] for k in pdo.keys]))
+
+    def send_acyclic(self, now_ns: int) -> None:
+        """At SYNC: TPDOs of type 0 whose values changed."""
+        for pdo in self._compiled.event:
+            if pdo.kind == 0 and pdo.pack(self._values) != pdo.last:
+                self._transmit(pdo, now_ns)
+
+    def send_events(self, now_ns: int) -> None:
+        """Send the event-driven TPDOs that changed, as far as their inhibit time lets them, or whose timer ran out."""
+        if not self._running:
+            return
+        due_ns = NEVER_NS
+        for pdo in self._compiled.event:
+            if pdo.kind < 254:
+                continue
+            if now_ns >= pdo.timer_ns or (now_ns >= pdo.quiet_until_ns and pdo.pack(self._values) != pdo.last):
+                self._transmit(pdo, now_ns)
+            elif pdo.pack(self._values) != pdo.last:
+                due_ns = min(due_ns, pdo.quiet_until_ns)
+            due_ns = min(due_ns, pdo.timer_ns)
+        self.next_timer_ns = due_ns
+
+    def answer_remote(self, cob_id: int, now_ns: int) -> None:
+        """A remote frame asks for a TPDO."""
+        if self._running:
+            for pdo in self.transmit:
+                if pdo.rtr and pdo.cob_id == cob_id:
+                    self._transmit(pdo, now_ns)
+
+    def apply(self, pdo: ReceivePdo, data: bytes) -> None:
+        """Take over the values of one RPDO."""
+        values = self._values
+        for address, value in zip(pdo.keys, pdo.layout.unpack_from(data), strict=True):
+            values[address] = value
+
+    def apply_pending(self) -> None:
+        """At SYNC: take over what came before it."""
+        self.pending = False
+        for pdo in self._compiled.receive:
+            if pdo.pending is not None:
+                self.apply(pdo, pdo.pending)
+                pdo.pending = None
+
+    def _transmit(self, pdo: TransmitPdo, now_ns: int) -> None:
+        pdo.last = pdo.pack(self._values)
+        pdo.quiet_until_ns = now_ns + pdo.inhibit_ns
+        if pdo.event_ns:
+            pdo.timer_ns = now_ns + pdo.event_ns
+        self._send(pdo.cob_id, pdo.last)
+
+    # -- configuration -------------------------------------------------------------------------------------------------
+
+    def _guard(self, com: int, mapping: int, *, receive: bool) -> None:
+        guards, effects = self._dictionary.guards, self._dictionary.effects
+        number = self._dictionary.number
+
+        def valid() -> bool:
+            return not number(key(com, 1)) & PDO_NOT_VALID
+
+        def cob_id(value: int) -> None:
+            if value & _EXTENDED or value & 0x1FFFF800 or not _usable_cob_id(value & 0x7FF):
+                raise SdoAbort(INVALID_VALUE)
+            if valid() and not value & PDO_NOT_VALID and (value ^ number(key(com, 1))) & 0x7FF:
+                raise SdoAbort(DEVICE_STATE)
+
+        def transmission_type(value: int) -> None:
+            if _SYNC_MAX < value < 254:
+                raise SdoAbort(INVALID_VALUE)
+
+        def while_invalid(value: int) -> None:
+            if valid():
+                raise SdoAbort(DEVICE_STATE)
+
+        def count(value: int) -> None:
+            while_invalid(value)
+            bits = 0
+            for sub in range(1, value + 1):
+                mapped(number(key(mapping, sub)))
+                bits += number(key(mapping, sub)) & 0xFF
+            if bits > 64:
+                raise SdoAbort(MAPPING_TOO_LONG)
+
+        def entry(value: int) -> None:
+            while_invalid(value)
+            if number(key(mapping)):
+                raise SdoAbort(DEVICE_STATE)
+            if value:
+                mapped(value)
+
+        def mapped(value: int) -> None:
+            dummy = DUMMIES.get(value >> 16)
+            if dummy is not None and receive and not value >> 8 & 0xFF:
+                kind = dummy
+            else:
+                if value >> 16 in DUMMIES or value == 0:
+                    raise SdoAbort(NO_OBJECT if value == 0 else NOT_MAPPABLE)
+                found = self._dictionary.entry(value >> 8)
+                kind = found.kind
+                if not (found.receive if receive else found.transmit):
+                    raise SdoAbort(NOT_MAPPABLE)
+            if value & 0xFF != 8 * SIZE_BYTES[kind]:
+                raise SdoAbort(INCOMPATIBLE)
+
+        guards[key(com, 1)] = cob_id
+        guards[key(com, 2)] = transmission_type
+        if not receive:
+            guards[key(com, 3)] = while_invalid
+            guards[key(com, 6)] = while_invalid
+        guards[key(mapping)] = count
+        for sub in range(1, MAX_MAPPED + 1):
+            guards[key(mapping, sub)] = entry
+        for address in (*(key(com, sub) for sub in (1, 2, 3, 5, 6)), key(mapping)):
+            effects[address] = self._changed

@@ -1,0 +1,130 @@
+"""All drives of a robot on one bus, and their run time.
+
+A frame goes in by ``process``, time goes on by ``advance``; whatever the drives say comes out by ``transmit``. The rack
+knows no wall clock and no threads: the same calls give the same frames, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from frictid_drivers.virtual.joint_drive import servo_for
+from frictid_drivers.virtual.pdo import NEVER_NS
+from frictid_drivers.virtual.servo import Servo
+from frictid_hil.driver import RobotSetup
+
+Transmit = Callable[[int, bytes], None]
+Handler = Callable[[bytes, int], None]
+
+SYNC_GAP_TENTHS = 20
+"""2010h:01 in lock-step: drives alarm when a SYNC is more than twice its period late."""
+
+
+class Rack:
+    """The drives of one robot; empty until ``add`` or ``install``.
+
+    Attributes:
+        transmit: where the drives' frames go; set by whoever owns the bus.
+        now_ns: run time.
+        servos: by joint name, in the order of the robot file.
+    """
+
+    def __init__(self) -> None:
+        self.transmit: Transmit = _discard
+        self.now_ns = 0
+        self.servos: dict[str, Servo] = {}
+        self._next_ns = NEVER_NS
+        self._routes: dict[int, tuple[Handler, ...]] = {}
+        self._stale_routes = True
+
+    def install(
+        self,
+        setup: RobotSetup,
+        *,
+        missing: Mapping[str, frozenset[int]] | None = None,
+        sync_gap_tenths: int = SYNC_GAP_TENTHS,
+    ) -> None:
+        """Build the drives of a robot file in; they have no power yet.
+
+        Args:
+            setup: the robot.
+            missing: indices of objects that drives do not have, by joint.
+            sync_gap_tenths: longest gap between SYNCs that drives tolerate, in tenths of the period.
+
+        Raises:
+            InvalidFields: some joint's ``simulated`` mapping is wrong.
+        """
+        for joint in setup.joints:
+            absent = (missing or {}).get(joint.name, frozenset())
+            self.add(joint.name, servo_for(setup, joint, self.send, missing=absent, sync_gap_tenths=sync_gap_tenths))
+
+    def add(self, name: str, servo: Servo) -> None:
+        """Connect a drive."""
+        servo.wake = self._wake
+        servo.routes_changed = self._drop_routes
+        self.servos[name] = servo
+        self._stale_routes = True
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """A drive puts a frame on the bus."""
+        self.transmit(can_id, data)
+
+    def power_on(self) -> None:
+        """All drives boot."""
+        for servo in self.servos.values():
+            servo.boot(self.now_ns)
+
+    def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        """A frame with an 11-bit identifier arrives at every drive, now."""
+        if self._stale_routes:
+            self._renew_routes()
+        if remote:
+            for servo in self.servos.values():
+                servo.receive_remote(can_id, self.now_ns)
+            return
+        now_ns = self.now_ns
+        for handler in self._routes.get(can_id, ()):
+            handler(data, now_ns)
+
+    def advance(self, to_ns: int) -> None:
+        """Let run time go on to ``to_ns``, everything that falls due on the way in its order."""
+        while self._next_ns <= to_ns:
+            self.now_ns = max(self.now_ns, self._next_ns)
+            now_ns = self.now_ns
+            self._next_ns = NEVER_NS
+            for servo in self.servos.values():
+                if servo.next_event_ns <= now_ns:
+                    servo.on_time(now_ns)
+            self._next_ns = min((servo.next_event_ns for servo in self.servos.values()), default=NEVER_NS)
+        if to_ns > self.now_ns:
+            self.now_ns = to_ns
+
+    @property
+    def next_event_ns(self) -> int:
+        """When something falls due by itself."""
+        return self._next_ns
+
+    @property
+    def at_rest(self) -> bool:
+        """No motor has power, or every powered one stands still."""
+        return all(not servo.axis.powered or servo.axis.at_rest for servo in self.servos.values())
+
+    def _wake(self, at_ns: int) -> None:
+        if at_ns < self._next_ns:
+            self._next_ns = at_ns
+
+    def _drop_routes(self) -> None:
+        self._stale_routes = True
+
+    def _renew_routes(self) -> None:
+        found: dict[int, list[Handler]] = {}
+        for servo in self.servos.values():
+            for can_id, handler in servo.routes().items():
+                found.setdefault(can_id, []).append(handler)
+        found[0x000] = [servo.receive_nmt for servo in self.servos.values()]
+        self._routes = {can_id: tuple(handlers) for can_id, handlers in found.items()}
+        self._stale_routes = False
+
+
+def _discard(can_id: int, data: bytes) -> None:
+    """No bus yet."""
