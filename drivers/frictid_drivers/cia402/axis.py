@@ -1,0 +1,209 @@
+"""One joint in the cycle: what was asked of it, what it last reported, and the two command frames that follow.
+
+Asking (``enable``, ``lock``, ``stop``) only notes a wish; ``command`` walks towards it, one controlword per cycle.
+Until the drive says "enabled" in the wanted mode, the target position follows the actual one and every torque is zero,
+so that power can come on without a jump.
+"""
+
+from __future__ import annotations
+
+import math
+
+from frictid_drivers.cia402.codec import Command
+from frictid_drivers.cia402.facts import Scale
+from frictid_drivers.cia402.frame_map import Frame
+from frictid_drivers.cia402.state import (
+    DISABLE_VOLTAGE,
+    FAULT_RESET,
+    QUICK_STOP,
+    DriveState,
+    Target,
+    drive_state,
+    next_controlword,
+)
+from frictid_hil.driver import Feedback, Mode, SetPoint
+from frictid_hil.errors import HardwareError, SafetyAbort
+
+_FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
+
+
+class Axis:
+    """Wishes and commands of one joint.
+
+    Args:
+        joint: name.
+        scale: joint-side worth of the drive's units.
+        primary: RPDO1 as read back (controlword, target position, torque offset).
+        secondary: RPDO2 as read back (mode, target torque, target velocity).
+        feedback: the decoder's own object of this joint.
+        max_torque_nm: no torque beyond this is commanded.
+        standstill_rad_s: below this the joint stands.
+        reset_cycles: how long the drive may take to leave a fault.
+    """
+
+    def __init__(
+        self,
+        joint: str,
+        scale: Scale,
+        primary: Frame,
+        secondary: Frame,
+        feedback: Feedback,
+        *,
+        max_torque_nm: float,
+        standstill_rad_s: float,
+        reset_cycles: int,
+    ) -> None:
+        self.joint = joint
+        self.feedback = feedback
+        self.primary = Command(primary)
+        self.secondary = Command(secondary)
+        self.target = Target.DISABLED
+        self.mode = Mode.POSITION
+        self.locked = False
+        self.alarm: HardwareError | None = None
+        self._scale = scale
+        self._torque_units = math.floor(max_torque_nm / abs(scale.torque_nm))
+        self._standstill_rad_s = standstill_rad_s
+        self._reset_cycles = reset_cycles
+        self._reset_wanted = False
+        self._resetting = 0
+        self._target_units: int | None = None
+        self._held_at_rad: float | None = None
+        self._emergency = (Command(primary), Command(secondary))
+
+    def limit_torque(self, torque_nm: float) -> None:
+        """No torque beyond this is commanded from now on."""
+        self._torque_units = math.floor(torque_nm / abs(self._scale.torque_nm))
+
+    def enable(self, mode: Mode) -> None:
+        """Ask for power in a mode; a fault that stands now is reset once."""
+        self.mode = mode
+        self.target = Target.ENABLED
+        self._reset_wanted = True
+
+    def disable(self) -> None:
+        """Ask for power off."""
+        self.target = Target.DISABLED
+        self._reset_wanted = False
+
+    @property
+    def state(self) -> DriveState:
+        """As last reported."""
+        return drive_state(self.feedback.status_raw)
+
+    @property
+    def standing(self) -> bool:
+        """The joint does not move."""
+        return abs(self.feedback.velocity_rad_s) <= self._standstill_rad_s
+
+    def command(self, set_point: SetPoint, actual_units: int, *, healthy: bool) -> None:
+        """Fill both command frames for the coming cycle.
+
+        Args:
+            set_point: of the runner.
+            actual_units: last reported position in the drive's units.
+            healthy: watchdogs are armed and the heartbeat was seen; without it no power is asked for.
+
+        Raises:
+            SafetyAbort: the set-point is not a finite number.
+        """
+        state = self.state
+        shown = self.feedback.mode
+        mode = self.mode
+        if state in _FAULTS:
+            controlword = self._in_fault()
+        else:
+            self._resetting = 0
+            controlword = next_controlword(
+                state, self.target, standing=self.standing, may_enable=healthy and shown is mode
+            )
+        enabled = state is DriveState.ENABLED
+        if enabled:
+            self._reset_wanted = False
+        follows = enabled and self.target is Target.ENABLED and shown is mode
+        torque = velocity = offset = 0
+        if not enabled or shown is not Mode.POSITION or self._target_units is None:
+            self._target_units = actual_units
+        if follows:
+            scale = self._scale
+            offset = self._torque(set_point.torque_offset_nm)
+            if mode is Mode.POSITION:
+                self._follow(set_point.position_rad)
+            elif mode is Mode.TORQUE:
+                torque, offset = self._torque(set_point.torque_nm + set_point.torque_offset_nm), 0
+            else:
+                velocity = self._units(set_point.velocity_rad_s, scale.velocity_rad_s)
+        else:
+            self._held_at_rad = None
+        if enabled and self.target is Target.ENABLED and mode is Mode.TORQUE and not follows:
+            # Going over to torque mode while enabled: the torque must be there when the mode changes.
+            torque = self._torque(set_point.torque_nm + set_point.torque_offset_nm)
+        primary, secondary = self.primary, self.secondary
+        primary.set("controlword", controlword)
+        primary.set("target_position", self._target_units)
+        primary.set("torque_offset", offset)
+        primary.pack()
+        secondary.set("target_mode", mode)
+        secondary.set("target_torque", torque)
+        secondary.set("target_velocity", velocity)
+        secondary.pack()
+
+    def emergency(self) -> tuple[Command, Command]:
+        """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
+        self.target = Target.STOPPED
+        self._reset_wanted = False
+        primary, secondary = self._emergency
+        primary.set("controlword", QUICK_STOP)
+        primary.set("target_position", self._target_units or 0)
+        secondary.set("target_mode", self.mode)
+        primary.pack()
+        secondary.pack()
+        return primary, secondary
+
+    def _follow(self, position_rad: float) -> None:
+        """The joint holds where power came on until its set-point moves: the runner may still know an older place."""
+        if self.locked:
+            return
+        if self._held_at_rad is None:
+            self._held_at_rad = position_rad
+        if position_rad != self._held_at_rad:
+            self._held_at_rad = math.inf
+            self._target_units = self._units(position_rad, self._scale.position_rad)
+
+    def _in_fault(self) -> int:
+        """Bit 7 rises once where a reset was asked for; a fault that stays, or comes later, ends the wish for power."""
+        if self._resetting:
+            self._resetting -= 1
+            if self._resetting:
+                return FAULT_RESET
+            self.target = Target.DISABLED
+            self.alarm = HardwareError(
+                f"still in fault {self.feedback.error_code:#06x} after one fault reset",
+                where=f"joint {self.joint}",
+                cause="the cause of the fault is still there",
+                next_step="look the code up in the drive's manual, clear the cause, then start again",
+            )
+            return DISABLE_VOLTAGE
+        if self._reset_wanted:
+            self._reset_wanted = False
+            self._resetting = self._reset_cycles
+            # This cycle bit 7 is low, so that the next one is an edge.
+            return DISABLE_VOLTAGE
+        self.target = Target.DISABLED
+        return DISABLE_VOLTAGE
+
+    def _torque(self, torque_nm: float) -> int:
+        units = torque_nm / self._scale.torque_nm
+        limit = self._torque_units
+        if not math.isfinite(units):
+            raise self._not_a_number("torque", torque_nm)
+        return round(limit if units > limit else -limit if units < -limit else units)
+
+    def _units(self, value: float, unit: float) -> int:
+        units = value / unit
+        if not math.isfinite(units):
+            raise self._not_a_number("set-point", value)
+        return round(units)
+
+    def _not_a_number(self, what: str, value: float) -> SafetyAbort:
+        return SafetyAbort(f"the commanded {what} is {value}", where=f"joint {self.joint}", cause="a defect upstream")

@@ -1,0 +1,299 @@
+"""Frames to joint-side figures: one decoder for the live cycle and for logs, so that a replay is bit-identical.
+
+A row is one SYNC and the reports that answer it. The decoder is told when a row begins and ends and is fed what
+arrives between; a joint's figures are taken over only when all its cyclic reports of one SYNC are there, so that no
+row ever mixes the position of one SYNC with the velocity of another. Status, error and emergency are taken at once.
+
+Nothing here allocates objects of its own per frame, blocks, or raises on what a wire may bring.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import fields
+
+from frictid_drivers.cia402.frame_map import ERROR, FIGURES, MODE, STATUS, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.packing import packing
+from frictid_drivers.cia402.state import JOINT_STATES
+from frictid_hil.driver import Feedback, JointState, Mode
+
+EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x700
+MALFORMED_EMERGENCY = 0x1000
+"""Error code shown for an EMCY frame too short to hold one: "generic error" of CiA 301."""
+
+_ATTRIBUTES = {
+    "position": "position_rad",
+    "velocity": "velocity_rad_s",
+    "torque": "torque_nm",
+    "external_torque": "external_torque_nm",
+    "temperature": "temperature_c",
+}
+_MODES = {mode.value: mode for mode in Mode}
+
+
+class _Report:
+    """One PDO of one joint as last received."""
+
+    __slots__ = (
+        "awaited",
+        "cycle",
+        "error_at",
+        "figures",
+        "joint",
+        "mode_at",
+        "size",
+        "slow",
+        "status_at",
+        "t_ns",
+        "unpack",
+        "values",
+    )
+
+    def __init__(self, frame: Frame, joint: JointFrames) -> None:
+        codec = packing(frame.types)
+        self.size = codec.size
+        self.unpack = codec.unpack_from
+        self.joint: _Joint
+        self.awaited = False
+        self.slow = not {STATUS, "position", "velocity", "torque"} & set(frame.meanings)
+        self.cycle = -1
+        self.t_ns = 0
+        self.values: tuple[int, ...] = (0,) * len(frame.entries)
+        self.status_at = _position_of(STATUS, frame)
+        self.mode_at = _position_of(MODE, frame)
+        self.error_at = _position_of(ERROR, frame)
+        self.figures = tuple(
+            (at, _ATTRIBUTES[meaning], float(getattr(joint, FIGURES[meaning])))
+            for at, meaning in enumerate(frame.meanings)
+            if meaning in FIGURES
+        )
+
+
+class _Joint:
+    """What is known of one joint."""
+
+    __slots__ = ("cyclic", "feedback", "heartbeat_ns", "position_at", "restarted", "taken_cycle")
+
+    def __init__(self, frames: JointFrames) -> None:
+        self.feedback = Feedback()
+        self.cyclic: tuple[_Report, ...] = ()
+        self.position_at: tuple[_Report, int] | None = None
+        self.taken_cycle = -1
+        self.heartbeat_ns: int | None = None
+        self.restarted = False
+
+
+class Decoder:
+    """Reports of all joints, row by row.
+
+    Args:
+        frame_map: compiled once.
+        awaited: names of the joints whose cyclic reports are expected in every row.
+    """
+
+    def __init__(self, frame_map: FrameMap, awaited: Sequence[str] = ()) -> None:
+        self._reports: dict[int, _Report] = {}
+        self._joints: list[_Joint] = []
+        self._emergencies: dict[int, _Joint] = {}
+        self._heartbeats: dict[int, _Joint] = {}
+        for frames in frame_map.joints:
+            joint = _Joint(frames)
+            self._joints.append(joint)
+            self._emergencies[EMCY_BASE + frames.node] = joint
+            self._heartbeats[HEARTBEAT_BASE + frames.node] = joint
+            for frame in frames.reports:
+                report = self._reports[frame.cob_id] = _Report(frame, frames)
+                report.joint = joint
+                if "position" in frame.meanings:
+                    joint.position_at = (report, frame.meanings.index("position"))
+                if not report.slow:
+                    joint.cyclic = (*joint.cyclic, report)
+                    report.awaited = frames.name in awaited
+        self._awaited = sum(report.awaited for report in self._reports.values())
+        self._cycle = 0
+        self._t_ns = 0
+        self.missing = 0
+        self.feedback: list[Feedback] = [joint.feedback for joint in self._joints]
+
+    @property
+    def cycle(self) -> int:
+        """Number of the present row, from 1."""
+        return self._cycle
+
+    def restart(self) -> None:
+        """Forget every report, as at the start of cycling; the feedback objects stay the same."""
+        self._cycle = self._t_ns = self.missing = 0
+        for report in self._reports.values():
+            report.cycle = -1
+        blank = Feedback()
+        for joint in self._joints:
+            joint.taken_cycle = -1
+            joint.heartbeat_ns = None
+            joint.restarted = False
+            for field in fields(Feedback):
+                setattr(joint.feedback, field.name, getattr(blank, field.name))
+
+    def begin(self, t_ns: int) -> None:
+        """A row begins: SYNC at ``t_ns``."""
+        self._cycle += 1
+        self._t_ns = t_ns
+        self.missing = self._awaited
+
+    def feed(self, t_ns: int, cob_id: int, data: bytes | bytearray) -> bool:
+        """Take one frame; False when it is none of ours. A report shorter than its mapping marks its joint invalid."""
+        report = self._reports.get(cob_id)
+        if report is None:
+            return self._service(t_ns, cob_id, data)
+        feedback = report.joint.feedback
+        if len(data) < report.size:
+            feedback.valid = False
+            return True
+        values = report.values = report.unpack(data)
+        if report.cycle != self._cycle:
+            report.cycle = self._cycle
+            report.t_ns = self._t_ns
+            if report.awaited:
+                self.missing -= 1
+        if report.status_at >= 0:
+            status = feedback.status_raw = values[report.status_at]
+            feedback.state = JOINT_STATES[status & 0x6F]
+        if report.error_at >= 0:
+            feedback.error_code = values[report.error_at]
+        if report.mode_at >= 0:
+            feedback.mode = _MODES.get(values[report.mode_at], Mode.NONE)
+        if report.slow:
+            for at, attribute, factor in report.figures:
+                setattr(feedback, attribute, values[at] * factor)
+        return True
+
+    def has(self, cob_id: int) -> bool:
+        """This report has already come in the present row."""
+        report = self._reports.get(cob_id)
+        return report is not None and report.cycle == self._cycle
+
+    def finish(self) -> list[Feedback]:
+        """The row ends: take over what is complete, count the age of the rest."""
+        cycle = self._cycle
+        for joint in self._joints:
+            feedback = joint.feedback
+            cyclic = joint.cyclic
+            newest = cyclic[0].cycle if cyclic else -1
+            if newest > joint.taken_cycle and all(report.cycle == newest for report in cyclic):
+                joint.taken_cycle = newest
+                feedback.t_ns = cyclic[0].t_ns
+                feedback.valid = True
+                for report in cyclic:
+                    values = report.values
+                    for at, attribute, factor in report.figures:
+                        setattr(feedback, attribute, values[at] * factor)
+            feedback.age_cycles = cycle - joint.taken_cycle
+        return self.feedback
+
+    def position_units(self, joint: int) -> int | None:
+        """The joint's last reported position in the drive's own units; None before its first report."""
+        where = self._joints[joint].position_at
+        if where is None or where[0].cycle < 0:
+            return None
+        return where[0].values[where[1]]
+
+    def heartbeat_ns(self, joint: int) -> int | None:
+        """When the joint's last heartbeat came; None before the first."""
+        return self._joints[joint].heartbeat_ns
+
+    def restarted(self, joint: int) -> bool:
+        """A boot-up frame came: the drive was reset."""
+        return self._joints[joint].restarted
+
+    def _service(self, t_ns: int, cob_id: int, data: bytes | bytearray) -> bool:
+        joint = self._heartbeats.get(cob_id)
+        if joint is not None:
+            joint.heartbeat_ns = t_ns
+            if data and data[0] & 0x7F == 0:
+                joint.restarted = True
+                joint.feedback.state = JointState.UNKNOWN
+            return True
+        joint = self._emergencies.get(cob_id)
+        if joint is None:
+            return False
+        code = int.from_bytes(data[:2], "little") if len(data) >= 2 else MALFORMED_EMERGENCY
+        # Codes 00xx say that the error is gone.
+        joint.feedback.error_code = code if code & 0xFF00 else 0
+        return True
+
+
+def _position_of(meaning: str, frame: Frame) -> int:
+    return frame.meanings.index(meaning) if meaning in frame.meanings else -1
+
+
+class Command:
+    """One PDO that the host sends: named integers in, the same bytes buffer out, every cycle.
+
+    Values outside their type are cut to its bounds; the joint-side limits were applied before.
+    """
+
+    __slots__ = ("_at", "_bounds", "_pack", "_values", "cob_id", "data")
+
+    def __init__(self, frame: Frame) -> None:
+        codec = packing(frame.types)
+        self.cob_id = frame.cob_id
+        self.data = bytearray(codec.size)
+        self._pack = codec.pack_into
+        self._at = {meaning: at for at, meaning in enumerate(frame.meanings) if meaning}
+        self._bounds = [(kind.low, kind.high) for kind in frame.types]
+        self._values = [0] * len(frame.entries)
+
+    def __contains__(self, meaning: str) -> bool:
+        return meaning in self._at
+
+    def set(self, meaning: str, value: int) -> None:
+        """Set one entry; nothing happens where the frame does not carry it."""
+        at = self._at.get(meaning)
+        if at is not None:
+            low, high = self._bounds[at]
+            self._values[at] = low if value < low else high if value > high else value
+
+    def pack(self) -> bytearray:
+        """All entries into the frame's own buffer."""
+        self._pack(self.data, 0, *self._values)
+        return self.data
+
+
+class CommandDecoder:
+    """Set-points out of the host's own frames, for replay.
+
+    ``position_rad``, ``velocity_rad_s``, ``torque_nm`` and ``torque_offset_nm`` hold the last commanded figure of each
+    joint, NaN before the first.
+    """
+
+    def __init__(self, frame_map: FrameMap) -> None:
+        count = len(frame_map.joints)
+        self.position_rad = [float("nan")] * count
+        self.velocity_rad_s = [float("nan")] * count
+        self.torque_nm = [float("nan")] * count
+        self.torque_offset_nm = [float("nan")] * count
+        self._frames: dict[int, tuple[int, JointFrames, Frame]] = {
+            frame.cob_id: (at, joint, frame) for at, joint in enumerate(frame_map.joints) for frame in joint.commands
+        }
+        self._unpack = {cob_id: packing(item[2].types).unpack_from for cob_id, item in self._frames.items()}
+
+    def feed(self, cob_id: int, data: bytes | bytearray) -> bool:
+        """Take one frame; False when it is no command of ours."""
+        known = self._frames.get(cob_id)
+        if known is None:
+            return False
+        at, joint, frame = known
+        try:
+            values = self._unpack[cob_id](data)
+        except struct.error:
+            return True
+        for meaning, value in zip(frame.meanings, values, strict=True):
+            if meaning == "target_position":
+                self.position_rad[at] = value * joint.position_rad_per_unit
+            elif meaning == "target_velocity":
+                self.velocity_rad_s[at] = value * joint.velocity_rad_s_per_unit
+            elif meaning == "target_torque":
+                self.torque_nm[at] = value * joint.torque_nm_per_unit
+            elif meaning == "torque_offset":
+                self.torque_offset_nm[at] = value * joint.torque_nm_per_unit
+        return True

@@ -1,0 +1,319 @@
+"""The exchange: late frames, commands, SYNC, reports, watchdogs - once per cycle, on one thread, without canopen.
+
+::
+
+    drain what came late -> RPDOs -> SYNC -> receive until all awaited reports are here or the window ends -> checks
+
+A cycle never sends more than the layout's bus load allows for: every active joint's command, and at most one more
+frame, to whichever other joint or command changed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import can
+
+from frictid_drivers.cia402.axis import Axis
+from frictid_drivers.cia402.codec import HEARTBEAT_BASE, Command, Decoder
+from frictid_drivers.cia402.frame_map import FrameMap
+from frictid_drivers.cia402.layout import Layout
+from frictid_drivers.cia402.settings import BusSettings
+from frictid_drivers.cia402.state import DISABLE_VOLTAGE
+from frictid_hil.driver import Clock, Feedback, FrameSink, Mode, SetPoint
+from frictid_hil.errors import HardwareError, SafetyAbort
+
+SYNC_COB_ID = 0x80
+_OPERATIONAL = b"\x05"
+_SEND_FAILURES = 3
+
+
+@dataclass(slots=True)
+class CycleTiming:
+    """Durations in run time, nanoseconds."""
+
+    window_ns: int
+    host_heartbeat_ns: int
+    drive_timeout_ns: int
+    first_heartbeat_ns: int
+
+    @staticmethod
+    def of(layout: Layout, settings: BusSettings) -> CycleTiming:
+        """From rate and settings."""
+        drive_timeout_ns = round(settings.drive_timeout_s * 1e9)
+        return CycleTiming(
+            window_ns=round(settings.reply_window * 1e9 / layout.cycle_hz),
+            host_heartbeat_ns=round(settings.host_heartbeat_s * 1e9),
+            drive_timeout_ns=drive_timeout_ns,
+            first_heartbeat_ns=max(drive_timeout_ns, 500_000_000),
+        )
+
+
+class _Outgoing:
+    """One command frame, sent when due; remembers what the drive has been told."""
+
+    __slots__ = ("cob_id", "command", "data", "message", "told")
+
+    def __init__(self, command: Command) -> None:
+        self.command = command
+        self.cob_id = command.cob_id
+        self.data = command.data
+        # The message holds the command's own buffer: packing the command is all it takes to update it.
+        self.message = can.Message(arbitration_id=command.cob_id, is_extended_id=False, data=command.data)
+        self.told = b""
+
+
+class Cycle:
+    """Cyclic traffic of all joints.
+
+    Args:
+        bus: nobody else reads it while cycling.
+        clock: run time.
+        sink: told of every frame.
+        frame_map: as read back.
+        layout: the same, with rates.
+        axes: all joints, in order.
+        decoder: whose feedback the axes hold.
+        settings: of the bus.
+        nodes: node ids, in order.
+        other: given frames that are none of ours.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        clock: Clock,
+        sink: FrameSink | None,
+        frame_map: FrameMap,
+        layout: Layout,
+        axes: Sequence[Axis],
+        decoder: Decoder,
+        settings: BusSettings,
+        *,
+        lock_step: bool,
+        other: Callable[[int, bytearray, float], None],
+    ) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._sink = sink
+        self._axes = list(axes)
+        self._decoder = decoder
+        self._lock_step = lock_step
+        self._other = other
+        self._timing = CycleTiming.of(layout, settings)
+        self._active = [axis.joint in layout.active for axis in axes]
+        self._primary = [_Outgoing(axis.primary) for axis in axes]
+        self._secondary = [_Outgoing(axis.secondary) for axis in axes]
+        self._sync = can.Message(
+            arbitration_id=SYNC_COB_ID, is_extended_id=False, data=bytearray(1 if layout.sync_overflow else 0)
+        )
+        self._overflow = layout.sync_overflow
+        self._counter = 0
+        self._heartbeat = can.Message(
+            arbitration_id=HEARTBEAT_BASE + settings.host_node, is_extended_id=False, data=bytearray(_OPERATIONAL)
+        )
+        self._heartbeat_due_ns = 0
+        self._healthy = [False] * len(self._axes)
+        self._nodes = [joint.node for joint in frame_map.joints]
+        self._window_end_ns = -1
+        self._late: list[tuple[int, bytearray, float]] = []
+        self._turn = 0
+        self._failures = 0
+        self._alarmed = False
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> list[Feedback]:
+        """One cycle.
+
+        Raises:
+            SafetyAbort: a drive was reset, its heartbeat is missing, or a set-point is not a number. A quick stop has
+                been sent by then. Raised once; later exchanges go on, so that the stop can be watched.
+            HardwareError: frames cannot be sent, or a fault stays after its reset.
+        """
+        decoder, clock = self._decoder, self._clock
+        self._take_late(clock.now_ns())
+        try:
+            self._send_commands(set_points)
+            now_ns = clock.now_ns()
+            if now_ns >= self._heartbeat_due_ns:
+                self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
+                self._send(self._heartbeat, now_ns)
+            now_ns = clock.now_ns()
+            if self._overflow:
+                self._counter = self._counter % self._overflow + 1
+                self._sync.data[0] = self._counter
+            decoder.begin(now_ns)
+            self._window_end_ns = now_ns + self._timing.window_ns
+            self._send(self._sync, now_ns)
+            self._failures = 0
+        except can.CanError as error:
+            self._send_failed(error)
+            decoder.begin(clock.now_ns())
+        else:
+            self._receive()
+        feedback = decoder.finish()
+        self._check(now_ns if not self._failures else clock.now_ns())
+        return feedback
+
+    def quick_stop(self) -> None:
+        """Send the stop to all joints, active ones first, from any thread; never raises and waits for nothing.
+
+        The frames take effect with the SYNC that follows them; a second round costs nothing and covers a lost one.
+        """
+        frames: list[Command] = []
+        for active in (True, False):
+            for axis, is_active in zip(self._axes, self._active, strict=True):
+                if is_active is active:
+                    primary, secondary = axis.emergency()
+                    frames += [primary] if axis.mode is Mode.POSITION else [secondary, primary]
+        for _ in range(2):
+            for frame in frames:
+                self._send_whatever_happens(frame.cob_id, frame.data)
+            self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
+
+    def cut_power(self) -> None:
+        """Controlword 00 to all joints: the last resort where a joint would not come to rest; never raises."""
+        for axis in self._axes:
+            axis.primary.set("controlword", DISABLE_VOLTAGE)
+            axis.primary.set("torque_offset", 0)
+            self._send_whatever_happens(axis.primary.cob_id, axis.primary.pack())
+        self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
+
+    # -- sending ------------------------------------------------------------------------------------------------
+
+    def _send_commands(self, set_points: Sequence[SetPoint]) -> None:
+        decoder = self._decoder
+        changed = False
+        for at, axis in enumerate(self._axes):
+            actual_units = decoder.position_units(at)
+            if actual_units is None:
+                continue
+            try:
+                axis.command(set_points[at], actual_units, healthy=self._healthy[at])
+            except SafetyAbort:
+                self.quick_stop()
+                raise
+            primary, secondary = self._primary[at], self._secondary[at]
+            if self._active[at]:
+                regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
+                self._send_command(regular)
+                changed = changed or other.data != other.told
+            else:
+                changed = changed or primary.data != primary.told or secondary.data != secondary.told
+        if changed:
+            self._send_one_changed()
+
+    def _send_one_changed(self) -> None:
+        """One more frame: the next that differs from what its drive was told, each joint in its turn."""
+        count = len(self._axes)
+        for step in range(count):
+            at = (self._turn + step) % count
+            for outgoing in (self._secondary[at], self._primary[at]):
+                if outgoing.data != outgoing.told and self._decoder.position_units(at) is not None:
+                    self._turn = at + 1
+                    self._send_command(outgoing)
+                    return
+
+    def _send_command(self, outgoing: _Outgoing) -> None:
+        self._send(outgoing.message, self._clock.now_ns())
+        outgoing.told = bytes(outgoing.data)
+
+    def _send(self, message: can.Message, t_ns: int) -> None:
+        if self._sink is not None:
+            self._sink(t_ns, message.arbitration_id, bytes(message.data), True)
+        self._bus.send(message)
+
+    def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray) -> None:
+        message = can.Message(arbitration_id=cob_id, is_extended_id=False, data=bytes(data))
+        # Nothing may keep the next joint from being stopped, whatever this interface raises.
+        with contextlib.suppress(Exception):
+            self._bus.send(message)
+            if self._sink is not None:
+                self._sink(self._clock.now_ns(), cob_id, bytes(data), True)
+
+    def _send_failed(self, error: can.CanError) -> None:
+        """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
+        self._failures += 1
+        if self._failures >= _SEND_FAILURES:
+            self._failures = 0
+            raise HardwareError(
+                f"{_SEND_FAILURES} cycles in a row could not be sent: {error}",
+                where="bus",
+                cause="bus-off, an unplugged adapter, or nobody left on the bus to acknowledge",
+                next_step="check the wiring and termination; the drives stop by their own watchdogs",
+            ) from error
+
+    # -- receiving ----------------------------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        recv, now_ns, decoder = self._bus.recv, self._clock.now_ns, self._decoder
+        end_ns = self._window_end_ns
+        lock_step = self._lock_step
+        while decoder.missing > 0:
+            # In lock-step the answers were there before ``send`` returned: what is not there will not come.
+            timeout_s = 0.0 if lock_step else (end_ns - now_ns()) * 1e-9
+            if timeout_s < 0.0:
+                return
+            message = recv(timeout_s)
+            if message is None:
+                return
+            self._take(message, now_ns())
+        # Reports that are due on this SYNC only now and then.
+        while (message := recv(0.0)) is not None:
+            self._take(message, now_ns())
+
+    def _take(self, message: can.Message, t_ns: int) -> None:
+        if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+            return
+        cob_id, data = message.arbitration_id, message.data
+        if self._sink is not None:
+            self._sink(t_ns, cob_id, bytes(data), False)
+        if t_ns > self._window_end_ns:
+            # Kept until the next row begins, as a replay of the log will.
+            self._late.append((cob_id, data, message.timestamp))
+        elif not self._decoder.feed(t_ns, cob_id, data):
+            self._other(cob_id, data, message.timestamp)
+
+    def _take_late(self, now_ns: int) -> None:
+        """What came after the last row was closed: fed before the next one begins."""
+        t_ns = max(now_ns, self._window_end_ns + 1)
+        recv = self._bus.recv
+        while (message := recv(0.0)) is not None:
+            self._take(message, t_ns)
+        if self._late:
+            for cob_id, data, timestamp in self._late:
+                if not self._decoder.feed(t_ns, cob_id, data):
+                    self._other(cob_id, data, timestamp)
+            self._late.clear()
+
+    # -- watchdogs ----------------------------------------------------------------------------------------------
+
+    def _check(self, now_ns: int) -> None:
+        decoder, timing = self._decoder, self._timing
+        for at, axis in enumerate(self._axes):
+            if decoder.restarted(at):
+                self._alarm(at, "booted up in the middle of the run: the drive was reset")
+            seen_ns = decoder.heartbeat_ns(at)
+            if seen_ns is None:
+                if now_ns > timing.first_heartbeat_ns:
+                    self._alarm(at, f"no heartbeat within {timing.first_heartbeat_ns * 1e-9:g} s of the start")
+            else:
+                self._healthy[at] = True
+                if now_ns - seen_ns > timing.drive_timeout_ns:
+                    self._alarm(at, f"no heartbeat for {(now_ns - seen_ns) * 1e-9:.3f} s")
+            if axis.alarm is not None:
+                alarm, axis.alarm = axis.alarm, None
+                raise alarm
+
+    def _alarm(self, at: int, what: str) -> None:
+        if self._alarmed:
+            return
+        self._alarmed = True
+        self.quick_stop()
+        raise SafetyAbort(
+            what,
+            where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
+            cause="a drive that lost its supply or its bus, or a broken cable",
+            next_step="run `frictid-hil check`, and look at the drive's supply and wiring",
+        )

@@ -1,0 +1,247 @@
+"""``identify`` and ``check``: what drives say of themselves, and whether it suits the job. Reads only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.bus_load import BusLoad
+from frictid_drivers.cia402.facts import Facts, Scale, velocity_unit_rad_s
+from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_of
+from frictid_drivers.cia402.sdo import Drive
+from frictid_drivers.cia402.settings import BusSettings, JointSettings
+from frictid_drivers.cia402.state import DriveState, drive_state
+from frictid_hil.driver import Finding, JointIdentity, JointSetup, Mode, Severity, Timing
+from frictid_hil.units import format_angle, format_torque
+
+Said = Callable[..., Finding]
+"""Makes a finding of the joint at hand: severity, message, next step."""
+
+_LIMIT_SLACK = 0.01
+_SLOW_STOP_S = 1.0
+
+
+def identity(
+    joint: JointSetup, drive: Drive, facts: Facts, scale: Scale, settings: JointSettings, cycle_hz: float
+) -> JointIdentity:
+    """One drive's page of the provenance.
+
+    Args:
+        joint: of the robot file.
+        drive: to read its manufacturer objects.
+        facts: as read at ``open``.
+        scale: joint-side factors.
+        settings: options of the joint.
+        cycle_hz: rate, for the half cycle by which a cycle's torque is older than its SYNC.
+    """
+    known = read_settings(drive, facts.vendor, facts.product)
+    values: dict[str, str | float | int | bool] = {setting.object.name: value for setting, value in known.items()}
+    values["motor rated torque (6076), mN m"] = facts.rated_torque_mnm or 0
+    for name, ratio in (("encoder (608F)", facts.encoder), ("gear (6091)", facts.gear), ("feed (6092)", facts.feed)):
+        if ratio is not None:
+            values[name] = f"{ratio[0]}:{ratio[1]}"
+    unit = drive.find(od.VELOCITY_UNIT)
+    if unit is not None:
+        values["velocity unit (60A9)"] = f"{unit:#010x}"
+    assumed = Timing(torque_delay_s=0.5 / cycle_hz, uncertainty_s=0.5 / cycle_hz, source="assumed")
+    return JointIdentity(
+        joint=joint.name,
+        serial=str(facts.serial) if facts.serial else "",
+        firmware=" ".join(part for part in (facts.software, f"revision {facts.revision:#x}") if part),
+        product=f"{facts.name or 'unnamed'} {facts.hardware} (vendor {facts.vendor:#x}, product {facts.product:#x})",
+        rated_torque_nm=scale.rated_torque_nm,
+        gear_ratio=scale.gear_ratio,
+        position_resolution_rad=abs(scale.position_rad),
+        torque_resolution_nm=abs(scale.torque_nm),
+        torque_source=settings.torque_source,
+        timing=settings.timing or timing_of(known, 1.0 / cycle_hz) or assumed,
+        settings=values,
+    )
+
+
+def bus_finding(load: BusLoad, highest_hz: float) -> Finding:
+    """Does the layout fit the wire?"""
+    if load.fits:
+        return Finding(Severity.OK, "bus load", f"{load}; up to {highest_hz:g} Hz would fit")
+    return Finding(
+        Severity.ERROR,
+        "bus load",
+        f"{load}: more than 80 % on average or 100 % in one cycle",
+        f"use a rate of at most {highest_hz:g} Hz",
+    )
+
+
+def no_sync_counter(facts: Mapping[str, Facts]) -> Finding:
+    """Reports of locked joints cannot be spread."""
+    lacking = [joint for joint, fact in facts.items() if not fact.sync_counter]
+    return Finding(
+        Severity.WARNING,
+        "bus load",
+        f"no SYNC counter (1019, 18xx:06) on joint {', '.join(lacking)}: all locked joints answer the same SYNC",
+        "the rate that fits the bus is lower for it; newer firmware may have the SYNC counter",
+    )
+
+
+def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, scale: Scale, settings: BusSettings) -> list[Finding]:
+    """Everything worth saying of one drive."""
+    subject = f"joint {joint.name}"
+
+    def said(severity: Severity, message: str, next_step: str = "") -> Finding:
+        return Finding(severity, subject, message, next_step)
+
+    findings = [
+        said(
+            Severity.OK,
+            f"node {joint.address}: {facts.name or 'a drive'}, serial {facts.serial}, "
+            f"firmware {facts.software or '?'}, {scale.rated_torque_nm:.4g} N m rated, "
+            f"{abs(scale.position_rad):.3g} rad per count",
+        )
+    ]
+    if facts.device_type & 0xFFFF != 402:
+        findings.append(said(Severity.ERROR, f"device type {facts.device_type:#010x} (1000) is no CiA-402 drive"))
+    findings += _state(drive, said)
+    findings += _modes(facts, settings, said)
+    findings += _missing(drive, said)
+    findings += _limits(joint, drive, scale, said)
+    findings += _quick_stop(joint, drive, facts, scale, said)
+    for setting, value in read_settings(drive, facts.vendor, facts.product).items():
+        if setting.effect is Effect.FRICTION_COMPENSATION and value:
+            findings.append(
+                said(
+                    Severity.ERROR,
+                    f"the drive compensates friction by itself ({setting.object} = {value}): "
+                    "it would hide what is to be measured",
+                    "switch it off with the vendor's tool",
+                )
+            )
+    return findings
+
+
+def _state(drive: Drive, said: Said) -> list[Finding]:
+    findings = []
+    status = drive.read(od.STATUSWORD)
+    state = drive_state(status)
+    error = drive.find(od.ERROR_CODE) or 0
+    if state in (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE):
+        findings.append(
+            said(Severity.ERROR, f"the power stage is already on (statusword {status:#06x})", "switch the drive off")
+        )
+    if state in (DriveState.FAULT, DriveState.FAULT_REACTION) or error:
+        findings.append(
+            said(
+                Severity.ERROR,
+                f"error {error:#06x} is pending (statusword {status:#06x})",
+                "look the code up in the drive's manual, clear its cause, and reset the fault",
+            )
+        )
+    register = drive.find(od.ERROR_REGISTER) or 0
+    if register and not findings:
+        findings.append(said(Severity.WARNING, f"error register (1001) is {register:#04x}"))
+    return findings
+
+
+def _modes(facts: Facts, settings: BusSettings, said: Said) -> list[Finding]:
+    findings = []
+    if not facts.supports(Mode.POSITION):
+        findings.append(said(Severity.ERROR, f"no cyclic synchronous position mode (6502 = {facts.modes or 0:#x})"))
+    if not facts.supports(Mode.TORQUE):
+        findings.append(said(Severity.WARNING, "no cyclic synchronous torque mode; compensation only by torque offset"))
+    if not facts.torque_offset:
+        findings.append(said(Severity.WARNING, "no torque offset (60B2); compensation only in torque mode"))
+    if not facts.heartbeat_consumers:
+        allowed = settings.allow_torque_without_watchdog
+        findings.append(
+            said(
+                Severity.WARNING,
+                "no heartbeat consumer (1016): the drive does not notice when this program dies; torque mode is "
+                + ("allowed by the robot file all the same" if allowed else "refused"),
+                "keep the emergency stop in your hand",
+            )
+        )
+    return findings
+
+
+def _missing(drive: Drive, said: Said) -> list[Finding]:
+    """Objects without which something is not as safe as it could be."""
+    consequences = {
+        od.ABORT_CONNECTION: "what it does when the host is lost cannot be set",
+        od.QUICK_STOP_OPTION: "how it stops quickly cannot be set",
+        od.FOLLOWING_WINDOW: "it does not watch the following error",
+        od.MAX_TORQUE: "only the host limits the torque",
+        od.POSITION_LIMIT_MIN: "only the host limits the position",
+    }
+    findings = [
+        said(Severity.WARNING, f"the drive has no {item}: {consequence}")
+        for item, consequence in consequences.items()
+        if not drive.has(item)
+    ]
+    if not drive.has(od.HEARTBEAT_PRODUCER_MS):
+        findings.append(
+            said(
+                Severity.ERROR,
+                f"the drive has no {od.HEARTBEAT_PRODUCER_MS}: nobody would notice when it is gone",
+                "use another firmware or drive",
+            )
+        )
+    return findings
+
+
+def _limits(joint: JointSetup, drive: Drive, scale: Scale, said: Said) -> list[Finding]:
+    findings = []
+    torque = drive.find(od.MAX_TORQUE)
+    if torque is not None and torque * abs(scale.torque_nm) < joint.max_torque_nm * (1 - _LIMIT_SLACK):
+        findings.append(
+            said(
+                Severity.WARNING,
+                f"the drive's torque limit is {format_torque(torque * abs(scale.torque_nm))} (6072), "
+                f"the robot file's {format_torque(joint.max_torque_nm)}; the robot file's will be set",
+            )
+        )
+    low, high = drive.find(od.POSITION_LIMIT_MIN), drive.find(od.POSITION_LIMIT_MAX)
+    if low is not None and high is not None and low < high:
+        ends = sorted((low * scale.position_rad, high * scale.position_rad))
+        slack = math.radians(0.1)
+        if ends[0] > joint.position_min_rad + slack or ends[1] < joint.position_max_rad - slack:
+            findings.append(
+                said(
+                    Severity.WARNING,
+                    f"the drive's position limits are {format_angle(ends[0])}..{format_angle(ends[1])} (607D), "
+                    f"narrower than the robot file's {format_angle(joint.position_min_rad)}.."
+                    f"{format_angle(joint.position_max_rad)}; the robot file's will be set",
+                    "make sure that the robot file's are right",
+                )
+            )
+    position = drive.find(od.POSITION_ACTUAL)
+    if position is not None:
+        here = position * scale.position_rad
+        if not joint.position_min_rad <= here <= joint.position_max_rad:
+            findings.append(
+                said(
+                    Severity.ERROR,
+                    f"stands at {format_angle(here)}, outside the robot file's limits",
+                    "home the robot, or correct `direction`, `gear_ratio` or the limits",
+                )
+            )
+    return findings
+
+
+def _quick_stop(joint: JointSetup, drive: Drive, facts: Facts, scale: Scale, said: Said) -> list[Finding]:
+    """A quick stop that takes long is none. 6085 is in velocity units per second unless 60AA says otherwise."""
+    deceleration = drive.find(od.QUICK_STOP_DECELERATION)
+    if not deceleration or drive.has(od.ACCELERATION_UNIT) or facts.velocity_unit is None:
+        return []
+    told, assumed = velocity_unit_rad_s(facts.velocity_unit), velocity_unit_rad_s(od.MILLI_RPM)
+    if told is None or assumed is None:
+        return []
+    per_unit = abs(scale.velocity_rad_s) * told / assumed
+    stop_s = joint.max_velocity_rad_s / (deceleration * per_unit)
+    if stop_s <= _SLOW_STOP_S:
+        return []
+    return [
+        said(
+            Severity.WARNING,
+            f"a quick stop from full speed would take {stop_s:.2g} s (6085 = {deceleration})",
+            "raise 6085 with the vendor's tool",
+        )
+    ]

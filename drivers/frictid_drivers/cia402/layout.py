@@ -1,0 +1,218 @@
+"""Which PDO carries what, and on which SYNC: the layout of a robot's frames for one rate and one set of active joints.
+
+==========  ===================================  ==========================================================
+PDO         carries                              goes out
+==========  ===================================  ==========================================================
+RPDO1       6040 607A 60B2 (8 bytes)             every cycle in position mode, else when it changes
+RPDO2       6060 6071 60FF (7 bytes)             every cycle in torque and velocity mode, else when it changes
+TPDO1       6041 6064 6077 (8 bytes)             active joint: every SYNC; locked joint: at least every 10 ms
+TPDO2       606C, force sensor (4 to 8 bytes)    together with TPDO1
+TPDO3       6061 603F, temperature (3 to 5)      active joint: every 10 ms; locked joint: every sixth of those
+==========  ===================================  ==========================================================
+
+The mapping is the same for every joint, active or locked, so that going on to the next joint changes transmission
+types only, and one frame map decodes a whole run. Reports that do not come on every SYNC are spread over the SYNCs by
+their start value (18xx:06, with the SYNC counter of 1019): transmission type 10 alone would let all of them answer the
+same SYNC. Where a drive has no SYNC counter they do, and the load is computed so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.bus_load import BusLoad, SyncFrame, bus_load, frame_bits
+from frictid_drivers.cia402.frame_map import Entry, Frame
+
+REPORT_INTERVAL_S = 0.010
+"""A locked joint is seen to stand still at least this often."""
+
+_SLOW_FACTOR = 6
+_MAX_TYPE = 240
+
+
+@dataclass(frozen=True, slots=True)
+class Pdo:
+    """One PDO as it shall be configured.
+
+    Attributes:
+        transmit: a TPDO of the drive, else an RPDO.
+        number: from 1.
+        cob_id: of the predefined connection set.
+        entries: what it carries.
+        every: transmission type: sent or applied on every so many SYNCs.
+        start: SYNC counter value of the first one, 0 for none.
+    """
+
+    transmit: bool
+    number: int
+    cob_id: int
+    entries: tuple[Entry, ...]
+    every: int = 1
+    start: int = 0
+
+    @property
+    def frame(self) -> Frame:
+        """Identifier and content."""
+        return Frame(self.cob_id, self.entries)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeWish:
+    """What the layout must know of one joint.
+
+    Attributes:
+        joint: name.
+        node: id.
+        torque_offset: 60B2 exists.
+        torque_target: 6071 exists.
+        velocity_target: 60FF exists.
+        external_torque: vendor object of a force sensor, None for none.
+        temperature: vendor object of a temperature, None for none.
+    """
+
+    joint: str
+    node: int
+    torque_offset: bool = True
+    torque_target: bool = True
+    velocity_target: bool = True
+    external_torque: Entry | None = None
+    temperature: Entry | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """All frames of a robot at one rate.
+
+    Attributes:
+        cycle_hz: rate of SYNC.
+        active: joints that report on every SYNC.
+        pdos: by joint name.
+        sync_overflow: 1019, 0 where no SYNC counter is used.
+        interval_cycles: SYNCs between two reports of a locked joint.
+        host_heartbeat_s: period of our own heartbeat.
+        drive_heartbeat_s: period of every drive's heartbeat.
+    """
+
+    cycle_hz: float
+    active: tuple[str, ...]
+    pdos: dict[str, tuple[Pdo, ...]]
+    sync_overflow: int
+    interval_cycles: int
+    host_heartbeat_s: float
+    drive_heartbeat_s: float
+
+    def load(self, bitrate: int) -> BusLoad:
+        """Load of this layout on a bus."""
+        frames = [SyncFrame(1 if self.sync_overflow else 0)]
+        largest_command = 0
+        for joint, pdos in self.pdos.items():
+            commands = [pdo.frame.size for pdo in pdos if not pdo.transmit]
+            largest_command = max(largest_command, *commands)
+            if joint in self.active:
+                frames.append(SyncFrame(max(commands)))
+            frames += [SyncFrame(pdo.frame.size, pdo.every, pdo.start) for pdo in pdos if pdo.transmit]
+        timed = [(1, self.host_heartbeat_s)] + [(1, self.drive_heartbeat_s)] * len(self.pdos)
+        # Besides the active joints' commands at most one more goes out per cycle, to whichever joint needs one.
+        return bus_load(frames, self.cycle_hz, bitrate, occasional=[largest_command], timed=timed)
+
+
+def plan_layout(
+    wishes: Sequence[NodeWish],
+    active: Sequence[str],
+    cycle_hz: float,
+    *,
+    sync_counter: bool,
+    host_heartbeat_s: float,
+    drive_heartbeat_s: float,
+) -> Layout:
+    """Decide every PDO.
+
+    Args:
+        wishes: all joints.
+        active: names of those that report on every SYNC.
+        cycle_hz: rate.
+        sync_counter: every drive has 1019 and 18xx:06.
+        host_heartbeat_s: period of our heartbeat.
+        drive_heartbeat_s: period of the drives' heartbeats.
+    """
+    interval = max(1, min(_MAX_TYPE, math.floor(REPORT_INTERVAL_S * cycle_hz + 1e-9)))
+    slow = interval * max(1, min(_SLOW_FACTOR, _MAX_TYPE // interval))
+    starts = _starts(wishes, interval, slow) if sync_counter else {wish.joint: (0, 0) for wish in wishes}
+    pdos: dict[str, tuple[Pdo, ...]] = {}
+    for wish in wishes:
+        fast_start, slow_start = starts[wish.joint]
+        if wish.joint in active:
+            # The same SYNCs as when it is locked, more often: no other joint's start value has to change.
+            slow_start = (slow_start - 1) % interval + 1 if interval > 1 and slow_start else 0
+            pdos[wish.joint] = _pdos(wish, every=1, start=0, slow_every=interval, slow_start=slow_start)
+        else:
+            pdos[wish.joint] = _pdos(wish, every=interval, start=fast_start, slow_every=slow, slow_start=slow_start)
+    return Layout(
+        cycle_hz=cycle_hz,
+        active=tuple(joint for joint in pdos if joint in active),
+        pdos=pdos,
+        sync_overflow=slow if sync_counter and slow > 1 else 0,
+        interval_cycles=interval,
+        host_heartbeat_s=host_heartbeat_s,
+        drive_heartbeat_s=drive_heartbeat_s,
+    )
+
+
+def _starts(wishes: Sequence[NodeWish], interval: int, slow: int) -> dict[str, tuple[int, int]]:
+    """Start values (reports, slow report) of every joint as if all were locked; 0 where each SYNC is answered."""
+    slots = _Slots(slow)
+    fast_starts = {}
+    for wish in wishes:
+        pdos = _pdos(wish, every=1, start=0, slow_every=1, slow_start=0)
+        bits = sum(frame_bits(pdo.frame.size).worst for pdo in pdos if pdo.transmit and pdo.number < 3)
+        fast_starts[wish.joint] = slots.take(interval, bits) if interval > 1 else 0
+    # The slow ones go where the others left room.
+    return {
+        wish.joint: (fast_starts[wish.joint], slots.take(slow, frame_bits(5).worst) if slow > 1 else 0)
+        for wish in wishes
+    }
+
+
+class _Slots:
+    """SYNCs of one turn of the counter, and how full each is."""
+
+    def __init__(self, count: int) -> None:
+        self._bits = [0] * count
+
+    def take(self, every: int, bits: int) -> int:
+        """The start value, from 1, that leaves the fullest SYNC least full."""
+        count = len(self._bits)
+        start = min(range(every), key=lambda first: max(self._bits[first::every]))
+        for slot in range(start, count, every):
+            self._bits[slot] += bits
+        return start + 1
+
+
+def _pdos(wish: NodeWish, *, every: int, start: int, slow_every: int, slow_start: int) -> tuple[Pdo, ...]:
+    command = [Entry.of(od.CONTROLWORD), Entry.of(od.TARGET_POSITION)]
+    if wish.torque_offset:
+        command.append(Entry.of(od.TORQUE_OFFSET))
+    other = [Entry.of(od.MODE)]
+    if wish.torque_target:
+        other.append(Entry.of(od.TARGET_TORQUE))
+    if wish.velocity_target:
+        other.append(Entry.of(od.TARGET_VELOCITY))
+    fast = [Entry.of(od.STATUSWORD), Entry.of(od.POSITION_ACTUAL), Entry.of(od.TORQUE_ACTUAL)]
+    velocity = [Entry.of(od.VELOCITY_ACTUAL)] + ([wish.external_torque] if wish.external_torque else [])
+    display = [Entry.of(od.MODE_DISPLAY), Entry.of(od.ERROR_CODE)] + ([wish.temperature] if wish.temperature else [])
+    node = wish.node
+    return (
+        Pdo(False, 1, 0x200 + node, tuple(command)),
+        Pdo(False, 2, 0x300 + node, tuple(other)),
+        Pdo(True, 1, 0x180 + node, tuple(fast), every, start),
+        Pdo(True, 2, 0x280 + node, tuple(velocity), every, start),
+        Pdo(True, 3, 0x380 + node, tuple(display), slow_every, slow_start),
+    )
+
+
+def load_at(layout_at: Callable[[float], Layout], bitrate: int) -> Callable[[float], BusLoad]:
+    """The load as a function of the rate; the layout itself changes with it."""
+    return lambda cycle_hz: layout_at(cycle_hz).load(bitrate)

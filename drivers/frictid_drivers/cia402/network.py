@@ -1,0 +1,258 @@
+"""The wire: one python-can bus held exclusively, with canopen's SDO, NMT and EMCY on it and no thread behind it.
+
+canopen usually reads its bus from a notifier thread. Here whoever waits for an SDO answer reads the bus himself, so
+that SDO phases are as deterministic in lock-step as the cycle is, nothing has to be stopped before cycling, and no
+thread inherits the wrong scheduling class.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoCommunicationError
+from filelock import FileLock, Timeout
+
+from frictid_hil.driver import FrameSink
+from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
+
+BusFactory = Callable[[], can.BusABC]
+
+DEFAULT_BITRATE = 1_000_000
+_FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host")
+"""Robot-file options that are handed to python-can as they are, when given."""
+
+
+def split_bus(bus: str) -> tuple[str, str]:
+    """``"socketcan:can0"`` to interface and channel.
+
+    Raises:
+        UsageError: no colon.
+    """
+    interface, colon, channel = bus.partition(":")
+    if not (interface and colon and channel):
+        raise UsageError(
+            f"bus {bus!r} is not of the form interface:channel",
+            next_step="write it as e.g. socketcan:can0 or pcan:PCAN_USBBUS1",
+        )
+    return interface, channel
+
+
+def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
+    """Open any python-can interface.
+
+    Args:
+        bus: ``interface:channel``.
+        options: of the robot file; ``bitrate`` and a few others go to the interface.
+
+    Raises:
+        UsageError: not of that form.
+        HardwareError: interface unknown, channel absent, or no permission.
+    """
+    interface, channel = split_bus(bus)
+    settings = {key: options[key] for key in _FORWARDED if key in options}
+    if interface not in ("socketcan", "virtual"):
+        # A SocketCAN link carries its bitrate already; everybody else must be told.
+        settings.setdefault("bitrate", DEFAULT_BITRATE)
+    try:
+        return can.Bus(interface=interface, channel=channel, **settings)
+    except can.CanInterfaceNotImplementedError as error:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise HardwareError(
+            f"python-can has no working interface {interface!r}: {error}",
+            where=bus,
+            cause="a misspelt interface, or its vendor library is not installed",
+            next_step=f"choose one of {known}",
+        ) from error
+    except PermissionError as error:
+        raise HardwareError(
+            f"no permission to open the bus: {error}",
+            where=bus,
+            next_step="add your user to the group that owns the device",
+        ) from error
+    except (can.CanError, OSError, ValueError, TypeError, ImportError, AttributeError) as error:
+        # Interfaces raise whatever their vendor library does; none of it is the user's to debug.
+        raise HardwareError(
+            f"cannot open the bus: {error}",
+            where=bus,
+            cause=_likely_cause(error),
+            next_step=(
+                f"sudo ip link set {channel} up type can bitrate {options.get('bitrate', DEFAULT_BITRATE)}"
+                if interface == "socketcan"
+                else "check the adapter, its driver and the channel's name"
+            ),
+        ) from error
+
+
+def _likely_cause(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.errno == 19:
+        return "there is no such CAN interface on this machine"
+    return "the adapter is absent, the link is down, or an option does not suit the interface"
+
+
+class BusLock:
+    """Exclusive use of one bus among all processes of this machine; released by the system when we die."""
+
+    def __init__(self, bus: str) -> None:
+        self._bus = bus
+        name = re.sub(r"[^A-Za-z0-9.]+", "-", bus)
+        self.path = Path(tempfile.gettempdir()) / f"frictid-hil-{name}.lock"
+        self._lock = FileLock(self.path, mode=0o666)
+
+    def acquire(self) -> None:
+        """Take the bus.
+
+        Raises:
+            HardwareBusy: another process has it.
+            HardwareError: the lock file cannot be written.
+        """
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise HardwareBusy(
+                "held by another process",
+                where=self._bus,
+                cause="another frictid-hil is running on this bus",
+                next_step=f"wait for it to end, or see who holds it: fuser {self.path}",
+            ) from error
+        except OSError as error:
+            raise HardwareError(
+                f"cannot lock the bus: {error}",
+                where=str(self.path),
+                next_step="check the file's owner and permissions",
+            ) from error
+
+    def release(self) -> None:
+        """Give it back; safe to call twice."""
+        self._lock.release()
+
+
+class Wire(canopen.Network):
+    """A canopen network without a notifier; every frame in or out passes the sink.
+
+    Args:
+        bus: opened.
+        sink: told of every frame.
+        now_ns: run time to stamp frames with.
+    """
+
+    def __init__(self, bus: can.BusABC, sink: FrameSink | None, now_ns: Callable[[], int]) -> None:
+        super().__init__(bus)
+        self._wire = bus
+        self._sink = sink
+        self._now_ns = now_ns
+        self._sink_lock = threading.Lock()
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Send one frame (canopen's own way out)."""
+        message = can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(data), is_remote_frame=remote)
+        with self.send_lock:
+            self._tell(can_id, message.data, True)
+            self._wire.send(message)
+
+    def pump(self, timeout_s: float) -> bool:
+        """Receive at most one frame and hand it to its subscribers; False when none came in time."""
+        message = self._wire.recv(timeout_s)
+        if message is None:
+            return False
+        if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
+            self._tell(message.arbitration_id, message.data, False)
+            self.dispatch(message.arbitration_id, message.data, message.timestamp)
+        return True
+
+    def dispatch(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """Hand a frame to canopen; what canopen cannot digest (a short EMCY) must not end the reception."""
+        try:
+            self.notify(can_id, data, timestamp)
+        except Exception:  # canopen's callbacks raise whatever struct or its own parsing does
+            return
+
+    def drain(self) -> None:
+        """Hand over everything that has already arrived."""
+        while self.pump(0.0):
+            pass
+
+    def _tell(self, can_id: int, data: bytearray, sent: bool) -> None:
+        if self._sink is not None:
+            # The heartbeat timer sends from a thread of its own.
+            with self._sink_lock:
+                self._sink(self._now_ns(), can_id, bytes(data), sent)
+
+
+class InlineSdoClient(SdoClient):
+    """canopen's SDO client that reads the bus itself while it waits."""
+
+    network: Wire
+
+    def send_request(self, request: bytes) -> None:
+        """Send, after everything that is left from earlier requests is out of the way."""
+        self.network.drain()
+        while not self.responses.empty():
+            self.responses.get_nowait()
+        super().send_request(request)  # type: ignore[no-untyped-call]  # canopen is only partly typed
+
+    def read_response(self) -> Any:
+        """Wait for the answer by pumping the bus."""
+        deadline = time.monotonic() + self.RESPONSE_TIMEOUT
+        while self.responses.empty():
+            remaining = deadline - time.monotonic()
+            if remaining <= 0 or (not self.network.pump(remaining) and time.monotonic() >= deadline):
+                raise SdoCommunicationError("No SDO response received")
+        return super().read_response()  # type: ignore[no-untyped-call]  # canopen is only partly typed
+
+
+class Node(canopen.RemoteNode):
+    """A remote node whose SDO client pumps inline."""
+
+    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> InlineSdoClient:
+        """As canopen's, with our client."""
+        client = InlineSdoClient(  # type: ignore[no-untyped-call]  # canopen is only partly typed
+            rx_cobid, tx_cobid, self.object_dictionary
+        )
+        self.sdo_channels.append(client)
+        if self.has_network():
+            self.network.subscribe(client.tx_cobid, client.on_response)
+        return client
+
+
+class HeartbeatTimer:
+    """The host's heartbeat while nobody cycles: a small thread that survives send errors.
+
+    While cycling the exchange sends it; in lock-step, where time stands still outside the cycle, nobody needs to.
+    """
+
+    def __init__(self, send: Callable[[], None], period_s: float) -> None:
+        self._send = send
+        self._period_s = period_s
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin; does nothing when already running."""
+        if self._thread is None:
+            self._stop.clear()
+            self._thread = threading.Thread(target=self._run, name="frictid-heartbeat", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End; safe to call twice."""
+        if self._thread is not None:
+            self._stop.set()
+            self._thread.join(1.0)
+            self._thread = None
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._period_s):
+            try:
+                self._send()
+            except can.CanError:
+                # A full buffer or a bus-off passes; the drives' watchdogs are the judge of how long is too long.
+                continue

@@ -1,0 +1,198 @@
+"""The settings of a robot file that this driver reads, checked before anything is opened.
+
+======================================  ========  =====================================================================
+options (robot)                         default   meaning
+======================================  ========  =====================================================================
+bitrate                                 1000000   bit/s; also the base of the bus load
+sdo_timeout_s                           0.5       how long a drive may take to answer
+watchdog_ms                             150       the drive stops when our heartbeat is missing for this long (1016)
+drive_heartbeat_ms                      100       heartbeat period of the drives (1017); 2.5 of it missing is a stop
+host_node                               127       our own node id
+reply_window                            0.7       share of the cycle in which reports must have come
+allow_torque_without_watchdog           false     torque modes on drives without 1016
+quick_stop_option                       6         605A: 5, 6 or 7 (stop and hold)
+abort_option                            3         6007: 2 (disable voltage) or 3 (quick stop)
+======================================  ========  =====================================================================
+
+======================================  ========  =====================================================================
+options (joint)                         default   meaning
+======================================  ========  =====================================================================
+following_window_rad                    0.12      6065 of the joint that moves
+locked_window_rad                       0.009     6065 of joints that stand locked
+following_timeout_ms                    20        6066
+standstill_rad_s                        0.02      speed below which the joint stands
+external_torque_object                  -         force sensor, e.g. ``"2030:00 i32"``
+external_torque_nm_per_unit             -         what its unit is worth, joint side
+temperature_object                      -         e.g. ``"2031:00 i16"``
+temperature_c_per_unit                  -         what its unit is worth
+position_units_per_revolution           -         of the joint; where 6092 and 608F do not tell
+velocity_unit_rad_s                     -         joint side; where 60A9 does not tell
+rated_torque_side                       motor     6076 is ``motor`` or ``joint`` side
+torque_source                           -         what the reported torque is, for the profile
+timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s
+======================================  ========  =====================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from frictid_drivers.cia402.frame_map import Entry
+from frictid_drivers.cia402.network import DEFAULT_BITRATE
+from frictid_hil.driver import JointSetup, RobotSetup, Timing
+from frictid_hil.errors import FieldProblem, InvalidFields
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """Robot-wide settings; see the module's table."""
+
+    bitrate: int
+    sdo_timeout_s: float
+    watchdog_ms: int
+    drive_heartbeat_ms: int
+    host_node: int
+    reply_window: float
+    allow_torque_without_watchdog: bool
+    quick_stop_option: int
+    abort_option: int
+
+    @property
+    def host_heartbeat_s(self) -> float:
+        """Three of our heartbeats fit into the drives' patience."""
+        return self.watchdog_ms / 3000.0
+
+    @property
+    def drive_timeout_s(self) -> float:
+        """Our own patience."""
+        return self.drive_heartbeat_ms * 2.5e-3
+
+
+@dataclass(frozen=True, slots=True)
+class JointSettings:
+    """Settings of one joint; see the module's table."""
+
+    following_window_rad: float
+    locked_window_rad: float
+    following_timeout_ms: int
+    standstill_rad_s: float
+    external_torque: Entry | None
+    external_torque_nm_per_unit: float
+    temperature: Entry | None
+    temperature_c_per_unit: float
+    torque_source: str
+    timing: Timing | None
+
+
+def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
+    """Check and read all options.
+
+    Raises:
+        InvalidFields: every option or node id that is wrong.
+    """
+    reader = _Reader()
+    bus = reader.bus(setup.options)
+    joints = {joint.name: reader.joint(joint) for joint in setup.joints}
+    reader.nodes(setup, bus.host_node)
+    if reader.problems:
+        raise InvalidFields(reader.problems)
+    return bus, joints
+
+
+class _Reader:
+    def __init__(self) -> None:
+        self.problems: list[FieldProblem] = []
+
+    def bus(self, options: Mapping[str, Any]) -> BusSettings:
+        at: tuple[str, ...] = ("options",)
+        return BusSettings(
+            bitrate=self._whole(at, options, "bitrate", DEFAULT_BITRATE, 10_000, 1_000_000),
+            sdo_timeout_s=self._number(at, options, "sdo_timeout_s", 0.5, 0.01, 60.0),
+            watchdog_ms=self._whole(at, options, "watchdog_ms", 150, 20, 1000),
+            drive_heartbeat_ms=self._whole(at, options, "drive_heartbeat_ms", 100, 10, 1000),
+            host_node=self._whole(at, options, "host_node", 127, 1, 127),
+            reply_window=self._number(at, options, "reply_window", 0.7, 0.1, 0.95),
+            allow_torque_without_watchdog=bool(options.get("allow_torque_without_watchdog", False)),
+            quick_stop_option=self._whole(at, options, "quick_stop_option", 6, 5, 7),
+            abort_option=self._whole(at, options, "abort_option", 3, 2, 3),
+        )
+
+    def joint(self, joint: JointSetup) -> JointSettings:
+        options = joint.options
+        at = ("joints", joint.name, "options")
+        external, external_unit = self._object(at, options, "external_torque", "nm_per_unit")
+        temperature, temperature_unit = self._object(at, options, "temperature", "c_per_unit")
+        return JointSettings(
+            following_window_rad=self._number(at, options, "following_window_rad", 0.12, 1e-4, math.pi),
+            locked_window_rad=self._number(at, options, "locked_window_rad", 0.009, 1e-5, 0.5),
+            following_timeout_ms=self._whole(at, options, "following_timeout_ms", 20, 0, 10_000),
+            standstill_rad_s=self._number(at, options, "standstill_rad_s", 0.02, 1e-4, 1.0),
+            external_torque=external,
+            external_torque_nm_per_unit=external_unit,
+            temperature=temperature,
+            temperature_c_per_unit=temperature_unit,
+            torque_source=str(options.get("torque_source", "6077 actual torque")),
+            timing=self._timing(at, options),
+        )
+
+    def nodes(self, setup: RobotSetup, host_node: int) -> None:
+        seen = {host_node: "the host itself (options.host_node)"}
+        for joint in setup.joints:
+            if not 1 <= joint.address <= 127:
+                self._problem(("joints", joint.name, "node"), f"expected a node id 1..127, found {joint.address}")
+            elif joint.address in seen:
+                self._problem(
+                    ("joints", joint.name, "node"), f"node {joint.address} is already used by {seen[joint.address]}"
+                )
+            seen.setdefault(joint.address, f"joint {joint.name}")
+
+    def _timing(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Timing | None:
+        given = options.get("timing")
+        if given is None:
+            return None
+        known = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
+        if not isinstance(given, Mapping) or not set(given) <= set(known):
+            self._problem((*at, "timing"), f"expected a mapping of {', '.join(known)}")
+            return None
+        here = (*at, "timing")
+        values = {key: self._number(here, given, key, 0.0, -1.0, 1.0) for key in known if key in given}
+        return Timing(**values, source="robot file")
+
+    def _object(
+        self, at: tuple[str, ...], options: Mapping[str, Any], meaning: str, unit: str
+    ) -> tuple[Entry | None, float]:
+        text = options.get(f"{meaning}_object")
+        if text is None:
+            return None, math.nan
+        try:
+            entry = Entry.parse(f"{text} {meaning}")
+        except ValueError as error:
+            self._problem((*at, f"{meaning}_object"), str(error))
+            return None, math.nan
+        if entry.type.bits not in (8, 16, 32):
+            self._problem((*at, f"{meaning}_object"), f"expected 8, 16 or 32 bits, found {entry.type}")
+        return entry, self._number(at, options, f"{meaning}_{unit}", None, -1e9, 1e9)
+
+    def _number(
+        self, at: tuple[str, ...], options: Mapping[str, Any], key: str, default: float | None, low: float, high: float
+    ) -> float:
+        value = options.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            self._problem((*at, key), f"expected a number {low:g}..{high:g}, found {value!r}")
+            return low
+        return float(value)
+
+    def _whole(
+        self, at: tuple[str, ...], options: Mapping[str, Any], key: str, default: int, low: int, high: int
+    ) -> int:
+        value = options.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            self._problem((*at, key), f"expected a whole number {low}..{high}, found {value!r}")
+            return default
+        return value
+
+    def _problem(self, path: tuple[str | int, ...], message: str) -> None:
+        self.problems.append(FieldProblem(path, message))
