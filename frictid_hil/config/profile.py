@@ -16,13 +16,13 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from frictid_hil.config.prismatic import linear_name, linear_names, rotary_name
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.schema import Numbers, Pair, Pairs, Strict, schema_version, validated
 from frictid_hil.config.write import dump, plain, write_whole
 from frictid_hil.config.yaml import Document, KeyPath, Node, read
 from frictid_hil.errors import ConfigError, ProfileMismatch
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.linear_axis import linear_name, linear_names, rotary_name
 
 KIND = "frictid.profile"
 NEWEST = 1
@@ -133,7 +133,7 @@ class Gate(Strict):
 
 
 class JointProfile(Strict):
-    """One joint; on a linear axis the file says m, m/s, N (see ``config.prismatic``) and these names hold them.
+    """One joint; on a linear axis the file says m, m/s, N (see ``linear_axis``) and these names hold them.
 
     Attributes:
         method: estimator (``function-a``, ``aligned``, ``least-squares``).

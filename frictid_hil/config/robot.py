@@ -154,11 +154,14 @@ class Robot:
         """What may happen without a person."""
         return self.file.policy
 
+    def values(self) -> dict[str, Any]:
+        """The values as they are in force, in one mapping: a site file merged with what it extends."""
+        return {key: value for key, value in self.document.data.items() if key != "extends"}
+
     @property
     def digest(self) -> str:
         """SHA-256 of the values (comments and layout do not count), hexadecimal."""
-        values = {key: value for key, value in self.document.data.items() if key != "extends"}
-        canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
+        canonical = json.dumps(self.values(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()
 
     def driver(self, bus: str | None = None) -> str:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
+from frictid_hil.config.write import dump
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 
 FIXTURE = Path(__file__).with_name("fixture_robot.yaml")
@@ -114,6 +115,8 @@ def test_a_site_file_overrides_what_differs(tmp_path: Path) -> None:
     assert [joint.address for joint in robot.to_setup().joints] == [1, 9]
     assert robot.digest != load_robot(tmp_path / "two.yaml").digest
     assert robot.path == site
+    (tmp_path / "used.yaml").write_text(dump(robot.values()))
+    assert load_robot(tmp_path / "used.yaml").digest == robot.digest, "a run's copy is the configuration itself"
 
 
 def test_errors_of_a_site_file_point_into_the_file_at_fault(tmp_path: Path) -> None:

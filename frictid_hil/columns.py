@@ -1,0 +1,82 @@
+"""Which column of a foreign file is which: the column map as a value.
+
+People log with what they have: other names, other units, a voltage that a gain turns into a force, six joints in one
+cell. A map says so once, and the same file then serves every recording of that logger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from frictid_hil.units import parse_quantity
+
+QUANTITIES: dict[str, tuple[str, str]] = {
+    "position_rad": ("angle", "length"),
+    "velocity_rad_s": ("angular velocity", "speed"),
+    "torque_nm": ("torque", "force"),
+    "position_command_rad": ("angle", "length"),
+    "external_torque_nm": ("torque", "force"),
+    "rigid_body_torque_nm": ("torque", "force"),
+}
+"""Dimension of each column of ``Samples``, on a rotary joint and on a linear axis."""
+
+TIME_UNITS_NS: dict[str, float] = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where one column comes from: the product of some columns of the file, times a scale.
+
+    Attributes:
+        columns: names in the file; more than one are multiplied (a constant counts as a column of equal values).
+        scale: factor to the product's SI value, unit and sign included.
+        offset: added after scaling, SI.
+        index: for cells that hold a list, which of its values.
+        file: for recordings spread over files, the name of the other file, beside the first and with equal rows.
+    """
+
+    columns: tuple[str, ...]
+    scale: float = 1.0
+    offset: float = 0.0
+    index: int | None = None
+    file: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class JointColumns:
+    """The columns of one joint.
+
+    Attributes:
+        sources: by the names of ``Samples`` (``position_rad``, ...).
+        prismatic: the values are m, m/s, N.
+        meta: what else is known (torque_source, ...); travels with the samples.
+    """
+
+    sources: Mapping[str, Source]
+    prismatic: bool = False
+    meta: Mapping[str, str | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """A foreign file's columns.
+
+    Attributes:
+        name: of the map.
+        time: source of the time; its scale is to nanoseconds.
+        joints: by name, in order.
+    """
+
+    name: str
+    time: Source
+    joints: Mapping[str, JointColumns]
+
+
+def si_factor(unit: str, column: str, *, prismatic: bool) -> float:
+    """What a value in ``unit`` is multiplied by to become the SI value of ``column``.
+
+    Raises:
+        UsageError: not a unit of that column's dimension; the message lists those there are.
+    """
+    return parse_quantity(f"1 {unit}", QUANTITIES[column][prismatic])

@@ -1,0 +1,66 @@
+"""Files on disk: replaced whole or not at all, and a full disk told as such."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+
+from frictid_hil.errors import FrictidError
+
+
+def write_whole(path: Path, text: str | bytes, *, replace: bool = True) -> None:
+    """Write a file so that every reader, at any moment and after any crash, sees the old content or the new, whole.
+
+    The new content is staged in the same folder (a rename works only within one file system), synced, and named last.
+
+    Args:
+        path: of the file; its folder must exist.
+        text: the whole content.
+        replace: False to leave an existing file untouched and raise ``FileExistsError``.
+
+    Raises:
+        FrictidError: disk full, or no permission.
+        FileExistsError: see ``replace``.
+    """
+    content = text.encode() if isinstance(text, str) else text
+    staged = None
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        staged = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            os.fchmod(handle, 0o644)
+            file.write(content)
+            file.flush()
+            os.fsync(handle)
+        if replace:
+            staged.replace(path)
+        else:
+            path.hardlink_to(staged)
+        sync_folder(path.parent)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise could_not_write(path, error) from error
+    finally:
+        if staged is not None:
+            staged.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder survive a power failure."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def could_not_write(path: Path, error: OSError) -> FrictidError:
+    """The error a person should see when writing failed."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return FrictidError(
+            "the disk is full; what was written before is kept", where=str(path), next_step="free some space (`df -h`)"
+        )
+    return FrictidError(f"cannot be written: {error.strerror or error}", where=str(path))
