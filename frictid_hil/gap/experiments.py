@@ -1,0 +1,320 @@
+"""The diagnostic experiments: what a joint is asked to do so that its effects part from one another.
+
+Every experiment is a handful of plan motions inside one *envelope* (middle of the travel, travel, speed), so the same
+list runs on a real bus, on the virtual one, and in the generator of the blind check. Two experiments are never fitted:
+on them the gap is reported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.errors import UsageError
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.plan import Corners, Hold, Motion, Move, Sine
+
+CHIRP_LOW_HZ = 0.3
+SHORT = ("triangle_slow", "sines_payload", "chirp", "breakaway", "moves_payload", "sines_repeat")
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """Where and how fast a joint may move for its diagnosis.
+
+    Attributes:
+        centre_rad: middle of every travel.
+        travel_rad: peak-to-peak travel of the small sines; the large ones travel twice as far.
+        velocity_rad_s: peak speed of the sines.
+        triangle_rad: half travel of the slow triangle.
+        triangle_velocity_rad_s: its constant speed.
+        creep_velocity_rad_s: speed of the break-away's creep.
+        chirp_velocity_rad_s: speed amplitude of the chirp.
+        chirp_high_hz: its last frequency.
+        second_centre_rad: middle of the second posture, or None where the joint has no room for one.
+    """
+
+    centre_rad: float
+    travel_rad: float
+    velocity_rad_s: float
+    triangle_rad: float = 0.5
+    triangle_velocity_rad_s: float = 0.1
+    creep_velocity_rad_s: float = 0.012
+    chirp_velocity_rad_s: float = 0.35
+    chirp_high_hz: float = 8.0
+    second_centre_rad: float | None = None
+
+    @staticmethod
+    def within(
+        position_min_rad: float,
+        position_max_rad: float,
+        max_velocity_rad_s: float,
+        *,
+        centre_rad: float | None = None,
+        travel_rad: float | None = None,
+        velocity_rad_s: float | None = None,
+    ) -> Envelope:
+        """The widest envelope that keeps clear of the limits.
+
+        Args:
+            position_min_rad: lower software limit.
+            position_max_rad: upper software limit.
+            max_velocity_rad_s: limit of the joint; the sines reach 90 % of it at most.
+            centre_rad: middle of the travel; the middle of the limits unless given.
+            travel_rad: of the small sines; at most a quarter of what there is.
+            velocity_rad_s: peak speed of the sines; at most 2 rad/s unless given.
+
+        Raises:
+            UsageError: less than 5 degrees are left for the small sines.
+        """
+        centre = 0.5 * (position_min_rad + position_max_rad) if centre_rad is None else centre_rad
+        room = 0.95 * min(centre - position_min_rad, position_max_rad - centre)
+        travel = min(0.56, room) if travel_rad is None else travel_rad
+        if travel < math.radians(5.0) or travel > room:
+            raise UsageError(
+                f"a travel of {travel:.3g} rad either way does not fit: {room:.3g} rad at centre {centre:.3g} rad",
+                next_step="choose another centre, or a smaller travel (at least 5deg)",
+            )
+        speed = min(2.0, 0.9 * max_velocity_rad_s) if velocity_rad_s is None else velocity_rad_s
+        if not 0.0 < speed <= max_velocity_rad_s:
+            raise UsageError(f"a peak speed of {speed:.3g} rad/s is beyond the joint's {max_velocity_rad_s:.3g} rad/s")
+        aside = [
+            c for c in (centre + 1.2, centre - 1.2) if position_min_rad < c - travel and c + travel < position_max_rad
+        ]
+        return Envelope(
+            centre_rad=centre,
+            travel_rad=travel,
+            velocity_rad_s=speed,
+            triangle_rad=min(0.5, 0.9 * travel),
+            chirp_velocity_rad_s=min(0.35, 0.25 * speed + 0.1),
+            second_centre_rad=aside[0] if aside else None,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Chirp:
+    """A speed of constant amplitude whose frequency rises linearly, about ``centre_rad``; faded in and out."""
+
+    centre_rad: float
+    velocity_rad_s: float
+    high_hz: float
+    duration_s: float
+    low_hz: float = CHIRP_LOW_HZ
+    name: str = "chirp"
+
+    def position_rad(self, time_s: Array) -> Array:
+        """centre + v / (2 pi f(t)) sin(phase), f linear in t."""
+        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)
+        rise = (self.high_hz - self.low_hz) / self.duration_s
+        frequency_hz = self.low_hz + rise * t
+        phase = 2 * math.pi * (self.low_hz + 0.5 * rise * t) * t
+        fade_s = 0.05 * self.duration_s
+        fade = _smooth(t / fade_s) * _smooth((self.duration_s - t) / fade_s)
+        return self.centre_rad + fade * self.velocity_rad_s / (2 * math.pi * frequency_hz) * np.sin(phase)
+
+    def details(self) -> Mapping[str, Any]:
+        """Speed and band."""
+        return {"velocity_rad_s": self.velocity_rad_s, "low_hz": self.low_hz, "high_hz": self.high_hz}
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """One recording: motions in order, and what it is for. Itself a motion, so that one mark covers it.
+
+    Attributes:
+        name: of the experiment and its log.
+        role: ``identification`` (fitted) or ``validation`` (never fitted).
+        payload: the known payload is mounted.
+        motions: in order; each starts where the one before ends.
+        reveals: what it separates, for a person.
+    """
+
+    name: str
+    role: str
+    payload: bool
+    motions: tuple[Motion, ...]
+    reveals: str = field(default="", compare=False)
+
+    @property
+    def duration_s(self) -> float:
+        """Sum of the motions."""
+        return sum(motion.duration_s for motion in self.motions)
+
+    @property
+    def start_rad(self) -> float:
+        """Where it begins, at rest."""
+        return float(self.motions[0].position_rad(np.zeros(1))[0])
+
+    def position_rad(self, time_s: Array) -> Array:
+        """Set-points of all motions, one after the other; the last position afterwards."""
+        t = np.asarray(time_s, dtype=np.float64)
+        ends = np.cumsum([motion.duration_s for motion in self.motions])
+        which = np.minimum(np.searchsorted(ends, t, side="right"), len(self.motions) - 1)
+        position = np.empty(t.shape)
+        for k, motion in enumerate(self.motions):
+            here = which == k
+            position[here] = motion.position_rad(t[here] - (ends[k] - motion.duration_s))
+        return position
+
+    def details(self) -> Mapping[str, Any]:
+        """Role, payload, and the parameters of every motion."""
+        return {
+            "role": self.role,
+            "payload": self.payload,
+            "motions": [{"name": motion.name, **motion.details()} for motion in self.motions],
+        }
+
+
+def full_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
+    """Every experiment, in the order in which they run.
+
+    Args:
+        envelope: where and how fast.
+        seed: of the validation moves, which are drawn at random.
+    """
+    e = envelope
+    small, large = e.centre_rad - e.travel_rad / 2, e.centre_rad - e.travel_rad
+    identification = [
+        _sines("sines_small", small, e.travel_rad, _rising(e.velocity_rad_s, 8), reveals="the friction curve"),
+        _sines("sines_large", large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6), reveals="speed against position"),
+        _triangle(e),
+        _sines(
+            "sines_payload",
+            small,
+            e.travel_rad,
+            _rising(0.8 * e.velocity_rad_s, 5),
+            payload=True,
+            reveals="load, gravity, inertia, torque constant",
+        ),
+        _chirp(e),
+        _breakaway(e),
+    ]
+    shuffled = tuple(e.velocity_rad_s * n / 6 for n in (5, 2, 6, 3, 1, 4))
+    validation = [
+        _moves(e, seed),
+        _sines(
+            "sines_repeat",
+            small,
+            e.travel_rad,
+            shuffled,
+            role="validation",
+            reveals="nothing: the gap is reported here",
+        ),
+    ]
+    if e.second_centre_rad is not None:
+        identification.append(second_posture(e))
+    return tuple(identification + validation)
+
+
+def short_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
+    """The experiments that part most effects in the least time: about 80 s, validation included."""
+    return tuple(experiment for experiment in full_set(envelope, seed=seed) if experiment.name in SHORT)
+
+
+def second_posture(envelope: Envelope) -> Experiment:
+    """The small sines elsewhere: parts a torque bias from an encoder offset.
+
+    Raises:
+        UsageError: the envelope has no second centre.
+    """
+    if envelope.second_centre_rad is None:
+        raise UsageError("the joint's travel leaves no room for a second posture")
+    moved = replace(envelope, centre_rad=envelope.second_centre_rad)
+    return _sines(
+        "sines_posture",
+        moved.centre_rad - moved.travel_rad / 2,
+        moved.travel_rad,
+        _rising(0.6 * moved.velocity_rad_s, 3),
+        reveals="torque bias against encoder offset and gravity",
+    )
+
+
+def _rising(velocity_rad_s: float, cycles: int) -> tuple[float, ...]:
+    return tuple(velocity_rad_s * (n + 1) / cycles for n in range(cycles))
+
+
+def _sines(
+    name: str,
+    start_rad: float,
+    travel_rad: float,
+    speeds_rad_s: tuple[float, ...],
+    *,
+    role: str = "identification",
+    payload: bool = False,
+    reveals: str = "",
+) -> Experiment:
+    cycles = [Sine(start_rad, travel_rad, speed) for speed in speeds_rad_s]
+    return _experiment(name, role, payload, cycles, reveals)
+
+
+def _triangle(e: Envelope) -> Experiment:
+    quarter_s = e.triangle_rad / e.triangle_velocity_rad_s
+    c, a = e.centre_rad, e.triangle_rad
+    corners = Corners("triangle", (0.0, quarter_s, 3 * quarter_s, 4 * quarter_s), (c, c + a, c - a, c))
+    return _experiment(
+        "triangle_slow",
+        "identification",
+        False,
+        [corners],
+        "ripple, the shape of gravity, hysteresis at reversals",
+        1.0,
+    )
+
+
+def _chirp(e: Envelope) -> Experiment:
+    chirp = Chirp(e.centre_rad + 0.2 * e.triangle_rad, e.chirp_velocity_rad_s, e.chirp_high_hz, 10.0)
+    return _experiment("chirp", "identification", False, [chirp], "delay, lag, elasticity, inertia")
+
+
+def _breakaway(
+    e: Envelope, step_rad: float = 0.014, dwells_s: tuple[float, ...] = (0.6, 1.2, 2.4, 0.3, 1.2)
+) -> Experiment:
+    """Creep steps with dwells between them, three one way and three back."""
+    step_s = step_rad / e.creep_velocity_rad_s
+    times, positions = [0.0], [e.centre_rad + 0.1 * e.triangle_rad]
+    for k, dwell_s in enumerate((*dwells_s, 0.0)):
+        times.append(times[-1] + step_s)
+        positions.append(positions[-1] + (step_rad if k < 3 else -step_rad))
+        if dwell_s:
+            times.append(times[-1] + dwell_s)
+            positions.append(positions[-1])
+    corners = Corners("breakaway", tuple(times), tuple(positions))
+    return _experiment(
+        "breakaway", "identification", False, [corners], "stiction that grows with the dwell, presliding", 0.8
+    )
+
+
+def _moves(e: Envelope, seed: int) -> Experiment:
+    """Point-to-point moves of random length, speed and pause: ordinary work, unlike any identification motion."""
+    rng = np.random.default_rng([seed, 6])
+    here = e.centre_rad
+    moves: list[Motion] = []
+    while sum(motion.duration_s for motion in moves) < 10.0:
+        there = e.centre_rad + rng.uniform(-1.2, 1.2) * e.travel_rad * 0.8
+        if abs(there - here) < 0.25 * e.travel_rad:
+            continue
+        # A quintic move of travel d peaks at 1.642 v^2 / d of acceleration; 6 rad/s2 is ordinary work.
+        speed = rng.uniform(0.15, 0.85) * e.velocity_rad_s
+        speed = min(speed, math.sqrt(6.0 * abs(there - here) / 1.642))
+        pause_s = float(rng.choice([0.2, 0.2, 0.7]))
+        moves += [Move.within(here, there, speed), Hold(there, pause_s)]
+        here = there
+    return _experiment("moves_payload", "validation", True, moves, "nothing: the gap is reported here")
+
+
+def _experiment(
+    name: str, role: str, payload: bool, motions: list[Any], reveals: str, dwell_s: float = 0.6, tail_s: float = 0.4
+) -> Experiment:
+    first = float(motions[0].position_rad(np.zeros(1))[0])
+    last = float(motions[-1].position_rad(np.full(1, motions[-1].duration_s))[0])
+    return Experiment(name, role, payload, (Hold(first, dwell_s), *motions, Hold(last, tail_s)), reveals)
+
+
+def _smooth(u: Array) -> Array:
+    """0 below 0, 1 above 1, with zero slope at both."""
+    u = np.clip(u, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
