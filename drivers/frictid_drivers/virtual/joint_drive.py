@@ -79,7 +79,7 @@ def servo_for(
         model,
         period_s=CONTROL_PERIOD_S,
         seed=zlib.crc32(f"{robot.seed}/{robot.name}/{joint.name}".encode()),
-        position_rad=joint.start_position_rad,
+        position_rad=joint.locked_position_rad,
     )
 
     def hold_hand(held: bool, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
