@@ -182,9 +182,12 @@ class Axis:
             self._ramp = None
             self._outside_since_ns = None
             self.following_error = self.internal_limit = False
-            self._plant.power(on)
             if on:
-                self.resume()
+                # In this order: the loops start with the torque that holds the joint.
+                self._stopped = False
+                self._clear_set_points(self._plant.measured_position_rad)
+                self._plant.set_mode(self.mode or CSP)
+            self._plant.power(on)
         self._plant.brake(brake)
 
     def resume(self) -> None:
