@@ -1,0 +1,156 @@
+"""The scheduler against simulated CiA-402 drives, frame by frame, in lock-step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import Driver, JointState, RobotSetup, load_driver
+from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, SafetyAbort
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.plans import calibration_plan, expected_of
+from frictid_hil.plan import Plan
+from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
+from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
+from frictid_hil.runner.scheduler import Recorder, Scheduler
+
+DEG = math.pi / 180
+ROBOT = load_robot("hp3j.yaml")
+
+
+class Stop:
+    """Asks to stop once a phase has begun and some cycles of it have passed."""
+
+    def __init__(self, level: int = 0) -> None:
+        self.wanted = level
+        self.armed = False
+        self.reads = 0
+
+    @property
+    def level(self) -> int:
+        if self.armed:
+            self.reads += 1
+        return self.wanted if self.reads > 200 else 0
+
+
+def run(
+    joints: tuple[str, ...] = ("3",),
+    *,
+    change: Callable[[RobotSetup], RobotSetup] = lambda setup: setup,
+    proceed: bool = True,
+    stop: Stop | None = None,
+) -> tuple[list[Event], Rows, Driver, FrictidError | None]:
+    setup = ROBOT.to_setup()
+    procedures = {name: Procedure(6 * DEG, 40 * DEG, cycles=2) for name in joints}
+    plan: Plan = calibration_plan(ROBOT, setup, procedures, expected_of(ROBOT), rehearse=joints)
+    setup = change(setup)
+    stop = stop or Stop()
+    events: list[Event] = []
+
+    def notify(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, PhaseStarted) and event.phase == "cycles":
+            stop.armed = True
+
+    driver = load_driver("virtual")(setup)  # type: ignore[call-arg]
+    samples = sample_ring(1 << 17)
+    scheduler = Scheduler(
+        driver, setup, plan, Recorder(samples, frame_ring()), notify=notify, proceed=lambda _: proceed, stop=stop
+    )
+    ended: FrictidError | None = None
+    try:
+        scheduler.run()
+    except FrictidError as error:
+        ended = error
+    return events, samples.drain(), driver, ended
+
+
+@pytest.fixture(scope="module")
+def healthy() -> tuple[list[Event], Rows, Driver, FrictidError | None]:
+    return run(("3", "4"))
+
+
+def test_joints_run_one_by_one_in_the_planned_order(
+    healthy: tuple[list[Event], Rows, Driver, FrictidError | None],
+) -> None:
+    events, _, _, ended = healthy
+    assert ended is None
+    assert isinstance(events[0], Preflight)
+    assert [event.joint for event in events if isinstance(event, JointRun)] == ["3", "4"]
+    phases = [event.phase for event in events if isinstance(event, PhaseStarted) and event.joint == "3"]
+    assert phases == [
+        "configure",
+        "reference",
+        "enable",
+        "move",
+        "rehearsal",
+        "hold",
+        "cycles",
+        "drift",
+        "hold",
+        "reversal",
+        "return",
+        "hold",
+    ]
+
+
+def test_only_the_planned_joint_moves(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
+    events, rows, _, _ = healthy
+    for run_of in (event for event in events if isinstance(event, JointRun)):
+        start, end = run_of.marks[0].start_ns, run_of.marks[-1].end_ns
+        during = rows[(rows["t_ns"] >= start) & (rows["t_ns"] < end)]
+        moving = ROBOT.joint_names.index(run_of.joint)
+        for index in range(6):
+            travel = np.ptp(during["position_rad"][during["joint"] == index])
+            assert (travel > 5 * DEG) == (index == moving), f"joint {index} travelled {travel:.5f} rad"
+
+
+def test_run_time_goes_on_from_joint_to_joint(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
+    events, rows, _, _ = healthy
+    first, second = (event for event in events if isinstance(event, JointRun))
+    assert second.marks[0].start_ns > first.marks[-1].end_ns
+    for index in range(6):
+        assert np.all(np.diff(rows["t_ns"][rows["joint"] == index]) > 0)
+    assert first.rate_hz == pytest.approx(1000.0)
+    assert first.late_cycles == first.missed_cycles == 0
+
+
+def test_lock_step_is_bit_identical(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
+    _, rows, _, _ = run(("3", "4"))
+    assert rows.tobytes() == healthy[1].tobytes()
+
+
+def test_without_a_yes_nothing_is_enabled() -> None:
+    events, rows, _, ended = run(proceed=False)
+    assert isinstance(ended, PlanRefused)
+    assert [type(event) for event in events] == [Preflight]
+    assert rows.size == 0
+
+
+def test_a_lost_position_reference_is_refused_before_power() -> None:
+    def elsewhere(setup: RobotSetup) -> RobotSetup:
+        moved = [replace(j, locked_position_rad=j.locked_position_rad + 0.4) for j in setup.joints[1:2]]
+        return replace(setup, joints=(setup.joints[0], *moved, *setup.joints[2:]))
+
+    events, _, _, ended = run(change=elsewhere)
+    assert isinstance(ended, SafetyAbort)
+    assert "joint 1" in str(ended) and "expected" in str(ended)
+    assert "enable" not in [event.phase for event in events if isinstance(event, PhaseStarted)]
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_request_to_stop_brings_the_joint_to_rest(level: int) -> None:
+    _, rows, _, ended = run(stop=Stop(level))
+    assert isinstance(ended, Interrupted)
+    last = rows[rows["joint"] == 3][-20:]
+    assert np.abs(last["velocity_rad_s"]).max() < 0.5 * DEG
+    assert np.ptp(last["position_rad"]) < 0.01 * DEG
+
+
+def test_states_are_what_the_protocol_names() -> None:
+    assert {state.value for state in JointState} == {"unknown", "disabled", "enabled", "stopping", "fault"}
