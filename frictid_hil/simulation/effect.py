@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Any
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.inverse import InverseForm
 
 
 class Channel(Enum):
@@ -118,7 +119,7 @@ class Effect:
         signature: where it shows.
         hooks: the forward form.
         illustrate: a plot of the effect at given parameters (``typical`` ones when empty).
-        inverse: the inverse form, ``regressors(view, ...)``; its protocol belongs to the diagnosis.
+        inverse: the inverse form, for effects that show in the plant; None for those of drive and encoder.
         state_size: number of slots in the state vector.
         carried: its state survives from one recording to the next (temperature).
     """
@@ -130,7 +131,7 @@ class Effect:
     signature: Signature
     hooks: tuple[Hook, ...]
     illustrate: Callable[[Mapping[str, float]], Illustration]
-    inverse: Callable[..., Any] | None = None
+    inverse: InverseForm | None = None
     state_size: int = 0
     carried: bool = False
 

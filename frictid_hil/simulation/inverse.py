@@ -72,13 +72,11 @@ class InverseForm:
         shapes: grid of the nonlinear parameters; ``({},)`` where there are none.
         regressors: (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
         parameters: (shape, coefficients (k,)) -> the effect's own parameters.
-        refinable: names of the shape's parameters that may be refined between grid points.
     """
 
     shapes: tuple[Shape, ...]
     regressors: Callable[[Sequence[View], Shape], list[Array]]
     parameters: Callable[[Shape, Array], dict[str, float]]
-    refinable: tuple[str, ...] = ()
 
 
 def grid(**axes: Sequence[float]) -> tuple[Shape, ...]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -33,6 +35,30 @@ def coupling_damping(
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Torque through the play less that of a rigid joint, once."""
+    from frictid_hil.simulation.inverse_loops import transmitted
+
+    columns: list[Array] = []
+    for v in views:
+        link = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2
+        stiffness = shape["contact_stiffness_nm_per_rad"]
+        torque = transmitted(
+            v.position_rad,
+            v.step_s,
+            link,
+            v.gravity_cos_nm,
+            v.gravity_sin_nm,
+            shape["gap_rad"],
+            stiffness,
+            shape["contact_relaxation_s"] * stiffness,
+        )
+        rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
+        columns.append((torque - rigid)[:, None])
+    return columns
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -68,4 +94,16 @@ EFFECT = Effect(
         Hook("coupling_damping", coupling_damping, order=60),
     ),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(
+            gap_rad=(1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 5e-3),
+            contact_stiffness_nm_per_rad=(1.2e4, 4e4),
+            contact_relaxation_s=(5e-4,),
+        ),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {
+            **shape,
+            "gap_rad": shape["gap_rad"] * max(0.05, float(coefficients[0])),
+        },
+    ),
 )

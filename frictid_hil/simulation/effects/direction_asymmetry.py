@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -19,6 +21,12 @@ def friction(
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Even parts of level and rate, per share."""
+    return [np.stack([v.coulomb_nm * np.abs(v.slip), np.abs(v.rate_nm)], axis=1) for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -54,4 +62,12 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("friction", friction),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {
+            "coulomb_share": float(coefficients[0]),
+            "viscous_share": float(coefficients[1]),
+        },
+    ),
 )

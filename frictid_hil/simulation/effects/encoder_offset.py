@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -17,6 +19,12 @@ def encoder(measured_rad: float, offset_rad: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Slope of gravity, per radian."""
+    return [np.stack([-v.gravity_slope_nm_per_rad], axis=1) for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -44,4 +52,9 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION,)),
     hooks=(Hook("encoder", encoder),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"offset_rad": float(coefficients[0])},
+    ),
 )

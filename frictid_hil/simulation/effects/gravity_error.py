@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -17,6 +19,12 @@ def gravity(gravity_nm: float, error_share: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The joint's own gravity, per share."""
+    return [np.stack([v.gravity_nm], axis=1) for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -43,4 +51,9 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
+    ),
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -17,6 +19,12 @@ def inertia(link_kg_m2: float, error_share: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The link's own inertia torque, per share."""
+    return [np.stack([v.link_inertia_kg_m2 * v.acceleration_rad_s2], axis=1) for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -45,4 +53,9 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.ACCELERATION, Region.FREQUENCY)),
     hooks=(Hook("inertia", inertia),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
+    ),
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -24,6 +26,30 @@ def coupling_damping(
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Torque through the spring less that of a rigid joint, once."""
+    from frictid_hil.simulation.inverse_loops import transmitted
+
+    columns: list[Array] = []
+    for v in views:
+        link = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2
+        stiffness = 1.0 / shape["compliance_rad_per_nm"]
+        torque = transmitted(
+            v.position_rad,
+            v.step_s,
+            link,
+            v.gravity_cos_nm,
+            v.gravity_sin_nm,
+            0.0,
+            stiffness,
+            shape["relaxation_s"] * stiffness,
+        )
+        rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
+        columns.append((torque - rigid)[:, None])
+    return columns
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -60,4 +86,14 @@ EFFECT = Effect(
         Hook("coupling_damping", coupling_damping),
     ),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(
+            compliance_rad_per_nm=(3e-5, 6e-5, 1e-4, 2e-4, 3.5e-4, 6e-4, 1e-3, 1.7e-3, 3e-3), relaxation_s=(5e-4, 3e-3)
+        ),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {
+            "compliance_rad_per_nm": shape["compliance_rad_per_nm"] * max(0.05, float(coefficients[0])),
+            "relaxation_s": shape["relaxation_s"],
+        },
+    ),
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -17,6 +19,18 @@ def level(level_nm: float, load_nm: float, linear_share: float, quadratic_per_nm
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Level raised by transmitted torque: linear, and squared where the shape asks for it."""
+    columns: list[Array] = []
+    for v in views:
+        linear = v.slip * np.abs(v.load_nm)
+        columns.append(
+            np.stack([linear, linear * np.abs(v.load_nm)], axis=1) if shape["quadratic"] else linear[:, None]
+        )
+    return columns
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -51,4 +65,12 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.ACCELERATION)),
     hooks=(Hook("level", level, order=60),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({"quadratic": 0.0}, {"quadratic": 1.0}),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {
+            "linear_share": float(coefficients[0]),
+            "quadratic_per_nm": float(coefficients[1]) if coefficients.size > 1 else 0.0,
+        },
+    ),
 )

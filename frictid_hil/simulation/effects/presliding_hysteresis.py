@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -49,6 +51,15 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """What the soft element carries instead of the stiff spring, per share."""
+    from frictid_hil.simulation.inverse_loops import soft_spring
+
+    numbers = shape["distance_rad"], shape["loop_exponent"], shape["loop_beta"]
+    return [(v.coulomb_nm * (soft_spring(v.position_rad, *numbers) - v.slip))[:, None] for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -91,5 +102,14 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=tuple(
+            {"distance_rad": d, "loop_exponent": n, "loop_beta": b}
+            for d in (0.001, 0.002, 0.004, 0.007, 0.012, 0.02, 0.035)
+            for n, b in ((1.0, 1.0), (1.0, 0.5), (2.0, 0.6))
+        ),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+    ),
     state_size=1,
 )

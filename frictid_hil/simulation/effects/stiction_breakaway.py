@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -35,6 +37,15 @@ def settle(state: Any, at: int, velocity_rad_s: float, dwell_time_s: float, trav
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The level raised by rest, per share."""
+    from frictid_hil.simulation.inverse_loops import rest_memory
+
+    numbers = shape["dwell_time_s"], shape["travel_rad"]
+    return [(v.coulomb_nm * v.slip * rest_memory(v.velocity_rad_s, v.step_s, *numbers))[:, None] for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -71,5 +82,10 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+    ),
     state_size=1,
 )

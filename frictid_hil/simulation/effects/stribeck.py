@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -27,6 +29,22 @@ def level(
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The raised level along the motion, per share."""
+    return [
+        np.stack(
+            [
+                v.coulomb_nm
+                * v.slip
+                * np.exp(-((np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]) ** shape["exponent"]))
+            ],
+            axis=1,
+        )
+        for v in views
+    ]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -60,4 +78,9 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+    ),
 )

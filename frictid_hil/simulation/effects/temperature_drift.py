@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -42,6 +44,23 @@ def temperature(temperature_c: float, state: Any, at: int, rise_c: float) -> flo
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+POWER_W = 5.0
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """Fall of level and rate part with warmth, which carries over from recording to recording."""
+    from frictid_hil.simulation.inverse_loops import warmth
+
+    columns, start = [], 0.0
+    for v in views:
+        loss_w = (v.coulomb_nm * v.slip + v.rate_nm) * v.velocity_rad_s
+        state = warmth(start, loss_w, v.step_s, shape["time_constant_s"], POWER_W)
+        start = float(state[-1])
+        columns.append(np.stack([-v.coulomb_nm * v.slip * state, -v.rate_nm * state], axis=1))
+    return columns
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -87,6 +106,16 @@ EFFECT = Effect(
         Hook("temperature", temperature),
     ),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(time_constant_s=(15.0, 40.0, 100.0, 300.0)),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {
+            "coulomb_share": float(coefficients[0]),
+            "viscous_share": float(coefficients[1]),
+            "power_w": POWER_W,
+            **shape,
+        },
+    ),
     state_size=1,
     carried=True,
 )

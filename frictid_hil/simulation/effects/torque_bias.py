@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -17,6 +19,12 @@ def shaft(torque_nm: float, bias_nm: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """One, per N m."""
+    return [np.stack([np.ones_like(v.position_rad)], axis=1) for v in views]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -44,4 +52,9 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"bias_nm": float(coefficients[0])},
+    ),
 )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -24,6 +26,18 @@ def rate(
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The bend along the motion, per share."""
+    columns: list[Array] = []
+    for v in views:
+        relative = 1.0 + np.abs(v.velocity_rad_s) / shape["knee_rad_s"]
+        bend = shape["bend"]
+        bent = np.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
+        columns.append((v.coulomb_nm * np.sign(v.velocity_rad_s) * bent)[:, None])
+    return columns
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -43,21 +57,26 @@ EFFECT = Effect(
     name="viscous_nonlinearity",
     summary="Viscous friction bends: it saturates or stiffens with speed.",
     documentation=(
-        "Viscous friction of greased gears is seldom a straight line: shear-thinning and warming grease "
-        "saturates, churning grows faster than speed. F_0 * share * ((1 + |v| / v_k)^p - 1) / p is added with the "
-        "sign of v: p below 1 saturates (p = 0 is a logarithm), p = 1 is linear and indistinguishable from "
-        "viscosity, 2 and 3 bend upwards. It shows at high speed as a curve where the model has a line. The form "
-        "is the Box-Cox family, chosen because one exponent covers the square-root, asinh, quadratic and cubic "
-        "laws of A. C. Bittencourt, S. Gunnarsson, 'Static friction in a robot joint - modeling and "
-        "identification of load and temperature effects', ASME J. Dyn. Syst. Meas. Control 134(5), 2012, and of "
-        "Armstrong-Helouvry et al. 1994."
+        "Viscous friction of greased gears is seldom a straight line: shear-thinning and warming grease saturates, "
+        "churning grows faster than speed. F_0 * share * ((1 + |v| / v_k)^p - 1) / p is added with the sign of v: p "
+        "below 1 saturates (p = 0 is a logarithm), p = 1 is linear and indistinguishable from viscosity, 2 and 3 bend "
+        "upwards. It shows at high speed as a curve where the model has a line. One Box-Cox exponent stands for the "
+        "square-root, asinh, quadratic and cubic laws in use. Sources: A. C. Bittencourt, S. Gunnarsson, 'Static "
+        "friction in a robot joint - modeling and identification of load and temperature effects', ASME J. Dyn. Syst. "
+        "Meas. Control 134(5), 2012; Armstrong-Helouvry et al. 1994."
     ),
     parameters=(
         Parameter("share", -3.0, 3.0, 0.4, "size, fraction of the Coulomb level", off=0.0),
         Parameter("knee_rad_s", 0.02, 5.0, 0.4, "speed at which the bend sets in"),
-        Parameter("bend", 0.0, 3.0, 0.2, "exponent p: below 1 saturates, above 1 stiffens"),
+        Parameter("bend", -4.0, 3.0, 0.2, "exponent p: below 1 saturates, above 1 stiffens"),
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
     hooks=(Hook("rate", rate),),
     illustrate=illustrate,
+    inverse=InverseForm(
+        shapes=grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 1.0, 2.0, 3.0))
+        + grid(knee_rad_s=(0.2, 0.6, 1.8), bend=(-3.0, -1.5)),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+    ),
 )

@@ -1,0 +1,92 @@
+"""Compiled loops of the inverse forms: memories and transmissions driven by a measured motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from frictid_hil.friction.trajectory import Array
+
+
+@njit(cache=True)
+def soft_spring(position_rad: Array, distance_rad: float, loop_exponent: float, loop_beta: float) -> Array:
+    """State of the Bouc-Wen element of presliding_hysteresis, from a relaxed start, shape (n,)."""
+    state = np.zeros(position_rad.shape[0])
+    loop = 0.0
+    for k in range(1, position_rad.shape[0]):
+        travel = position_rad[k] - position_rad[k - 1]
+        parts = int(abs(travel) / distance_rad * 4.0) + 1
+        turn = travel / distance_rad / parts
+        for _ in range(parts):
+            towards = 1.0 if loop * turn > 0.0 else (-1.0 if loop * turn < 0.0 else 0.0)
+            loop += turn * (1.0 - abs(loop) ** loop_exponent * (loop_beta * towards + 1.0 - loop_beta))
+            loop = min(1.0, max(-1.0, loop))
+        state[k] = loop
+    return state
+
+
+@njit(cache=True)
+def rest_memory(velocity_rad_s: Array, step_s: float, dwell_time_s: float, travel_rad: float) -> Array:
+    """State of stiction_breakaway: filled at rest, wiped out by travel, shape (n,)."""
+    state = np.zeros(velocity_rad_s.shape[0])
+    filled = 1.0
+    for k in range(velocity_rad_s.shape[0]):
+        rate_per_s = 1.0 / dwell_time_s + abs(velocity_rad_s[k]) / travel_rad
+        rest = 1.0 / (dwell_time_s * rate_per_s)
+        filled = rest + (filled - rest) * math.exp(-rate_per_s * step_s)
+        state[k] = filled
+    return state
+
+
+@njit(cache=True)
+def warmth(start: float, loss_w: Array, step_s: float, time_constant_s: float, power_w: float) -> Array:
+    """State H of temperature_drift, shape (n,)."""
+    state = np.zeros(loss_w.shape[0])
+    heat = start
+    for k in range(loss_w.shape[0]):
+        heat += step_s / time_constant_s * (max(0.0, loss_w[k]) / power_w - heat)
+        state[k] = heat
+    return state
+
+
+@njit(cache=True)
+def transmitted(
+    position_rad: Array,
+    step_s: float,
+    link_kg_m2: float,
+    gravity_cos_nm: float,
+    gravity_sin_nm: float,
+    gap_rad: float,
+    stiffness_nm_per_rad: float,
+    damping_nm_s_per_rad: float,
+) -> Array:
+    """Torque from motor to link through play and spring, the link moved by the measured motor, N m, shape (n,)."""
+    rows = position_rad.shape[0]
+    torque = np.zeros(rows)
+    parts = max(1, math.ceil(step_s * math.sqrt(stiffness_nm_per_rad / link_kg_m2) / 0.35))
+    part_s = step_s / parts
+    half = 0.5 * gap_rad
+    load = gravity_cos_nm * math.cos(position_rad[0]) + gravity_sin_nm * math.sin(position_rad[0])
+    link = position_rad[0] - load / stiffness_nm_per_rad - math.copysign(half, load)
+    speed = 0.0
+    for k in range(rows - 1):
+        motor_speed = (position_rad[k + 1] - position_rad[k]) / step_s
+        for part in range(parts):
+            motor = position_rad[k] + motor_speed * part_s * (part + 0.5)
+            stretch = motor - link
+            spring = 0.0
+            damping = 0.0
+            if abs(stretch) > half:
+                spring = stiffness_nm_per_rad * (stretch - math.copysign(half, stretch))
+                damping = damping_nm_s_per_rad
+            torque[k] += 0.5 * (spring + damping * (motor_speed - speed)) / parts
+            torque[k + 1] += 0.5 * (spring + damping * (motor_speed - speed)) / parts
+            gravity = gravity_cos_nm * math.cos(link) + gravity_sin_nm * math.sin(link)
+            push = spring + damping * motor_speed - gravity
+            speed = (speed + part_s / link_kg_m2 * push) / (1.0 + part_s / link_kg_m2 * damping)
+            link += part_s * speed
+    torque[0] *= 2.0
+    torque[rows - 1] *= 2.0
+    return torque
