@@ -24,6 +24,7 @@ from frictid_drivers.cia402.state import (
 from frictid_hil.driver import Feedback, Mode, SetPoint
 from frictid_hil.errors import HardwareError, SafetyAbort
 
+_NEVER = -1
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
@@ -59,7 +60,8 @@ class Axis:
         self.secondary = Command(secondary)
         self.target = Target.DISABLED
         self.mode = Mode.POSITION
-        self.locked = False
+        self._locked = False
+        self._steady_status = _NEVER
         self.alarm: HardwareError | None = None
         self._scale = scale
         self._torque_units = math.floor(max_torque_nm / abs(scale.torque_nm))
@@ -80,11 +82,30 @@ class Axis:
         self.mode = mode
         self.target = Target.ENABLED
         self._reset_wanted = True
+        self._steady_status = _NEVER
 
     def disable(self) -> None:
         """Ask for power off."""
         self.target = Target.DISABLED
         self._reset_wanted = False
+        self._steady_status = _NEVER
+
+    def lock(self) -> None:
+        """Hold the present target in position mode, whatever the set-point says."""
+        self.mode = Mode.POSITION
+        self._locked = True
+        self._steady_status = _NEVER
+
+    def unlock(self) -> None:
+        """Follow the set-point again."""
+        self._locked = False
+        self._held_at_rad = None
+        self._steady_status = _NEVER
+
+    @property
+    def steady(self) -> bool:
+        """Locked, enabled, and nothing has changed since: its commands stay as they are."""
+        return self._steady_status == self.feedback.status_raw and self.feedback.mode is Mode.POSITION
 
     @property
     def state(self) -> DriveState:
@@ -122,9 +143,13 @@ class Axis:
             self._reset_wanted = False
         follows = enabled and self.target is Target.ENABLED and shown is mode
         torque = velocity = offset = 0
-        if not enabled or shown is not Mode.POSITION or self._target_units is None:
+        if self._target_units is None or (
+            self.target is Target.ENABLED and (not enabled or shown is not Mode.POSITION)
+        ):
             self._target_units = actual_units
-        if follows:
+        if follows and self._locked:
+            self._steady_status = self.feedback.status_raw
+        elif follows:
             scale = self._scale
             offset = self._torque(set_point.torque_offset_nm)
             if mode is Mode.POSITION:
@@ -151,6 +176,7 @@ class Axis:
     def emergency(self) -> tuple[Command, Command]:
         """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
         self.target = Target.STOPPED
+        self._steady_status = _NEVER
         self._reset_wanted = False
         primary, secondary = self._emergency
         primary.set("controlword", QUICK_STOP)
@@ -162,8 +188,6 @@ class Axis:
 
     def _follow(self, position_rad: float) -> None:
         """The joint holds where power came on until its set-point moves: the runner may still know an older place."""
-        if self.locked:
-            return
         if self._held_at_rad is None:
             self._held_at_rad = position_rad
         if position_rad != self._held_at_rad:

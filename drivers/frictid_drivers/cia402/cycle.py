@@ -27,7 +27,7 @@ from frictid_hil.errors import HardwareError, SafetyAbort
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
-_SEND_FAILURES = 3
+_WIRE_FAILURES = 3
 
 
 @dataclass(slots=True)
@@ -132,28 +132,31 @@ class Cycle:
             HardwareError: frames cannot be sent, or a fault stays after its reset.
         """
         decoder, clock = self._decoder, self._clock
-        self._take_late(clock.now_ns())
+        begun = False
         try:
+            self._take_late(clock.now_ns())
             self._send_commands(set_points)
-            now_ns = clock.now_ns()
-            if now_ns >= self._heartbeat_due_ns:
-                self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
-                self._send(self._heartbeat, now_ns)
-            now_ns = clock.now_ns()
             if self._overflow:
                 self._counter = self._counter % self._overflow + 1
                 self._sync.data[0] = self._counter
+            now_ns = clock.now_ns()
             decoder.begin(now_ns)
+            begun = True
             self._window_end_ns = now_ns + self._timing.window_ns
             self._send(self._sync, now_ns)
+            self._receive()
+            if now_ns >= self._heartbeat_due_ns:
+                # After the reports, so that no SYNC ever waits behind it.
+                self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
+                self._send(self._heartbeat, clock.now_ns())
             self._failures = 0
         except can.CanError as error:
-            self._send_failed(error)
-            decoder.begin(clock.now_ns())
-        else:
-            self._receive()
+            self._wire_failed(error)
+            if not begun:
+                # A row in which nobody was asked: every report is a cycle older.
+                decoder.begin(clock.now_ns())
         feedback = decoder.finish()
-        self._check(now_ns if not self._failures else clock.now_ns())
+        self._check(clock.now_ns())
         return feedback
 
     def quick_stop(self) -> None:
@@ -186,15 +189,16 @@ class Cycle:
         decoder = self._decoder
         changed = False
         for at, axis in enumerate(self._axes):
-            actual_units = decoder.position_units(at)
-            if actual_units is None:
-                continue
-            try:
-                axis.command(set_points[at], actual_units, healthy=self._healthy[at])
-            except SafetyAbort:
-                self.quick_stop()
-                raise
             primary, secondary = self._primary[at], self._secondary[at]
+            if not axis.steady:
+                actual_units = decoder.position_units(at)
+                if actual_units is None:
+                    continue
+                try:
+                    axis.command(set_points[at], actual_units, healthy=self._healthy[at])
+                except SafetyAbort:
+                    self.quick_stop()
+                    raise
             if self._active[at]:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
                 self._send_command(regular)
@@ -232,13 +236,13 @@ class Cycle:
             if self._sink is not None:
                 self._sink(self._clock.now_ns(), cob_id, bytes(data), True)
 
-    def _send_failed(self, error: can.CanError) -> None:
+    def _wire_failed(self, error: can.CanError) -> None:
         """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
         self._failures += 1
-        if self._failures >= _SEND_FAILURES:
+        if self._failures >= _WIRE_FAILURES:
             self._failures = 0
             raise HardwareError(
-                f"{_SEND_FAILURES} cycles in a row could not be sent: {error}",
+                f"{_WIRE_FAILURES} cycles in a row failed on the bus: {error}",
                 where="bus",
                 cause="bus-off, an unplugged adapter, or nobody left on the bus to acknowledge",
                 next_step="check the wiring and termination; the drives stop by their own watchdogs",

@@ -290,13 +290,11 @@ class Cia402Driver:
 
     def lock(self, joint: str) -> None:
         """Hold the joint at its present target in position mode, whatever its set-point says."""
-        axis = self._axis_of(joint)
-        axis.mode = Mode.POSITION
-        axis.locked = True
+        self._axis_of(joint).lock()
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
-        self._axis_of(joint).locked = False
+        self._axis_of(joint).unlock()
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """One cycle; see ``Cycle.exchange``."""

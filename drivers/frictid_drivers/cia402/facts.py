@@ -11,10 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.sdo import Drive
 from frictid_hil.driver import Finding, JointSetup, Severity
 from frictid_hil.errors import HardwareError
 
@@ -58,7 +57,23 @@ class Facts:
         return self.modes is None or bool(self.modes & od.MODE_BITS.get(mode, 0))
 
 
-def read_facts(drive: Drive) -> Facts:
+class Source(Protocol):
+    """What can be asked for objects: a drive, or an EDS file."""
+
+    def read(self, item: od.Object) -> int:
+        """A value that must be there."""
+        ...
+
+    def find(self, item: od.Object) -> int | None:
+        """A value, None where there is none."""
+        ...
+
+    def find_text(self, index: int) -> str:
+        """A text, "" where there is none."""
+        ...
+
+
+def read_facts(drive: Source) -> Facts:
     """Ask the drive; about thirty uploads, no download.
 
     Raises:

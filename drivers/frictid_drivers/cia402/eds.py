@@ -1,0 +1,131 @@
+"""A frame map out of a drive's EDS or DCF file: for logs of drives that we never configured.
+
+The mapping is that of the file's parameter values, or its defaults; figures that an EDS cannot know (gear ratio,
+direction, rated torque where 6076 has no default) come from the robot file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.facts import raise_on_error, read_facts, scale_of
+from frictid_drivers.cia402.frame_map import Entry, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.objects import IntegerType, Object
+from frictid_drivers.cia402.settings import read_settings
+from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import HardwareError, InputFileError
+
+_NOT_VALID = 1 << 31
+_PDOS = range(1, 9)
+_SIGNED = {0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15}
+"""CiA 301 data types INTEGER8, 16, 32, 24, 40, 48, 56, 64."""
+
+
+class _File:
+    """An object dictionary on disk, asked like a drive."""
+
+    def __init__(self, path: Path, joint: JointSetup) -> None:
+        self._path = path
+        try:
+            self._dictionary = canopen.import_od(str(path), joint.address)
+        except OSError as error:
+            raise InputFileError(f"cannot be read: {error}", where=str(path)) from error
+        except Exception as error:  # the parser raises whatever configparser and int() do
+            raise InputFileError(f"is no EDS or DCF file: {error}", where=str(path)) from error
+
+    def variable(self, index: int, sub: int) -> ODVariable | None:
+        found = self._dictionary.get_variable(index, sub)
+        return found if isinstance(found, ODVariable) else None
+
+    def find(self, item: Object) -> int | None:
+        variable = self.variable(item.index, item.sub)
+        if variable is None:
+            return None
+        value = variable.value if variable.value is not None else variable.default
+        return value if isinstance(value, int) else None
+
+    def read(self, item: Object) -> int:
+        value = self.find(item)
+        if value is None:
+            raise HardwareError(f"has no value for {item}", where=str(self._path))
+        return value
+
+    def find_text(self, index: int) -> str:
+        variable = self.variable(index, 0)
+        value = None if variable is None else variable.value or variable.default
+        return value if isinstance(value, str) else ""
+
+
+def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
+    """The frames of a robot whose drives all have the mapping of one EDS or DCF file.
+
+    Args:
+        path: the file.
+        setup: node ids, gear ratios, directions, and the joints' options.
+
+    Raises:
+        InputFileError: not readable, or it maps no position.
+        HardwareError: its figures contradict the robot file.
+    """
+    _, options = read_settings(setup)
+    joints = []
+    for joint in setup.joints:
+        file = _File(path, joint)
+        facts = read_facts(file)
+        scale, findings = scale_of(facts, joint, facts.velocity_unit)
+        raise_on_error(findings)
+        meanings = {
+            (entry.index, entry.sub): entry
+            for entry in (options[joint.name].external_torque, options[joint.name].temperature)
+            if entry is not None
+        }
+        reports = _frames(file, True, meanings)
+        if not any("position" in frame.meanings for frame in reports):
+            raise InputFileError(
+                "no valid TPDO of this file carries 6064",
+                where=str(path),
+                cause="the drive was mapped at run time",
+                next_step="write a mapping file by hand, or export a DCF from the vendor's tool",
+            )
+        joints.append(
+            JointFrames(
+                name=joint.name,
+                node=joint.address,
+                position_rad_per_unit=scale.position_rad,
+                velocity_rad_s_per_unit=scale.velocity_rad_s,
+                torque_nm_per_unit=scale.torque_nm,
+                external_torque_nm_per_unit=options[joint.name].external_torque_nm_per_unit,
+                temperature_c_per_unit=options[joint.name].temperature_c_per_unit,
+                reports=reports,
+                commands=_frames(file, False, meanings),
+            )
+        )
+    return FrameMap(tuple(joints))
+
+
+def _frames(file: _File, transmit: bool, meanings: dict[tuple[int, int], Entry]) -> tuple[Frame, ...]:
+    frames = []
+    for number in _PDOS:
+        cob_id = file.find(od.pdo_cob_id(transmit, number))
+        count = file.find(od.pdo_entry_count(transmit, number)) or 0
+        if cob_id is None or cob_id & _NOT_VALID or not count:
+            continue
+        words = [file.find(od.pdo_entry(transmit, number, sub)) or 0 for sub in range(1, count + 1)]
+        entries = tuple(_entry(file, word, meanings) for word in words if word & 0xFF)
+        if entries:
+            frames.append(Frame(cob_id & 0x7FF, entries))
+    return tuple(frames)
+
+
+def _entry(file: _File, word: int, meanings: dict[tuple[int, int], Entry]) -> Entry:
+    index, sub, bits = word >> 16, word >> 8 & 0xFF, min(word & 0xFF, 64)
+    known = meanings.get((index, sub))
+    if known is not None:
+        return known
+    variable = file.variable(index, sub)
+    signed = variable is not None and variable.data_type in _SIGNED
+    return Entry.of(Object(index, sub, IntegerType(signed, bits), ""))

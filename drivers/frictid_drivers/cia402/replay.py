@@ -1,0 +1,116 @@
+"""A log played into the decoder of the live cycle: the same frames give the same rows, bit for bit.
+
+A row begins at SYNC and ends where the live cycle ended it: when the reply window was over, or the next SYNC came. Set
+points of a row are those that its SYNC put into force. Without SYNC (logs of event-driven drives) a row begins where
+a report comes a second time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from frictid_drivers.cia402.codec import CommandDecoder, Decoder
+from frictid_drivers.cia402.frame_map import FrameMap
+from frictid_hil.driver import Feedback
+
+LoggedFrame = tuple[int, int, bytes]
+"""Run time in ns, CAN id, data - in the order of the log."""
+
+_NMT, _SYNC, _TIME = 0x000, 0x080, 0x100
+_NMT_START = 0x01
+_EXTENDED = 1 << 31
+_SERVICES = {0x080: "EMCY", 0x580: "SDO answer", 0x600: "SDO request", 0x700: "heartbeat"}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One cycle of a log.
+
+    Attributes:
+        t_ns: SYNC.
+        feedback: of all joints, in the order of the frame map; reused from row to row.
+        commands: last set-points of all joints; reused from row to row.
+    """
+
+    t_ns: int
+    feedback: Sequence[Feedback]
+    commands: CommandDecoder
+
+
+class LogDecoder:
+    """Rows of one log.
+
+    Args:
+        frame_map: of the run's manifest, or written for a log of other origin.
+
+    Attributes:
+        unknown: frames that are neither reports, commands, nor services of our nodes, counted by name.
+        repeated: reports that came a second time in their row (with SYNC only).
+        backwards: frames whose time is before that of the frame before them.
+    """
+
+    def __init__(self, frame_map: FrameMap) -> None:
+        self._sync = frame_map.sync_cob_id
+        self._window_ns = frame_map.window_ns
+        self._decoder = Decoder(frame_map)
+        self._commands = CommandDecoder(frame_map)
+        self._reports = {frame.cob_id for joint in frame_map.joints for frame in joint.reports}
+        self._command_ids = {frame.cob_id for joint in frame_map.joints for frame in joint.commands}
+        self.unknown: Counter[str] = Counter()
+        self.repeated = 0
+        self.backwards = 0
+
+    def rows(self, frames: Iterable[LoggedFrame]) -> Iterator[Row]:
+        """Decode frame by frame; whatever a log may hold, this does not raise."""
+        decoder, commands = self._decoder, self._commands
+        waiting: list[tuple[int, bytes]] = []
+        opened_ns: int | None = None
+        last_ns = 0
+        for t_ns, can_id, data in frames:
+            if t_ns < last_ns:
+                self.backwards += 1
+            last_ns = t_ns
+            is_report = can_id in self._reports
+            begins = (
+                can_id == self._sync
+                if self._sync is not None
+                else is_report and (opened_ns is None or decoder.has(can_id))
+            )
+            restarts = can_id == _NMT and data[:1] == bytes([_NMT_START])
+            over = opened_ns is not None and 0 < self._window_ns < t_ns - opened_ns
+            if opened_ns is not None and (begins or restarts or over):
+                yield Row(opened_ns, decoder.finish(), commands)
+                opened_ns = None
+            if restarts:
+                decoder.restart()
+                waiting.clear()
+            if begins:
+                for cob_id, command in waiting:
+                    commands.feed(cob_id, command)
+                waiting.clear()
+                decoder.begin(t_ns)
+                opened_ns = t_ns
+                if can_id == self._sync:
+                    continue
+            if can_id in self._command_ids:
+                waiting.append((can_id, data))
+                continue
+            if is_report and self._sync is not None and opened_ns is not None and decoder.has(can_id):
+                self.repeated += 1
+            if not decoder.feed(t_ns, can_id, data) and not restarts:
+                self.unknown[_name(can_id)] += 1
+        if opened_ns is not None:
+            yield Row(opened_ns, decoder.finish(), commands)
+
+
+def _name(can_id: int) -> str:
+    """A frame as a person would call it."""
+    if can_id & _EXTENDED or can_id > 0x7FF:
+        return f"extended frame {can_id & ~_EXTENDED:#010x}"
+    for cob_id, name in ((_NMT, "NMT"), (_SYNC, "SYNC"), (_TIME, "TIME")):
+        if can_id == cob_id:
+            return name
+    service = _SERVICES.get(can_id & 0x780)
+    return f"{service} of node {can_id & 0x7F}" if service else f"frame {can_id:#05x}"
