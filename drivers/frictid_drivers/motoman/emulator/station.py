@@ -28,7 +28,6 @@ class Parameters:
         retry_1: invalid or no response.
         retry_2: NAK to a text.
         hush_s: silence after which rubbish on the line has ended.
-        yields: gives way when the host bids at the same moment.
     """
 
     timer_a_s: float = 3.0
@@ -36,7 +35,6 @@ class Parameters:
     retry_1: int = 10
     retry_2: int = 3
     hush_s: float = 0.1
-    yields: bool = True
 
 
 class Voice(Protocol):
@@ -46,8 +44,12 @@ class Voice(Protocol):
         """Put ``data`` on the wire; kinds are enq, ack, nak, block, eot."""
         ...
 
-    def hears_enq(self) -> bool:
-        """An ENQ arrived; True makes the station bid against it (a fault)."""
+    def hears_enq(self) -> str:
+        """An ENQ arrived; ``bid`` makes the station bid against it, ``insist`` not give way either (faults)."""
+        ...
+
+    def delivered(self, arrived: bool) -> None:
+        """A message of the controller has been delivered and ended by EOT, or was given up."""
         ...
 
     def doubts_block(self) -> bool:
@@ -72,6 +74,7 @@ class Station:
         self._now_s = 0.0
         self._story = self._life()
         self._wake_s: float | None = None
+        self._yields = True
         self._note_wait(next(self._story))
 
     @property
@@ -126,9 +129,12 @@ class Station:
                 yield from self._greet()
 
     def _greet(self) -> Listening:
-        if self._voice.hears_enq():
+        against = self._voice.hears_enq()
+        if against:
             self._outbox.append(("90,001", "UNASKED"))
+            self._yields = against == "bid"
             yield from self._speak()
+            self._yields = True
         else:
             yield from self._listen()
 
@@ -138,23 +144,18 @@ class Station:
         for _ in range(self._p.retry_1 + 1):
             self._voice.say("enq", b"\x05")
             answer = yield from self._answer()
-            if answer == "ACK0":
-                break
-            if answer == "ENQ" and self._p.yields:
+            if answer == "ENQ" and self._yields:
                 yield from self._listen()
                 return
-        else:
-            self._hang_up()
-            return
-        for number, piece in enumerate(_pieces(header, text), start=1):
-            delivered = yield from self._deliver(piece, f"ACK{number % 2}", numbered=number == 1)
-            if not delivered:
+            if answer == "ACK0":
                 break
-        self._hang_up()
-
-    def _hang_up(self) -> None:
+        arrived = answer == "ACK0"
+        for number, piece in enumerate(_pieces(header, text), start=1):
+            if arrived:
+                arrived = yield from self._deliver(piece, f"ACK{number % 2}", numbered=number == 1)
         self._outbox.popleft()
         self._voice.say("eot", b"\x04")
+        self._voice.delivered(arrived)
 
     def _deliver(self, piece: bytes, wanted: str, *, numbered: bool) -> Delivering:
         refused = unanswered = 0

@@ -1,0 +1,120 @@
+"""Faults on command: what shall go wrong, and at which of the things that the controller does.
+
+A fault is written ``kind@n``, ``kind@nxK`` or ``kind@n:value``: at the n-th occasion (from 0), K times in a row, with a
+figure. Which occasions are counted depends on the kind:
+
+=============  =======================  ====================================================================
+kind           counts                   does
+=============  =======================  ====================================================================
+lost_ack       acknowledgements said    swallows it
+wrong_ack      acknowledgements said    says the other parity
+nak            blocks heard             rejects an intact block
+bad_bcc        blocks said              falsifies the block check
+lost_block     blocks said              swallows it
+garble         all utterances           flips a bit in the middle of it
+silence        all utterances           says nothing for ``value`` seconds
+enq            ENQs heard               bids against it; ``value`` 1: and does not yield
+split          all utterances           from here on, byte by byte
+merge          all utterances           from here on, utterances within ``value`` seconds arrive together
+close          all utterances           the port disappears
+bad_crc        stream frames said       falsifies the CRC
+lost_frame     stream frames said       swallows it
+deaf           stream frames heard      does not hear it
+noise          stream frames heard      hears it with a flipped bit
+late           ticks of motion          the feedback of this tick comes ``value`` seconds late
+alarm          ticks of motion          alarm number ``value``: servo power off
+hold           ticks of motion          somebody presses hold on the pendant
+drop           ticks of motion          the speed limiter drops ``value`` pulses of every moving axis
+unplug         ticks of motion          the port disappears
+=============  =======================  ====================================================================
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from frictid_hil.errors import UsageError
+
+OCCASIONS = {
+    "lost_ack": "ack",
+    "wrong_ack": "ack",
+    "nak": "block heard",
+    "bad_bcc": "block",
+    "lost_block": "block",
+    "garble": "utterance",
+    "silence": "utterance",
+    "enq": "enq heard",
+    "split": "utterance",
+    "merge": "utterance",
+    "close": "utterance",
+    "bad_crc": "frame",
+    "lost_frame": "frame",
+    "deaf": "frame heard",
+    "noise": "frame heard",
+    "late": "tick",
+    "alarm": "tick",
+    "hold": "tick",
+    "drop": "tick",
+    "unplug": "tick",
+}
+_FROM_HERE_ON = {"split", "merge"}
+_WRITTEN = re.compile(r"^([a-z_]+)@(\d+)(?:x(\d+))?(?::(-?\d+(?:\.\d+)?))?$", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that shall go wrong.
+
+    Attributes:
+        kind: see the table above.
+        at: first occasion, from 0.
+        times: occasions in a row.
+        value: figure of the kind (seconds, alarm number, pulses).
+    """
+
+    kind: str
+    at: int
+    times: int = 1
+    value: float = 0.0
+
+    @staticmethod
+    def parse(text: str) -> Fault:
+        """From ``kind@n``, ``kind@nxK``, ``kind@n:value``.
+
+        Raises:
+            UsageError: not of this form, or no such kind.
+        """
+        match = _WRITTEN.match(text.strip())
+        if match is None or match[1] not in OCCASIONS:
+            raise UsageError(
+                f"{text!r} is no fault; write kind@n, kind@nxK or kind@n:value",
+                next_step=f"kinds: {', '.join(OCCASIONS)}",
+            )
+        return Fault(match[1], int(match[2]), int(match[3] or 1), float(match[4] or 0.0))
+
+
+class FaultPlan:
+    """Counts occasions and says which faults are due.
+
+    Attributes:
+        counted: occasions so far, by name.
+    """
+
+    def __init__(self, faults: Iterable[Fault] = ()) -> None:
+        self._faults = tuple(faults)
+        self.counted: Counter[str] = Counter()
+
+    def occasion(self, name: str) -> dict[str, Fault]:
+        """One more occasion of this name; the faults that strike at it, by kind."""
+        index = self.counted[name]
+        self.counted[name] += 1
+        if not self._faults:
+            return {}
+        return {fault.kind: fault for fault in self._faults if OCCASIONS[fault.kind] == name and _strikes(fault, index)}
+
+
+def _strikes(fault: Fault, index: int) -> bool:
+    return index >= fault.at and (fault.kind in _FROM_HERE_ON or index < fault.at + fault.times)

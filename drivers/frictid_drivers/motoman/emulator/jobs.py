@@ -1,0 +1,363 @@
+"""The batch application: one job of one axis, generated, executed and recorded on the controller, fetched afterwards.
+
+Texts are those of the controller-application page; every number in them is decimal unless said otherwise there.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from frictid_drivers.motoman.emulator.axis import Axis
+from frictid_drivers.motoman.emulator.compensation import Compensator, Table
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, data, refusal
+
+SAMPLES_PER_BLOCK = 18
+MOST_TICKS = 60_000
+STOPPING_TICKS = 25
+_START_TOLERANCE = 0.005
+"""rad between the planned start of a job and where the axis stands."""
+
+ACCEPTED, RUNNING, FINISHED, STOPPED = 1, 2, 3, 4
+REASONS = {"": 0, "watchdog": 1, "hold": 2, "alarm": 3, "limit": 4, "torque": 5, "host": 6, "servo off": 7}
+
+
+def crc16(raw: bytes) -> int:
+    """CRC-16/CCITT-FALSE, bit by bit as in the standard's text."""
+    register = 0xFFFF
+    for byte in raw:
+        for bit in range(7, -1, -1):
+            feedback = (register >> 15) ^ (byte >> bit & 1)
+            register = (register << 1) & 0xFFFF
+            if feedback:
+                register ^= 0x1021
+    return register
+
+
+@dataclass
+class Job:
+    """An accepted job and what became of it."""
+
+    number: int
+    axis: int
+    path: list[int]
+    floating: list[bool]
+    torque_limit_micro: int
+    watchdog_ticks: int
+    state: int = ACCEPTED
+    reason: str = ""
+    done: int = 0
+    dropped: int = 0
+    samples: list[tuple[int, int, int]] = field(default_factory=list)
+
+    def shifts(self) -> tuple[int, int]:
+        """How far velocity and torque are shifted right to fit 24 bits."""
+        return _shift(max((abs(s[1]) for s in self.samples), default=0)), _shift(
+            max((abs(s[2]) for s in self.samples), default=0)
+        )
+
+
+class BatchApplication:
+    """FHELLO, FJOB, FRUN, FSTAT, FSTOP, FREAD, FTABLE, FTREAD, FCOMP.
+
+    Args:
+        panel: state of the controller.
+        axes: the arm.
+        tick_s: interpolation clock.
+        on_guided: told when an axis is given into a person's hands, and taken back.
+
+    Attributes:
+        compensated: mask of axes whose table is applied every tick.
+    """
+
+    def __init__(
+        self,
+        panel: Panel,
+        axes: Sequence[Axis],
+        tick_s: float,
+        *,
+        averaging_ms: int = 0,
+        on_guided: Callable[[int, bool], None] | None = None,
+    ) -> None:
+        self._panel = panel
+        self._axes = axes
+        self._tick_s = tick_s
+        self._averaging_ms = averaging_ms
+        self._on_guided = on_guided
+        self._job: Job | None = None
+        self._tables: dict[int, tuple[bytes, Table]] = {}
+        self._compensators: dict[int, Compensator] = {}
+        self.compensated = 0
+        self._unheard_ticks = 0
+        self._overload_ticks = 0
+        self._stopping: list[int] | None = None
+        self._commands: dict[str, Callable[[str, list[str]], Reply]] = {
+            "FHELLO": self._hello,
+            "FJOB": self._accept,
+            "FRUN": self._run,
+            "FSTAT": self._stat,
+            "FSTOP": self._stop_command,
+            "FREAD": self._read,
+            "FTABLE": self._table,
+            "FTREAD": self._table_back,
+            "FCOMP": self._comp,
+        }
+
+    @property
+    def moving(self) -> bool:
+        """A job is running."""
+        return self._job is not None and self._job.state == RUNNING
+
+    def knows(self, command: str) -> bool:
+        """Whether this is a command of this application."""
+        return command in self._commands
+
+    def obey(self, text: str) -> Reply:
+        """Execute one of its commands."""
+        command, _, rest = text.partition(" ")
+        operands = rest.split(",")
+        if operands[0] != "1":
+            return refusal(5170)
+        try:
+            return self._commands[command](text, operands[1:])
+        except (ValueError, struct.error):
+            return refusal(1012)
+
+    def heard_host(self) -> None:
+        """The host said something whole: it lives."""
+        self._unheard_ticks = 0
+
+    def stop(self, reason: str) -> None:
+        """End the running job by deceleration; an alarm or lost servo power ends it at once."""
+        job = self._job
+        if job is None or job.state != RUNNING:
+            return
+        if reason in ("alarm", "servo off"):
+            job.reason = reason
+            self._end(job, STOPPED)
+        elif self._stopping is None:
+            job.reason = reason
+            issued = self._axes[job.axis].issued
+            speed = job.path[job.done] - job.path[job.done - 1] if 0 < job.done < len(job.path) else 0
+            ahead = [round(issued + speed * (k - k * k / (2 * STOPPING_TICKS))) for k in range(1, STOPPING_TICKS + 1)]
+            self._stopping = ahead
+
+    # -- the interpolation clock -------------------------------------------------------------------------------
+
+    def tick(self, dropped: int) -> None:
+        """One tick of a running job: latch, then issue the next command."""
+        job = self._job
+        if job is None or job.state != RUNNING:
+            return
+        axis = self._axes[job.axis]
+        self._unheard_ticks += 1
+        if self._stopping is None and self._unheard_ticks > job.watchdog_ticks:
+            self.stop("watchdog")
+        job.samples.append((axis.pulses, axis.speed_tenths, axis.torque_micro))
+        self._overload_ticks = self._overload_ticks + 1 if abs(axis.torque_micro) > job.torque_limit_micro else 0
+        if self._overload_ticks > 5:
+            self.stop("torque")
+        job.done += 1
+        if self._stopping is not None:
+            if not self._stopping:
+                self._end(job, STOPPED)
+            else:
+                axis.ask(self._stopping.pop(0))
+            return
+        if job.done >= len(job.path):
+            self._end(job, FINISHED)
+            return
+        floating = job.floating[job.done]
+        if floating != axis.floating:
+            axis.set_floating(floating)
+            if self._on_guided is not None:
+                self._on_guided(job.axis, floating)
+        job.dropped += axis.ask(job.path[job.done], dropped)
+
+    def compensate(self) -> None:
+        """Every tick: the tables' torque on every compensated axis."""
+        for number, axis in enumerate(self._axes):
+            if not self.compensated >> number & 1 or number not in self._tables:
+                continue
+            compensator = self._compensators.get(number)
+            if compensator is None:
+                compensator = self._compensators[number] = Compensator(self._tables[number][1], axis.pulses)
+            micro = compensator.torque_micro(axis.pulses, axis.speed_tenths, gravity=axis.floating)
+            sign = 1.0 if axis.plate.pulses_per_rad > 0 else -1.0
+            axis.feed_forward_nm = sign * micro * 1e-6 * axis.plate.gear_ratio
+
+    def _end(self, job: Job, state: int) -> None:
+        axis = self._axes[job.axis]
+        if axis.floating:
+            axis.set_floating(False)
+            if self._on_guided is not None:
+                self._on_guided(job.axis, False)
+        job.state = state
+        self._stopping = None
+        self._panel.operating = False
+
+    # -- commands ----------------------------------------------------------------------------------------------
+
+    def _hello(self, text: str, operands: list[str]) -> Reply:
+        figures = (1, round(self._tick_s * 1e6), len(self._axes), MOST_TICKS, 1, self._averaging_ms, 21)
+        return data(",".join(map(str, figures)) + ",EMULATED")
+
+    def _accept(self, text: str, operands: list[str]) -> Reply:
+        body, _, check = text.rpartition(",")
+        if len(check) != 4 or int(check, 16) != crc16((body + ",").encode("ascii")):
+            return refusal(5170)
+        if self.moving:
+            return refusal(2010)
+        number, axis_number, start, lowest, highest, step, torque, watchdog = map(int, operands[:8])
+        if not (0 < number < 65536 and 0 <= axis_number < len(self._axes) and watchdog > 0):
+            return refusal(1012)
+        axis = self._axes[axis_number]
+        path, floating = [start], [False]
+        for segment in operands[8:-1]:
+            _append_segment(segment, path, floating)
+            if len(path) > MOST_TICKS:
+                return refusal(1013)
+        if len(path) < 2:
+            return refusal(1011)
+        plate = axis.plate
+        fastest = max(abs(b - a) for a, b in pairwise(path))
+        if min(path) < max(lowest, plate.lowest) or max(path) > min(highest, plate.highest) or fastest > step:
+            return refusal(1012)
+        self._job = Job(number, axis_number, path, floating, torque, watchdog)
+        return DONE
+
+    def _run(self, text: str, operands: list[str]) -> Reply:
+        (number,) = map(int, operands)
+        job = self._job
+        if job is None or job.number != number:
+            return refusal(4040)
+        forbidden = self._panel.moving_forbidden()
+        if forbidden:
+            return refusal(forbidden)
+        if job.state != ACCEPTED:
+            return refusal(2080)
+        axis = self._axes[job.axis]
+        if abs(axis.pulses - job.path[0]) > abs(_START_TOLERANCE * axis.plate.pulses_per_rad):
+            return refusal(3040)
+        job.state = RUNNING
+        self._panel.operating = True
+        self._unheard_ticks = self._overload_ticks = 0
+        return DONE
+
+    def _stat(self, text: str, operands: list[str]) -> Reply:
+        (number,) = map(int, operands)
+        job = self._job
+        if job is None or job.number != number:
+            return data(f"{number},0,0,0,{self._panel.alarm},0,0,0,0")
+        velocity_shift, torque_shift = job.shifts() if job.state != RUNNING else (0, 0)
+        figures = (
+            *(number, job.state, job.done, len(job.path), self._panel.alarm, REASONS[job.reason]),
+            *(velocity_shift, torque_shift, job.dropped),
+        )
+        return data(",".join(map(str, figures)))
+
+    def _stop_command(self, text: str, operands: list[str]) -> Reply:
+        self.stop("host")
+        return DONE
+
+    def _read(self, text: str, operands: list[str]) -> Reply:
+        number, first, count = map(int, operands)
+        job = self._job
+        if job is None or job.number != number:
+            return refusal(4040)
+        if job.state == RUNNING:
+            return refusal(2010)
+        if not (0 <= first < len(job.samples) and count > 0):
+            return refusal(1012)
+        velocity_shift, torque_shift = job.shifts()
+        blocks = []
+        last = min(first + count, len(job.samples))
+        for begin in range(first, last, SAMPLES_PER_BLOCK):
+            rows = job.samples[begin : min(begin + SAMPLES_PER_BLOCK, last)]
+            raw = number.to_bytes(2, "little") + begin.to_bytes(4, "little") + bytes([len(rows)])
+            for pulses, speed, torque in rows:
+                raw += pulses.to_bytes(4, "little", signed=True)
+                raw += (speed >> velocity_shift).to_bytes(3, "little", signed=True)
+                raw += (torque >> torque_shift).to_bytes(3, "little", signed=True)
+            raw += crc16(raw).to_bytes(2, "little")
+            blocks.append(base64.b64encode(raw).decode("ascii"))
+        return data(",".join(blocks))
+
+    def _table(self, text: str, operands: list[str]) -> Reply:
+        (coded,) = operands
+        raw = base64.b64decode(coded, validate=True)
+        if len(raw) < 34 or int.from_bytes(raw[-2:], "little") != crc16(raw[:-2]):
+            return refusal(5170)
+        number, count, ratio, step, stiffness, turn, cosine, sine = struct.unpack_from("<BBHIIIii", raw)
+        if len(raw) != 24 + 4 * count + 2:
+            return refusal(1013)
+        points = struct.unpack_from(f"<{count}i", raw, 24)
+        plausible = step > 0 and stiffness > 0 and turn > 0 and count >= 2 and points[0] > 0 and ratio <= 10_000
+        if number >= len(self._axes) or not plausible:
+            return refusal(1012)
+        table = Table(ratio * 1e-4, float(step), stiffness * 1e-3, float(turn), float(cosine), float(sine), points)
+        self._tables[number] = (raw, table)
+        self._compensators.pop(number, None)
+        return DONE
+
+    def _table_back(self, text: str, operands: list[str]) -> Reply:
+        (number,) = map(int, operands)
+        if number not in self._tables:
+            return refusal(4040)
+        return data(base64.b64encode(self._tables[number][0]).decode("ascii"))
+
+    def _comp(self, text: str, operands: list[str]) -> Reply:
+        (mask,) = map(int, operands)
+        if any(mask >> number & 1 and number not in self._tables for number in range(8)):
+            return refusal(4040)
+        self.compensated = mask
+        self._compensators.clear()
+        for number, axis in enumerate(self._axes):
+            if not mask >> number & 1:
+                axis.feed_forward_nm = 0.0
+        return DONE
+
+
+def _append_segment(segment: str, path: list[int], floating: list[bool]) -> None:
+    """Commands of one segment, one per tick."""
+    kind, *figures = segment.split(":")
+    numbers = [int(figure) for figure in figures]
+    here = path[-1]
+    if kind == "H" and len(numbers) == 1:
+        made = [here] * _ticks(numbers[0])
+    elif kind == "G" and len(numbers) == 1:
+        path += [here] * _ticks(numbers[0])
+        floating += [True] * numbers[0]
+        return
+    elif kind == "L" and len(numbers) == 2:
+        ticks, goal = _ticks(numbers[0]), numbers[1]
+        made = [round(here + (goal - here) * k / ticks) for k in range(1, ticks + 1)]
+    elif kind == "M" and len(numbers) == 2:
+        ticks, goal = _ticks(numbers[0]), numbers[1]
+        made = []
+        for k in range(1, ticks + 1):
+            u = k / ticks
+            made.append(round(here + (goal - here) * (10 * u**3 - 15 * u**4 + 6 * u**5)))
+    elif kind == "C" and len(numbers) >= 2:
+        travel = numbers[0]
+        made = []
+        for ticks in map(_ticks, numbers[1:]):
+            made += [round(here + travel / 2 * (1 - math.cos(2 * math.pi * k / ticks))) for k in range(1, ticks + 1)]
+    else:
+        raise ValueError(segment)
+    path += made
+    floating += [False] * len(made)
+
+
+def _ticks(number: int) -> int:
+    if not 0 < number <= MOST_TICKS:
+        raise ValueError(f"{number} ticks")
+    return number
+
+
+def _shift(largest: int) -> int:
+    return max(0, largest.bit_length() - 23)

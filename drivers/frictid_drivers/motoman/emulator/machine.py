@@ -1,0 +1,351 @@
+"""The whole controller in whatever time it is given: bytes in, bytes out, and when it next wants to be looked at.
+
+The serial line takes its time: a byte of 8 data bits costs 10 or 11 bits at the line's speed, in both directions. The
+interpolation clock ticks while something moves or streams; in between, simulated time passes in larger portions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from frictid_drivers.motoman.emulator.axis import Axis
+from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
+from frictid_drivers.motoman.emulator.jobs import BatchApplication
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, refusal
+from frictid_drivers.motoman.emulator.station import Parameters, Station
+from frictid_drivers.motoman.emulator.streaming import StreamApplication
+
+_LONGEST_REST_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How this controller is made.
+
+    Attributes:
+        generation: erc, xrc, nx or dx.
+        baud: of host control.
+        parity: E, O or N; a byte costs 11 bits with, 10 without.
+        stream_bauds: speeds that FSTREAM may ask for; none on an ordinary port.
+        batch: the batch application is installed.
+        tick_s: interpolation clock.
+        averaging_ticks: moving average on the command; 1 is none.
+        thinking_s: between a command and the bid to reply.
+        parameters: of the link.
+    """
+
+    generation: str = "nx"
+    baud: int = 19200
+    parity: str = "E"
+    stream_bauds: tuple[int, ...] = (115200, 921600)
+    batch: bool = True
+    tick_s: float = 0.004
+    averaging_ticks: int = 1
+    thinking_s: float = 0.012
+    parameters: Parameters = field(default_factory=Parameters)
+
+
+class Emulator:
+    """See the module's first page.
+
+    Args:
+        axes: the arm; standing, unpowered.
+        settings: how it is made.
+        faults: what shall go wrong.
+        on_guided: told when an axis is given into a person's hands, and taken back.
+
+    Attributes:
+        panel: what a person sees; tests press its buttons.
+        line: speed and parity now.
+        gone: the port has disappeared.
+        now_s: time of this controller.
+    """
+
+    def __init__(
+        self,
+        axes: Sequence[Axis],
+        settings: Settings | None = None,
+        faults: FaultPlan | None = None,
+        *,
+        on_guided: Callable[[int, bool], None] | None = None,
+    ) -> None:
+        self.settings = settings or Settings()
+        self.faults = faults or FaultPlan()
+        self.axes = list(axes)
+        self.panel = Panel(self.axes, self.settings.generation)
+        self.panel.on_stop = self._stop_motion
+        averaging_ms = round((self.settings.averaging_ticks - 1) * self.settings.tick_s * 1000)
+        self._averaging_ms = averaging_ms
+        self.batch = BatchApplication(
+            self.panel, self.axes, self.settings.tick_s, averaging_ms=averaging_ms, on_guided=on_guided
+        )
+        self.station = Station(self.settings.parameters, self, self._message)
+        self.stream: StreamApplication | None = None
+        self._on_stream_line = False
+        self.line = (self.settings.baud, self.settings.parity)
+        self.gone = False
+        self.now_s = 0.0
+        self._incoming: deque[tuple[float, bytes]] = deque()
+        self._outgoing: deque[tuple[float, bytes]] = deque()
+        self._in_free_s = self._out_free_s = 0.0
+        self._delivered = bytearray()
+        self._replies: deque[tuple[float, Reply]] = deque()
+        self._next_line: tuple[int, str, int] | None = None
+        self._next_tick_s = 0.0
+        self._settling_ticks = 0
+        self._physics_s = 0.0
+        self._mute_until_s = 0.0
+        self._hold_back_s = 0.0
+
+    # -- what the wire sees ------------------------------------------------------------------------------------
+
+    def hear(self, chunk: bytes) -> None:
+        """The host puts bytes on the wire now; they arrive when the line has carried them."""
+        begin_s = max(self.now_s, self._in_free_s)
+        self._in_free_s = begin_s + len(chunk) * self._byte_s
+        self._incoming.append((self._in_free_s, chunk))
+
+    def take(self) -> bytes:
+        """Bytes that have reached the host by now."""
+        while self._outgoing and self._outgoing[0][0] <= self.now_s:
+            self._delivered += self._outgoing.popleft()[1]
+        taken = bytes(self._delivered)
+        self._delivered.clear()
+        return taken
+
+    def next_event_s(self) -> float:
+        """When something happens next, at the latest a moment from now."""
+        times = [self.now_s + _LONGEST_REST_S]
+        if self._incoming:
+            times.append(self._incoming[0][0])
+        if self._outgoing:
+            times.append(self._outgoing[0][0])
+        if self._replies:
+            times.append(self._replies[0][0])
+        if self.station.deadline_s is not None:
+            times.append(self.station.deadline_s)
+        if self._ticking:
+            times.append(self._next_tick_s)
+        return max(self.now_s, min(times))
+
+    def advance(self, to_s: float) -> None:
+        """Let everything happen that happens until then."""
+        while not self.gone:
+            event_s = self.next_event_s()
+            if event_s > to_s:
+                break
+            self.now_s = event_s
+            self._happen()
+            if self._outgoing and self._outgoing[0][0] <= self.now_s:
+                self._delivered += self._outgoing.popleft()[1]
+        self.now_s = max(self.now_s, to_s)
+
+    # -- what happens ------------------------------------------------------------------------------------------
+
+    def _happen(self) -> None:
+        if self._incoming and self._incoming[0][0] <= self.now_s:
+            self._hear_now(self._incoming.popleft()[1])
+        self.station.tick(self.now_s)
+        if self._replies and self._replies[0][0] <= self.now_s:
+            self.station.post(*self._replies.popleft()[1], self.now_s)
+        if self._ticking:
+            if self._next_tick_s <= self.now_s:
+                self._tick()
+        else:
+            self._rest()
+
+    def _hear_now(self, chunk: bytes) -> None:
+        if not self._on_stream_line:
+            self.station.hear(chunk, self.now_s)
+            return
+        struck = self.faults.occasion("frame heard")
+        if "deaf" in struck:
+            return
+        if "noise" in struck:
+            middle = len(chunk) // 2
+            chunk = chunk[:middle] + bytes([chunk[middle] ^ 0x10]) + chunk[middle + 1 :]
+        assert self.stream is not None
+        self.stream.hear(chunk)
+
+    @property
+    def _ticking(self) -> bool:
+        return (
+            self._on_stream_line
+            or self.batch.moving
+            or (self.stream is not None and self.stream.moving)
+            or self._settling_ticks > 0
+            or (self.batch.compensated != 0 and self.panel.servo_on)
+        )
+
+    def _tick(self) -> None:
+        tick_s = self.settings.tick_s
+        moving = self.batch.moving or (self.stream is not None and self.stream.moving)
+        late_s, dropped = 0.0, 0
+        if moving:
+            self._settling_ticks = self.settings.averaging_ticks + 1
+            late_s, dropped = self._strike_motion()
+        elif self._settling_ticks:
+            self._settling_ticks -= 1
+        self._hold_back_s = late_s
+        self.batch.tick(dropped)
+        if self.stream is not None:
+            self.stream.tick(dropped)
+        self._hold_back_s = 0.0
+        self.batch.compensate()
+        for axis in self.axes:
+            axis.run(tick_s)
+        self._next_tick_s += tick_s
+        self._physics_s = self._next_tick_s
+
+    def _rest(self) -> None:
+        """Nothing moves: physics in one portion up to now, and the next tick from here."""
+        self._next_tick_s = self.now_s
+        passed_s = self.now_s - self._physics_s
+        if passed_s >= 0.001:
+            self._physics_s = self.now_s
+            if self.panel.servo_on or passed_s < 1.0:
+                for axis in self.axes:
+                    axis.rest(passed_s)
+
+    def _strike_motion(self) -> tuple[float, int]:
+        """Faults of this tick: seconds of lateness, dropped pulses; the others strike at once."""
+        struck = self.faults.occasion("tick")
+        if "alarm" in struck:
+            self.panel.raise_alarm(round(struck["alarm"].value) or 4107)
+        if "hold" in struck:
+            self.panel.press_hold("pendant")
+        if "unplug" in struck:
+            self.gone = True
+        late_s = struck["late"].value or 0.05 if "late" in struck else 0.0
+        dropped = round(struck["drop"].value) or 50 if "drop" in struck else 0
+        return late_s, dropped
+
+    def _stop_motion(self, reason: str) -> None:
+        self.batch.stop(reason)
+        if self.stream is not None:
+            self.stream.halt(reason)
+
+    # -- messages ----------------------------------------------------------------------------------------------
+
+    def _message(self, header: str, text: str) -> None:
+        """A whole message of the host: think about it, then reply."""
+        self.batch.heard_host()
+        self._replies.append((self.now_s + self.settings.thinking_s, self._reply(header, text)))
+
+    def _reply(self, header: str, text: str) -> Reply:
+        command, _, rest = text.partition(" ")
+        operands = [operand.strip() for operand in rest.split(",")] if rest else []
+        if header != "01,000":
+            return refusal(1010)
+        if self.panel.knows(command):
+            return self.panel.obey(command, operands)
+        if self.settings.batch and self.batch.knows(command):
+            return self.batch.obey(text)
+        if command == "FSTREAM" and self.settings.stream_bauds:
+            return self._begin_streaming(operands)
+        return refusal(1010)
+
+    def _begin_streaming(self, operands: list[str]) -> Reply:
+        if len(operands) != 4:
+            return refusal(1011)
+        try:
+            version, baud, tick_us, mask = map(int, operands)
+        except ValueError:
+            return refusal(5170)
+        if version != 1 or baud not in self.settings.stream_bauds or tick_us != round(self.settings.tick_s * 1e6):
+            return refusal(1012)
+        if not 0 < mask < 1 << len(self.axes):
+            return refusal(1012)
+        if self.batch.moving:
+            return refusal(2010)
+        self._next_line = (baud, "N", mask)
+        return DONE
+
+    def _switch_to_stream(self, baud: int, parity: str, mask: int) -> None:
+        """The line changes with the EOT that ends the granting reply."""
+        self.line = (baud, parity)
+        self._on_stream_line = True
+        self._in_free_s = self._out_free_s
+        self.stream = StreamApplication(
+            self.panel,
+            self.axes,
+            mask,
+            self.settings.tick_s,
+            self.say,
+            self._switch_to_host_control,
+            averaging_ms=self._averaging_ms,
+            compensated=self.batch.compensated != 0,
+        )
+        self._next_tick_s = self._physics_s = self.now_s + self.settings.tick_s
+
+    def _switch_to_host_control(self) -> None:
+        self.line = (self.settings.baud, self.settings.parity)
+        self._on_stream_line = False
+        self.panel.operating = False
+        self.station.reset(self.now_s)
+
+    # -- the voice of the station and of the stream ------------------------------------------------------------
+
+    def say(self, kind: str, chunk: bytes) -> None:
+        """Put an utterance on the wire, after the faults that strike it."""
+        frame = kind in ("feedback", "nack", "hello", "stop")
+        if frame and not self._on_stream_line:
+            return
+        struck = self.faults.occasion("frame" if frame else "utterance")
+        if kind in ("ack", "block"):
+            struck |= self.faults.occasion(kind)
+        if "close" in struck:
+            self.gone = True
+        if "silence" in struck:
+            self._mute_until_s = self.now_s + (struck["silence"].value or 4.0)
+        if struck.keys() & {"lost_ack", "lost_block", "lost_frame"} or self.now_s < self._mute_until_s:
+            return
+        begin_s = max(self.now_s, self._out_free_s) + self._hold_back_s
+        self._out_free_s = begin_s + len(chunk) * self._byte_s
+        chunk = _damaged(chunk, struck)
+        if "split" in struck:
+            for k in range(len(chunk)):
+                self._outgoing.append((begin_s + (k + 1) * self._byte_s, chunk[k : k + 1]))
+            return
+        arrival_s = self._out_free_s
+        if "merge" in struck:
+            together_s = struck["merge"].value or 0.02
+            arrival_s = math.ceil(arrival_s / together_s) * together_s
+        self._outgoing.append((arrival_s, chunk))
+
+    def delivered(self, arrived: bool) -> None:
+        """See ``station.Voice``: a granted stream begins once the host has the grant."""
+        line, self._next_line = self._next_line, None
+        if arrived and line is not None:
+            self._switch_to_stream(*line)
+
+    def hears_enq(self) -> str:
+        """See ``station.Voice``."""
+        fault = self.faults.occasion("enq heard").get("enq")
+        if fault is None:
+            return ""
+        return "insist" if fault.value else "bid"
+
+    def doubts_block(self) -> bool:
+        """See ``station.Voice``."""
+        return "nak" in self.faults.occasion("block heard")
+
+    @property
+    def _byte_s(self) -> float:
+        baud, parity = self.line
+        return (10 if parity == "N" else 11) / baud
+
+
+def _damaged(chunk: bytes, struck: Mapping[str, Fault]) -> bytes:
+    """The utterance as the faults leave it."""
+    if "wrong_ack" in struck:
+        chunk = chunk[:-1] + bytes([chunk[-1] ^ 1])
+    if struck.keys() & {"bad_bcc", "bad_crc"}:
+        chunk = chunk[:-1] + bytes([chunk[-1] ^ 0x40])
+    if "garble" in struck:
+        middle = len(chunk) // 2
+        chunk = chunk[:middle] + bytes([chunk[middle] ^ 0x04]) + chunk[middle + 1 :]
+    return chunk

@@ -1,0 +1,354 @@
+"""The streaming application: absolute targets with due ticks in, positions, velocities and torques out, every tick.
+
+Layout of every frame, all little-endian: A5 5A, version * 16 + type, length of the payload, u16 sequence number,
+payload, u16 CRC over everything after A5 5A.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+
+from frictid_drivers.motoman.emulator.axis import Axis
+from frictid_drivers.motoman.emulator.jobs import STOPPING_TICKS, crc16
+from frictid_drivers.motoman.emulator.panel import Panel
+
+SET_POINT, FEEDBACK, NACK, HELLO, STOP = 1, 2, 3, 4, 5
+BAD_CRC, BAD_VERSION, BAD_SESSION, LATE, GAP, LIMIT, NOT_ARMED, ALARM = 1, 2, 3, 4, 5, 6, 7, 8
+ARMED, LATCHED, DROPPED, EXTRAPOLATED, STRAYED, COMPENSATED = 1, 2, 4, 8, 16, 32
+
+VERSION = 1
+QUEUE = 64
+WATCHDOG_TICKS = 3
+_STRAY_RAD = 0.004
+_SILENT_TICKS = 500
+"""A line on which nobody opens a session goes back to host control."""
+
+
+class StreamApplication:
+    """One streaming session after another, until the host leaves.
+
+    Args:
+        panel: state of the controller.
+        axes: the arm.
+        mask: axes granted by FSTREAM.
+        tick_s: interpolation clock.
+        say: puts a frame on the wire; told kind and bytes.
+        on_leave: the line goes back to host control.
+
+    Attributes:
+        tick_number: of the interpolation clock, since streaming began.
+    """
+
+    def __init__(
+        self,
+        panel: Panel,
+        axes: Sequence[Axis],
+        mask: int,
+        tick_s: float,
+        say: Callable[[str, bytes], None],
+        on_leave: Callable[[], None],
+        *,
+        averaging_ms: int = 0,
+        compensated: bool = False,
+    ) -> None:
+        self._panel = panel
+        self._axes = axes
+        self._granted = mask
+        self._tick_s = tick_s
+        self._say = say
+        self._on_leave = on_leave
+        self._averaging_ms = averaging_ms
+        self._compensated = compensated
+        self._heard = bytearray()
+        self._sequence = 0
+        self._session = 0
+        self._old_session = 0
+        self._mask = 0
+        self._numbers: list[int] = []
+        self._last_heard: int | None = None
+        self._last_due = 0
+        self._last_asked: list[int] = []
+        self._queue: dict[int, tuple[list[int], list[int]]] = {}
+        self._armed = False
+        self._latched = False
+        self._misses = 0
+        self._speed: list[float] = []
+        self._stopping = 0
+        self._dropped = False
+        self._extrapolated = False
+        self._idle_ticks = 0
+        self._home: list[int] = []
+        self.tick_number = 0
+
+    @property
+    def moving(self) -> bool:
+        """Targets are being followed, or the arm is still being decelerated."""
+        return self._armed and (not self._latched or self._stopping > 0)
+
+    # -- the wire ----------------------------------------------------------------------------------------------
+
+    def hear(self, chunk: bytes) -> None:
+        """Bytes from the host."""
+        self._heard += chunk
+        while True:
+            start = self._heard.find(b"\xa5\x5a")
+            if start < 0:
+                del self._heard[: max(0, len(self._heard) - 1)]
+                return
+            del self._heard[:start]
+            if len(self._heard) < 6:
+                return
+            kind, length = self._heard[2] & 15, self._heard[3]
+            if kind not in (SET_POINT, HELLO, STOP) or length > 40:
+                del self._heard[0]
+                continue
+            if len(self._heard) < length + 8:
+                return
+            frame = bytes(self._heard[: length + 8])
+            if crc16(frame[2:-2]) != frame[-2] | frame[-1] << 8:
+                del self._heard[0]
+                self._nack(frame[4] | frame[5] << 8, BAD_CRC)
+                continue
+            del self._heard[: length + 8]
+            self._take(frame[2] >> 4, kind, frame[4] | frame[5] << 8, frame[6:-2])
+
+    def _send(self, kind: int, payload: bytes) -> None:
+        body = bytes([VERSION << 4 | kind, len(payload)]) + self._sequence.to_bytes(2, "little") + payload
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        name = {FEEDBACK: "feedback", NACK: "nack", HELLO: "hello", STOP: "stop"}[kind]
+        self._say(name, b"\xa5\x5a" + body + crc16(body).to_bytes(2, "little"))
+
+    def _nack(self, sequence: int, code: int, axis: int = 0xFF, due: int = 0) -> None:
+        now = self.tick_number & 0xFFFF
+        self._send(NACK, struct.pack("<HBBHBB", sequence, code, self._session, due, axis, 0) + struct.pack("<H", now))
+
+    def _take(self, version: int, kind: int, sequence: int, payload: bytes) -> None:
+        self._idle_ticks = 0
+        if version != VERSION:
+            self._nack(sequence, BAD_VERSION)
+        elif kind == HELLO:
+            self._open(sequence, payload)
+        elif kind == STOP:
+            self._stop(sequence, payload)
+        else:
+            self._set_point(sequence, payload)
+
+    # -- sessions ----------------------------------------------------------------------------------------------
+
+    def _open(self, sequence: int, payload: bytes) -> None:
+        if len(payload) != 4:
+            self._nack(sequence, BAD_CRC)
+            return
+        oldest, newest, mask, session = payload
+        if not oldest <= VERSION <= newest:
+            self._nack(sequence, BAD_VERSION)
+            return
+        if session == 0 or mask == 0 or mask & ~self._granted:
+            self._nack(sequence, BAD_SESSION)
+            return
+        if session != self._session:
+            if session == self._old_session:
+                self._nack(sequence, BAD_SESSION)
+                return
+            self._old_session, self._session = self._session, session
+            self._mask = mask
+            self._numbers = [number for number in range(len(self._axes)) if mask >> number & 1]
+            self._last_heard = sequence
+            self._queue.clear()
+            self._armed = self._latched = False
+            self._misses = self._stopping = 0
+            self._last_asked = [self._axes[number].issued for number in self._numbers]
+            self._home = [axis.pulses for axis in self._axes]
+        self._greet()
+
+    def _greet(self) -> None:
+        flags = 1 | 2 | (4 if self._compensated else 0)
+        payload = struct.pack(
+            "<BBBBHBBHHI",
+            *(VERSION, self._session, self._mask, flags, round(self._tick_s * 1e6), WATCHDOG_TICKS, QUEUE),
+            *(self._averaging_ms, 0, self.tick_number),
+        )
+        for number in self._numbers:
+            plate = self._axes[number].plate
+            payload += struct.pack("<iii", plate.lowest, plate.highest, plate.step)
+        self._send(HELLO, payload)
+
+    def _stop(self, sequence: int, payload: bytes) -> None:
+        if len(payload) != 4:
+            self._nack(sequence, BAD_SESSION)
+            return
+        session, kind = payload[0], payload[1]
+        if session != self._session and kind == 0:
+            self._nack(sequence, BAD_SESSION)
+            return
+        if self._armed:
+            self.halt("host")
+        self._send(STOP, payload)
+        if kind == 1:
+            self._on_leave()
+
+    def halt(self, reason: str) -> None:
+        """Decelerate and latch; a lost servo power needs no deceleration."""
+        if not self._armed or self._latched:
+            return
+        self._latched = True
+        self._queue.clear()
+        self._stopping = 0 if reason in ("alarm", "servo off") else STOPPING_TICKS
+        if reason == "watchdog":
+            self._panel.holds.add("command")
+
+    # -- set-points --------------------------------------------------------------------------------------------
+
+    def _set_point(self, sequence: int, payload: bytes) -> None:
+        count = len(self._numbers)
+        if len(payload) not in (4 + 4 * count, 4 + 6 * count) or not count:
+            self._nack(sequence, BAD_SESSION)
+            return
+        session, mask, due = struct.unpack_from("<BBH", payload)
+        targets = list(struct.unpack_from(f"<{count}i", payload, 4))
+        torques = list(struct.unpack_from(f"<{count}h", payload, 4 + 4 * count)) if len(payload) > 4 + 4 * count else []
+        if session != self._session or mask != self._mask:
+            self._nack(sequence, BAD_SESSION, due=due)
+            return
+        assert self._last_heard is not None
+        ahead = (sequence - self._last_heard) & 0xFFFF
+        if not 0 < ahead < 0x8000:
+            self._nack(sequence, GAP, due=due)
+            return
+        if ahead > 1:
+            self._nack(sequence, GAP, due=due)
+        self._last_heard = sequence
+        if self._panel.alarm:
+            self._nack(sequence, ALARM, due=due)
+            return
+        if self._latched or self._panel.moving_forbidden() not in (0, 2010):
+            self._nack(sequence, NOT_ARMED, due=due)
+            return
+        wait = (due - self.tick_number) & 0xFFFF
+        if not 2 <= wait <= QUEUE:
+            self._nack(sequence, LATE, due=due)
+            return
+        wide_due = self.tick_number + wait
+        if self._armed and wide_due <= self._last_due:
+            self._nack(sequence, LATE, due=due)
+            return
+        ticks = wide_due - self._last_due if self._armed else 1
+        for place, number in enumerate(self._numbers):
+            plate = self._axes[number].plate
+            moved = targets[place] - self._last_asked[place]
+            if not plate.lowest <= targets[place] <= plate.highest or abs(moved) > plate.step * ticks:
+                self._nack(sequence, LIMIT, axis=number, due=due)
+                return
+        if not self._armed:
+            self._armed = self._panel.operating = True
+            self._misses = 0
+            self._speed = [0.0] * count
+        self._last_due, self._last_asked = wide_due, targets
+        self._queue[wide_due] = (targets, torques)
+
+    # -- the interpolation clock -------------------------------------------------------------------------------
+
+    def tick(self, dropped: int) -> None:
+        """One tick: report what is, then issue what is due next."""
+        self.tick_number += 1
+        if self._session:
+            self._report()
+        else:
+            self._idle_ticks += 1
+            if self._idle_ticks > _SILENT_TICKS:
+                self._on_leave()
+                return
+        self._dropped = self._extrapolated = False
+        if not self._armed:
+            return
+        forbidden = self._panel.moving_forbidden()
+        if forbidden not in (0, 2010) and not self._latched:
+            self.halt("alarm" if forbidden in (2060, 2070) else "hold")
+        if self._latched:
+            self._decelerate()
+            return
+        due = self.tick_number + 1
+        if due in self._queue:
+            self._misses = 0
+            targets, torques = self._queue.pop(due)
+            self._go(targets, dropped)
+            self._feed_forward(torques)
+        elif self._queue:
+            self._between(due, dropped)
+        elif self._last_due < due:
+            self._miss(due, dropped)
+
+    def _go(self, targets: Sequence[float], dropped: int = 0) -> None:
+        for place, number in enumerate(self._numbers):
+            axis = self._axes[number]
+            before = axis.issued
+            if axis.ask(round(targets[place]), dropped):
+                self._dropped = True
+            self._speed[place] = axis.issued - before
+
+    def _between(self, due: int, dropped: int) -> None:
+        """A tick that the host left out, between here and its next target: a straight line."""
+        later = min(self._queue)
+        targets = self._queue[later][0]
+        here = [self._axes[number].issued for number in self._numbers]
+        share = 1.0 / (later - due + 1)
+        self._go([a + (b - a) * share for a, b in zip(here, targets, strict=True)], dropped)
+
+    def _miss(self, due: int, dropped: int) -> None:
+        """Nothing to do: one tick straight on, then slower, and at the third the watchdog latches."""
+        self._misses += 1
+        if self._misses >= WATCHDOG_TICKS:
+            self.halt("watchdog")
+            self._decelerate()
+            return
+        self._extrapolated = True
+        if self._misses > 1:
+            self._slow_down()
+        here = [self._axes[number].issued for number in self._numbers]
+        self._go([a + b for a, b in zip(here, self._speed, strict=True)], dropped)
+
+    def _decelerate(self) -> None:
+        if self._stopping > 0:
+            self._slow_down()
+            self._stopping -= 1
+            speed = list(self._speed)
+            here = [self._axes[number].issued for number in self._numbers]
+            self._go([a + b for a, b in zip(here, speed, strict=True)])
+            self._speed = speed
+        self._feed_forward([])
+
+    def _slow_down(self) -> None:
+        left = max(1, self._stopping or STOPPING_TICKS)
+        self._speed = [speed * (left - 1) / left for speed in self._speed]
+
+    def _feed_forward(self, torques: Sequence[int]) -> None:
+        for place, number in enumerate(self._numbers):
+            axis = self._axes[number]
+            sign = 1.0 if axis.plate.pulses_per_rad > 0 else -1.0
+            axis.feed_forward_nm = sign * torques[place] * 1e-4 * axis.plate.rated_torque_nm if torques else 0.0
+
+    def _report(self) -> None:
+        first, second = self._panel.words()
+        strayed = any(
+            abs(axis.pulses - self._home[number]) > abs(_STRAY_RAD * axis.plate.pulses_per_rad)
+            for number, axis in enumerate(self._axes)
+            if number not in self._numbers
+        )
+        flags = (
+            (ARMED if self._armed and not self._latched else 0)
+            | (LATCHED if self._latched else 0)
+            | (DROPPED if self._dropped else 0)
+            | (EXTRAPOLATED if self._extrapolated else 0)
+            | (STRAYED if strayed else 0)
+            | (COMPENSATED if self._compensated else 0)
+        )
+        payload = struct.pack(
+            "<IHBBHBBBBH",
+            *(self.tick_number, self._last_heard or 0, first, second, self._panel.alarm, len(self._queue), flags),
+            *(self._session, self._mask, 0),
+        )
+        for number in self._numbers:
+            axis = self._axes[number]
+            payload += struct.pack("<iii", axis.pulses, axis.speed_tenths, axis.torque_micro)
+        self._send(FEEDBACK, payload)

@@ -1,0 +1,267 @@
+"""Layer A, host control: one command, one reply - status, joint pulses, servo power, hold, alarms.
+
+What a stock controller of the ERC to DX generations offers on its serial port. There is **no torque** in it, and at
+9600 to 19200 baud no more than 11 to 22 readings per second, so nothing can be identified through it alone.
+
+From public documents, untested on hardware.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from frictid_drivers.motoman.bsc import BlockReceived, BscLink, BscTiming, Event, Failed, Received, Sent
+from frictid_drivers.motoman.bsc_block import Message
+from frictid_drivers.motoman.controller_errors import BadReply, LinkError, controller_error
+from frictid_drivers.motoman.port import BytePort
+
+_COMMAND: Final = "01,000"
+_RESULT: Final = "90,000"
+_DATA: Final = "90,001"
+
+_LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that is off"
+_LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerProfile:
+    """What differs between controller generations.
+
+    Attributes:
+        name: as written in the robot file.
+        data_1: meaning of bits 0.. of the first figure of RSTATS.
+        data_2: meaning of bits 0.. of the second; "" is unused.
+    """
+
+    name: str
+    data_1: tuple[str, ...]
+    data_2: tuple[str, ...]
+
+
+_MODES_1: Final = ("step", "1-cycle", "auto", "running", "safe speed", "teach", "play", "command remote")
+_MODES_2: Final = ("", "pendant hold", "external hold", "command hold", "alarm", "error", "servo on")
+
+PROFILES: Final = {
+    "erc": ControllerProfile("erc", _MODES_1[:5], ("panel hold", "teach box hold", *_MODES_2[2:])),
+    "xrc": ControllerProfile("xrc", _MODES_1, _MODES_2),
+    "nx": ControllerProfile("nx", _MODES_1, _MODES_2),
+    "dx": ControllerProfile("dx", _MODES_1, _MODES_2),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The reply to RSTATS.
+
+    Attributes:
+        data_1: first figure as sent.
+        data_2: second figure as sent.
+        conditions: names of the bits that are set.
+        reports_mode: this generation reports teach, play and command remote at all.
+    """
+
+    data_1: int
+    data_2: int
+    conditions: frozenset[str]
+    reports_mode: bool
+
+    @property
+    def holds(self) -> list[str]:
+        """Which holds are on."""
+        return sorted(name for name in self.conditions if name.endswith("hold"))
+
+    @property
+    def servo_on(self) -> bool:
+        """Servo power is on."""
+        return "servo on" in self.conditions
+
+    @property
+    def faulty(self) -> bool:
+        """An alarm or an error is pending."""
+        return bool(self.conditions & {"alarm", "error"})
+
+
+def decode_status(profile: ControllerProfile, data_1: int, data_2: int) -> Status:
+    """Name the bits of both figures of RSTATS (or of a streamed status)."""
+    names = {
+        name
+        for figure, bits in ((data_1, profile.data_1), (data_2, profile.data_2))
+        for bit, name in enumerate(bits)
+        if name and figure >> bit & 1
+    }
+    return Status(data_1, data_2, frozenset(names), "command remote" in profile.data_1)
+
+
+class HostControl:
+    """Commands and replies over one link.
+
+    Args:
+        port: open.
+        profile: generation of the controller.
+        timing: of the link.
+        reply_s: how long the controller may think about a command before it bids to reply.
+        sink: told of every portion of bytes on the wire, with True for ours.
+    """
+
+    def __init__(
+        self,
+        port: BytePort,
+        profile: ControllerProfile,
+        timing: BscTiming | None = None,
+        *,
+        reply_s: float = 10.0,
+        sink: Callable[[bytes, bool], None] | None = None,
+    ) -> None:
+        self._port = port
+        self._profile = profile
+        self._timing = timing or BscTiming()
+        self._reply_s = reply_s
+        self._sink = sink
+        self._link = BscLink(self._timing)
+        self._owed_reply = False
+
+    # -- commands ----------------------------------------------------------------------------------------------
+
+    def status(self) -> Status:
+        """RSTATS."""
+        figures = self._figures("RSTATS", 2)
+        return decode_status(self._profile, *figures)
+
+    def pulses(self) -> list[int]:
+        """RPOSJ: the joints' positions in pulses; axes that the robot lacks read 0."""
+        return self._figures("RPOSJ", 12)
+
+    def servo(self, on: bool) -> None:
+        """SVON."""
+        self.order(f"SVON {int(on)}")
+
+    def hold(self, on: bool) -> None:
+        """HOLD."""
+        self.order(f"HOLD {int(on)}")
+
+    def reset(self) -> None:
+        """RESET an alarm."""
+        self.order("RESET")
+
+    def alarms(self) -> str:
+        """RALARM, as sent: the layout of its reply is not public, so it is shown and not interpreted."""
+        return self.ask("RALARM")
+
+    # -- the exchange ------------------------------------------------------------------------------------------
+
+    def order(self, text: str, *, within_s: float | None = None) -> None:
+        """A command that is answered by ``0000``.
+
+        Raises:
+            ControllerError: the controller refused it.
+            LinkError: no answer.
+        """
+        reply = self._exchange(text, within_s=within_s)
+        if reply.header != _RESULT:
+            raise BadReply(f"{reply.header} {reply.text!r} instead of a result", where=text)
+
+    def ask(self, text: str, on_text: Callable[[str, int], None] | None = None) -> str:
+        """A command that is answered by data.
+
+        Args:
+            text: the command.
+            on_text: told of every block of the reply as it comes (text, index), also when the rest never comes.
+
+        Raises:
+            ControllerError: the controller refused it.
+            LinkError: no answer, or a broken one.
+        """
+        reply = self._exchange(text, on_text)
+        if reply.header != _DATA:
+            raise BadReply(f"{reply.header} {reply.text!r} instead of data", where=text)
+        return reply.text
+
+    def _figures(self, command: str, count: int) -> list[int]:
+        reply = self.ask(command)
+        try:
+            figures = [int(part.strip()) for part in reply.split(",")]
+        except ValueError:
+            figures = []
+        if len(figures) != count:
+            raise BadReply(f"{reply!r} is not {count} whole numbers", where=command)
+        return figures
+
+    def _exchange(
+        self, text: str, on_text: Callable[[str, int], None] | None = None, *, within_s: float | None = None
+    ) -> Message:
+        where = text if len(text) <= 24 else f"{text[:21]}..."
+        if self._owed_reply and within_s is None:
+            # Replies carry no name: one that comes late must not be taken for the answer to this command.
+            self.listen(self._timing.sequence_s)
+        self._owed_reply = True
+        self._link.send(Message(_COMMAND, text), self._port.now_s())
+        reply = self._await_reply(where, on_text, within_s)
+        self._owed_reply = False
+        if reply.header == _RESULT and reply.text.strip() != "0000":
+            number = reply.text.strip()
+            if not (number.isdecimal() and len(number) == 4):
+                raise BadReply(f"{reply.text!r} is not an error number", where=where)
+            raise controller_error(int(number), where=where)
+        return reply
+
+    def _await_reply(self, where: str, on_text: Callable[[str, int], None] | None, within_s: float | None) -> Message:
+        """Until the reply is here, the link gives up, or the controller has thought too long about it."""
+        timing, sent = self._timing, False
+        # The link's own timers end every wait; this ends a controller that keeps it busy with something else.
+        patience_s = self._reply_s + 2 * (timing.response_retries + 1) * timing.sequence_s + timing.text_end_s
+        give_up_s = self._port.now_s() + (patience_s if within_s is None else within_s)
+        thinking_until_s = give_up_s
+        while True:
+            limit_s = thinking_until_s if sent and self._link.idle else give_up_s
+            if self._port.now_s() >= limit_s:
+                self._link.abort()
+                self._flush()
+                raise LinkError("no reply" if sent else "the line is never free", where=where, next_step=_LOOK_AT_LINE)
+            for event in self._step(limit_s):
+                match event:
+                    case Sent():
+                        sent = True
+                        thinking_until_s = min(give_up_s, self._port.now_s() + self._reply_s)
+                    case Failed(reason):
+                        raise LinkError(reason, where=where, cause=_LINK_CAUSE, next_step=_LOOK_AT_LINE)
+                    case BlockReceived(block, index) if sent and on_text is not None:
+                        on_text(block, index)
+                    case Received(message) if sent:
+                        return message
+
+    def listen(self, duration_s: float) -> None:
+        """Serve the link and drop whatever it brings."""
+        until_s = self._port.now_s() + duration_s
+        while self._port.now_s() < until_s:
+            self._step(until_s)
+
+    def leave(self) -> None:
+        """Let the link finish, then forget it: the port goes to another protocol."""
+        until_s = self._port.now_s() + self._timing.sequence_s
+        while not self._link.idle and self._port.now_s() < until_s:
+            self._step(until_s)
+        self._link = BscLink(self._timing)
+        self._owed_reply = False
+
+    def _step(self, until_s: float) -> list[Event]:
+        """Write what the link wants, wait for bytes or its next timer, and return what happened."""
+        self._flush()
+        link, port = self._link, self._port
+        wake_s = until_s if link.deadline_s is None else min(until_s, link.deadline_s)
+        data = port.read(max(0.0, wake_s - port.now_s()))
+        if data:
+            if self._sink is not None:
+                self._sink(data, False)
+            link.receive(data, port.now_s())
+        link.advance(port.now_s())
+        self._flush()
+        return link.take_events()
+
+    def _flush(self) -> None:
+        output = self._link.take_output()
+        if output:
+            if self._sink is not None:
+                self._sink(output, True)
+            self._port.write(output)

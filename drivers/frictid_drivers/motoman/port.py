@@ -1,0 +1,158 @@
+"""A serial port as the layers above need it: bytes out, bytes in within a time, and the time itself.
+
+``SerialPort`` is the real one. Tests and the lock-step emulator bring their own, on virtual time.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import termios
+import time
+from typing import Protocol
+
+import serial
+
+from frictid_hil.errors import HardwareBusy, HardwareError
+
+
+class BytePort(Protocol):
+    """Bytes both ways, and the clock they run on.
+
+    Attributes:
+        lock_step: time is virtual and stands still except in ``read``.
+    """
+
+    lock_step: bool
+
+    def now_s(self) -> float:
+        """Time now, from any origin."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Put bytes on the wire. ``HardwareError`` when the port is gone."""
+        ...
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived, waiting at most this long for a first byte. ``HardwareError`` when the port is gone."""
+        ...
+
+    def set_line(self, baud: int, parity: str) -> None:
+        """Change speed and parity; bytes under way are sent first."""
+        ...
+
+    def close(self) -> None:
+        """Release the port; safe to call twice."""
+        ...
+
+
+class SerialPort:
+    """A serial port of this machine, held exclusively.
+
+    Args:
+        path: device, e.g. ``/dev/ttyUSB0``.
+        baud: bits per second.
+        parity: E, O or N; never changed silently, a wrong one garbles every byte.
+
+    Raises:
+        HardwareBusy: another process holds it.
+        HardwareError: it does not exist, may not be opened, or does not accept the parity.
+    """
+
+    lock_step = False
+
+    def __init__(self, path: str, baud: int, parity: str) -> None:
+        self._path = path
+        try:
+            self._serial: serial.Serial | None = serial.Serial(
+                path, baud, bytesize=8, parity=parity, stopbits=1, timeout=0, write_timeout=1.0, exclusive=True
+            )
+        except serial.SerialException as error:
+            raise _not_opened(path, error) from None
+        except termios.error as error:
+            raise _bad_line(path, baud, parity, error) from None
+
+    def now_s(self) -> float:
+        """The machine's monotonic clock."""
+        return time.monotonic()
+
+    def write(self, data: bytes) -> None:
+        """Put bytes on the wire."""
+        try:
+            self._open().write(data)
+        except serial.SerialTimeoutException:
+            raise HardwareError(
+                "the port accepts no more bytes", where=self._path, cause="flow control, or a stuck adapter"
+            ) from None
+        except (serial.SerialException, OSError, termios.error) as error:
+            raise self._gone(error) from None
+
+    def read(self, timeout_s: float) -> bytes:
+        """Whatever has arrived, waiting at most ``timeout_s`` for the first byte."""
+        port = self._open()
+        try:
+            ready, _, _ = select.select([port.fileno()], [], [], max(0.0, timeout_s))
+            if not ready:
+                return b""
+            data: bytes = port.read(max(1, port.in_waiting))
+        except (serial.SerialException, OSError, termios.error) as error:
+            raise self._gone(error) from None
+        return data
+
+    def set_line(self, baud: int, parity: str) -> None:
+        """Change speed and parity once everything written has left."""
+        port = self._open()
+        try:
+            port.flush()
+            port.baudrate = baud
+            port.parity = parity
+        except (serial.SerialException, OSError) as error:
+            raise self._gone(error) from None
+        except (termios.error, ValueError) as error:
+            raise _bad_line(self._path, baud, parity, error) from None
+
+    def close(self) -> None:
+        """Release the port and its lock."""
+        port, self._serial = self._serial, None
+        if port is not None:
+            try:
+                port.close()
+            except (serial.SerialException, OSError, termios.error):
+                # It was unplugged; the kernel has taken it back already.
+                return
+
+    def _open(self) -> serial.Serial:
+        if self._serial is None:
+            raise HardwareError("the port is closed", where=self._path)
+        return self._serial
+
+    def _gone(self, error: Exception) -> HardwareError:
+        return HardwareError(
+            f"the port failed: {error}",
+            where=self._path,
+            cause="the adapter was unplugged or its cable pulled; the controller's watchdog stops the arm",
+            next_step="plug it in again, check that the arm stands, then start again",
+        )
+
+
+def _not_opened(path: str, error: serial.SerialException) -> HardwareError:
+    if "exclusively lock" in str(error) or error.errno in (errno.EBUSY, errno.EAGAIN):
+        return HardwareBusy(
+            "the port is held by another process",
+            where=path,
+            cause="another frictid-hil, or a terminal program",
+            next_step=f"find it with `fuser {path}` and end it",
+        )
+    next_step = "check the cable and the name of the port"
+    if error.errno == errno.EACCES:
+        next_step = "add yourself to the group that owns the port (often `dialout`), then log in again"
+    return HardwareError(f"cannot be opened: {error.strerror or error}", where=path, next_step=next_step)
+
+
+def _bad_line(path: str, baud: int, parity: str, error: Exception) -> HardwareError:
+    return HardwareError(
+        f"does not accept {baud} baud with parity {parity}: {error}",
+        where=path,
+        cause="a pseudo terminal carries no parity, and not every adapter every speed",
+        next_step="set `options.parity` (N for an emulator) and `options.baud` in the robot file",
+    )
