@@ -12,6 +12,7 @@ _LINEAR = {
     "position_command_rad": "position_command_m",
     "velocity_rad_s": "velocity_m_s",
     "torque_nm": "force_n",
+    "torque_command_nm": "force_command_n",
     "torque_interval_nm": "force_interval_n",
     "external_torque_nm": "external_force_n",
     "rigid_body_torque_nm": "rigid_body_force_n",

@@ -1,0 +1,324 @@
+"""Samples to an MCAP file that survives whatever kills the process.
+
+Rows are kept in memory until ``flush``, which writes them as one chunk and syncs it to the disk: what was flushed is
+readable after SIGKILL, and after a power failure up to the last whole record. ``close`` adds the summary by which tools
+seek; a file without it is read just as well, only slower.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from numpy.typing import NDArray
+
+import frictid_hil
+from frictid_hil.files import could_not_write
+from frictid_hil.recording import mcap_layout as layout
+from frictid_hil.recording.samples import Mark, Samples
+
+MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_ROWS = 32_768
+"""Rows that are written without being asked to, so that memory stays bounded."""
+
+_MARKS_CHANNEL = 1
+_ROTARY_SCHEMA, _LINEAR_SCHEMA, _MARK_SCHEMA = 1, 2, 3
+
+
+class SampleWriter:
+    """Writes one MCAP file, one channel per joint.
+
+    Args:
+        path: of the new file; an existing one is replaced.
+        joints: names.
+        meta: provenance common to all joints; plain values.
+        prismatic: names of the linear axes among ``joints``.
+
+    Raises:
+        FrictidError: the file cannot be created (no permission, disk full).
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        joints: Sequence[str],
+        meta: Mapping[str, Any] | None = None,
+        *,
+        prismatic: Collection[str] = (),
+    ) -> None:
+        self._path = path
+        self._channels = {joint: number for number, joint in enumerate(joints, start=_MARKS_CHANNEL + 1)}
+        self._rows: list[NDArray[np.void]] = []
+        self._pending = 0
+        self._marks: list[Message] = []
+        self._counts: dict[int, int] = {}
+        self._index: list[ChunkIndex] = []
+        self._metadata_index: list[MetadataIndex] = []
+        self._head = [*_schemas(), *self._channel_records(prismatic)]
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise could_not_write(path, error) from error
+        self._end = 0
+        self._write(MAGIC + _bytes(Header("", f"frictid-hil {frictid_hil.__version__}"), *self._head))
+        if meta:
+            self.metadata("recording", meta)
+
+    def append(self, joint: str, rows: NDArray[np.void]) -> None:
+        """Take rows of one joint.
+
+        Args:
+            joint: one of ``joints``.
+            rows: structured, shape (n,), with ``t_ns`` and any of ``mcap_layout.VALUES`` and ``COUNTS``; further fields
+                are ignored.
+        """
+        if not rows.size:
+            return
+        records = np.zeros(rows.size, layout.RECORD)
+        channel = self._channels[joint]
+        start = self._counts.get(channel, 0)
+        self._counts[channel] = start + rows.size
+        time_ns = rows["t_ns"]
+        records["opcode"] = layout.MESSAGE_OPCODE
+        records["length"] = layout.RECORD_LENGTH
+        records["channel"] = channel
+        records["sequence"] = np.arange(start, start + rows.size, dtype=np.int64)
+        records["log_time"] = records["publish_time"] = time_ns
+        records["encapsulation"] = layout.CDR_LITTLE_ENDIAN
+        records["sec"], records["nanosec"] = np.divmod(time_ns, 1_000_000_000)
+        names = rows.dtype.names or ()
+        for name in layout.VALUES:
+            records[name] = rows[name] if name in names else np.nan
+        for name in layout.COUNTS:
+            if name in names:
+                records[name] = rows[name]
+        self._rows.append(records)
+        self._pending += rows.size
+        if self._pending >= _CHUNK_ROWS:
+            self._write_rows()
+
+    def mark(self, joint: str, mark: Mark) -> None:
+        """Take a mark of one joint."""
+        body = {
+            "joint": joint,
+            "name": mark.name,
+            "start_ns": mark.start_ns,
+            "end_ns": mark.end_ns,
+            "details": dict(mark.details),
+        }
+        self._marks.append(
+            Message(
+                channel_id=_MARKS_CHANNEL,
+                sequence=len(self._marks),
+                log_time=mark.start_ns,
+                publish_time=mark.start_ns,
+                data=json.dumps(body).encode(),
+            )
+        )
+
+    def metadata(self, name: str, values: Mapping[str, Any]) -> None:
+        """Write provenance at once: ``recording`` for all joints, ``joint/<name>`` for one."""
+        record = Metadata(name=name, metadata={key: json.dumps(value) for key, value in values.items()})
+        data = _bytes(record)
+        self._metadata_index.append(MetadataIndex(offset=self._end, length=len(data), name=name))
+        self._write(data)
+
+    def flush(self) -> None:
+        """Write what was taken and have it on the disk before returning.
+
+        Raises:
+            FrictidError: disk full; what was flushed before is kept and readable.
+        """
+        self._write_rows()
+        self._write_marks()
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise could_not_write(self._path, error) from error
+
+    def close(self) -> None:
+        """Flush, and add the summary; safe to call twice."""
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+            self._write(_bytes(DataEnd(0)))
+            start = self._end
+            summary = _bytes(*self._head, self._statistics(), *self._index, *self._metadata_index)
+            self._write(summary + _bytes(Footer(summary_start=start, summary_offset_start=0, summary_crc=0)) + MAGIC)
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> SampleWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write_rows(self) -> None:
+        if not self._rows:
+            return
+        records = np.concatenate(self._rows)
+        self._rows, self._pending = [], 0
+        self._write_chunk(
+            records.tobytes(),
+            records["channel"],
+            records["log_time"],
+            np.arange(records.size, dtype=np.uint64) * np.uint64(records.itemsize),
+        )
+
+    def _write_marks(self) -> None:
+        if not self._marks:
+            return
+        texts = [_bytes(mark) for mark in self._marks]
+        times = np.array([mark.log_time for mark in self._marks], dtype=np.uint64)
+        self._counts[_MARKS_CHANNEL] = self._counts.get(_MARKS_CHANNEL, 0) + len(texts)
+        self._marks = []
+        offsets = np.cumsum([0, *map(len, texts[:-1])], dtype=np.uint64)
+        self._write_chunk(b"".join(texts), np.full(len(texts), _MARKS_CHANNEL, np.uint16), times, offsets)
+
+    def _write_chunk(
+        self, content: bytes, channels: NDArray[Any], times: NDArray[np.uint64], offsets: NDArray[np.uint64]
+    ) -> None:
+        start, end = int(times.min()), int(times.max())
+        chunk = _bytes(
+            Chunk(
+                compression="",
+                data=content,
+                message_start_time=start,
+                message_end_time=end,
+                uncompressed_crc=zlib.crc32(content),
+                uncompressed_size=len(content),
+            )
+        )
+        chunk_at = self._end
+        index = bytearray()
+        places: dict[int, int] = {}
+        for channel in map(int, np.unique(channels)):
+            mine = channels == channel
+            places[channel] = chunk_at + len(chunk) + len(index)
+            index += _message_index(channel, np.column_stack([times[mine], offsets[mine]]))
+        self._write(chunk + index)
+        self._index.append(
+            ChunkIndex(
+                chunk_start_offset=chunk_at,
+                chunk_length=len(chunk),
+                compression="",
+                compressed_size=len(content),
+                uncompressed_size=len(content),
+                message_start_time=start,
+                message_end_time=end,
+                message_index_length=len(index),
+                message_index_offsets=places,
+            )
+        )
+
+    def _write(self, data: bytes) -> None:
+        """All of it or, as far as the reader is concerned, nothing."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            self._file.truncate(self._end)
+            self._file.seek(self._end)
+            raise could_not_write(self._path, error) from error
+        self._end += len(data)
+
+    def _channel_records(self, prismatic: Collection[str]) -> list[McapRecord]:
+        joints = [
+            Channel(
+                id=number,
+                topic=layout.topic_of(joint),
+                message_encoding="cdr",
+                metadata={"joint": joint},
+                schema_id=_LINEAR_SCHEMA if joint in prismatic else _ROTARY_SCHEMA,
+            )
+            for joint, number in self._channels.items()
+        ]
+        return [Channel(_MARKS_CHANNEL, layout.MARKS_TOPIC, "json", {}, _MARK_SCHEMA), *joints]
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels) + 1,
+            channel_message_counts=self._counts,
+            chunk_count=len(self._index),
+            message_count=sum(self._counts.values()),
+            message_start_time=min((chunk.message_start_time for chunk in self._index), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in self._index), default=0),
+            metadata_count=len(self._metadata_index),
+            schema_count=3,
+        )
+
+
+def write_samples(path: Path, recordings: Sequence[Samples]) -> None:
+    """Write whole recordings, one per joint.
+
+    Raises:
+        FrictidError: disk full, or no permission.
+    """
+    linear = [samples.joint for samples in recordings if samples.prismatic]
+    with SampleWriter(path, [samples.joint for samples in recordings], prismatic=linear) as writer:
+        for samples in recordings:
+            columns = samples.columns()
+            rows = np.zeros(len(samples), [("t_ns", "<i8"), *((name, "<f8") for name in columns)])
+            rows["t_ns"] = samples.time_ns
+            for name, column in columns.items():
+                rows[name] = column
+            writer.append(samples.joint, rows)
+            writer.metadata(f"joint/{samples.joint}", samples.meta)
+            for mark in samples.marks:
+                writer.mark(samples.joint, mark)
+
+
+def _schemas() -> list[McapRecord]:
+    return [
+        Schema(_ROTARY_SCHEMA, layout.schema_text(prismatic=False).encode(), "ros2msg", layout.ROTARY),
+        Schema(_LINEAR_SCHEMA, layout.schema_text(prismatic=True).encode(), "ros2msg", layout.LINEAR),
+        Schema(_MARK_SCHEMA, layout.MARK_SCHEMA.encode(), "jsonschema", "frictid.Mark"),
+    ]
+
+
+def _message_index(channel: int, entries: NDArray[np.uint64]) -> bytes:
+    """The record by which tools find a channel's messages in a chunk: (log time, offset) pairs."""
+    pairs = entries.astype("<u8").tobytes()
+    length = 2 + 4 + len(pairs)
+    return (
+        b"\x07"
+        + length.to_bytes(8, "little")
+        + channel.to_bytes(2, "little")
+        + len(pairs).to_bytes(4, "little")
+        + pairs
+    )
+
+
+def _bytes(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves this one method untyped
