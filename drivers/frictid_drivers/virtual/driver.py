@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from frictid_drivers.virtual import channel
+from frictid_drivers.virtual import channel, side_channel
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
+from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
+from frictid_drivers.virtual.socket_bus import SocketBus
 from frictid_hil.driver import (
     Capabilities,
-    Driver,
     Feedback,
     Finding,
     FrameSink,
@@ -28,6 +29,7 @@ from frictid_hil.driver import (
     SetPoint,
     WallClock,
 )
+from frictid_hil.errors import UsageError
 
 if TYPE_CHECKING:
     import filelock
@@ -46,13 +48,9 @@ class VirtualDriver:
         self._channel = channel.channel_name(setup.bus)
         self._lock: filelock.BaseFileLock | None = None
         self._rack = Rack()
+        self._process: RunningRack | None = None
         self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._rack)
-        self._host: Driver = Cia402Driver(setup, bus_factory=self._open_bus, clock=self.clock)
-
-    def _open_bus(self) -> can.BusABC:
-        bus = LockStepBus(self._rack, self._channel)
-        self._rack.power_on()
-        return bus
+        self._host = Cia402Driver(setup, bus_factory=self._open_bus, clock=self.clock)
 
     # -- life cycle ----------------------------------------------------------------------------------------------------
 
@@ -60,17 +58,30 @@ class VirtualDriver:
         """Take the channel, power the drives and reach them."""
         self._lock = channel.take(self._channel)
         try:
-            self._rack.install(self._setup)
+            if self._setup.realtime:
+                self._process = start_rack(self._setup)
+            else:
+                self._rack.install(self._setup)
             self._host.open(frame_sink)
         except BaseException:
             self.close()
             raise
+
+    def _open_bus(self) -> can.BusABC:
+        if self._setup.realtime:
+            return SocketBus(self._channel)
+        bus = LockStepBus(self._rack, self._channel)
+        self._rack.power_on()
+        return bus
 
     def close(self) -> None:
         """Bring everything to rest and let go of the channel."""
         try:
             self._host.close()
         finally:
+            if self._process is not None:
+                self._process.stop()
+                self._process = None
             if self._lock is not None:
                 self._lock.release()
                 self._lock = None
@@ -78,6 +89,41 @@ class VirtualDriver:
     def capabilities(self) -> Capabilities:
         """What the host driver says of these drives, and whether time is theirs."""
         return replace(self._host.capabilities(), lock_step=not self._setup.realtime)
+
+    # -- what only a simulated robot can do ----------------------------------------------------------------------------
+
+    def simulate_hand(
+        self, joint: str, centre_rad: float = 0.0, amplitude_rad: float = 0.0, frequency_hz: float = 0.0
+    ) -> None:
+        """Let a person guide a joint along centre + amplitude sin(2 pi f t), t from now; frequency 0 lets go.
+
+        Raises:
+            UsageError: the robot file gives this joint no ``hand``.
+        """
+        grip = frequency_hz > 0.0
+        if grip and "hand" not in self._setup.joint(joint).simulated:
+            raise UsageError(
+                "this joint has no simulated hand",
+                where=f"joint {joint}",
+                next_step="give it stiffness and damping under `simulated: hand:` in the robot file",
+            )
+        self._write(joint, 0x2040, 1, 0)
+        if grip:
+            self._write(joint, 0x2040, 2, round(centre_rad * 1e6))
+            self._write(joint, 0x2040, 3, round(amplitude_rad * 1e6))
+            self._write(joint, 0x2040, 4, round(frequency_hz * 1e3))
+            self._write(joint, 0x2040, 1, 1)
+
+    def mount_payload(self, joint: str, mounted: bool) -> None:
+        """Put the payload of the robot file on a joint, or take it off."""
+        self._write(joint, 0x2041, 0, int(mounted))
+
+    def _write(self, joint: str, index: int, subindex: int, value: int) -> None:
+        if self._setup.realtime:
+            with SocketBus(self._channel) as bus:
+                side_channel.write(bus, self._setup.joint(joint).address, index, subindex, value)
+        else:
+            self._rack.servos[joint].write(index, subindex, value)
 
     # -- forwarded -----------------------------------------------------------------------------------------------------
 

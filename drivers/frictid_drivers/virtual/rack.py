@@ -20,6 +20,9 @@ SYNC_GAP_TENTHS = 20
 """2010h:01 in lock-step: drives alarm when a SYNC is more than twice its period late."""
 
 
+_WARM_UP_NS = 1_000_000
+
+
 class Rack:
     """The drives of one robot; empty until ``add`` or ``install``.
 
@@ -98,6 +101,12 @@ class Rack:
             self._next_ns = min((servo.next_event_ns for servo in self.servos.values()), default=NEVER_NS)
         if to_ns > self.now_ns:
             self.now_ns = to_ns
+
+    def warm_up(self) -> None:
+        """Let every joint's physics run a little before power-on, so that nothing is compiled or loaded later."""
+        self.now_ns += _WARM_UP_NS
+        for servo in self.servos.values():
+            servo.axis.catch_up(self.now_ns)
 
     @property
     def next_event_ns(self) -> int:

@@ -23,6 +23,7 @@ from frictid_drivers.virtual.object_dictionary import (
     INVALID_VALUE,
     ObjectDictionary,
     SdoAbort,
+    encode,
 )
 from frictid_drivers.virtual.objects import Key, Value, key
 from frictid_drivers.virtual.pdo import NEVER_NS, ProcessData, ReceivePdo
@@ -573,6 +574,22 @@ class Servo:
             if mode == CSP and axis.following_error:
                 word |= 0x2000
         return word
+
+    @property
+    def sync_period_ns(self) -> int:
+        """1006h as time."""
+        return self.dictionary.number(key(0x1006)) * 1000
+
+    def write(self, index: int, subindex: int, value: int) -> None:
+        """Write an object from inside, now, as an SDO download would.
+
+        Raises:
+            SdoAbort: refused.
+        """
+        entry = self.dictionary.entry(key(index, subindex))
+        self._run_to(self._now_ns)
+        self.dictionary.download(entry.key, encode(entry, value))
+        self._settle()
 
     # -- configuration -------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,67 @@
+"""The owner's end of the drives' own process: start it, wait until it is ready, let it go."""
+
+from __future__ import annotations
+
+import select
+import subprocess
+import sys
+
+from frictid_drivers.virtual.rack_process import READY, encode_setup
+from frictid_hil.driver import RobotSetup
+from frictid_hil.errors import HardwareError
+
+_START_S = 120.0
+_END_S = 5.0
+
+
+class RunningRack:
+    """The drives' process, running."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def stop(self) -> None:
+        """Ask it to end by closing its standard input; insist after a while."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+
+def start_rack(setup: RobotSetup) -> RunningRack:
+    """Start the drives of a robot in a process of their own.
+
+    Raises:
+        HardwareError: it did not come up; the message says why.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "frictid_drivers.virtual.rack_process"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        # A terminal's Ctrl-C reaches the owner, not the drives.
+        start_new_session=True,
+    )
+    rack = RunningRack(process)
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        process.stdin.write(encode_setup(setup) + "\n")
+        process.stdin.flush()
+        readable, _, _ = select.select([process.stdout], [], [], _START_S)
+        answer = process.stdout.readline().strip() if readable else "no answer"
+    except OSError as error:
+        answer = str(error)
+    if answer != READY:
+        rack.stop()
+        raise HardwareError(f"the simulated drives did not start: {answer or 'their process ended'}", where=setup.bus)
+    return rack

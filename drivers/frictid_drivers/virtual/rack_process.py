@@ -1,0 +1,191 @@
+"""The simulated drives in a process of their own, on the wall clock.
+
+``python -m frictid_drivers.virtual.rack_process``: its owner writes one JSON line with the robot to its standard input
+and reads one line back (``ready``, or what is wrong); from then on the drives are on the bus ``frictid:CHANNEL``. The
+process ends when the owner says so by closing its standard input. When the owner disappears instead - SIGKILL of the
+host loop - the drives live on until their own watchdogs have brought every joint to rest, so that what drives do
+without their host happens here as it does in a robot.
+
+The drives' time follows SYNC where there is one, as in drives that lock their control loops to it: a SYNC is taken to
+be exactly on its grid, so that the jitter of two processes' scheduling does not become motion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import gc
+import json
+import os
+import select
+import signal
+import sys
+import time
+from typing import Any
+
+from frictid_drivers.virtual import channel
+from frictid_drivers.virtual.rack import Rack
+from frictid_drivers.virtual.socket_bus import ERROR, EXTENDED, REMOTE, Hub
+from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import FrictidError
+
+READY = "ready"
+SYNC_ID = 0x80
+SYNC_GAP_TENTHS = 500
+"""2010h:01 on the wall clock: 50 periods. An ordinary operating system loses the processor for tens of milliseconds now
+and then; the host's heartbeat, not SYNC, is what stops the drives here."""
+
+_LONGEST_WAIT_S = 0.005
+_SHORTEST_WAIT_S = 0.0002
+_FAREWELL_NS = 10_000_000_000
+_STANDSTILL_NS = 1_000_000_000
+_FIFO_PRIORITY = 50
+_GRID_GAP = 10
+_GRID_SHARE = 0.01
+
+
+class SyncGrid:
+    """Run time of the drives on the wall clock, locked to SYNC.
+
+    A SYNC counts as sent exactly on the nearest point of the grid, and the grid follows the mean deviation by a
+    hundredth; after ten periods without SYNC the next one starts a new grid. Between SYNCs run time stands on the last
+    grid point that has passed, so that a SYNC is never too late for its own point.
+
+    Attributes:
+        period_ns: of SYNC; 0 without one, and run time is the wall clock's.
+    """
+
+    def __init__(self, period_ns: int = 0) -> None:
+        self.period_ns = period_ns
+        self._offset_ns = 0.0  # grid time minus wall time
+        self._last_ns: int | None = None
+
+    def time_ns(self, wall_ns: int) -> int:
+        """Run time at a moment of the wall clock."""
+        raw_ns = wall_ns + round(self._offset_ns)
+        if not self.period_ns or self._last_ns is None:
+            return raw_ns
+        periods = (raw_ns - self._last_ns) // self.period_ns
+        if periods > _GRID_GAP:
+            return raw_ns
+        return self._last_ns + max(0, periods) * self.period_ns
+
+    def sync_ns(self, wall_ns: int) -> int:
+        """Run time of a SYNC that was sent at a moment of the wall clock."""
+        raw_ns = wall_ns + round(self._offset_ns)
+        if self.period_ns and self._last_ns is not None:
+            periods = round((raw_ns - self._last_ns) / self.period_ns)
+            if periods <= _GRID_GAP:
+                grid_ns = self._last_ns + max(0, periods) * self.period_ns
+                self._offset_ns += _GRID_SHARE * (grid_ns - raw_ns)
+                self._last_ns = grid_ns
+                return grid_ns
+        self._last_ns = raw_ns
+        return raw_ns
+
+
+class RackProcess:
+    """The drives, their bus and their clock."""
+
+    def __init__(self, rack: Rack, hub: Hub) -> None:
+        self._rack = rack
+        self._hub = hub
+        self._origin_ns = time.monotonic_ns() - rack.now_ns
+        self._grid = SyncGrid()
+        rack.transmit = hub.send
+        hub.heard = self._heard
+
+    def _heard(self, can_id: int, data: bytes, stamp_ns: int) -> None:
+        if can_id & (EXTENDED | ERROR):
+            return
+        wall_ns = stamp_ns - self._origin_ns
+        if can_id == SYNC_ID:
+            self._grid.period_ns = next((servo.sync_period_ns for servo in self._rack.servos.values()), 0)
+            self._rack.advance(self._grid.sync_ns(wall_ns))
+        else:
+            self._rack.advance(self._grid.time_ns(wall_ns))
+        self._rack.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
+
+    def run(self, owner_pid: int) -> None:
+        """Serve until the owner closes our standard input, or is gone and the robot stands still."""
+        self._rack.power_on()
+        farewell = _Farewell()
+        while True:
+            wait_s = (self._rack.next_event_ns - self._rack.now_ns) * 1e-9
+            self._hub.wait(min(_LONGEST_WAIT_S, max(_SHORTEST_WAIT_S, wait_s)))
+            # First the time, then the frames: none that was sent before it is left when run time reaches it.
+            wall_ns = time.monotonic_ns() - self._origin_ns
+            self._hub.serve()
+            self._rack.advance(self._grid.time_ns(wall_ns))
+            if os.getppid() == owner_pid:
+                if _closed(sys.stdin.fileno()):
+                    return
+            elif farewell.over(wall_ns, resting=self._rack.at_rest and not self._hub.members):
+                return
+
+
+class _Farewell:
+    """How long drives without an owner live on: a second of standstill unobserved, at most ten altogether."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self._resting_since_ns: int | None = None
+
+    def over(self, now_ns: int, *, resting: bool) -> bool:
+        """It is time to end."""
+        self._since_ns = now_ns if self._since_ns is None else self._since_ns
+        if not resting:
+            self._resting_since_ns = None
+        elif self._resting_since_ns is None:
+            self._resting_since_ns = now_ns
+        rested = self._resting_since_ns is not None and now_ns - self._resting_since_ns > _STANDSTILL_NS
+        return rested or now_ns - self._since_ns > _FAREWELL_NS
+
+
+def _closed(descriptor: int) -> bool:
+    readable, _, _ = select.select([descriptor], [], [], 0)
+    return bool(readable) and not os.read(descriptor, 4096)
+
+
+def encode_setup(setup: RobotSetup) -> str:
+    """The robot as one line of JSON."""
+    return json.dumps(dataclasses.asdict(setup), default=dict)
+
+
+def decode_setup(line: str) -> RobotSetup:
+    """The robot of ``encode_setup``."""
+    mapping: dict[str, Any] = json.loads(line)
+    joints = tuple(JointSetup(**joint) for joint in mapping.pop("joints"))
+    return RobotSetup(joints=joints, **mapping)
+
+
+def main() -> int:
+    """Entry of the process."""
+    # Ctrl-C is for the owner, who then closes our standard input.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    owner_pid = os.getppid()
+    setup = decode_setup(sys.stdin.readline())
+    rack = Rack()
+    try:
+        rack.install(setup, sync_gap_tenths=SYNC_GAP_TENTHS)
+        hub = Hub(channel.socket_path(channel.channel_name(setup.bus)))
+    except (FrictidError, OSError) as error:
+        print(f"failed: {error}", flush=True)
+        return 1
+    rack.warm_up()
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+    gc.collect()
+    gc.freeze()
+    process = RackProcess(rack, hub)
+    print(READY, flush=True)
+    try:
+        process.run(owner_pid)
+    finally:
+        with contextlib.suppress(OSError):
+            hub.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,236 @@
+"""A CAN bus over a local socket: python-can's interface ``frictid``, and the hub that joins its members.
+
+python-can's own ``virtual`` bus does not leave its process; this one does. The hub belongs to the process that holds
+the simulated drives; every client hears every frame but its own, as on a wire. A frame is one packet
+(``SOCK_SEQPACKET`` keeps the boundaries), and a client too slow to read loses frames rather than holding up the bus, as
+a controller with a full receive buffer would::
+
+    can.Bus(interface="frictid", channel="hp3j")
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+
+from frictid_drivers.virtual.channel import runtime_folder, socket_path
+
+FRAME = struct.Struct("<IB3x8sQ")
+"""Identifier with flags as in SocketCAN, length, data, and when it was sent on the machine's monotonic clock, ns."""
+
+EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+_BUFFER_BYTES = 1 << 20
+_CONNECT_S = 0.2
+
+
+def pack(can_id: int, data: bytes, stamp_ns: int) -> bytes:
+    """One frame as a packet."""
+    return FRAME.pack(can_id, len(data), data, stamp_ns)
+
+
+class SocketBus(can.BusABC):
+    """One member of the bus.
+
+    Args:
+        channel: name of the bus, or path of its socket.
+        can_filters: as for any python-can bus.
+        arguments: settings of other interfaces (``bitrate``), of no meaning here.
+
+    Raises:
+        can.CanInitializationError: nobody simulates drives on this channel.
+    """
+
+    def __init__(self, channel: Any = "frictid", can_filters: Any = None, **arguments: Any) -> None:
+        path = Path(channel) if "/" in str(channel) else socket_path(str(channel))
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket.settimeout(_CONNECT_S)
+            self._socket.connect(str(path))
+        except OSError as error:
+            self._socket.close()
+            raise can.CanInitializationError(f"no simulated bus at {path}: {error.strerror or error}") from None
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+            self._socket.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
+        self._socket.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
+        self.channel_info = f"simulated bus {channel}"
+        super().__init__(channel=channel, can_filters=can_filters)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Put a frame on the bus.
+
+        Raises:
+            can.CanOperationError: the bus is gone, or full for longer than ``timeout``.
+        """
+        can_id = msg.arbitration_id
+        if msg.is_extended_id:
+            can_id |= EXTENDED
+        if msg.is_remote_frame:
+            can_id |= REMOTE
+        if msg.is_error_frame:
+            can_id |= ERROR
+        packet = pack(can_id, bytes(msg.data), time.monotonic_ns())
+        deadline_s = time.monotonic() + (timeout if timeout else 0.0)
+        while True:
+            try:
+                self._socket.send(packet)
+            except BlockingIOError:
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0:
+                    raise can.CanOperationError("the simulated bus takes no frames: transmit buffer full") from None
+                select.select([], [self._socket], [], left_s)
+            except OSError as error:
+                raise can.CanOperationError(f"the simulated bus is gone: {error.strerror}") from None
+            else:
+                return
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        while True:
+            try:
+                packet = self._socket.recv(FRAME.size)
+            except BlockingIOError:
+                if timeout is not None and timeout <= 0:
+                    return None, False
+                if not self._poll.poll(None if timeout is None else timeout * 1e3):
+                    return None, False
+                timeout = 0 if timeout is not None else None
+                continue
+            except OSError as error:
+                raise can.CanOperationError(f"the simulated bus is gone: {error.strerror}") from None
+            if not packet:
+                raise can.CanOperationError("the simulated bus is gone: its process has ended")
+            return message_of(packet, self.channel_info), False
+
+    def fileno(self) -> int:
+        """For ``select``."""
+        return self._socket.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        super().shutdown()
+        self._socket.close()
+
+    @staticmethod
+    def _detect_available_configs() -> list[can.typechecking.AutoDetectedConfig]:
+        return [{"interface": "frictid", "channel": path.stem} for path in sorted(runtime_folder().glob("*.sock"))]
+
+
+def message_of(packet: bytes, channel: str | None = None) -> can.Message:
+    """A packet as python-can's message."""
+    can_id, size, data, stamp_ns = FRAME.unpack(packet)
+    return can.Message(
+        timestamp=(time.time_ns() - time.monotonic_ns() + stamp_ns) * 1e-9,
+        arbitration_id=can_id & 0x1FFFFFFF,
+        is_extended_id=bool(can_id & EXTENDED),
+        is_remote_frame=bool(can_id & REMOTE),
+        is_error_frame=bool(can_id & ERROR),
+        dlc=size,
+        data=None if can_id & REMOTE else data[:size],
+        channel=channel,
+    )
+
+
+class Hub:
+    """The wire: accepts members, hands every frame to all others and to the drives.
+
+    Args:
+        path: of the socket; an old one that nobody listens on is replaced.
+
+    Attributes:
+        heard: called as (identifier with flags, data, when it was sent) for every frame of a member.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        path.unlink(missing_ok=True)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(str(path))
+        self._listener.listen(16)
+        self._listener.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._listener, select.POLLIN)
+        self._members: dict[int, socket.socket] = {}
+        self.heard: Callable[[int, bytes, int], None] = _ignore
+
+    @property
+    def members(self) -> int:
+        """How many are connected."""
+        return len(self._members)
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """A frame of the drives, to all members."""
+        self._spread(pack(can_id, data, time.monotonic_ns()), -1)
+
+    def wait(self, longest_s: float) -> None:
+        """Return when there is something to serve, or after so long."""
+        self._poll.poll(max(0.0, longest_s) * 1e3)
+
+    def serve(self) -> None:
+        """Deal with everything that has arrived."""
+        for number, _ in self._poll.poll(0):
+            if number == self._listener.fileno():
+                self._accept()
+            else:
+                self._read(number)
+
+    def close(self) -> None:
+        """Unplug everybody."""
+        for number in list(self._members):
+            self._drop(number)
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            member, _ = self._listener.accept()
+            member.setblocking(False)
+            for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+                member.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
+            self._members[member.fileno()] = member
+            self._poll.register(member, select.POLLIN)
+
+    def _read(self, number: int) -> None:
+        member = self._members[number]
+        while True:
+            try:
+                packet = member.recv(FRAME.size)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._drop(number)
+                return
+            if len(packet) == FRAME.size:
+                self._spread(packet, number)
+                can_id, size, data, stamp_ns = FRAME.unpack(packet)
+                self.heard(can_id, data[: min(size, 8)], stamp_ns)
+
+    def _spread(self, packet: bytes, sender: int) -> None:
+        for number, member in list(self._members.items()):
+            if number != sender:
+                try:
+                    member.send(packet)
+                except BlockingIOError:
+                    continue  # too slow: its loss
+                except OSError:
+                    self._drop(number)
+
+    def _drop(self, number: int) -> None:
+        member = self._members.pop(number, None)
+        if member is not None:
+            self._poll.unregister(member)
+            member.close()
+
+
+def _ignore(can_id: int, data: bytes, stamp_ns: int) -> None:
+    """Nobody listens."""
