@@ -53,7 +53,8 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """Fall of level and rate part with warmth, which carries over from recording to recording."""
     from frictid_hil.simulation.inverse_loops import warmth
 
-    columns, start = [], 0.0
+    columns: list[Array] = []
+    start = 0.0
     for v in views:
         loss_w = (v.coulomb_nm * v.slip + v.rate_nm) * v.velocity_rad_s
         state = warmth(start, loss_w, v.step_s, shape["time_constant_s"], POWER_W)

@@ -1,0 +1,252 @@
+"""The actuation and the kinematic channel: delay, lag, clipping and velocity lag, each fitted as the drive would do it.
+
+Between the controller's demand and the reported torque there is nothing but the drive, so a candidate predicts the
+reported torque sample by sample. Candidates are added one by one while the prediction gets much better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import optimize
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.experiment_set import Controller
+from frictid_hil.gap.residuals import LowPass, Recording, demand_of, lagged, rms, settled
+
+MAX_DELAY_S = 0.05
+MAX_LAG_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What stands between demand and reported torque.
+
+    Attributes:
+        delay_s: dead time.
+        lag_s: first-order time constant.
+        limit_nm: clip level.
+        velocity_lag_s: extra lag of the velocity that the controller sees.
+    """
+
+    delay_s: float = 0.0
+    lag_s: float = 0.0
+    limit_nm: float = math.inf
+    velocity_lag_s: float = 0.0
+
+    def reported(self, demand_nm: Array, step_s: float) -> Array:
+        """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
+        torque = np.concatenate([demand_nm[:1], demand_nm[:-1]])
+        if self.delay_s > 0.0:
+            whole, part = divmod(self.delay_s / step_s, 1.0)
+            torque = (1.0 - part) * _shifted(torque, int(whole)) + part * _shifted(torque, int(whole) + 1)
+        if self.lag_s > 0.0:
+            torque = _lagged_mean(torque, step_s, self.lag_s)
+        if math.isfinite(self.limit_nm):
+            torque = np.clip(torque, -self.limit_nm, self.limit_nm)
+        return torque
+
+
+@dataclass(frozen=True, slots=True)
+class ActuationFit:
+    """What the actuation channel says.
+
+    Attributes:
+        nominal: the drive that the nominal joint believes in.
+        drive: the fitted one.
+        found: effect name -> score gained on the identification logs when it was taken in, in the order of taking.
+        rivals: effect name -> the same for the candidates not taken, relative to what was taken in their place.
+        ratio: by log name, low-passed residual over what white noise of its high frequencies would leave.
+        before_ratio: the same without the found effects.
+        intervals: effect name -> half width of a 95 % interval of its parameter.
+    """
+
+    nominal: Drive
+    drive: Drive
+    found: Mapping[str, float]
+    rivals: Mapping[str, float] = field(default_factory=dict)
+    ratio: Mapping[str, float] = field(default_factory=dict)
+    before_ratio: Mapping[str, float] = field(default_factory=dict)
+    intervals: Mapping[str, float] = field(default_factory=dict)
+
+    def residual(self, recording: Recording, controller: Controller) -> Array:
+        """A of one recording with the fitted drive."""
+        return residual(recording, controller, self.drive)
+
+
+def residual(recording: Recording, controller: Controller, drive: Drive) -> Array:
+    """Reported torque minus what controller and drive predict, N m, shape (n,)."""
+    assert recording.experiment.torque_nm is not None
+    demand = demand_of(controller, recording.experiment, recording.step_s, drive.velocity_lag_s)
+    return settled(recording.experiment.torque_nm - drive.reported(demand, recording.step_s), recording.step_s)
+
+
+def noise_rms(values: Array) -> float:
+    """RMS of the white part, from third-order differences of what is already nearly free of motion."""
+    if values.size < 8:
+        return 0.0
+    return float(np.std(np.diff(values, 2)) / math.sqrt(6.0))
+
+
+def _shifted(values: Array, rows: int) -> Array:
+    if rows <= 0:
+        return values
+    return np.concatenate([np.full(min(rows, values.size), values[0]), values[:-rows]])
+
+
+def _lagged_mean(torque: Array, step_s: float, time_constant_s: float) -> Array:
+    end = lagged(torque, step_s, time_constant_s)
+    start = np.concatenate([end[:1], end[:-1]])
+    mean: Array = torque + (start - torque) * (time_constant_s / step_s) * (1.0 - math.exp(-step_s / time_constant_s))
+    return mean
+
+
+_EFFECTS = ("torque_delay", "electrical_lag", "torque_saturation", "velocity_lag")
+_FIELD = {
+    "torque_delay": "delay_s",
+    "electrical_lag": "lag_s",
+    "torque_saturation": "limit_nm",
+    "velocity_lag": "velocity_lag_s",
+}
+
+
+def fit_actuation(
+    recordings: Sequence[Recording],
+    controller: Controller,
+    nominal: Drive,
+    library: Sequence[str],
+    velocity_lag_s: float,
+    least_gain: float = 25.0,
+    least_share: float = 0.04,
+) -> ActuationFit:
+    """Explain the actuation residual of the identification logs by as few effects as it takes.
+
+    Args:
+        recordings: all logs of the set.
+        controller: the nominal one.
+        nominal: the drive the nominal joint believes in.
+        library: names of the effects that may be used.
+        velocity_lag_s: lag found in the reported velocity, tried as a lag of the controller's velocity; 0 for none.
+        least_gain: score below which a candidate is not taken.
+        least_share: share of the residual's squares that a candidate must remove.
+    """
+    logs = [r for r in recordings if r.actuation_nm is not None]
+    fitted = [r for r in logs if not r.experiment.validation]
+    demands: dict[tuple[str, float], Array] = {}
+
+    def demand(recording: Recording, lag_s: float) -> Array:
+        key = (recording.experiment.name, lag_s)
+        if key not in demands:
+            demands[key] = demand_of(controller, recording.experiment, recording.step_s, lag_s)
+        return demands[key]
+
+    def left(drive: Drive, recording: Recording) -> Array:
+        assert recording.experiment.torque_nm is not None
+        predicted = drive.reported(demand(recording, drive.velocity_lag_s), recording.step_s)
+        return settled(recording.experiment.torque_nm - predicted, recording.step_s)
+
+    def squares(drive: Drive) -> float:
+        return float(sum(np.sum(left(drive, r) ** 2) for r in fitted))
+
+    rows = sum(r.experiment.position_rad.size for r in fitted)
+    drive, found, rivals = nominal, dict[str, float](), dict[str, float]()
+    start = current = squares(nominal)
+    for _ in range(3):
+        tried: dict[str, tuple[float, Drive]] = {}
+        for name in _EFFECTS:
+            if name in found or name not in library:
+                continue
+            candidate = _best(name, drive, squares, demand, fitted, velocity_lag_s)
+            if candidate is not None:
+                tried[name] = candidate
+        if not tried:
+            break
+        name, (least, best) = min(tried.items(), key=lambda item: item[1][0])
+        gain = 0.5 * rows * math.log(current / max(least, 1e-300))
+        if gain < least_gain or least > (1.0 - least_share) * current:
+            break
+        if not found:
+            rivals = {other: 0.5 * rows * math.log(current / value) / gain for other, (value, _) in tried.items()}
+        found[name] = gain
+        drive, current = best, least
+    del start
+    gain_of_noise = {r.experiment.name: LowPass.at(1.0 / r.step_s) for r in logs}
+
+    def ratios(which: Drive) -> dict[str, float]:
+        out = {}
+        for r in logs:
+            low_pass = gain_of_noise[r.experiment.name]
+            rest = left(which, r)[2:]
+            floor = low_pass.white_gain * noise_rms(rest)
+            out[r.experiment.name] = rms(low_pass(rest)) / floor if floor > 0.0 else math.inf
+        return out
+
+    return ActuationFit(
+        nominal,
+        drive,
+        found,
+        {k: v for k, v in rivals.items() if k not in found},
+        ratios(drive),
+        ratios(nominal),
+        _intervals(drive, found, squares, current, rows),
+    )
+
+
+def _best(
+    name: str,
+    drive: Drive,
+    squares: Callable[[Drive], float],
+    demand: Callable[[Recording, float], Array],
+    fitted: Sequence[Recording],
+    velocity_lag_s: float,
+) -> tuple[float, Drive] | None:
+    if name == "velocity_lag":
+        if velocity_lag_s <= 0.0:
+            return None
+        candidate = _with(drive, name, velocity_lag_s)
+        return squares(candidate), candidate
+    if name == "torque_saturation":
+        highest = max(float(np.max(np.abs(demand(r, drive.velocity_lag_s)))) for r in fitted)
+        reported = max(float(np.quantile(np.abs(r.experiment.torque_nm), 0.999)) for r in fitted)  # type: ignore[arg-type]
+        if reported > 0.995 * highest:
+            return None
+        grid = np.linspace(0.7, 1.05, 15) * reported
+    else:
+        step = fitted[0].step_s
+        grid = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * step
+        grid = grid[grid <= (MAX_DELAY_S if name == "torque_delay" else MAX_LAG_S)]
+    costs = [squares(_with(drive, name, float(value))) for value in grid]
+    k = int(np.argmin(costs))
+    low, high = grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)]
+    if k == 0 and name != "torque_saturation":
+        low = 0.0
+    found = optimize.minimize_scalar(
+        lambda value: squares(_with(drive, name, float(value))),
+        bounds=(low, high),
+        method="bounded",
+        options={"maxiter": 14},
+    )
+    value, cost = (float(found.x), float(found.fun)) if found.fun < costs[k] else (float(grid[k]), costs[k])
+    return cost, _with(drive, name, value)
+
+
+def _with(drive: Drive, name: str, value: float) -> Drive:
+    numbers = {f: getattr(drive, f) for f in ("delay_s", "lag_s", "limit_nm", "velocity_lag_s")}
+    return Drive(**{**numbers, _FIELD[name]: value})
+
+
+def _intervals(
+    drive: Drive, found: Mapping[str, float], squares: Callable[[Drive], float], least: float, rows: int
+) -> dict[str, float]:
+    """95 % half widths from the curvature of the squares at the fit."""
+    widths = {}
+    for name in found:
+        value = getattr(drive, _FIELD[name])
+        h = 0.02 * value
+        bend = squares(_with(drive, name, value + h)) + squares(_with(drive, name, value - h)) - 2.0 * least
+        variance = least / rows
+        widths[name] = 1.96 * math.sqrt(2.0 * variance * h * h / bend) if bend > 0.0 else math.inf
+    return widths

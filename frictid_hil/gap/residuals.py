@@ -1,0 +1,308 @@
+"""Three residual channels: what the reported velocity, the reported torque and the plant say against the nominal model.
+
+- **K**, kinematic: reported velocity minus differenced position.
+- **A**, actuation: reported torque minus the controller's own demand, the controller replayed on the measured position.
+- **P**, plant: reported torque minus inertia, gravity and friction of the nominal model along the measured motion.
+
+Position is never filtered before it is differentiated; whatever is compared passes the same low-pass once. Filtering
+parts differently makes every healthy joint look as if it had backlash.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+from scipy import signal
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
+from frictid_hil.simulation.inverse import View
+
+CUTOFF_HZ = 20.0
+"""Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
+
+SETTLED_S = 0.5
+"""The controller's integral is unknown at the start; its level is read from this first stretch."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One experiment on a uniform clock with its residuals; arrays have shape (n,), None where they cannot be formed.
+
+    Attributes:
+        experiment: as recorded, resampled where its clock was not uniform.
+        step_s: sampling step.
+        resampled: the clock was not uniform.
+        view: what inverse forms see; None without torque.
+        plant_nm: P, unfiltered.
+        demand_nm: the controller's replayed demand, in force from each sample on.
+        actuation_nm: A, unfiltered.
+        kinematic_rad_s: K.
+    """
+
+    experiment: Experiment
+    step_s: float
+    resampled: bool
+    view: View | None
+    plant_nm: Array | None
+    demand_nm: Array | None
+    actuation_nm: Array | None
+    kinematic_rad_s: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class LowPass:
+    """The one low-pass of a set: fourth-order Butterworth, forwards and backwards."""
+
+    rate_hz: float
+    cutoff_hz: float
+
+    @staticmethod
+    def at(rate_hz: float) -> LowPass:
+        """The filter for a sampling rate."""
+        return LowPass(rate_hz, min(CUTOFF_HZ, 0.2 * rate_hz))
+
+    def __call__(self, columns: Array) -> Array:
+        """Filtered along the first axis; shape unchanged."""
+        b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
+        padding = min(15, columns.shape[0] - 1)
+        filtered: Array = signal.filtfilt(b, a, columns, axis=0, padlen=padding)
+        return filtered
+
+    @property
+    def stride(self) -> int:
+        """Thinning that loses nothing after the filter."""
+        return max(1, int(self.rate_hz / (3.0 * self.cutoff_hz)))
+
+    @property
+    def white_gain(self) -> float:
+        """RMS of filtered white noise of unit RMS."""
+        b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
+        _, response = signal.freqz(b, a, worN=2048)
+        return float(np.sqrt(np.mean(np.abs(response) ** 4)))
+
+
+def rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def recordings(experiments: ExperimentSet) -> tuple[Recording, ...]:
+    """All experiments of a set with their residuals, in run order."""
+    result = []
+    start_s = 0.0
+    for experiment in experiments.experiments:
+        result.append(_recording(experiments.nominal, experiment, start_s))
+        start_s += float(experiment.time_s[-1] - experiment.time_s[0])
+    return tuple(result)
+
+
+def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
+    experiment, step_s, resampled = uniform(raw)
+    q = experiment.position_rad
+    velocity = np.gradient(q, step_s)
+    demand = actuation = kinematic = plant = None
+    view = None
+    if nominal.controller is not None and experiment.position_command_rad is not None:
+        demand = demand_of(nominal.controller, experiment, step_s)
+    if experiment.torque_nm is not None:
+        view = _view(nominal, experiment, step_s, start_s, velocity)
+        plant = view.torque_nm - nominal_torque(nominal, experiment, view)
+        if demand is not None:
+            actuation = settled(experiment.torque_nm - held(demand), step_s)
+    if experiment.velocity_rad_s is not None:
+        difference = np.diff(q, prepend=q[0]) / step_s
+        kinematic = experiment.velocity_rad_s - lagged(difference, step_s, nominal.velocity_filter_s)
+    return Recording(experiment, step_s, resampled, view, plant, demand, actuation, kinematic)
+
+
+def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
+    """The experiment on a clock of equal steps; (it, step in s, whether it had to be resampled)."""
+    steps = np.diff(experiment.time_s)
+    step_s = float(np.median(steps))
+    if float(np.max(np.abs(steps - step_s))) < 0.02 * step_s:
+        return experiment, float(np.mean(steps)), False
+    time = np.arange(experiment.time_s[0], experiment.time_s[-1], step_s)
+    columns = {
+        name: np.interp(time, experiment.time_s, column)
+        for name in (
+            "position_rad",
+            "velocity_rad_s",
+            "torque_nm",
+            "position_command_rad",
+            "rigid_body_torque_nm",
+            "temperature_c",
+        )
+        if (column := getattr(experiment, name)) is not None
+    }
+    return replace(experiment, time_s=time, **columns), step_s, True
+
+
+def _view(nominal: Nominal, experiment: Experiment, step_s: float, start_s: float, velocity: Array) -> View:
+    q = experiment.position_rad
+    assert experiment.torque_nm is not None
+    acceleration = np.zeros_like(q)
+    acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2
+    torque = experiment.torque_nm.copy()
+    # Row k carries the torque applied since row k-1: half a step late.
+    torque[:-1] = 0.5 * (experiment.torque_nm[:-1] + experiment.torque_nm[1:])
+    inertia = nominal.inertia_kg_m2 or 0.0
+    motor = inertia * (nominal.motor_inertia_share or 0.0)
+    payload = nominal.payload if experiment.payload else None
+    payload_inertia = payload.inertia_kg_m2 if payload is not None else 0.0
+    payload_cos = payload.gravity_cos_nm if payload is not None else 0.0
+    cos, sin = np.cos(q), np.sin(q)
+    gravity = nominal.gravity_cos_nm * cos + nominal.gravity_sin_nm * sin
+    coulomb, stiffness = friction_scales(nominal)
+    load = gravity + payload_cos * cos + (inertia - motor + payload_inertia) * acceleration
+    if experiment.rigid_body_torque_nm is not None:
+        load = experiment.rigid_body_torque_nm
+    return View(
+        step_s=step_s,
+        start_s=start_s,
+        position_rad=q,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
+        torque_nm=torque,
+        slip=slip_state(q, stiffness / coulomb),
+        rate_nm=nominal.curve.rate_part(velocity) if nominal.curve is not None else np.zeros_like(q),
+        gravity_nm=gravity,
+        payload_gravity_nm=payload_cos * cos,
+        gravity_slope_nm_per_rad=nominal.gravity_sin_nm * cos - (nominal.gravity_cos_nm + payload_cos) * sin,
+        load_nm=load,
+        coulomb_nm=coulomb,
+        stiffness_nm_per_rad=stiffness,
+        motor_inertia_kg_m2=motor,
+        link_inertia_kg_m2=inertia - motor,
+        payload_inertia_kg_m2=payload_inertia,
+        gear_ratio=nominal.gear_ratio or 1.0,
+        gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
+        gravity_sin_nm=nominal.gravity_sin_nm,
+    )
+
+
+def friction_scales(nominal: Nominal) -> tuple[float, float]:
+    """(F_0 in N m, presliding stiffness in N m/rad), with a stiff default where the file does not say."""
+    coulomb = nominal.curve.coulomb_nm if nominal.curve is not None else 1.0
+    return coulomb, nominal.presliding_stiffness_nm_per_rad or coulomb / 2e-4
+
+
+def nominal_torque(nominal: Nominal, experiment: Experiment, view: View) -> Array:
+    """Torque that the nominal model asks for along the measured motion, shape (n,)."""
+    if experiment.rigid_body_torque_nm is not None:
+        rigid = experiment.rigid_body_torque_nm
+    else:
+        inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2 + view.payload_inertia_kg_m2
+        rigid = inertia * view.acceleration_rad_s2 + view.gravity_nm + view.payload_gravity_nm
+    friction = friction_torque(nominal.curve, view.slip, view.rate_nm)
+    total: Array = rigid + friction
+    return total
+
+
+def friction_torque(curve: FrictionCurve | None, slip: Array, rate_nm: Array) -> Array:
+    """F_0 s + phi_0(v), 0 without a curve."""
+    if curve is None:
+        return np.zeros_like(slip)
+    torque: Array = curve.coulomb_nm * slip + rate_nm
+    return torque
+
+
+@njit(cache=True)
+def slip_state(position_rad: Array, slip_per_rad: float) -> Array:
+    """State of the slip spring (20) driven by a measured position, from a relaxed start."""
+    slip = np.zeros(position_rad.shape[0])
+    for k in range(1, position_rad.shape[0]):
+        turned = slip[k - 1] + slip_per_rad * (position_rad[k] - position_rad[k - 1])
+        slip[k] = min(1.0, max(-1.0, turned))
+    return slip
+
+
+def controller_demand(
+    controller: Controller,
+    position_rad: Array,
+    command_rad: Array,
+    step_s: float,
+    *,
+    integral_nm: float = 0.0,
+    velocity_lag_s: float = 0.0,
+) -> Array:
+    """The controller replayed on a measured position; in force from each sample on, shape (n,).
+
+    Args:
+        controller: gains and limit.
+        position_rad: measured.
+        command_rad: commanded.
+        step_s: sampling step.
+        integral_nm: level of the integral at the start.
+        velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
+    """
+    difference = np.diff(position_rad, prepend=position_rad[0]) / step_s
+    velocity = lagged(lagged(difference, step_s, velocity_lag_s), step_s, controller.velocity_filter_s)
+    feed = np.gradient(command_rad, step_s)
+    error = command_rad - position_rad
+    direct = controller.kp_nm_per_rad * error + controller.kd_nm_s_per_rad * (feed - velocity)
+    return _integrated(direct, controller.ki_nm_per_rad_s * step_s * error, controller.torque_limit_nm, integral_nm)
+
+
+@njit(cache=True)
+def _integrated(direct: Array, integral_step: Array, limit: float, start: float) -> Array:
+    demand = np.empty_like(direct)
+    integral = start
+    for k in range(direct.shape[0]):
+        wanted = direct[k] + integral
+        if abs(wanted) > limit:
+            wanted = math.copysign(limit, wanted)
+        else:
+            integral += integral_step[k]
+        demand[k] = wanted
+    return demand
+
+
+def held(demand_nm: Array) -> Array:
+    """Torque that a drive without delay reports for a demand in force from each sample on: one row later."""
+    return np.concatenate([demand_nm[:1], demand_nm[:-1]])
+
+
+def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:
+    """First-order lag, exact for held input; starts settled."""
+    if time_constant_s <= 0.0:
+        return values
+    share = 1.0 - math.exp(-step_s / time_constant_s)
+    b, a = np.array([share]), np.array([1.0, share - 1.0])
+    out, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
+    filtered: Array = out
+    return filtered
+
+
+def settled(residual_nm: Array, step_s: float) -> Array:
+    """The residual less its level over the first half second (what is left of the integral's unknown start)."""
+    shifted: Array = residual_nm - np.median(residual_nm[1 : start_rows(residual_nm, step_s)])
+    shifted[0] = 0.0
+    return shifted
+
+
+def start_rows(values: Array, step_s: float) -> int:
+    """Rows of the first half second, at least a few."""
+    return min(values.size, max(8, int(SETTLED_S / step_s)))
+
+
+def demand_of(controller: Controller, experiment: Experiment, step_s: float, velocity_lag_s: float = 0.0) -> Array:
+    """The controller's demand along a recording; its integral starts where the reported torque says."""
+    assert experiment.position_command_rad is not None
+    q, command = experiment.position_rad, experiment.position_command_rad
+    level = 0.0
+    if experiment.torque_nm is not None:
+        rows = start_rows(q, step_s)
+        free = controller_demand(
+            replace(controller, torque_limit_nm=math.inf),
+            q[:rows],
+            command[:rows],
+            step_s,
+            velocity_lag_s=velocity_lag_s,
+        )
+        level = float(np.median(experiment.torque_nm[1:rows] - held(free)[1:]))
+    return controller_demand(controller, q, command, step_s, integral_nm=level, velocity_lag_s=velocity_lag_s)
