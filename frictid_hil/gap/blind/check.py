@@ -1,0 +1,216 @@
+"""The blind check of the diagnosis: draw, seal, diagnose in other processes, then open the seal and score.
+
+Order matters and is the point. All cases are drawn and written first; their truth stays in this process's memory and
+only its SHA-256 is published. The diagnosing processes get the folder of cases as their working directory and nothing
+else: no seed, no truth, no path to any. Truth is written out after the last answer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.gap.blind.generator import Assignment, assignments, draw_case, truth_text, write_case
+from frictid_hil.gap.blind.score import Answer, score, score_left_out
+
+SCHEMA = "frictid.gap-check/1"
+
+Progress = Callable[[str, int, int], None]
+"""Called with the phase (``draw``, ``diagnose``, ``leave one out``), how many are done, and of how many."""
+DiagnoserCommand = tuple[str, ...]
+DIAGNOSER: DiagnoserCommand = (sys.executable, "-m", "frictid_hil.gap.blind.diagnoser")
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """Drawn cases: sets on disk, truth in memory, its hash for the world.
+
+    Attributes:
+        folder: of the cases.
+        truths: by case name.
+        texts: the truth files to be, by case name.
+        digest: SHA-256 over all of them, hexadecimal.
+    """
+
+    folder: Path
+    truths: dict[str, dict[str, Any]]
+    texts: dict[str, str]
+    digest: str
+
+
+def run_check(
+    cases: int,
+    seed: int,
+    *,
+    out: Path | None = None,
+    processes: int = 1,
+    leave_one_out: bool = False,
+    progress: Progress | None = None,
+    diagnoser: DiagnoserCommand = DIAGNOSER,
+) -> dict[str, Any]:
+    """Draw, diagnose and score.
+
+    Args:
+        cases: how many joints.
+        seed: of everything drawn; equal seeds give equal cases, whatever ``processes``.
+        out: folder to keep the commitment, the cases, the answers, the truth and the result in; kept nowhere if None.
+        processes: how many diagnose (and draw) at once.
+        leave_one_out: also diagnose every visible joint with one effect by a library that lacks this effect.
+        progress: see ``Progress``.
+        diagnoser: command of a diagnosing process; see ``diagnoser.serve`` for what it is told and answers.
+
+    Returns:
+        The scores, plain values, with ``schema``, ``seed``, ``cases``, ``truth_sha256``.
+    """
+    report = progress or (lambda phase, done, of: None)
+    with _folder(out) as folder:
+        sealed = draw_sealed(assignments(cases, seed), seed, folder / "cases", processes, report)
+        # The commitment stands before the first answer is asked for.
+        commitment = {"schema": SCHEMA, "cases": cases, "truth_sha256": sealed.digest}
+        (folder / "commitment.json").write_text(json.dumps(commitment, indent=2) + "\n")
+        requests = [{"case": name, "left_out": None} for name in sealed.truths]
+        lines = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "diagnose")
+        answers = {line["case"]: Answer.from_json(line) for line in lines}
+        result: dict[str, Any] = {
+            **commitment,
+            "seed": seed,
+            "scores": score(sealed.truths, answers),
+            "leave_one_out": None,
+        }
+        left_out: list[dict[str, Any]] = []
+        if leave_one_out:
+            requests = [
+                {"case": name, "left_out": truth["effects"][0]["name"]}
+                for name, truth in sealed.truths.items()
+                if truth["kind"] == "single" and truth["visible"]
+            ]
+            left_out = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "leave one out")
+            result["leave_one_out"] = score_left_out(
+                [(sealed.truths[line["case"]], Answer.from_json(line)) for line in left_out]
+            )
+        _open_seal(folder, sealed, {"answers": lines, "answers_left_out": left_out, "result": result})
+    return result
+
+
+def draw_sealed(dealt: Sequence[Assignment], seed: int, folder: Path, processes: int, progress: Progress) -> Sealed:
+    """Draw all cases and write their sets below ``folder``; truth comes back to the caller's memory alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks = [(index, seed, assignment, folder) for index, assignment in enumerate(dealt)]
+    truths: dict[str, dict[str, Any]] = {}
+    for done, truth in enumerate(_mapped(tasks, processes), start=1):
+        truths[truth["case"]] = truth
+        progress("draw", done, len(tasks))
+    texts = {name: truth_text(truth) for name, truth in truths.items()}
+    digest = hashlib.sha256("".join(texts[name] for name in sorted(texts)).encode()).hexdigest()
+    return Sealed(folder, truths, texts, digest)
+
+
+def _mapped(tasks: Sequence[tuple[int, int, Assignment, Path]], processes: int) -> Iterator[dict[str, Any]]:
+    if processes <= 1:
+        yield from map(_draw_and_write, tasks)
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(_draw_and_write, tasks, chunksize=4)
+
+
+def _draw_and_write(task: tuple[int, int, Assignment, Path]) -> dict[str, Any]:
+    index, seed, assignment, folder = task
+    case = draw_case(index, seed, assignment)
+    write_case(case, folder / case.name)
+    return case.truth
+
+
+def _diagnosed(
+    command: DiagnoserCommand,
+    folder: Path,
+    requests: Sequence[dict[str, Any]],
+    processes: int,
+    progress: Progress,
+    phase: str,
+) -> list[dict[str, Any]]:
+    """All answers, in the order of the requests; a process that dies answers its request with its exit code."""
+    todo: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+    done: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    for request in requests:
+        todo.put(request)
+    workers = [
+        threading.Thread(target=_attend, args=(command, folder, todo, done), daemon=True)
+        for _ in range(min(max(processes, 1), len(requests)))
+    ]
+    for worker in workers:
+        todo.put(None)
+        worker.start()
+    by_case: dict[str, dict[str, Any]] = {}
+    for count in range(1, len(requests) + 1):
+        answer = done.get()
+        by_case[answer["case"]] = answer
+        progress(phase, count, len(requests))
+    for worker in workers:
+        worker.join()
+    return [by_case[request["case"]] for request in requests]
+
+
+def _attend(
+    command: DiagnoserCommand,
+    folder: Path,
+    todo: queue.SimpleQueue[dict[str, Any] | None],
+    done: queue.SimpleQueue[dict[str, Any]],
+) -> None:
+    """Feed one diagnosing process after another until the requests run out."""
+    process: subprocess.Popen[str] | None = None
+    while (request := todo.get()) is not None:
+        if process is None:
+            process = subprocess.Popen(command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        answer = _asked(process, request)
+        if answer is None:
+            answer = {"case": request["case"], "error": f"the diagnosing process ended with code {process.wait()}"}
+            process = None
+        done.put(answer)
+    if process is not None and process.stdin is not None:
+        process.stdin.close()
+        process.wait()
+
+
+def _asked(process: subprocess.Popen[str], request: dict[str, Any]) -> dict[str, Any] | None:
+    """The answer to one request; None when the process is gone or says something that is no answer."""
+    if process.stdin is None or process.stdout is None:
+        return None
+    try:
+        process.stdin.write(json.dumps(request) + "\n")
+        process.stdin.flush()
+        answer = json.loads(process.stdout.readline())
+    except (BrokenPipeError, json.JSONDecodeError):
+        process.kill()
+        return None
+    return answer if isinstance(answer, dict) and answer.get("case") == request["case"] else None
+
+
+def _open_seal(folder: Path, sealed: Sealed, documents: dict[str, Any]) -> None:
+    """Truth, answers and result beside the cases, once nothing is left to be answered."""
+    (folder / "truth").mkdir(exist_ok=True)
+    for name, text in sealed.texts.items():
+        (folder / "truth" / f"{name}.yaml").write_text(text)
+    for name, document in documents.items():
+        (folder / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n")
+
+
+@contextmanager
+def _folder(out: Path | None) -> Iterator[Path]:
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        yield out
+        return
+    with tempfile.TemporaryDirectory(prefix="frictid-gap-check-") as name:
+        yield Path(name)

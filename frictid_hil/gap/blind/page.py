@@ -1,0 +1,204 @@
+"""The page that shows a blind check, failures included, as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_HEAD = """# How often the diagnosis is right
+
+`frictid-hil gap check` draws joints from a generator of its own (other formulas and another integrator than the effect
+library), seals what was drawn, has other processes diagnose the recordings, and only then compares. This page is the
+last full run, failures included.
+"""
+
+
+def page(result: Mapping[str, Any]) -> str:
+    """The whole page of one run."""
+    scores = result["scores"]
+    lines = [
+        _HEAD,
+        f"{result['cases']} joints, seed {result['seed']}. SHA-256 of the truth, published before the first answer: "
+        f"`{result['truth_sha256']}`.",
+        "",
+        *_rates(scores),
+        *_by_size(scores),
+        *_closed(scores),
+        *_calibration(scores),
+        *_figures(scores),
+        *_confusion(scores),
+        *_outside(scores),
+        *_misses(scores),
+        *(_left_out(result["leave_one_out"]) if result.get("leave_one_out") else ()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _rates(scores: Mapping[str, Any]) -> list[str]:
+    rows = [
+        ("Visible single effects named first", scores["singles"]["top_1"]),
+        ("... or its alias", scores["singles"]["top_1_or_alias"]),
+        ("... among the first two", scores["singles"]["top_2"]),
+        ("Healthy joints answered `none`", scores["none"]["answered_none"]),
+        ("Visible effects from outside the library answered `unknown`", scores["outside"]["answered_unknown"]),
+        ("Both of two effects (each visible alone) in the first two", scores["doubles"]["both_in_top_2"]),
+        ("... of all pairs", scores["doubles"]["both_in_top_2_all"]),
+        ("Invisible effects answered `none` or by their name", scores["invisible"]),
+        ("Answers of confidence 0.9 and more that are right", scores["confident"]["right"]),
+        ("... or the alias of right", scores["confident"]["right_or_alias"]),
+    ]
+    seconds = scores["seconds"]
+    return [
+        "## Rates",
+        "",
+        "| | share | 95 % interval | count |",
+        "|---|---|---|---|",
+        *(f"| {label} | {_percent(rate['share'])} | {_interval(rate)} | {_count(rate)} |" for label, rate in rows),
+        "",
+        f"Time per joint: median {_number(seconds['median'])} s, 90 % within {_number(seconds['p90'])} s, longest "
+        f"{_number(seconds['worst'])} s. Diagnoses that raised an error: {len(scores['errors'])}. Answers `unknown` "
+        f"that enlarged the gap: {len(scores['unknown_enlarges_gap'])}.",
+        "",
+    ]
+
+
+def _by_size(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## Single effects by size",
+        "",
+        "The size is the largest ratio of gap to floor: small below 4, medium below 12, large above.",
+        "",
+        "| size | first | first two | count |",
+        "|---|---|---|---|",
+        *(
+            f"| {size} | {_percent(rates['top_1']['share'])} | {_percent(rates['top_2']['share'])} "
+            f"| {rates['top_1']['of']} |"
+            for size, rates in scores["singles"]["by_size"].items()
+        ),
+        "",
+    ]
+
+
+def _closed(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## Share of the gap closed",
+        "",
+        "On validation logs, for single effects named first: (before - after) / (before - floor), before and after as "
+        "the tool reports them, the floor from the truth.",
+        "",
+        "| figure | median | 10 % quantile | worst | joints |",
+        "|---|---|---|---|---|",
+        *(
+            f"| `{figure}` | {_number(row['median'])} | {_number(row['p10'])} | {_number(row['worst'])} "
+            f"| {row['joints']} |"
+            for figure, row in scores["closed"].items()
+        ),
+        "",
+    ]
+
+
+def _calibration(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## Calibration",
+        "",
+        "| confidence | mean | right | count |",
+        "|---|---|---|---|",
+        *(
+            f"| {row['from']:.2f} to {row['to']:.2f} | {_number(row['mean_confidence'])} | {_percent(row['share'])} "
+            f"| {_count(row)} |"
+            for row in scores["calibration"]
+        ),
+        "",
+    ]
+
+
+def _figures(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## The tool's own figures against the truth",
+        "",
+        "The gap that the tool reports before any fix, over the gap that the recordings contain. A larger one is a "
+        "defect.",
+        "",
+        "| figure | median | 5 % | 95 % | larger | smaller | after, better than ideal |",
+        "|---|---|---|---|---|---|---|",
+        *(
+            f"| `{figure}` | {_number(row['median_ratio'])} | {_number(row['p05_ratio'])} | "
+            f"{_number(row['p95_ratio'])} | {len(row['larger_than_the_logs_contain'])} | "
+            f"{len(row['smaller_than_the_logs_contain'])} | {len(row['better_than_ideal'])} |"
+            for figure, row in scores["figures_against_truth"].items()
+        ),
+        "",
+    ]
+
+
+def _confusion(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## What was answered for what",
+        "",
+        "| truth | first answers |",
+        "|---|---|",
+        *(f"| {truth} | {_counts(answers)} |" for truth, answers in scores["confusion"].items()),
+        "",
+    ]
+
+
+def _outside(scores: Mapping[str, Any]) -> list[str]:
+    return [
+        "## Effects from outside, answered `unknown`",
+        "",
+        "| effect | answered `unknown` |",
+        "|---|---|",
+        *(f"| {effect} | {_count(rate)} |" for effect, rate in scores["outside"]["by_effect"].items()),
+        "",
+    ]
+
+
+def _misses(scores: Mapping[str, Any]) -> list[str]:
+    rows = []
+    for miss in scores["misses"]:
+        truth = " + ".join(miss["truth"]) or "none"
+        named = ", ".join(f"{cause['effect']} ({cause['confidence']:.2f})" for cause in miss["named"]) or "-"
+        visible = "" if miss["visible"] else ", invisible"
+        rows.append(
+            f"| {miss['case']} | {truth} ({miss['kind']}{visible}) | {miss['size_ratio']:.2f} | {miss['verdict']} "
+            f"| {named} |"
+        )
+    return ["## Every miss", "", "| case | truth | size | verdict | named |", "|---|---|---|---|---|", *rows, ""]
+
+
+def _left_out(check: Mapping[str, Any]) -> list[str]:
+    wrong = check["confident_wrong"]
+    return [
+        "## With the joint's own effect taken out of the library",
+        "",
+        f"{check['joints']} visible joints with one effect. A confident (0.9 and more) wrong cause: "
+        f"{_percent(wrong['share'])} ({_count(wrong)}, {_interval(wrong)}); "
+        f"a confident partner of the true one: {_count(check['confident_partner'])}; answered `unknown`: "
+        f"{_percent(check['answered_unknown']['share'])}.",
+        "",
+        "| effect left out | first answers |",
+        "|---|---|",
+        *(f"| {effect} | {_counts(answers)} |" for effect, answers in check["by_effect"].items()),
+        "",
+    ]
+
+
+def _counts(answers: Mapping[str, int]) -> str:
+    return ", ".join(f"{answer} {count}" for answer, count in answers.items())
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def _interval(rate: Mapping[str, Any]) -> str:
+    interval = rate["interval_95"]
+    return "-" if interval is None else f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f} %"
+
+
+def _count(rate: Mapping[str, Any]) -> str:
+    return f"{rate['right']} of {rate['of']}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

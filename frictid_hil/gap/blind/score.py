@@ -1,0 +1,371 @@
+"""Scores answers of a diagnosis against the sealed truth: rates with intervals, never a single flattering number.
+
+Truths and answers are the plain mappings of ``truth/*.yaml`` and of ``gap diagnose --json``; nothing here knows how
+either came about.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+NAMING = ("explained", "ambiguous")
+CONFIDENT = 0.9
+BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
+
+PARTNERS = (
+    ("torque_bias", "direction_asymmetry"),
+    ("torque_bias", "encoder_offset"),
+    ("encoder_offset", "gravity_error"),
+    ("viscous_nonlinearity", "stribeck"),
+    ("stribeck", "stiction_breakaway"),
+    ("torque_delay", "electrical_lag"),
+    ("presliding_hysteresis", "torque_delay"),
+)
+"""Pairs whose traces in a recording are alike; within one, the partner at low confidence is an honest answer."""
+
+# A figure the tool reports may differ from truth's by its own choice of filter, not by more.
+AGREEMENT = 1.25
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer of the diagnosis.
+
+    Attributes:
+        verdict: ``none``, ``explained``, ``ambiguous``, ``unknown``, or ``error`` where the diagnosis raised.
+        causes: ranked (effect, confidence).
+        confusable: effects that the first cause could be mistaken for.
+        gap: before, after, noise_floor on validation logs, each a mapping of figures; empty after an error.
+        seconds: time it took.
+        message: of the error.
+    """
+
+    verdict: str
+    causes: tuple[tuple[str, float], ...] = ()
+    confusable: tuple[str, ...] = ()
+    gap: Mapping[str, Mapping[str, float | None]] | None = None
+    seconds: float = math.nan
+    message: str = ""
+
+    @staticmethod
+    def from_json(document: Mapping[str, Any]) -> Answer:
+        """From a line of the diagnosing process: ``{"case", "seconds", "diagnosis"}`` or ``{"case", "error"}``."""
+        if "error" in document:
+            return Answer("error", message=str(document["error"]), seconds=float(document.get("seconds", math.nan)))
+        diagnosis = document["diagnosis"]
+        causes = diagnosis.get("causes", [])
+        return Answer(
+            verdict=str(diagnosis["verdict"]),
+            causes=tuple((str(cause["effect"]), float(cause["confidence"])) for cause in causes),
+            confusable=tuple(causes[0].get("confusable_with", ())) if causes else (),
+            gap=diagnosis.get("gap"),
+            seconds=float(document.get("seconds", math.nan)),
+        )
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Effects named as causes, in order; nothing unless the verdict names any."""
+        return tuple(effect for effect, _ in self.causes) if self.verdict in NAMING else ()
+
+    @property
+    def ranking(self) -> tuple[str, ...]:
+        """Causes, then what the first may be confused with."""
+        return tuple(dict.fromkeys((*self.named, *(self.confusable if self.named else ()))))
+
+    @property
+    def first(self) -> str:
+        """The first cause, or the verdict where none is named."""
+        return self.named[0] if self.named else self.verdict
+
+    @property
+    def confidence(self) -> float:
+        """Of the first cause; 0 where none is named."""
+        return self.causes[0][1] if self.named else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """A share with its 95 % Wilson interval."""
+
+    right: int
+    of: int
+
+    @staticmethod
+    def over(outcomes: Iterable[bool]) -> Rate:
+        """Counted from outcomes."""
+        counted = list(outcomes)
+        return Rate(sum(counted), len(counted))
+
+    @property
+    def share(self) -> float | None:
+        """None where nothing was counted."""
+        return self.right / self.of if self.of else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Wilson score interval, 95 %."""
+        if not self.of:
+            return None
+        z = 1.959964
+        p, n = self.right / self.of, self.of
+        middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return max(0.0, middle - half), min(1.0, middle + half)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "right": self.right,
+            "of": self.of,
+            "share": self.share,
+            "interval_95": list(self.interval) if self.interval else None,
+        }
+
+
+def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]) -> dict[str, Any]:
+    """Every rate of the blind check, plain values.
+
+    Args:
+        truths: by case name.
+        answers: by case name; a case without an answer counts as an error.
+    """
+    cases = [(truth, answers.get(name, Answer("error", message="no answer"))) for name, truth in truths.items()]
+    visible = [(t, a) for t, a in cases if t["visible"]]
+    singles = [(t, a) for t, a in visible if t["kind"] == "single"]
+    doubles = [(t, a) for t, a in visible if t["kind"] == "double"]
+    apart = [(t, a) for t, a in doubles if _both_visible(t)]
+    healthy = [(t, a) for t, a in cases if t["kind"] == "none"]
+    outside = [(t, a) for t, a in visible if t["kind"] == "outside"]
+    confident = [(t, a) for t, a in cases if a.confidence >= CONFIDENT]
+    classes = ("small", "medium", "large")
+    return {
+        "cases": len(cases),
+        "errors": [{"case": t["case"], "message": a.message} for t, a in cases if a.verdict == "error"],
+        "singles": {
+            "top_1": Rate.over(a.first == _name(t) for t, a in singles).to_json(),
+            "top_2": Rate.over(_name(t) in a.ranking[:2] for t, a in singles).to_json(),
+            "top_1_or_alias": Rate.over(_same_or_alias(t, a) for t, a in singles).to_json(),
+            "by_size": {
+                size: {
+                    "top_1": Rate.over(a.first == _name(t) for t, a in singles if t["size_class"] == size).to_json(),
+                    "top_2": Rate.over(
+                        _name(t) in a.ranking[:2] for t, a in singles if t["size_class"] == size
+                    ).to_json(),
+                }
+                for size in classes
+            },
+        },
+        "invisible": Rate.over(
+            a.first in ("none", "unknown") if t["kind"] == "outside" else a.first in ("none", *_names(t))
+            for t, a in cases
+            if not t["visible"]
+        ).to_json(),
+        "none": {
+            "answered_none": Rate.over(a.verdict == "none" for _, a in healthy).to_json(),
+            "false_alarms": Rate.over(a.verdict != "none" for _, a in healthy).to_json(),
+        },
+        "outside": {
+            "answered_unknown": Rate.over(a.verdict == "unknown" for _, a in outside).to_json(),
+            "by_effect": {
+                name: Rate.over(a.verdict == "unknown" for t, a in outside if _name(t) == name).to_json()
+                for name in sorted({_name(t) for t, _ in outside})
+            },
+        },
+        "doubles": {
+            "both_in_top_2": Rate.over(set(_names(t)) <= set(a.named[:2]) for t, a in apart).to_json(),
+            "both_in_top_2_all": Rate.over(set(_names(t)) <= set(a.named[:2]) for t, a in doubles).to_json(),
+            "at_least_one_in_top_2": Rate.over(bool(set(_names(t)) & set(a.named[:2])) for t, a in apart).to_json(),
+        },
+        "confident": {
+            "right": Rate.over(a.first in _names(t) for t, a in confident).to_json(),
+            "right_or_alias": Rate.over(_same_or_alias(t, a) for t, a in confident).to_json(),
+        },
+        "calibration": _calibration(cases),
+        "closed": {
+            figure: _closed(figure, [(t, a) for t, a in singles if a.first == _name(t)])
+            for figure in ("forward_torque_nm", "inverse_nm")
+        },
+        "figures_against_truth": {
+            figure: _agreement(figure, cases) for figure in ("inverse_nm", "forward_torque_nm", "forward_position_rad")
+        },
+        "unknown_enlarges_gap": [t["case"] for t, a in cases if a.verdict == "unknown" and _enlarged(a)],
+        "confusion": _confusion(cases),
+        "seconds": _times([a.seconds for _, a in cases]),
+        "misses": [_miss(t, a) for t, a in cases if not _right(t, a)],
+    }
+
+
+def score_left_out(answers: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+    """The second check: each joint's own effect was taken out of the library before it was diagnosed.
+
+    Args:
+        answers: (truth, answer) of visible joints with one effect.
+    """
+
+    def partner(truth: Mapping[str, Any], answer: Answer) -> bool:
+        return {_name(truth), answer.first} in [set(pair) for pair in PARTNERS]
+
+    confident = [(t, a) for t, a in answers if a.confidence >= CONFIDENT]
+    return {
+        "joints": len(answers),
+        "errors": [{"case": t["case"], "message": a.message} for t, a in answers if a.verdict == "error"],
+        "confident_wrong": Rate.over(a.confidence >= CONFIDENT and not partner(t, a) for t, a in answers).to_json(),
+        "confident_partner": Rate.over(a.confidence >= CONFIDENT and partner(t, a) for t, a in answers).to_json(),
+        "answered_unknown": Rate.over(a.verdict == "unknown" for _, a in answers).to_json(),
+        "wrong_causes": [
+            {"case": t["case"], "effect": _name(t), "named": a.first, "confidence": a.confidence} for t, a in confident
+        ],
+        "by_effect": {
+            name: dict(Counter(a.first for t, a in answers if _name(t) == name).most_common())
+            for name in sorted({_name(t) for t, _ in answers})
+        },
+    }
+
+
+def _name(truth: Mapping[str, Any]) -> str:
+    return str(truth["effects"][0]["name"])
+
+
+def _names(truth: Mapping[str, Any]) -> tuple[str, ...]:
+    """Library effects that act; an outsider has no name that an answer could give."""
+    return tuple(effect["name"] for effect in truth["effects"] if effect["in_library"])
+
+
+def _same_or_alias(truth: Mapping[str, Any], answer: Answer) -> bool:
+    pairs = [set(pair) for pair in truth["aliases"]]
+    return any(answer.first == name or {answer.first, name} in pairs for name in _names(truth))
+
+
+def _both_visible(truth: Mapping[str, Any]) -> bool:
+    """Each of two effects would be visible alone; truth files without that figure do not say otherwise."""
+    return all(effect.get("size_ratio_alone", math.inf) >= 1.5 for effect in truth["effects"])
+
+
+def _right(truth: Mapping[str, Any], answer: Answer) -> bool:
+    if truth["kind"] == "none":
+        return answer.verdict == "none"
+    if truth["kind"] == "outside":
+        return answer.verdict == "unknown" or (not truth["visible"] and answer.verdict == "none")
+    if not truth["visible"]:
+        return answer.first in ("none", *_names(truth))
+    return set(_names(truth)) <= set(answer.named[: len(truth["effects"])])
+
+
+def _miss(truth: Mapping[str, Any], answer: Answer) -> dict[str, Any]:
+    return {
+        "case": truth["case"],
+        "kind": truth["kind"],
+        "truth": [effect["name"] for effect in truth["effects"]],
+        "visible": truth["visible"],
+        "size_ratio": truth["size_ratio"],
+        "verdict": answer.verdict,
+        "named": [{"effect": effect, "confidence": confidence} for effect, confidence in answer.causes],
+    }
+
+
+def _calibration(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[dict[str, Any]]:
+    named = [(a.confidence, a.first in _names(t)) for t, a in cases if a.named]
+    rows = []
+    for low, high in itertools.pairwise(BINS):
+        inside = [(c, right) for c, right in named if low <= c < high or (high == 1.0 and c == 1.0)]
+        rows.append(
+            {
+                "from": low,
+                "to": high,
+                "mean_confidence": float(np.mean([c for c, _ in inside])) if inside else None,
+                **Rate.over(right for _, right in inside).to_json(),
+            }
+        )
+    return rows
+
+
+def _figure(answer: Answer, when: str, figure: str) -> float | None:
+    value = ((answer.gap or {}).get(when) or {}).get(figure)
+    return None if value is None else float(value)
+
+
+def _closed(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+    """Share of the closable gap that was closed on validation logs, from the tool's own figures and truth's floor."""
+    shares, without = [], 0
+    for truth, answer in cases:
+        before, after = _figure(answer, "before", figure), _figure(answer, "after", figure)
+        ideal = _held_out(truth, "ideal_residual", figure)
+        # Where the validation logs hold nothing to close, a share is a quotient of noise.
+        if before is None or after is None or before - ideal < 0.15 * ideal:
+            without += 1
+            continue
+        shares.append((before - after) / (before - ideal))
+    return {
+        "joints": len(shares),
+        "without_figure": without,
+        "median": float(np.median(shares)) if shares else None,
+        "p10": float(np.quantile(shares, 0.1)) if shares else None,
+        "worst": float(min(shares)) if shares else None,
+    }
+
+
+def _held_out(truth: Mapping[str, Any], what: str, figure: str) -> float:
+    """A truth figure over the validation logs, or over all where the file does not part them."""
+    return float(truth.get("validation", truth)[what][figure])
+
+
+def _agreement(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+    """The gap that the tool reports before any fix, over the gap that the logs contain."""
+    ratios = {
+        str(truth["case"]): before / _held_out(truth, "gap", figure)
+        for truth, answer in cases
+        if (before := _figure(answer, "before", figure)) is not None and _held_out(truth, "gap", figure) > 0.0
+    }
+    too_good = {
+        str(truth["case"]): after / _held_out(truth, "ideal_residual", figure)
+        for truth, answer in cases
+        if (after := _figure(answer, "after", figure)) is not None
+        and _held_out(truth, "ideal_residual", figure) > 0.0
+        and after < _held_out(truth, "ideal_residual", figure) / AGREEMENT
+    }
+    values = list(ratios.values())
+    return {
+        "joints": len(values),
+        "median_ratio": float(np.median(values)) if values else None,
+        "p05_ratio": float(np.quantile(values, 0.05)) if values else None,
+        "p95_ratio": float(np.quantile(values, 0.95)) if values else None,
+        "larger_than_the_logs_contain": sorted(case for case, ratio in ratios.items() if ratio > AGREEMENT),
+        "smaller_than_the_logs_contain": sorted(case for case, ratio in ratios.items() if ratio < 1 / AGREEMENT),
+        "better_than_ideal": sorted(too_good),
+    }
+
+
+def _enlarged(answer: Answer) -> bool:
+    pairs = [
+        (_figure(answer, "before", figure), _figure(answer, "after", figure))
+        for figure in ("inverse_nm", "forward_torque_nm")
+    ]
+    return any(after is not None and before is not None and after > 1.01 * before for before, after in pairs)
+
+
+def _confusion(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, dict[str, int]]:
+    """First answers by true effect, visible joints with at most one effect; ``none`` and ``outside`` are rows too."""
+    rows: dict[str, Counter[str]] = {}
+    for truth, answer in cases:
+        if truth["visible"] and truth["kind"] != "double":
+            row = _name(truth) if truth["kind"] == "single" else str(truth["kind"])
+            rows.setdefault(row, Counter())[answer.first] += 1
+    return {row: dict(counts.most_common()) for row, counts in sorted(rows.items())}
+
+
+def _times(seconds: Sequence[float]) -> dict[str, float | None]:
+    measured = [value for value in seconds if math.isfinite(value)]
+    if not measured:
+        return {"median": None, "p90": None, "worst": None}
+    return {
+        "median": float(np.median(measured)),
+        "p90": float(np.quantile(measured, 0.9)),
+        "worst": float(max(measured)),
+    }
