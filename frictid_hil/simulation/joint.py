@@ -265,6 +265,8 @@ def _read_friction(fields: Fields, *, required: bool, top: Fields) -> FrictionCu
     if "velocity_rad_s" in fields or "torque_nm" in fields:
         velocity, torque = fields.numbers("velocity_rad_s"), fields.numbers("torque_nm")
         fields.no_others()
+        if not velocity or not torque:
+            return CoulombViscous(0.0)
         try:
             return FrictionCurve.through(np.array(velocity), np.array(torque))
         except IdentificationError as error:
