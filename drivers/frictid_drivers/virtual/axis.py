@@ -175,8 +175,8 @@ class Axis:
 
     # -- power ---------------------------------------------------------------------------------------------------------
 
-    def switch(self, on: bool, brake: bool) -> None:
-        """Power stage and brake; the caller has caught up. Commands start from where the joint is."""
+    def switch(self, on: bool) -> None:
+        """Power stage; the caller has caught up. Commands start from where the joint is."""
         if on != self.powered:
             self.powered = on
             self._ramp = None
@@ -188,7 +188,6 @@ class Axis:
                 self._clear_set_points(self._plant.measured_position_rad)
                 self._plant.set_mode(self.mode or CSP)
             self._plant.power(on)
-        self._plant.brake(brake)
 
     def resume(self) -> None:
         """Follow the host's set-points again, starting from here and at rest."""

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import can
 
 from frictid_drivers.virtual import channel, side_channel
+from frictid_drivers.virtual.faults import faults_of, missing_objects
+from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
@@ -24,6 +26,7 @@ from frictid_hil.driver import (
     Finding,
     FrameSink,
     JointIdentity,
+    JointSetup,
     Mode,
     RobotSetup,
     SetPoint,
@@ -45,12 +48,14 @@ class VirtualDriver:
         from frictid_drivers.cia402 import Cia402Driver
 
         self._setup = setup
+        self._faults = faults_of(setup)
         self._channel = channel.channel_name(setup.bus)
         self._lock: filelock.BaseFileLock | None = None
         self._rack = Rack()
+        self._drives = FaultyRack(self._rack, self._faults) if self._faults else self._rack
         self._process: RunningRack | None = None
-        self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._rack)
-        self._host = Cia402Driver(setup, bus_factory=self._open_bus, clock=self.clock)
+        self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._drives)
+        self._host = Cia402Driver(_told_to_host(setup), bus_factory=self._open_bus, clock=self.clock)
 
     # -- life cycle ----------------------------------------------------------------------------------------------------
 
@@ -61,7 +66,7 @@ class VirtualDriver:
             if self._setup.realtime:
                 self._process = start_rack(self._setup)
             else:
-                self._rack.install(self._setup)
+                self._rack.install(self._setup, missing=missing_objects(self._faults))
             self._host.open(frame_sink)
         except BaseException:
             self.close()
@@ -70,7 +75,7 @@ class VirtualDriver:
     def _open_bus(self) -> can.BusABC:
         if self._setup.realtime:
             return SocketBus(self._channel)
-        bus = LockStepBus(self._rack, self._channel)
+        bus = LockStepBus(self._drives, self._channel)
         self._rack.power_on()
         return bus
 
@@ -180,3 +185,17 @@ class VirtualDriver:
     def stop_cycling(self) -> None:
         """As ``Driver.stop_cycling``."""
         self._host.stop_cycling()
+
+
+def _told_to_host(setup: RobotSetup) -> RobotSetup:
+    """The robot as the host driver shall see it: no faults, and where our drives keep what other drives have not."""
+    options = {name: value for name, value in setup.options.items() if name != "faults"}
+    joints = tuple(replace(joint, options={**_objects(joint), **joint.options}) for joint in setup.joints)
+    return replace(setup, options=options, joints=joints)
+
+
+def _objects(joint: JointSetup) -> dict[str, str | float]:
+    known: dict[str, str | float] = {"temperature_object": "2031:00 i16", "temperature_c_per_unit": 0.1}
+    if "hand" in joint.simulated:
+        known |= {"external_torque_object": "2030:00 i32", "external_torque_nm_per_unit": 0.001}
+    return known

@@ -9,12 +9,30 @@ from __future__ import annotations
 
 import queue
 import threading
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any, Protocol, cast
 
 import can
 from can.interfaces.virtual import VirtualBus
 
-from frictid_drivers.virtual.rack import Rack
+
+class Drives(Protocol):
+    """The drives behind the bus: a ``Rack``, or one with faults."""
+
+    transmit: Callable[[int, bytes], None]
+
+    @property
+    def now_ns(self) -> int:
+        """Run time."""
+        ...
+
+    def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        """A frame arrives."""
+        ...
+
+    def advance(self, to_ns: int) -> None:
+        """Run time goes on."""
+        ...
 
 
 class LockStepBus(VirtualBus):
@@ -26,7 +44,7 @@ class LockStepBus(VirtualBus):
         arguments: of ``can.interfaces.virtual.VirtualBus``.
     """
 
-    def __init__(self, rack: Rack, channel: str = "frictid", **arguments: Any) -> None:
+    def __init__(self, rack: Drives, channel: str = "frictid", **arguments: Any) -> None:
         super().__init__(channel=channel, preserve_timestamps=True, **arguments)
         self.channel_info = f"lock-step bus {channel}"
         # Same interface, a tenth of the cost; the old queue is this bus's entry in the channel's list.
@@ -86,7 +104,7 @@ class LockStepBus(VirtualBus):
 class LockStepClock:
     """Run time of the drives on a lock-step bus; see ``frictid_hil.driver.Clock``."""
 
-    def __init__(self, rack: Rack) -> None:
+    def __init__(self, rack: Drives) -> None:
         self._rack = rack
         self._origin_ns = rack.now_ns
 

@@ -21,9 +21,12 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from frictid_drivers.virtual import channel
+from frictid_drivers.virtual.faults import Fault, faults_of, missing_objects
+from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.socket_bus import ERROR, EXTENDED, REMOTE, Hub
 from frictid_hil.driver import JointSetup, RobotSetup
@@ -87,12 +90,13 @@ class SyncGrid:
 class RackProcess:
     """The drives, their bus and their clock."""
 
-    def __init__(self, rack: Rack, hub: Hub) -> None:
+    def __init__(self, rack: Rack, hub: Hub, faults: Sequence[Fault] = ()) -> None:
         self._rack = rack
+        self._drives = FaultyRack(rack, faults) if faults else rack
         self._hub = hub
         self._origin_ns = time.monotonic_ns() - rack.now_ns
         self._grid = SyncGrid()
-        rack.transmit = hub.send
+        self._drives.transmit = hub.send
         hub.heard = self._heard
 
     def _heard(self, can_id: int, data: bytes, stamp_ns: int) -> None:
@@ -101,22 +105,22 @@ class RackProcess:
         wall_ns = stamp_ns - self._origin_ns
         if can_id == SYNC_ID:
             self._grid.period_ns = next((servo.sync_period_ns for servo in self._rack.servos.values()), 0)
-            self._rack.advance(self._grid.sync_ns(wall_ns))
+            self._drives.advance(self._grid.sync_ns(wall_ns))
         else:
-            self._rack.advance(self._grid.time_ns(wall_ns))
-        self._rack.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
+            self._drives.advance(self._grid.time_ns(wall_ns))
+        self._drives.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
 
     def run(self, owner_pid: int) -> None:
         """Serve until the owner closes our standard input, or is gone and the robot stands still."""
-        self._rack.power_on()
+        self._drives.power_on()
         farewell = _Farewell()
         while True:
-            wait_s = (self._rack.next_event_ns - self._rack.now_ns) * 1e-9
+            wait_s = (self._drives.next_event_ns - self._drives.now_ns) * 1e-9
             self._hub.wait(min(_LONGEST_WAIT_S, max(_SHORTEST_WAIT_S, wait_s)))
             # First the time, then the frames: none that was sent before it is left when run time reaches it.
             wall_ns = time.monotonic_ns() - self._origin_ns
             self._hub.serve()
-            self._rack.advance(self._grid.time_ns(wall_ns))
+            self._drives.advance(self._grid.time_ns(wall_ns))
             if os.getppid() == owner_pid:
                 if _closed(sys.stdin.fileno()):
                     return
@@ -167,7 +171,8 @@ def main() -> int:
     setup = decode_setup(sys.stdin.readline())
     rack = Rack()
     try:
-        rack.install(setup, sync_gap_tenths=SYNC_GAP_TENTHS)
+        faults = faults_of(setup)
+        rack.install(setup, missing=missing_objects(faults), sync_gap_tenths=SYNC_GAP_TENTHS)
         hub = Hub(channel.socket_path(channel.channel_name(setup.bus)))
     except (FrictidError, OSError) as error:
         print(f"failed: {error}", flush=True)
@@ -177,7 +182,7 @@ def main() -> int:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
     gc.collect()
     gc.freeze()
-    process = RackProcess(rack, hub)
+    process = RackProcess(rack, hub, faults)
     print(READY, flush=True)
     try:
         process.run(owner_pid)

@@ -121,6 +121,7 @@ class Servo:
         self._halted = False
         self._controlword = 0
         self._outputs = 0
+        self._brake_blocked = False
         self._last_sync_ns: int | None = None
         self._heartbeat_ns = NEVER_NS
         self._consumers: list[_Consumer] = []
@@ -393,6 +394,24 @@ class Servo:
         if self.nmt_state in (OPERATIONAL, PRE_OPERATIONAL):
             self._send(self._values[key(0x1014)] & 0x7FF, data)
 
+    def warn(self, code: int, now_ns: int) -> None:
+        """The drive finds something wrong that does not stop it."""
+        self._arrive(now_ns)
+        self.emergency.report(code)
+        self._settle()
+
+    def fail(self, code: int, now_ns: int) -> None:
+        """The drive finds something wrong that stops it."""
+        self._arrive(now_ns)
+        self.fault(code)
+        self._settle()
+
+    def block_brake(self, blocked: bool, now_ns: int) -> None:
+        """The brake's coil breaks: it stays closed, whatever the drive says; or it is mended."""
+        self._arrive(now_ns)
+        self._brake_blocked = blocked
+        self._apply_brake()
+
     # -- power state machine -------------------------------------------------------------------------------------------
 
     def fault(self, code: int) -> None:
@@ -525,13 +544,15 @@ class Servo:
     def _power_on(self) -> None:
         self._halted = False
         self._after_ramp = None
-        self.axis.switch(True, self._brake_wanted(True))
+        self.axis.switch(True)
+        self._apply_brake()
         self._schedule()
 
     def _power_off(self) -> None:
         self._after_ramp = None
         self._halted = False
-        self.axis.switch(False, self._brake_wanted(False))
+        self.axis.switch(False)
+        self._apply_brake()
 
     def _brake_wanted(self, powered: bool) -> bool:
         """The drive works the brake with its power, unless the host masked the output to work it itself."""
@@ -540,7 +561,7 @@ class Servo:
         return not powered
 
     def _apply_brake(self) -> None:
-        self._plant.brake(self._brake_wanted(self.axis.powered))
+        self._plant.brake(self._brake_blocked or self._brake_wanted(self.axis.powered))
 
     # -- readings ------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,158 @@
+"""A rack whose wire and drives fail by a schedule; to the bus it looks like any rack."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from frictid_drivers.virtual.faults import Fault, FrameFaults, Late
+from frictid_drivers.virtual.rack import Rack, Transmit
+from frictid_drivers.virtual.servo import Servo
+
+_SYNC_ID = 0x80
+
+
+class FaultyRack:
+    """See ``Rack`` for what its members mean.
+
+    Args:
+        rack: the drives.
+        faults: what goes wrong.
+    """
+
+    def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
+        self.transmit: Transmit = _discard
+        self._rack = rack
+        self._faults = tuple(faults)
+        self._frames = FrameFaults(faults)
+        self._late = Late()
+        self._start_ns: int | None = None
+        self._muted: set[int] = set()
+        rack.transmit = self._from_drives
+
+    @property
+    def now_ns(self) -> int:
+        """Run time."""
+        return self._rack.now_ns
+
+    @property
+    def next_event_ns(self) -> int:
+        """When something falls due by itself."""
+        return round(min(self._rack.next_event_ns, self._late.next_ns))
+
+    def power_on(self) -> None:
+        """All drives boot."""
+        self._rack.power_on()
+
+    def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
+        """A frame of the host."""
+        if can_id == _SYNC_ID and self._start_ns is None:
+            self._start()
+        if can_id not in self._frames.cob_ids:
+            self._to_drives(can_id, data, remote)
+            return
+        for due_ns, out_id, out in self._frames.through(self._elapsed_ns(), can_id, data):
+            self._at(due_ns, self._delivery(out_id, out, remote))
+
+    def advance(self, to_ns: int) -> None:
+        """Let run time go on."""
+        while self._late.next_ns <= to_ns:
+            self._rack.advance(round(self._late.next_ns))
+            self._late.run(self._rack.now_ns)
+        self._rack.advance(to_ns)
+
+    # -- frames --------------------------------------------------------------------------------------------------------
+
+    def _to_drives(self, can_id: int, data: bytes, remote: bool) -> None:
+        if not self._muted:
+            self._rack.process(can_id, data, remote=remote)
+            return
+        for servo in self._rack.servos.values():
+            if servo.node_id not in self._muted:
+                if can_id == 0x000:
+                    servo.receive_nmt(data, self.now_ns)
+                elif remote:
+                    servo.receive_remote(can_id, self.now_ns)
+                elif (handler := servo.routes().get(can_id)) is not None:
+                    handler(data, self.now_ns)
+
+    def _delivery(self, can_id: int, data: bytes, remote: bool) -> Callable[[], None]:
+        return lambda: self._to_drives(can_id, data, remote)
+
+    def _from_drives(self, can_id: int, data: bytes) -> None:
+        if can_id & 0x7F in self._muted:
+            return
+        if can_id not in self._frames.cob_ids:
+            self.transmit(can_id, data)
+            return
+        for due_ns, out_id, out in self._frames.through(self._elapsed_ns(), can_id, data):
+            self._at(due_ns, self._departure(out_id, out))
+
+    def _departure(self, can_id: int, data: bytes) -> Callable[[], None]:
+        return lambda: self.transmit(can_id, data)
+
+    def _at(self, due_ns: int, action: Callable[[], None]) -> None:
+        """Now where it is due, else later; ``due_ns`` counts from the first SYNC."""
+        due_ns += self._start_ns or 0
+        if due_ns <= self.now_ns:
+            action()
+        else:
+            self._late.put(due_ns, action)
+
+    def _elapsed_ns(self) -> int:
+        return -1 if self._start_ns is None else self.now_ns - self._start_ns
+
+    # -- drives --------------------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        self._start_ns = self.now_ns
+        for fault in self._faults:
+            for joint in fault.joints:
+                servo = self._rack.servos.get(joint)
+                switch = None if servo is None else self._switch(fault, servo)
+                if switch is None:
+                    continue
+                self._late.put(self._start_ns + round(fault.at_s * 1e9), _call(switch, True))
+                if fault.for_s < 1e9:
+                    self._late.put(self._start_ns + round((fault.at_s + fault.for_s) * 1e9), _call(switch, False))
+        self._late.run(self.now_ns)
+
+    def _switch(self, fault: Fault, servo: Servo) -> Callable[[bool], None] | None:
+        """What turns a drive's fault on and off; None for faults of another kind."""
+
+        def mute(on: bool) -> None:
+            (self._muted.add if on else self._muted.discard)(servo.node_id)
+
+        def reset(on: bool) -> None:
+            if on:
+                servo.reset(self.now_ns)
+
+        def warn(on: bool) -> None:
+            if on:
+                servo.warn(fault.code, self.now_ns)
+
+        def fail(on: bool) -> None:
+            if on:
+                servo.fail(fault.code, self.now_ns)
+
+        def stick(on: bool) -> None:
+            servo.axis.encoder_stuck = on
+
+        def block(on: bool) -> None:
+            servo.block_brake(on, self.now_ns)
+
+        def interlock(on: bool) -> None:
+            servo.interlock_closed = not on
+
+        switches: dict[str, Callable[[bool], None]] = {
+            "mute": mute, "reset": reset, "emcy": warn, "fault": fail, "stuck_encoder": stick, "blocked": block,
+            "interlock_open": interlock,
+        }  # fmt: skip
+        return switches.get(fault.kind)
+
+
+def _call(switch: Callable[[bool], None], on: bool) -> Callable[[], None]:
+    return lambda: switch(on)
+
+
+def _discard(can_id: int, data: bytes) -> None:
+    """No bus yet."""
