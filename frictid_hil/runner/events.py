@@ -66,10 +66,23 @@ class JointRun:
 
 
 @dataclass(frozen=True, slots=True)
+class Marked:
+    """A stretch of a joint's plan is over.
+
+    Attributes:
+        joint: name.
+        mark: what it was, on the run time of the samples.
+    """
+
+    joint: str
+    mark: Mark
+
+
+@dataclass(frozen=True, slots=True)
 class Warned:
     """Something a person should know that does not end the run."""
 
     message: str
 
 
-Event = Preflight | PhaseStarted | JointRun | Warned
+Event = Preflight | PhaseStarted | Marked | JointRun | Warned

@@ -23,10 +23,10 @@ import numpy as np
 
 from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode, RobotSetup, SetPoint, Severity
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
-from frictid_hil.plan import Hold, JointPlan, Motion, Move, Plan
+from frictid_hil.plan import JointPlan, Motion, Move, Plan
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, StopRequest, Stream
-from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
+from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 from frictid_hil.units import degrees, format_angle
@@ -35,6 +35,8 @@ _POWER_TIMEOUT_S = 3.0
 _STANDSTILL_S = 0.2
 _LOCKED_REPORT_S = 0.010
 """Locked joints report at least this often, whatever the layout of the bus."""
+_AT_RAD = 1e-4
+"""A joint this near to where it should be needs no approach."""
 _SESSION_GAP_NS = 1_000_000_000
 
 
@@ -225,33 +227,29 @@ class Scheduler:
         for index, joint in enumerate(self._setup.joints):
             target_rad = plan.locked.get(joint.name)
             here_rad = loop.set_points[index].position_rad
-            if index != moving and target_rad is not None and abs(target_rad - here_rad) > 1e-4:
+            if index != moving and target_rad is not None and abs(target_rad - here_rad) > _AT_RAD:
                 approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
                 self._lock_all_but(index, loop, supervisor)
                 self._stream(loop, index, approach)
         self._lock_all_but(moving, loop, supervisor)
         self._see_standstill(loop)
-        start_rad = loop.set_points[moving].position_rad
-        first = float(plan.motions[0].position_rad(np.zeros(1))[0])
-        if abs(first - start_rad) > 1e-4:
-            marks.append(
-                self._stream(loop, moving, Move.within(start_rad, first, self._care.approach_rad_s, name="approach"))
-            )
-        for motion in plan.motions:
+        motions = self._from_here(loop.set_points[moving].position_rad, plan)
+        for motion in motions:
             self._notify(PhaseStarted(plan.joint, motion.name, motion.duration_s))
             if motion.name == "rehearsal":
-                marks.append(self._rehearse(loop, supervisor, moving, plan, motion))
+                mark = self._rehearse(loop, supervisor, moving, plan, motion)
             else:
-                marks.append(self._stream(loop, moving, motion))
-        home_rad = self._setup.joints[moving].locked_position_rad
-        back_rad = loop.set_points[moving].position_rad
-        if abs(home_rad - back_rad) > 1e-4:
-            self._notify(PhaseStarted(plan.joint, "return", 0.0))
-            marks.append(
-                self._stream(loop, moving, Move.within(back_rad, home_rad, self._care.approach_rad_s, name="return"))
-            )
-        marks.append(self._stream(loop, moving, Hold(home_rad, 0.2)))
+                mark = self._stream(loop, moving, motion)
+            self._notify(Marked(plan.joint, mark))
+            marks.append(mark)
         return marks
+
+    def _from_here(self, here_rad: float, plan: JointPlan) -> list[Motion]:
+        """The planned motions, after a small approach where the joint does not stand exactly at their beginning."""
+        first_rad = float(plan.motions[0].position_rad(np.zeros(1))[0])
+        if abs(first_rad - here_rad) <= _AT_RAD:
+            return list(plan.motions)
+        return [Move.within(here_rad, first_rad, self._care.approach_rad_s, name="approach"), *plan.motions]
 
     def _stream(self, loop: CyclicLoop, index: int, motion: Motion) -> Mark:
         steps = max(1, math.ceil(motion.duration_s / loop.period_s))

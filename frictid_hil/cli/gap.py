@@ -1,0 +1,160 @@
+"""``gap``: record diagnostic experiments, find where the sim-to-real gap lies and why, check the diagnosis itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from frictid_hil.cli.output import BusOption, JsonOption, Output, QuietOption, Result, RobotOption, YesOption
+
+app = typer.Typer(
+    help="Where the simulator differs from the machine, why, and how far it closes.", no_args_is_help=True
+)
+
+
+@app.command("diagnose")
+def diagnose(
+    experiment_set: Annotated[
+        Path, typer.Argument(metavar="SET", help="Folder with nominal.yaml and one CSV per log.")
+    ],
+    write_model: Annotated[
+        Path | None, typer.Option("--write-model", help="Write the improved joint as a robot file.")
+    ] = None,
+    apply: Annotated[
+        bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the report page.")] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
+    from frictid_hil.jobs.gap_diagnose import diagnose as job
+
+    output = Output(as_json, quiet)
+    output.run(
+        "gap_diagnose",
+        lambda: job(experiment_set, write_model=write_model, apply=apply, out=out),
+        lambda result: _print_diagnosis(output, result),
+    )
+
+
+@app.command("check")
+def check(
+    cases: Annotated[int, typer.Option("--cases", min=1, help="Joints to draw.")] = 40,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the draw.")] = 1,
+    processes: Annotated[int, typer.Option("--processes", min=1, help="Parallel processes.")] = 2,
+    leave_one_out: Annotated[
+        bool, typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to keep cases, answers and scores in.")] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Draw joints whose truth is sealed, diagnose them, open the seal, score the answers."""
+    from frictid_hil.jobs.gap_check import run_gap_check
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        table = Table("figure", "value", "95 % interval", "of", title=f"Blind check: {cases} joints, seed {seed}")
+        for name, rate in result["rates"].items():
+            if rate.get("of"):
+                interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
+                table.add_row(name.replace("_", " "), f"{100 * rate['rate']:.1f} %", interval, str(rate["of"]))
+        output.out.print(table)
+
+    output.run(
+        "gap_check",
+        lambda: run_gap_check(
+            cases, seed, out, processes=processes, leave_one_out=leave_one_out, progress=output.err.print
+        ),
+        show,
+    )
+
+
+@app.command("record")
+def record(
+    robot: RobotOption,
+    joint: Annotated[str, typer.Option("--joint", "-j", help="The joint to record.")],
+    bus: BusOption = None,
+    short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="Record just what an ambiguous diagnosis asked for.")
+    ] = None,
+    profile: Annotated[
+        Path | None, typer.Option("--profile", help="Friction profile that the simulator believes.")
+    ] = None,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the experiment set.")] = None,
+    yes: YesOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Run the diagnostic experiments on the bus and write an experiment set."""
+    from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.jobs.gap_record import GapRecordOptions
+    from frictid_hil.jobs.gap_record import record as job
+
+    output = Output(as_json, quiet)
+    watcher = TerminalWatcher(output, yes=yes)
+    options = GapRecordOptions(
+        robot=robot,
+        joint=joint,
+        bus=bus,
+        short=short,
+        plan=plan,
+        profile=profile,
+        realtime=realtime,
+        seed=seed,
+        out=out,
+    )
+
+    def run() -> Result:
+        try:
+            return job(options, watcher)
+        finally:
+            watcher.close()
+
+    def show(result: Result) -> None:
+        output.out.print(f"{len(result['experiments'])} experiments: {', '.join(result['experiments'])}")
+        output.out.print(f"set: {result['set']}", soft_wrap=True)
+
+    output.run("gap_record", run, show)
+
+
+def _print_diagnosis(output: Output, result: Result) -> None:
+    output.out.print(f"[bold]{result['summary']}[/]")
+    causes = Table("cause", "confidence", "closes", "parameters", "confusable with")
+    for cause in result["causes"]:
+        parameters = ", ".join(
+            f"{name} = {value['value']:.4g}" if isinstance(value, dict) else f"{name} = {value:.4g}"
+            for name, value in cause["parameters"].items()
+        )
+        closed = cause["gap_closed_percent"]
+        causes.add_row(
+            cause["effect"],
+            f"{cause['confidence']:.2f}",
+            "" if closed is None else f"{closed:.0f} %",
+            parameters,
+            ", ".join(cause["confusable_with"]),
+        )
+    if result["causes"]:
+        output.out.print(causes)
+    where = Table("where", "share of gap", "")
+    for region in result["where"]:
+        where.add_row(region["region"], f"{100 * region['share_of_gap']:.0f} %", region["description"])
+    output.out.print(where)
+    gap = Table("on validation logs", "before", "after", "noise floor")
+    for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
+        row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
+        gap.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row))
+    output.out.print(gap)
+    if result.get("next_experiment"):
+        output.out.print(f"record next: {result['next_experiment'].get('description', '')}")
+    for key in ("model", "report"):
+        if result.get(key):
+            output.out.print(f"{key}: {result[key]}", soft_wrap=True)

@@ -1,0 +1,283 @@
+"""``frictid-hil calibrate``: the whole procedure, each joint in turn, and the profile at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.profile import DriveIdentity, FrictionProfile, JointProfile
+from frictid_hil.config.provenance import Provenance, git_revision, utc_now
+from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.driver import JointIdentity, RobotSetup
+from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.identify import identify_joint, joint_result
+from frictid_hil.jobs.plans import calibration_plan, expected_of
+from frictid_hil.jobs.watch import Watcher
+from frictid_hil.plan import Plan, refuse_beyond_limits
+from frictid_hil.runner.events import Event, JointRun, Preflight
+from frictid_hil.runner.run import run_plan
+from frictid_hil.runner.run_folder import RunFolder
+
+VERB = "calibrate"
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateOptions:
+    """What a person asked for; None and () mean the robot file's own.
+
+    Attributes:
+        robot: robot file, by path or name.
+        bus: ``interface:channel``.
+        joints: names; all joints when empty.
+        amplitude_rad: A.
+        velocity_rad_s: V.
+        cycles: N.
+        ratio: c.
+        method: estimator.
+        dry_run: plan only.
+        realtime: wall clock for the virtual robot.
+        seed: of simulated noise.
+        resume: run folder to continue.
+        out: run folder to write.
+    """
+
+    robot: str
+    bus: str | None = None
+    joints: tuple[str, ...] = ()
+    amplitude_rad: float | None = None
+    velocity_rad_s: float | None = None
+    cycles: int | None = None
+    ratio: float | None = None
+    method: str = "aligned"
+    dry_run: bool = False
+    realtime: bool = False
+    seed: int = 0
+    resume: Path | None = None
+    out: Path | None = None
+
+
+@dataclass(slots=True)
+class _Progress:
+    """What a run has come to, so that an error halfway loses nothing."""
+
+    identities: dict[str, JointIdentity] = field(default_factory=dict)
+    joints: dict[str, JointProfile] = field(default_factory=dict)
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    ended: FrictidError | None = None
+
+
+def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
+    """Plan, check, ask, run, identify, write.
+
+    Raises:
+        UsageError: refused before anything moved (arguments, files, limits, the person said no).
+        HardwareError: hardware unreachable.
+
+    Returns:
+        The JSON of the verb. A safety abort or an interruption after motion began is an outcome, not an exception: what
+        was measured until then is in the run folder and in the result.
+    """
+    robot = load_robot(options.robot)
+    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    wanted = options.joints or robot.joint_names
+    robot.check_joints(wanted)
+    resumed = RunFolder.resume(options.resume, robot) if options.resume else None
+    kept = resumed.kept_joints() if resumed else {}
+    procedures = {name: _procedure(robot, name, options) for name in dict.fromkeys(wanted) if name not in kept}
+    expected = expected_of(robot)
+    rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
+    plan = calibration_plan(
+        robot, setup, procedures, expected, rehearse=rehearse, notes=_notes(procedures, expected, rehearse)
+    )
+    refuse_beyond_limits(plan, setup, expected)
+    if options.dry_run:
+        return {"outcome": "ok", "dry_run": True, "robot": robot.name, "plan": plan, "setup": setup}
+    watcher.plan(plan, setup)
+    folder = resumed or RunFolder.create(robot, VERB, options.out)
+    progress = _Progress(
+        joints={name: profile for name, (profile, _) in kept.items()},
+        results={name: result for name, (_, result) in kept.items()},
+    )
+    lost = _run(robot, setup, plan, folder, options, watcher, progress)
+    return _finish(robot, setup, folder, options, progress, lost)
+
+
+def _run(
+    robot: Robot,
+    setup: RobotSetup,
+    plan: Plan,
+    folder: RunFolder,
+    options: CalibrateOptions,
+    watcher: Watcher,
+    progress: _Progress,
+) -> int:
+    """Move the joints; every finished joint is identified and kept before the next one begins."""
+
+    def notify(event: Event) -> None:
+        watcher.event(event)
+        folder.note(event)
+        if isinstance(event, Preflight):
+            progress.identities = event.identities
+        elif isinstance(event, JointRun):
+            _identify(event, folder, setup, options, watcher, progress)
+
+    with folder.keeping(setup, watcher.at) as keeper:
+        try:
+            return run_plan(
+                robot.driver(options.bus),
+                setup,
+                plan,
+                keeper,
+                notify=notify,
+                proceed=lambda preflight: watcher.confirm(plan, preflight),
+            )
+        except FrictidError as error:
+            if isinstance(error, UsageError) or not keeper.rows:
+                folder.discard()
+                raise
+            progress.ended = error
+            return 0
+
+
+def _identify(
+    run: JointRun,
+    folder: RunFolder,
+    setup: RobotSetup,
+    options: CalibrateOptions,
+    watcher: Watcher,
+    progress: _Progress,
+) -> None:
+    identity = progress.identities[run.joint]
+    samples = folder.samples(run, identity)
+    result: dict[str, Any] = {
+        "duration_s": run.duration_s,
+        "rate_hz": run.rate_hz,
+        "late_cycles": run.late_cycles,
+        "missed_cycles": run.missed_cycles,
+    }
+    try:
+        profile = identify_joint(
+            samples, setup.joint(run.joint), method=options.method, late_cycles=run.late_cycles + run.missed_cycles
+        )
+    except IdentificationError as error:
+        progress.results[run.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
+        watcher.joint(run.joint, str(error), ok=False)
+        return
+    profile = profile.model_copy(update={"drive": _drive(identity)})
+    progress.joints[run.joint] = profile
+    progress.results[run.joint] = {**joint_result(profile), **result}
+    folder.keep_joint(run.joint, profile, progress.results[run.joint])
+    folder.remember_rehearsed(run.joint)
+    outcome = progress.results[run.joint]["outcome"]
+    watcher.joint(run.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
+
+
+_NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
+
+
+def _drive(identity: JointIdentity) -> DriveIdentity:
+    return DriveIdentity(
+        serial=identity.serial,
+        firmware=identity.firmware,
+        product=identity.product,
+        rated_torque_nm=identity.rated_torque_nm if np.isfinite(identity.rated_torque_nm) else None,
+        gear_ratio=identity.gear_ratio if np.isfinite(identity.gear_ratio) else None,
+        settings=dict(identity.settings),
+    )
+
+
+def _finish(
+    robot: Robot,
+    setup: RobotSetup,
+    folder: RunFolder,
+    options: CalibrateOptions,
+    progress: _Progress,
+    lost: int,
+) -> dict[str, Any]:
+    profile_path: Path | None = None
+    if progress.joints:
+        ordered = {name: progress.joints[name] for name in robot.joint_names if name in progress.joints}
+        profile = FrictionProfile(
+            robot=robot.name, joints=ordered, provenance=_provenance(robot, setup, folder, options, progress)
+        )
+        profile_path = folder.write_profile(profile)
+    ended = progress.ended
+    failed = [name for name, result in progress.results.items() if result["outcome"] != "ok"]
+    if ended is None and lost:
+        ended = GateFailed(
+            f"{lost} rows were lost because files were written too slowly",
+            cause="a slow disk or an overloaded computer",
+        )
+    if ended is None and failed:
+        ended = GateFailed(
+            f"joints {', '.join(failed)} failed a quality gate; see their remarks",
+            next_step="nothing was promoted; the recording is kept",
+        )
+    result: dict[str, Any] = {
+        "outcome": ended.outcome if ended else "ok",
+        "exit_code": ended.exit_code if ended else 0,
+        "robot": robot.name,
+        "run": str(folder.path.resolve()),
+        "profile": str(profile_path.resolve()) if profile_path else None,
+        "joints": {name: progress.results[name] for name in robot.joint_names if name in progress.results},
+    }
+    if ended is not None:
+        result["error"] = {
+            "what": ended.what,
+            "where": ended.where,
+            "cause": ended.cause,
+            "next_step": ended.next_step,
+        }
+    folder.finish(result)
+    return result
+
+
+def _provenance(
+    robot: Robot, setup: RobotSetup, folder: RunFolder, options: CalibrateOptions, progress: _Progress
+) -> Provenance:
+    driver = robot.driver(options.bus)
+    temperatures = {
+        f"joint {name}": joint.temperature_c
+        for name, joint in progress.joints.items()
+        if joint.temperature_c is not None
+    }
+    return Provenance(
+        created_utc=utc_now(),
+        git_revision=git_revision(),
+        robot_file=robot.path.name,
+        config_sha256=robot.digest,
+        driver=driver,
+        bus=setup.bus,
+        settings={"cycle_hz": setup.cycle_hz, **dict(setup.options)},
+        realtime=setup.realtime or driver != "virtual",
+        seed=setup.seed if driver == "virtual" else None,
+        run=str(folder.path.resolve()),
+        log_sha256=folder.log_digests(),
+        temperatures_c=temperatures,
+    )
+
+
+def _procedure(robot: Robot, name: str, options: CalibrateOptions) -> Procedure:
+    return robot.procedure(
+        name,
+        amplitude_rad=options.amplitude_rad,
+        velocity_rad_s=options.velocity_rad_s,
+        cycles=options.cycles,
+        ratio=options.ratio,
+    )
+
+
+def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
+    notes = []
+    if rehearse:
+        notes.append(
+            f"first run on this robot: joints {', '.join(rehearse)} rehearse their whole travel slowly, torque watched"
+        )
+    unknown = [name for name in procedures if name not in expected]
+    if unknown:
+        notes.append(f"peak torque of joints {', '.join(unknown)} is not predicted (no `expected` in the robot file)")
+    return notes
