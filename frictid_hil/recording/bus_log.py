@@ -1,0 +1,273 @@
+"""Every frame on the wire, to a file and back: what a run can be replayed from, bit for bit.
+
+Written is BLF, in small containers that are synced as they come: it keeps nanoseconds (text formats keep microseconds)
+and a killed file is readable up to its last flush. Read is whatever python-can reads: BLF, ASC, candump, TRC, ....
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from frictid_hil.errors import InputFileError
+from frictid_hil.files import could_not_write
+from frictid_hil.recording import blf
+
+EXTENDED = 0x8000_0000
+"""Bit of ``can_id`` that says the frame has a 29-bit id."""
+
+LOG_SUFFIXES = (".blf", ".asc", ".log", ".trc", ".db", ".mf4")
+_FRAMES_PER_CONTAINER = 2048
+_EPOCH_S = 1e8
+"""Times beyond this (three years) are of a wall clock, not run time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """The frames of a log, in the order of the file.
+
+    Attributes:
+        t_ns: run time (since the start of the log, where it tells the time of day), shape (n,).
+        can_id: bit 31 set for extended ids, shape (n,).
+        length: bytes used, shape (n,).
+        data: shape (n, 8), or (n, 64) where a frame is longer.
+        sent: by the host; False throughout where the format does not tell, shape (n,).
+        skipped: error and remote frames, which carry no data.
+        damage: where the log ends before its end ("" for a whole one).
+    """
+
+    t_ns: NDArray[np.int64]
+    can_id: NDArray[np.uint32]
+    length: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+    sent: NDArray[np.bool_]
+    skipped: int = 0
+    damage: str = ""
+
+    def __len__(self) -> int:
+        return int(self.t_ns.size)
+
+    def unknown_to(self, known: Collection[int]) -> dict[int, int]:
+        """How many frames there are of each id that is not among ``known``, most frequent first."""
+        ids, counts = np.unique(self.can_id, return_counts=True)
+        unknown = Counter({int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in known})
+        return dict(unknown.most_common())
+
+
+class BusLogWriter:
+    """Writes frames to a BLF file.
+
+    Args:
+        path: of the new file; an existing one is replaced.
+
+    Raises:
+        FrictidError: the file cannot be created (no permission, disk full).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._pending: list[bytes] = []
+        self._single: list[tuple[int, int, bytes, bool]] = []
+        self._frames = 0
+        self._content_size = blf.FILE_HEADER_SIZE
+        self._end = 0
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise could_not_write(path, error) from error
+        self._write(blf.file_header(0, 0, 0))
+
+    def frame(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
+        """Take one frame; a ``driver.FrameSink``."""
+        self._single.append((t_ns, can_id, data, sent))
+
+    def append(self, rows: NDArray[np.void]) -> None:
+        """Take rows with ``t_ns, can_id, length, sent, data`` (bytes of fixed width), shape (n,)."""
+        self._take_singles()
+        if rows.size:
+            data = np.frombuffer(rows["data"].tobytes(), np.uint8).reshape(rows.size, -1)
+            self._take(rows["t_ns"], rows["can_id"], rows["length"], rows["sent"] != 0, data)
+
+    def flush(self) -> None:
+        """Write what was taken and have it on the disk before returning.
+
+        Raises:
+            FrictidError: disk full; what was flushed before is kept and readable.
+        """
+        self._take_singles()
+        pending, self._pending = self._pending, []
+        for objects in pending:
+            self._write(blf.container(objects))
+            self._content_size += blf.OBJECT_HEAD.size + blf.CONTAINER_HEAD.size + len(objects)
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise could_not_write(self._path, error) from error
+
+    def close(self) -> None:
+        """Flush, and fill in the file header; safe to call twice."""
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+            self._file.seek(0)
+            self._file.write(blf.file_header(self._end, self._content_size, self._frames))
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> BusLogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take_singles(self) -> None:
+        if self._single:
+            singles, self._single = self._single, []
+            width = max(8, *(len(data) for _, _, data, _ in singles))
+            self._take(
+                np.array([t_ns for t_ns, *_ in singles], np.int64),
+                np.array([can_id for _, can_id, *_ in singles], np.uint32),
+                np.array([len(data) for _, _, data, _ in singles], np.uint8),
+                np.array([sent for *_, sent in singles], np.bool_),
+                np.frombuffer(b"".join(d.ljust(width, b"\0") for _, _, d, _ in singles), np.uint8).reshape(-1, width),
+            )
+
+    def _take(
+        self,
+        t_ns: NDArray[np.int64],
+        can_id: NDArray[np.uint32],
+        length: NDArray[np.uint8],
+        sent: NDArray[np.bool_],
+        data: NDArray[np.uint8],
+    ) -> None:
+        for start in range(0, t_ns.size, _FRAMES_PER_CONTAINER):
+            part = slice(start, start + _FRAMES_PER_CONTAINER)
+            self._pending.append(blf.frame_objects(t_ns[part], can_id[part], length[part], sent[part], data[part]))
+        self._frames += t_ns.size
+
+    def _write(self, data: bytes) -> None:
+        """All of it or nothing, so that a full disk leaves a log that ends with a whole container."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            self._file.truncate(self._end)
+            self._file.seek(self._end)
+            raise could_not_write(self._path, error) from error
+        self._end += len(data)
+
+
+def read_frames(path: Path) -> Frames:
+    """All data frames of a bus log, whole or cut off.
+
+    Args:
+        path: ``.blf``, ``.asc``, ``.log`` (candump), ``.trc``, ``.db``; also gzipped (``.asc.gz``).
+
+    Raises:
+        InputFileError: unreadable, of no known format, or without a single frame.
+    """
+    try:
+        if path.suffix.lower() == ".blf":
+            frames = _from_blf(path)
+            if frames is not None:
+                return frames
+        return _from_python_can(path)
+    except OSError as error:
+        raise InputFileError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
+
+
+def _from_blf(path: Path) -> Frames | None:
+    """The fast way, for logs of classic frames alone (such as ours); None for others."""
+    data = path.read_bytes()
+    if len(data) < blf.FILE_HEADER.size or not data.startswith(b"LOGG"):
+        raise InputFileError("not a BLF file" if data else "the file is empty", where=f"{path}, byte 0")
+    contents, damage = [], ""
+    for content, wrong in blf.containers(data):
+        contents.append(content)
+        damage = wrong
+    content = b"".join(contents)
+    if damage:
+        content = content[: len(content) // blf.FRAME.itemsize * blf.FRAME.itemsize]
+    if not content:
+        raise InputFileError("holds no frames", where=str(path), cause=damage)
+    if len(content) % blf.FRAME.itemsize:
+        return None
+    objects = np.frombuffer(content, blf.FRAME)
+    plain = (objects["signature"] == b"LOBJ") & (objects["type"] == blf.CAN_FRAME)
+    plain &= (objects["size"] == blf.FRAME.itemsize) & (objects["time_flags"] == 2) & (objects["dlc"] <= 8)
+    if not plain.all():
+        return None
+    carries_data = (objects["flags"] & blf.REMOTE) == 0
+    objects = objects[carries_data]
+    if not objects.size:
+        raise InputFileError("holds no frames that carry data", where=str(path))
+    if int(objects["t_ns"].max()) > np.iinfo(np.int64).max:
+        raise InputFileError("a time is out of range", where=str(path))
+    return Frames(
+        t_ns=objects["t_ns"].astype(np.int64),
+        can_id=np.ascontiguousarray(objects["can_id"]),
+        length=np.ascontiguousarray(objects["dlc"]),
+        data=np.ascontiguousarray(objects["data"]),
+        sent=(objects["flags"] & blf.SENT) != 0,
+        skipped=int(np.count_nonzero(~carries_data)),
+        damage=damage,
+    )
+
+
+def _from_python_can(path: Path) -> Frames:
+    messages: list[can.Message] = []
+    skipped, damage, start_s = 0, "", 0.0
+    try:
+        with can.LogReader(path) as reader:
+            start_s = float(getattr(reader, "start_timestamp", 0.0) or 0.0) if path.suffix.lower() == ".blf" else 0.0
+            for message in reader:
+                if message.is_error_frame or message.is_remote_frame:
+                    skipped += 1
+                else:
+                    messages.append(message)
+    except OSError:
+        raise
+    except Exception as error:  # each of python-can's readers has errors of its own, some of the bare language
+        damage = f"reading stopped after {len(messages)} frames: {error or type(error).__name__}"
+    if not messages:
+        raise InputFileError(
+            "holds no frames",
+            where=str(path),
+            cause=damage or f"not a bus log that can be read ({', '.join(LOG_SUFFIXES)})",
+        )
+    times_s = np.array([message.timestamp for message in messages], np.float64)
+    if not np.all(np.isfinite(times_s)) or abs(times_s).max() > 1e12:
+        raise InputFileError("a time is not finite, or out of range", where=str(path))
+    width = 64 if max(len(message.data) for message in messages) > 8 else 8
+    return Frames(
+        t_ns=_run_time_ns(times_s, start_s),
+        can_id=np.array([m.arbitration_id | (EXTENDED if m.is_extended_id else 0) for m in messages], np.uint32),
+        length=np.array([len(m.data) for m in messages], np.uint8),
+        data=np.frombuffer(b"".join(bytes(m.data).ljust(width, b"\0") for m in messages), np.uint8).reshape(-1, width),
+        sent=np.array([not m.is_rx for m in messages], np.bool_),
+        skipped=skipped,
+        damage=damage,
+    )
+
+
+def _run_time_ns(times_s: NDArray[np.float64], start_s: float) -> NDArray[np.int64]:
+    """Nanoseconds of run time; times of day keep the microseconds that a float of them holds, and start at zero."""
+    if start_s:
+        times_s = times_s - start_s
+    elif times_s[0] > _EPOCH_S:
+        microseconds = np.rint(times_s * 1e6).astype(np.int64)
+        return np.asarray((microseconds - microseconds[0]) * 1000)
+    return np.rint(times_s * 1e9).astype(np.int64)
