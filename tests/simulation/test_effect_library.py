@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import math
 import re
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from sim_joints import CONTROLLER, COULOMB, GRAVITY, INERTIA, STIFFNESS, VISCOUS, bare, excitation, simulate
 
-from frictid_hil.simulation import compose
+from frictid_hil.simulation import catalogue, compose
 from frictid_hil.simulation.effect import Channel
 from frictid_hil.simulation.effects import all_effects
 
@@ -186,3 +188,21 @@ def test_the_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monk
     folder = compose._cache_folder()
     assert folder.is_dir() and "frictid-hil-" in folder.name
     folder.rmdir()
+
+
+def test_the_page_of_effects_is_up_to_date() -> None:
+    docs = Path(__file__).parents[2] / "docs"
+    regenerate = "python -m frictid_hil.simulation.catalogue docs"
+    assert (docs / "effects.md").read_text(encoding="utf-8") == catalogue.page(), regenerate
+    for name in NAMES:
+        assert (docs / "effects" / f"{name}.svg").is_file(), regenerate
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_are_well_formed(name: str) -> None:
+    picture = catalogue.picture(all_effects()[name].illustrate({}))
+    lines = ElementTree.fromstring(picture).findall("{http://www.w3.org/2000/svg}polyline")
+    assert lines
+    for line in lines:
+        for x, y in (point.split(",") for point in line.attrib["points"].split()):
+            assert 0 <= float(x) <= 480 and 0 <= float(y) <= 250

@@ -130,11 +130,12 @@ def test_stribeck_raises_slow_sliding_by_its_share() -> None:
     np.testing.assert_allclose(raised, [0.2, 0.2 / math.e, 0.0], atol=1e-5)
 
 
-def test_a_bend_of_one_is_plain_viscosity() -> None:
-    model = bare(effects={"viscous_nonlinearity": {"share": 0.5, "knee_rad_s": 0.4, "bend": 1.0}})
+@pytest.mark.parametrize("share", [0.5, -0.1])
+def test_a_bend_of_one_is_plain_viscosity(share: float) -> None:
+    model = bare(effects={"viscous_nonlinearity": {"share": share, "knee_rad_s": 0.4, "bend": 1.0}})
     v = np.linspace(-2, 2, 9)
     added = model.steady_friction_nm(v) - bare().steady_friction_nm(v)
-    np.testing.assert_allclose(added, 0.5 * COULOMB / 0.4 * v, atol=1e-12)
+    np.testing.assert_allclose(added, share * COULOMB / 0.4 * v, atol=1e-12)
     logarithm = bare(effects={"viscous_nonlinearity": {"share": 0.5, "knee_rad_s": 0.4, "bend": 0.0}})
     nearly = bare(effects={"viscous_nonlinearity": {"share": 0.5, "knee_rad_s": 0.4, "bend": 1e-5}})
     np.testing.assert_allclose(logarithm.steady_friction_nm(v), nearly.steady_friction_nm(v), rtol=1e-3)

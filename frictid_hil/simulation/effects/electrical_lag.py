@@ -53,7 +53,7 @@ EFFECT = Effect(
         "Leonhard, 'Control of Electrical Drives', 3rd ed., 2001, chapter 7."
     ),
     parameters=(Parameter("time_constant_s", 0.0, 0.05, 0.002, "of the closed current loop", off=0.0),),
-    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.FREQUENCY)),
+    signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(
         Hook("current", current, order=40),
         Hook("settle", settle),

@@ -40,7 +40,7 @@ EFFECT = Effect(
         "both differential and integral nonlinearities', IEEE Trans. Instrumentation and Measurement 49(4), 2000."
     ),
     parameters=(Parameter("step_rad", 0.0, 5e-3, 1e-4, "true step of the position, joint side", off=0.0),),
-    signature=Signature((Channel.KINEMATIC, Channel.ACTUATION), (Region.KINEMATICS, Region.STANDSTILL)),
+    signature=Signature((Channel.KINEMATIC, Channel.PLANT), (Region.KINEMATICS, Region.STANDSTILL)),
     hooks=(Hook("resolution", resolution),),
     illustrate=illustrate,
 )

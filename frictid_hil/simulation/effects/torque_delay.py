@@ -59,7 +59,7 @@ EFFECT = Effect(
         "Systems', 3rd ed., 1997, section 2."
     ),
     parameters=(Parameter("delay_s", 0.0, 0.05, 0.002, "from demand to current", off=0.0),),
-    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.FREQUENCY)),
+    signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(
         Hook("current", current, order=20),
         Hook("settle", settle),

@@ -42,7 +42,7 @@ EFFECT = Effect(
         "what follows in the loop."
     ),
     parameters=(Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0),),
-    signature=Signature((Channel.ACTUATION, Channel.PLANT), (Region.ACTUATION, Region.ACCELERATION)),
+    signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.ACCELERATION)),
     hooks=(Hook("current", current, order=30),),
     illustrate=illustrate,
 )

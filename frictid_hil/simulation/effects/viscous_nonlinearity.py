@@ -22,7 +22,8 @@ def rate(
         return rate_nm
     relative = 1.0 + abs(velocity_rad_s) / knee_rad_s
     shape = math.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
-    return rate_nm + math.copysign(share * coulomb_nm * shape, velocity_rad_s)
+    bent_nm = share * coulomb_nm * shape
+    return rate_nm + (bent_nm if velocity_rad_s >= 0.0 else -bent_nm)
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
