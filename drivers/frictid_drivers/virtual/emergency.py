@@ -65,13 +65,11 @@ class Emergency:
         values[key(0x1003)] = count
         self._publish(code, detail)
 
-    def clear(self, *codes: int) -> None:
-        """Errors are gone: those named, or all."""
-        left = [code for code in self._present if codes and code not in codes]
-        if left == self._present:
-            return
-        self._present = left
-        self._publish(0, 0)
+    def clear(self, code: int) -> None:
+        """One error is gone."""
+        if code in self._present:
+            self._present.remove(code)
+            self._publish(0, 0)
 
     def forget(self) -> None:
         """Power was off: nothing is present, nothing is said."""

@@ -178,6 +178,8 @@ class Servo:
         if self.nmt_state != OPERATIONAL:
             return
         self._now_ns = now_ns
+        if self._last_sync_ns is None:
+            self._changed = True  # from here on SYNC is supervised
         self._last_sync_ns = now_ns
         if len(data) != self._sync_length:
             self.emergency.report(emergency.SYNC_LENGTH, len(data))
@@ -538,8 +540,10 @@ class Servo:
             return
         if self.state is PowerState.FAULT:
             self.state = PowerState.SWITCH_ON_DISABLED
-        standing = [emergency.HEARTBEAT_LOST] if any(consumer.lost for consumer in self._consumers) else []
-        self.emergency.clear(*(code for code in self.emergency.present if code not in standing))
+        missing = any(consumer.lost for consumer in self._consumers)
+        for code in self.emergency.present:
+            if not (missing and code == emergency.HEARTBEAT_LOST):
+                self.emergency.clear(code)
 
     def _power_on(self) -> None:
         self._halted = False
