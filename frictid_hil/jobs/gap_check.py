@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
-from frictid_hil.gap.blind.check import Progress, run_check
-from frictid_hil.gap.blind.page import page
+from frictid_hil.gap.blind.check import run_check
+from frictid_hil.gap.blind.page import headline, page
 
 
 def run_gap_check(
@@ -18,7 +19,7 @@ def run_gap_check(
     processes: int | None = None,
     *,
     leave_one_out: bool = False,
-    progress: Progress | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Draw joints whose effect is sealed, diagnose them in processes of their own, open the seal, score.
 
@@ -28,11 +29,11 @@ def run_gap_check(
         out: folder that keeps commitment, cases, answers, truth, ``result.json`` and ``gap-check.md``.
         processes: at once; one per processor core unless given.
         leave_one_out: also take each joint's own effect out of the library and diagnose again.
-        progress: called with phase, done, of.
+        progress: given a line now and then.
 
     Returns:
-        What ``--json`` prints: ``schema``, ``outcome``, ``seed``, ``cases``, ``truth_sha256``, ``scores``,
-        ``leave_one_out``.
+        What ``--json`` prints: ``outcome``, ``seed``, ``cases``, ``truth_sha256``, ``rates`` (each ``rate``, ``low``,
+        ``high``, ``right``, ``of``), ``scores`` (everything), ``leave_one_out`` (or None), ``out``.
 
     Raises:
         UsageError: no case asked for, or ``out`` holds the result of another run.
@@ -47,8 +48,23 @@ def run_gap_check(
         out=out,
         processes=processes or os.cpu_count() or 1,
         leave_one_out=leave_one_out,
-        progress=progress,
+        progress=_told(progress) if progress else None,
     )
     if out is not None:
         (out / "gap-check.md").write_text(page(result))
-    return {"outcome": "ok", **result}
+    return {
+        "outcome": "ok",
+        **result,
+        "rates": headline(result["scores"]),
+        "out": str(out.resolve()) if out is not None else None,
+    }
+
+
+def _told(tell: Callable[[str], None]) -> Callable[[str, int, int], None]:
+    """A line at every tenth of a phase."""
+
+    def progress(phase: str, done: int, of: int) -> None:
+        if done == of or 10 * done // of > 10 * (done - 1) // of:
+            tell(f"{phase}: {done} of {of}")
+
+    return progress

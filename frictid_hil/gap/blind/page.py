@@ -13,6 +13,36 @@ last full run, failures included.
 """
 
 
+_LABELS = {
+    "singles_top_1": "Visible single effects named first",
+    "singles_top_1_or_alias": "... or its alias",
+    "singles_top_2": "... among the first two",
+    "none_answered_none": "Healthy joints answered `none`",
+    "outside_answered_unknown": "Visible effects from outside the library answered `unknown`",
+    "doubles_both_in_top_2": "Both of two effects (each visible alone) in the first two",
+    "doubles_all_both_in_top_2": "... of all pairs",
+    "invisible_none_or_named": "Invisible effects answered `none` or by their name",
+    "confident_right": "Answers of confidence 0.9 and more that are right",
+    "confident_right_or_alias": "... or the alias of right",
+}
+
+
+def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The rates that a person asks for first, by name."""
+    return {
+        "singles_top_1": scores["singles"]["top_1"],
+        "singles_top_1_or_alias": scores["singles"]["top_1_or_alias"],
+        "singles_top_2": scores["singles"]["top_2"],
+        "none_answered_none": scores["none"]["answered_none"],
+        "outside_answered_unknown": scores["outside"]["answered_unknown"],
+        "doubles_both_in_top_2": scores["doubles"]["both_in_top_2"],
+        "doubles_all_both_in_top_2": scores["doubles"]["both_in_top_2_all"],
+        "invisible_none_or_named": scores["invisible"],
+        "confident_right": scores["confident"]["right"],
+        "confident_right_or_alias": scores["confident"]["right_or_alias"],
+    }
+
+
 def page(result: Mapping[str, Any]) -> str:
     """The whole page of one run."""
     scores = result["scores"]
@@ -35,25 +65,14 @@ def page(result: Mapping[str, Any]) -> str:
 
 
 def _rates(scores: Mapping[str, Any]) -> list[str]:
-    rows = [
-        ("Visible single effects named first", scores["singles"]["top_1"]),
-        ("... or its alias", scores["singles"]["top_1_or_alias"]),
-        ("... among the first two", scores["singles"]["top_2"]),
-        ("Healthy joints answered `none`", scores["none"]["answered_none"]),
-        ("Visible effects from outside the library answered `unknown`", scores["outside"]["answered_unknown"]),
-        ("Both of two effects (each visible alone) in the first two", scores["doubles"]["both_in_top_2"]),
-        ("... of all pairs", scores["doubles"]["both_in_top_2_all"]),
-        ("Invisible effects answered `none` or by their name", scores["invisible"]),
-        ("Answers of confidence 0.9 and more that are right", scores["confident"]["right"]),
-        ("... or the alias of right", scores["confident"]["right_or_alias"]),
-    ]
+    rows = [(_LABELS[name], rate) for name, rate in headline(scores).items()]
     seconds = scores["seconds"]
     return [
         "## Rates",
         "",
         "| | share | 95 % interval | count |",
         "|---|---|---|---|",
-        *(f"| {label} | {_percent(rate['share'])} | {_interval(rate)} | {_count(rate)} |" for label, rate in rows),
+        *(f"| {label} | {_percent(rate['rate'])} | {_interval(rate)} | {_count(rate)} |" for label, rate in rows),
         "",
         f"Time per joint: median {_number(seconds['median'])} s, 90 % within {_number(seconds['p90'])} s, longest "
         f"{_number(seconds['worst'])} s. Diagnoses that raised an error: {len(scores['errors'])}. Answers `unknown` "
@@ -71,7 +90,7 @@ def _by_size(scores: Mapping[str, Any]) -> list[str]:
         "| size | first | first two | count |",
         "|---|---|---|---|",
         *(
-            f"| {size} | {_percent(rates['top_1']['share'])} | {_percent(rates['top_2']['share'])} "
+            f"| {size} | {_percent(rates['top_1']['rate'])} | {_percent(rates['top_2']['rate'])} "
             f"| {rates['top_1']['of']} |"
             for size, rates in scores["singles"]["by_size"].items()
         ),
@@ -104,7 +123,7 @@ def _calibration(scores: Mapping[str, Any]) -> list[str]:
         "| confidence | mean | right | count |",
         "|---|---|---|---|",
         *(
-            f"| {row['from']:.2f} to {row['to']:.2f} | {_number(row['mean_confidence'])} | {_percent(row['share'])} "
+            f"| {row['from']:.2f} to {row['to']:.2f} | {_number(row['mean_confidence'])} | {_percent(row['rate'])} "
             f"| {_count(row)} |"
             for row in scores["calibration"]
         ),
@@ -172,9 +191,9 @@ def _left_out(check: Mapping[str, Any]) -> list[str]:
         "## With the joint's own effect taken out of the library",
         "",
         f"{check['joints']} visible joints with one effect. A confident (0.9 and more) wrong cause: "
-        f"{_percent(wrong['share'])} ({_count(wrong)}, {_interval(wrong)}); "
+        f"{_percent(wrong['rate'])} ({_count(wrong)}, {_interval(wrong)}); "
         f"a confident partner of the true one: {_count(check['confident_partner'])}; answered `unknown`: "
-        f"{_percent(check['answered_unknown']['share'])}.",
+        f"{_percent(check['answered_unknown']['rate'])}.",
         "",
         "| effect left out | first answers |",
         "|---|---|",
@@ -192,8 +211,7 @@ def _percent(share: float | None) -> str:
 
 
 def _interval(rate: Mapping[str, Any]) -> str:
-    interval = rate["interval_95"]
-    return "-" if interval is None else f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f} %"
+    return "-" if rate["low"] is None else f"{100 * rate['low']:.1f} to {100 * rate['high']:.1f} %"
 
 
 def _count(rate: Mapping[str, Any]) -> str:

@@ -120,13 +120,9 @@ class Rate:
         return max(0.0, middle - half), min(1.0, middle + half)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "right": self.right,
-            "of": self.of,
-            "share": self.share,
-            "interval_95": list(self.interval) if self.interval else None,
-        }
+        """Plain values; ``low`` and ``high`` bound the 95 % interval."""
+        low, high = self.interval or (None, None)
+        return {"rate": self.share, "low": low, "high": high, "right": self.right, "of": self.of}
 
 
 def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]) -> dict[str, Any]:
