@@ -188,11 +188,12 @@ class Axis:
 
     def _follow(self, position_rad: float) -> None:
         """The joint holds where power came on until its set-point moves: the runner may still know an older place."""
+        units = self._units(position_rad, self._scale.position_rad)
         if self._held_at_rad is None:
             self._held_at_rad = position_rad
         if position_rad != self._held_at_rad:
-            self._held_at_rad = math.inf
-            self._target_units = self._units(position_rad, self._scale.position_rad)
+            self._held_at_rad = math.nan  # equal to no set-point
+            self._target_units = units
 
     def _in_fault(self) -> int:
         """Bit 7 rises once where a reset was asked for; a fault that stays, or comes later, ends the wish for power."""

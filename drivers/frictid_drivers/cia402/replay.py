@@ -1,8 +1,9 @@
 """A log played into the decoder of the live cycle: the same frames give the same rows, bit for bit.
 
 A row begins at SYNC and ends where the live cycle ended it: when the reply window was over, or the next SYNC came. Set
-points of a row are those that its SYNC put into force. Without SYNC (logs of event-driven drives) a row begins where
-a report comes a second time.
+points of a row are those that its SYNC put into force. A SYNC that repeats the counter of the one before it was sent
+by a quick stop, between two cycles: it ends the row and begins none (before any report it is a doubled frame of a
+damaged log). Without SYNC (logs of event-driven drives) a row begins where a report comes a second time.
 """
 
 from __future__ import annotations
@@ -68,36 +69,44 @@ class LogDecoder:
         waiting: list[tuple[int, bytes]] = []
         opened_ns: int | None = None
         last_ns = 0
+        counter = b""
+        answered = False
         for t_ns, can_id, data in frames:
             if t_ns < last_ns:
                 self.backwards += 1
             last_ns = t_ns
-            is_report = can_id in self._reports
-            begins = (
-                can_id == self._sync
-                if self._sync is not None
-                else is_report and (opened_ns is None or decoder.has(can_id))
-            )
+            is_sync, is_report = can_id == self._sync, can_id in self._reports
+            again = is_report and opened_ns is not None and decoder.has(can_id)
+            repeats = is_sync and data != b"" and data == counter
+            if repeats and not answered:
+                continue
+            ends = is_sync or (again and self._sync is None)
             restarts = can_id == _NMT and data[:1] == bytes([_NMT_START])
             over = opened_ns is not None and 0 < self._window_ns < t_ns - opened_ns
-            if opened_ns is not None and (begins or restarts or over):
+            if opened_ns is not None and (ends or restarts or over):
                 yield Row(opened_ns, decoder.finish(), commands)
                 opened_ns = None
+            begins = ends or (is_report and self._sync is None and opened_ns is None)
+            if is_sync:
+                begins, counter = not repeats, data
             if restarts:
                 decoder.restart()
                 waiting.clear()
+                counter = b""
             if begins:
                 for cob_id, command in waiting:
                     commands.feed(cob_id, command)
                 waiting.clear()
                 decoder.begin(t_ns)
                 opened_ns = t_ns
-                if can_id == self._sync:
-                    continue
+                answered = False
+            if is_sync:
+                continue
             if can_id in self._command_ids:
                 waiting.append((can_id, data))
                 continue
-            if is_report and self._sync is not None and opened_ns is not None and decoder.has(can_id):
+            answered = answered or is_report
+            if again and self._sync is not None:
                 self.repeated += 1
             if not decoder.feed(t_ns, can_id, data) and not restarts:
                 self.unknown[_name(can_id)] += 1
