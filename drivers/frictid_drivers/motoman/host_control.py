@@ -21,6 +21,9 @@ _COMMAND: Final = "01,000"
 _RESULT: Final = "90,000"
 _DATA: Final = "90,001"
 
+_FAREWELL_S: Final = 0.3
+"""How long the EOT of a reply may take before the port goes to another protocol without it."""
+
 _LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that is off"
 _LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
 
@@ -239,7 +242,7 @@ class HostControl:
 
     def leave(self) -> None:
         """Let the link finish, then forget it: the port goes to another protocol."""
-        until_s = self._port.now_s() + self._timing.sequence_s
+        until_s = self._port.now_s() + _FAREWELL_S
         while not self._link.idle and self._port.now_s() < until_s:
             self._step(until_s)
         self._link = BscLink(self._timing)

@@ -1,7 +1,7 @@
 """Frames of the streaming extension: layout, CRC, and a reader that finds its way back after garbage.
 
-``A5 5A | version << 4 + type | length | seq u16 | payload | CRC u16``, little-endian; the CRC is CRC-16/CCITT-FALSE over
-everything from the version to the end of the payload.
+``A5 5A | version << 4 + type | length | seq u16 | payload | CRC u16``, little-endian; the CRC is CRC-16/CCITT-FALSE
+over everything from the version to the end of the payload.
 """
 
 from __future__ import annotations

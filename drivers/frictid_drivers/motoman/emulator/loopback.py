@@ -38,7 +38,7 @@ class LoopbackPort:
         until_s = emulator.now_s + max(0.0, timeout_s)
         while True:
             self._check()
-            data = emulator.take() if self._line == emulator.line else b""
+            data = emulator.take(self._line)
             if data or emulator.now_s >= until_s:
                 return data
             emulator.advance(min(until_s, emulator.next_event_s()))

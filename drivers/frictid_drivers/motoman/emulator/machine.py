@@ -20,6 +20,9 @@ from frictid_drivers.motoman.emulator.streaming import StreamApplication
 
 _LONGEST_REST_S = 0.1
 
+Line = tuple[int, str]
+"""Speed and parity."""
+
 
 @dataclass(frozen=True, slots=True)
 class Settings:
@@ -89,9 +92,8 @@ class Emulator:
         self.gone = False
         self.now_s = 0.0
         self._incoming: deque[tuple[float, bytes]] = deque()
-        self._outgoing: deque[tuple[float, bytes]] = deque()
+        self._outgoing: deque[tuple[float, bytes, Line]] = deque()
         self._in_free_s = self._out_free_s = 0.0
-        self._delivered = bytearray()
         self._replies: deque[tuple[float, Reply]] = deque()
         self._next_line: tuple[int, str, int] | None = None
         self._next_tick_s = 0.0
@@ -108,20 +110,21 @@ class Emulator:
         self._in_free_s = begin_s + len(chunk) * self._byte_s
         self._incoming.append((self._in_free_s, chunk))
 
-    def take(self) -> bytes:
-        """Bytes that have reached the host by now."""
+    def take(self, line: Line | None = None) -> bytes:
+        """Bytes that have reached the host by now; a host that listens at another speed hears none of them."""
+        taken = bytearray()
         while self._outgoing and self._outgoing[0][0] <= self.now_s:
-            self._delivered += self._outgoing.popleft()[1]
-        taken = bytes(self._delivered)
-        self._delivered.clear()
-        return taken
+            _, chunk, spoken_at = self._outgoing.popleft()
+            if line is None or line == spoken_at:
+                taken += chunk
+        return bytes(taken)
 
     def next_event_s(self) -> float:
         """When something happens next, at the latest a moment from now."""
         times = [self.now_s + _LONGEST_REST_S]
         if self._incoming:
             times.append(self._incoming[0][0])
-        if self._outgoing:
+        if self._outgoing and self._outgoing[0][0] > self.now_s:
             times.append(self._outgoing[0][0])
         if self._replies:
             times.append(self._replies[0][0])
@@ -139,8 +142,6 @@ class Emulator:
                 break
             self.now_s = event_s
             self._happen()
-            if self._outgoing and self._outgoing[0][0] <= self.now_s:
-                self._delivered += self._outgoing.popleft()[1]
         self.now_s = max(self.now_s, to_s)
 
     # -- what happens ------------------------------------------------------------------------------------------
@@ -308,13 +309,13 @@ class Emulator:
         chunk = _damaged(chunk, struck)
         if "split" in struck:
             for k in range(len(chunk)):
-                self._outgoing.append((begin_s + (k + 1) * self._byte_s, chunk[k : k + 1]))
+                self._outgoing.append((begin_s + (k + 1) * self._byte_s, chunk[k : k + 1], self.line))
             return
         arrival_s = self._out_free_s
         if "merge" in struck:
             together_s = struck["merge"].value or 0.02
             arrival_s = math.ceil(arrival_s / together_s) * together_s
-        self._outgoing.append((arrival_s, chunk))
+        self._outgoing.append((arrival_s, chunk, self.line))
 
     def delivered(self, arrived: bool) -> None:
         """See ``station.Voice``: a granted stream begins once the host has the grant."""

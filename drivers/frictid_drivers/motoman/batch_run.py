@@ -1,0 +1,159 @@
+"""One joint's plan as one job: checked, sent, started, watched, fetched, and turned into columns."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from frictid_drivers.motoman.batch import BatchClient, JobOrder, Record
+from frictid_drivers.motoman.host_control import HostControl
+from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.segments import JobMotion, motion_segments
+from frictid_hil.driver import JointSetup
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
+from frictid_hil.plan import JointPlan
+from frictid_hil.units import degrees
+
+_AT_START_RAD = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class JobBounds:
+    """What the job may do.
+
+    Attributes:
+        position_min_rad: of the travel.
+        position_max_rad: of the travel.
+        torque_nm: joint side.
+        watchdog_s: it stops when it hears nothing for so long.
+    """
+
+    position_min_rad: float
+    position_max_rad: float
+    torque_nm: float
+    watchdog_s: float
+
+
+class BatchRun:
+    """Runs one job.
+
+    Args:
+        batch: the controller application.
+        host: stock commands on the same line.
+        joint: who moves.
+        units: of its axis.
+        bounds: see there.
+        tick_s: interpolation clock.
+
+    Attributes:
+        number: of the job.
+        running: the controller may be moving the arm for this job.
+        columns: what was recorded; filled in also where the job was stopped.
+    """
+
+    def __init__(
+        self,
+        batch: BatchClient,
+        host: HostControl,
+        joint: JointSetup,
+        units: AxisUnits,
+        bounds: JobBounds,
+        tick_s: float,
+        number: int,
+    ) -> None:
+        self._batch = batch
+        self._host = host
+        self._joint = joint
+        self._units = units
+        self._bounds = bounds
+        self._tick_s = tick_s
+        self.number = number
+        self.running = False
+        self.columns: dict[str, Any] = {}
+
+    def run(
+        self,
+        plan: JointPlan,
+        power_on: Callable[[], None],
+        stop: Callable[[], bool],
+        progress: Callable[[str, float], None],
+    ) -> None:
+        """The whole job; see ``MotomanDriver.run_batch``."""
+        motion = motion_segments(plan.motions, self._units, self._tick_s)
+        self._batch.send(self._order(motion))
+        self._stand_at(motion.start)
+        power_on()
+        self.running = True
+        duration_s = len(motion.command) * self._tick_s
+        try:
+            self._batch.start(self.number)
+            self._batch.watch(self.number, duration_s, stop, lambda share: progress("motion", share))
+        except HardwareError:
+            # The line failed: the controller stops by its watchdog, and whoever closes the line tries to stop it too.
+            raise
+        except FrictidError:
+            self.running = False
+            with contextlib.suppress(FrictidError):
+                self._fetch(motion, progress)
+            raise
+        self.running = False
+        self._fetch(motion, progress)
+
+    def _order(self, motion: JobMotion) -> JobOrder:
+        units, bounds, where = self._units, self._bounds, f"joint {self._joint.name}"
+        lowest, highest = sorted((units.pulses(bounds.position_min_rad), units.pulses(bounds.position_max_rad)))
+        step = int(abs(self._joint.max_velocity_rad_s * self._tick_s * units.pulses_per_rad)) + 1
+        if int(motion.command.min()) < lowest or int(motion.command.max()) > highest:
+            raise PlanRefused("the job leaves the joint's travel", where=where)
+        if int(np.abs(np.diff(motion.command)).max(initial=0)) > step:
+            raise PlanRefused("the job exceeds the joint's velocity", where=where)
+        return JobOrder(
+            number=self.number,
+            axis=units.axis,
+            start=motion.start,
+            lowest=lowest,
+            highest=highest,
+            step=step,
+            torque_micro=units.motor_micro(bounds.torque_nm),
+            watchdog_ticks=round(bounds.watchdog_s / self._tick_s),
+            segments=motion.segments,
+        )
+
+    def _stand_at(self, start: int) -> None:
+        units = self._units
+        here = self._host.pulses()[units.axis]
+        if abs(here - start) > abs(_AT_START_RAD * units.pulses_per_rad):
+            raise HardwareError(
+                f"stands at {degrees(units.position_rad(here)):.2f} deg, "
+                f"the job starts at {degrees(units.position_rad(start)):.2f} deg",
+                where=f"joint {self._joint.name}",
+                next_step="bring it there first, or let the plan begin with a move from where it stands",
+            )
+
+    def _fetch(self, motion: JobMotion, progress: Callable[[str, float], None]) -> None:
+        state = self._batch.state(self.number)
+        if state.done_ticks == 0:
+            return
+        record = self._batch.fetch(self.number, state, state.done_ticks, lambda share: progress("transfer", share))
+        self.columns = self._columns(motion, record)
+
+    def _columns(self, motion: JobMotion, record: Record) -> dict[str, Any]:
+        units = self._units
+        n = len(record.pulses)
+        # A job that was stopped early goes on recording while it decelerates: its command ends before its samples.
+        command = np.concatenate([motion.command[:n], np.full(max(0, n - len(motion.command)), motion.command[-1])])
+        tick_ns = round(self._tick_s * 1e9)
+        sign = units.direction
+        return {
+            "time_ns": np.arange(n, dtype=np.int64) * tick_ns,
+            "position_rad": record.pulses / units.pulses_per_rad,
+            "velocity_rad_s": record.speed_tenths * 0.1 / units.pulses_per_rad,
+            "torque_nm": record.torque_micro * (1e-6 * units.gear_ratio * sign),
+            "position_command_rad": command / units.pulses_per_rad,
+            "motion_starts_ns": np.array(motion.motion_ticks, dtype=np.int64) * tick_ns,
+            "dropped_pulses": record.dropped_pulses,
+        }

@@ -1,0 +1,204 @@
+"""The cyclic exchange over a stream, and the run time it runs on.
+
+Run time is the controller's: tick T of its interpolation clock is run time (T - first tick) * tick. Targets sent after
+the report of tick T are due ``lead`` ticks later, and that is what "now" means here, so that a set-point given at run
+time t moves the arm at run time t, and the marks of a recording agree with its samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.stream import StreamSession
+from frictid_drivers.motoman.stream_frames import Flag, TickReport
+from frictid_hil.driver import Feedback, JointSetup, JointState, Mode, SetPoint
+from frictid_hil.errors import SafetyAbort
+from frictid_hil.units import degrees
+
+_SERVO_ON = 1 << 6
+_STEP_MARGIN = 1.05
+
+
+class TickClock:
+    """Run time by the controller's ticks; see the module's first page. Zero while nothing streams."""
+
+    def __init__(self) -> None:
+        self._session: StreamSession | None = None
+        self._now_s = 0.0
+        self._first_tick = 0
+        self._tick_ns = 1
+        self._lead_ticks = 0
+
+    def follow(self, session: StreamSession, first_tick: int, tick_ns: int, lead_ticks: int) -> None:
+        """Begin: this tick is run time zero."""
+        self._session = session
+        self._first_tick = first_tick
+        self._tick_ns = tick_ns
+        self._lead_ticks = lead_ticks
+
+    def release(self) -> None:
+        """The stream is over."""
+        self._session = None
+
+    def tick_ns(self, tick: int) -> int:
+        """Run time of a tick."""
+        return (tick - self._first_tick) * self._tick_ns
+
+    def now_ns(self) -> int:
+        """Run time that targets sent now are due at."""
+        session = self._session
+        if session is None or session.report is None:
+            return 0
+        return self.tick_ns(session.report.tick + self._lead_ticks) + session.age_ns()
+
+    def wait_until(self, deadline_ns: int) -> None:
+        """Return when the report has come after which targets for the deadline are to be sent.
+
+        Raises:
+            HardwareError: the controller fell silent.
+        """
+        session = self._session
+        if session is not None:
+            ticks = -(-deadline_ns // self._tick_ns)
+            session.wait_for_tick(self._first_tick + ticks - self._lead_ticks)
+
+
+class StreamCycle:
+    """All joints of one stream.
+
+    Args:
+        session: greeted, no target sent yet.
+        joints: order of set-points and feedback.
+        units: by joint name.
+        limits: by joint name: lowest and highest position, torque.
+        pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
+        clock: taken over from here.
+        lead_ticks: between a report and the tick that its answer is due at.
+    """
+
+    def __init__(
+        self,
+        session: StreamSession,
+        joints: Sequence[JointSetup],
+        units: Mapping[str, AxisUnits],
+        limits: Mapping[str, tuple[float, float, float]],
+        pulses: Sequence[int],
+        clock: TickClock,
+        lead_ticks: int,
+    ) -> None:
+        welcome = session.welcome
+        assert welcome is not None
+        self.session = session
+        self._clock = clock
+        self._torque_unit = welcome.torque_unit
+        self._may_feed_forward = welcome.feed_forward
+        self._joints = list(joints)
+        self._index = {joint.name: k for k, joint in enumerate(joints)}
+        self._units = [units[joint.name] for joint in joints]
+        self._feedback = [Feedback() for _ in joints]
+        self._wanted: set[int] = set()
+        self._locked: set[int] = set()
+        self._last_tick = -1
+        order = [axis for axis in range(8) if welcome.axis_mask >> axis & 1]
+        self._place = {k: order.index(units.axis) for k, units in enumerate(self._units) if units.axis in order}
+        tick_s = welcome.tick_us * 1e-6
+        self._bounds = []
+        for joint, unit in zip(joints, self._units, strict=True):
+            low, high, _ = limits[joint.name]
+            lowest, highest = sorted((unit.pulses(low), unit.pulses(high)))
+            step = abs(joint.max_velocity_rad_s * tick_s * unit.pulses_per_rad) * _STEP_MARGIN
+            self._bounds.append((lowest, highest, int(step) + 1))
+        first = session.wait_for_tick(0)
+        clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
+        # Targets in the order of the axes; axes without a joint stay where they are.
+        self._targets = [axis.pulses for axis in first.axes]
+        self._torques = [0] * len(order)
+        for k, unit in enumerate(self._units):
+            if k not in self._place:
+                report = self._feedback[k]
+                report.position_rad = unit.position_rad(pulses[unit.axis])
+                report.mode, report.valid, report.age_cycles = Mode.POSITION, True, 1
+
+    # -- who follows -------------------------------------------------------------------------------------------
+
+    def enable(self, joint: str) -> None:
+        """Follow set-points from here on."""
+        self._wanted.add(self._index[joint])
+
+    def disable(self, joint: str) -> None:
+        """Hold, and follow no more."""
+        self._wanted.discard(self._index[joint])
+
+    def lock(self, joint: str) -> None:
+        """Hold at the last target."""
+        self._locked.add(self._index[joint])
+
+    def unlock(self, joint: str) -> None:
+        """Follow set-points again."""
+        self._locked.discard(self._index[joint])
+
+    # -- the exchange ------------------------------------------------------------------------------------------
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """Targets for the deadline that was waited for; the newest report."""
+        session = self.session
+        report = session.wait_for_tick(0)
+        session.raise_if_stopped()
+        if self._wanted and not session.halted:
+            self._aim(set_points, ticks=max(1, report.tick - self._last_tick) if self._last_tick >= 0 else 1)
+            feed_forward = self._may_feed_forward and any(self._torques)
+            session.send(self._targets, self._torques if feed_forward else ())
+        self._read(report)
+        self._last_tick = report.tick
+        return self._feedback
+
+    def _aim(self, set_points: Sequence[SetPoint], ticks: int) -> None:
+        for k in self._wanted - self._locked:
+            place = self._place.get(k)
+            if place is None:
+                continue
+            unit, set_point = self._units[k], set_points[k]
+            target = unit.pulses(set_point.position_rad)
+            lowest, highest, step = self._bounds[k]
+            moved = abs(target - self._targets[place])
+            if not lowest <= target <= highest or moved > step * ticks:
+                raise SafetyAbort(
+                    f"set-point {degrees(set_point.position_rad):.3f} deg, after "
+                    f"{degrees(unit.position_rad(self._targets[place])):.3f} deg, "
+                    + ("is too large a step for one tick" if moved > step * ticks else "leaves the joint's travel"),
+                    where=f"joint {self._joints[k].name}",
+                )
+            self._targets[place] = target
+            self._torques[place] = unit.feed_forward(set_point.torque_offset_nm)
+
+    def _read(self, report: TickReport) -> None:
+        fresh = report.tick != self._last_tick
+        t_ns = self._clock.tick_ns(report.tick)
+        for k, feedback in enumerate(self._feedback):
+            place = self._place.get(k)
+            feedback.state = self._state(k, report)
+            feedback.status_raw = report.data_1 | report.data_2 << 8 | report.flags << 16
+            feedback.error_code = report.alarm
+            if place is None:
+                continue
+            if not fresh:
+                feedback.age_cycles += 1
+                continue
+            unit, axis = self._units[k], report.axes[place]
+            feedback.t_ns = t_ns
+            feedback.position_rad = unit.position_rad(axis.pulses)
+            feedback.velocity_rad_s = unit.velocity_rad_s(axis.speed_tenths)
+            feedback.torque_nm = unit.torque_nm(axis.torque, self._torque_unit)
+            feedback.mode = Mode.POSITION
+            feedback.age_cycles = 0
+            feedback.valid = True
+
+    def _state(self, k: int, report: TickReport) -> JointState:
+        if report.alarm:
+            return JointState.FAULT
+        if k not in self._wanted or not report.data_2 & _SERVO_ON:
+            return JointState.DISABLED
+        if Flag.ARMED in report.flags:
+            return JointState.ENABLED
+        return JointState.STOPPING if self.session.halted else JointState.DISABLED

@@ -1,0 +1,396 @@
+"""The serial driver: three layers behind the one driver protocol.
+
+Streaming is the cyclic exchange; batch is ``run_batch``; a stock controller without either can be looked at, and the
+findings say why it cannot be identified. The controller's interpolation clock is the run time of a stream.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from frictid_drivers.motoman import inspection
+from frictid_drivers.motoman.batch import TABLE_POINTS, BatchClient
+from frictid_drivers.motoman.batch_run import BatchRun, JobBounds
+from frictid_drivers.motoman.cycle import StreamCycle, TickClock
+from frictid_drivers.motoman.host_control import PROFILES, HostControl
+from frictid_drivers.motoman.joint_units import axis_units
+from frictid_drivers.motoman.layers import Layer, Line, Reach, find_layer, streamed_mask
+from frictid_drivers.motoman.port import BytePort, SerialPort
+from frictid_drivers.motoman.settings import serial_options
+from frictid_drivers.motoman.table import friction_table
+from frictid_hil.driver import (
+    Capabilities,
+    Feedback,
+    Finding,
+    FrameSink,
+    JointIdentity,
+    Mode,
+    RobotSetup,
+    SetPoint,
+)
+from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.plan import JointPlan, Plan
+
+PortFactory = Callable[[str, int, str], BytePort]
+"""Opens a port: path, baud, parity."""
+
+_SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
+"""Marks portions of serial bytes in a bus log; no CAN drive uses this identifier."""
+_LOGGED_BYTES = 64
+
+_POWER_S = 5.0
+_URGENT_S = 0.5
+
+
+class MotomanDriver:
+    """A MOTOMAN-class controller on a serial port.
+
+    Args:
+        setup: the robot; every joint needs ``options.pulses_per_degree``.
+        port_factory: opens the port; an emulator in the same process brings its own.
+
+    Raises:
+        InvalidFields: an option is unknown or impossible, or pulses per degree are missing.
+        ConfigError: the bus is no serial port.
+    """
+
+    def __init__(self, setup: RobotSetup, *, port_factory: PortFactory | None = None) -> None:
+        interface, _, self._path = setup.bus.partition(":")
+        if interface != "serial" or not self._path:
+            raise ConfigError(
+                f"the bus of a serial controller is serial:PORT, found {setup.bus!r}",
+                next_step="`--bus serial:/dev/ttyUSB0`, or the port that `emulate motoman --pty` prints",
+            )
+        self._setup = setup
+        self._options = serial_options(setup.options)
+        self._units = axis_units(setup.joints)
+        self._port_factory = port_factory or SerialPort
+        self._tick_us = round(1e6 / setup.cycle_hz)
+        self._line: Line | None = None
+        self._reach = Reach(Layer.HOST)
+        self._batch: BatchClient | None = None
+        self._cycle: StreamCycle | None = None
+        self._sink: FrameSink | None = None
+        self._active: list[str] = []
+        self._job: BatchRun | None = None
+        self._job_number = 0
+        self._limits = {
+            joint.name: (joint.position_min_rad, joint.position_max_rad, joint.max_torque_nm) for joint in setup.joints
+        }
+        self.clock = TickClock()
+        self.batch_columns: dict[str, Any] = {}
+
+    # -- reaching it -------------------------------------------------------------------------------------------
+
+    def open(self, frame_sink: FrameSink | None = None) -> None:
+        """Take the port exclusively, reach the controller, find out which layer it can do. Nothing moves."""
+        self._sink = frame_sink
+        options = self._options
+        port = self._port_factory(self._path, options.baud, options.parity)
+        try:
+            host = HostControl(
+                port, PROFILES[options.controller], options.link, reply_s=options.reply_s, sink=self._log
+            )
+            self._line = Line(port, host, options, self._tick_us, self._log)
+            self._batch = BatchClient(host, port.now_s)
+            host.status()
+            self._reach = find_layer(self._line, self._batch, options, self._mask(self._units))
+        except BaseException:
+            self._line = None
+            port.close()
+            raise
+
+    def identify(self) -> dict[str, JointIdentity]:
+        """What controller and robot file say of every joint."""
+        return {
+            joint.name: inspection.identity(joint, self._units[joint.name], self._options, self._reach)
+            for joint in self._setup.joints
+        }
+
+    def capabilities(self) -> Capabilities:
+        """What the layer that was found can do."""
+        reach = self._reach
+        tick_s = self._tick_us * 1e-6
+        table = reach.batch is not None and reach.batch.table_points >= TABLE_POINTS
+        if reach.layer is Layer.STREAM:
+            return Capabilities(
+                max_cycle_hz=1.0 / tick_s,
+                modes=frozenset({Mode.POSITION}),
+                torque_offset=reach.welcome is not None and reach.welcome.feed_forward,
+                drive_watchdog=True,
+                lock_step=self._open_line().port.lock_step,
+                cycle_quantum_s=tick_s,
+                table_download=table,
+            )
+        if reach.layer is Layer.BATCH:
+            return Capabilities(
+                max_cycle_hz=1.0 / tick_s,
+                modes=frozenset({Mode.POSITION}),
+                drive_watchdog=True,
+                batch_only=True,
+                lock_step=self._open_line().port.lock_step,
+                cycle_quantum_s=tick_s,
+                table_download=table,
+            )
+        return Capabilities(max_cycle_hz=0.0, modes=frozenset())
+
+    def check(self, plan: Plan | None) -> list[Finding]:
+        """Status, alarms, layers, limits of both sides, line load; reads only."""
+        return inspection.findings(self._setup, self._units, self._options, self._reach, self._open_line().host, plan)
+
+    # -- preparing ---------------------------------------------------------------------------------------------
+
+    def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
+        """Choose the axes of the stream; there is nothing to write to the controller.
+
+        Raises:
+            PlanRefused: the controller cannot do this, or not at this rate.
+        """
+        if self._reach.layer is Layer.HOST:
+            raise PlanRefused(
+                "this controller offers no torque: " + "; ".join(self._reach.reasons.values()),
+                next_step="install the controller application (docs/motoman-controller-application.md)",
+            )
+        if round(1e6 / cycle_hz) != self._tick_us:
+            raise PlanRefused(f"the controller ticks every {self._tick_us} us, not at {cycle_hz:g} Hz")
+        for name in active:
+            self._setup.joint(name)
+        self._active = list(active)
+
+    def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
+        """Bounds that this side keeps on every target, and sends along with every job; the controller has its own.
+
+        Raises:
+            HardwareError: the controller's own travel is narrower.
+        """
+        self._limits[joint] = (position_min_rad, position_max_rad, torque_nm)
+        welcome = self._reach.welcome
+        if welcome is None:
+            return
+        units = self._units[joint]
+        bound = welcome.limits[(welcome.axis_mask & ((1 << units.axis) - 1)).bit_count()]
+        low, high = sorted((units.pulses(position_min_rad), units.pulses(position_max_rad)))
+        if low < bound.lowest or high > bound.highest:
+            raise HardwareError(
+                f"the controller allows {bound.lowest}..{bound.highest} pulses, the robot file {low}..{high}",
+                where=f"joint {joint}",
+                next_step="narrow `position_min_rad` and `position_max_rad` in the robot file",
+            )
+
+    # -- cycling -----------------------------------------------------------------------------------------------
+
+    def start_cycling(self) -> None:
+        """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick."""
+        line = self._open_line()
+        welcome = self._reach.welcome
+        if welcome is None:
+            raise HardwareError("this controller does not stream", next_step="use run_batch")
+        self._servo_on()
+        pulses = line.host.pulses()
+        active = self._mask(self._active or self._units)
+        mask = streamed_mask(self._mask(self._units), active, self._options.stream_baud, welcome.tick_us)
+        session = line.begin_stream(mask)
+        self._cycle = StreamCycle(
+            session, self._setup.joints, self._units, self._limits, pulses, self.clock, self._options.lead_ticks
+        )
+
+    def enable(self, joint: str, mode: Mode) -> None:
+        """Let the joint follow its set-points from here on.
+
+        Raises:
+            HardwareError: a mode other than position.
+        """
+        if mode is not Mode.POSITION:
+            raise HardwareError(f"a serial controller cannot do mode {mode.name}", where=f"joint {joint}")
+        self._cycling().enable(joint)
+
+    def disable(self, joint: str) -> None:
+        """Hold the joint and no longer follow its set-points; servo power goes off with ``stop_cycling``."""
+        self._cycling().disable(joint)
+
+    def lock(self, joint: str) -> None:
+        """Hold the joint where it stands, whatever its set-point."""
+        self._cycling().lock(joint)
+
+    def unlock(self, joint: str) -> None:
+        """Follow the set-point again."""
+        self._cycling().unlock(joint)
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """Targets out, newest report in.
+
+        Raises:
+            SafetyAbort: the controller stopped, or a target is out of bounds.
+            HardwareError: it fell silent.
+        """
+        return self._cycling().exchange(set_points)
+
+    def stop_cycling(self) -> None:
+        """Back to host control, servo power off."""
+        cycle, self._cycle = self._cycle, None
+        if cycle is None:
+            return
+        line = self._open_line()
+        self.clock.release()
+        line.end_stream(cycle.session)
+        line.host.servo(False)
+
+    def quick_stop(self) -> None:
+        """Stop. A stream is told without waiting; a job by host control, whose handshake may take half a second.
+
+        In both cases our silence afterwards lets the controller's own watchdog stop the arm.
+        """
+        with contextlib.suppress(FrictidError):
+            if self._cycle is not None:
+                self._cycle.session.halt()
+            elif self._job is not None and self._job.running and self._batch is not None:
+                self._batch.stop(self._job.number, within_s=_URGENT_S)
+
+    def close(self) -> None:
+        """Everything to rest, servo power off, port released; safe to call twice and after errors."""
+        line, self._line = self._line, None
+        if line is None:
+            return
+        cycle, self._cycle = self._cycle, None
+        job, self._job = self._job, None
+        self.clock.release()
+        try:
+            if cycle is not None:
+                line.end_stream(cycle.session)
+            if job is not None and job.running and self._batch is not None:
+                self._batch.stop(job.number, within_s=_URGENT_S)
+            if cycle is not None or job is not None:
+                line.host.order("SVON 0", within_s=2 * _URGENT_S)
+        except FrictidError:
+            # The line itself failed; the controller's watchdog stops the arm.
+            return
+        finally:
+            line.port.close()
+
+    # -- batch -------------------------------------------------------------------------------------------------
+
+    def run_batch(
+        self,
+        plan: JointPlan,
+        *,
+        stop: Callable[[], bool] = lambda: False,
+        progress: Callable[[str, float], None] = lambda phase, share: None,
+    ) -> Mapping[str, Any]:
+        """One joint's motions as one job on the controller.
+
+        Args:
+            plan: the joint must stand where its first motion begins; all others are held by the controller.
+            stop: asked often; True brings the joint to rest and raises ``Interrupted``.
+            progress: told ``motion`` or ``transfer`` and the share that is done.
+
+        Returns:
+            Columns of shape (n,): ``time_ns``, ``position_rad``, ``velocity_rad_s``, ``torque_nm``,
+            ``position_command_rad``; and ``motion_starts_ns``, shape (motions + 1,), the last one the end.
+
+        Raises:
+            PlanRefused: a motion that the controller cannot make.
+            SafetyAbort: the controller stopped; what was recorded is in ``batch_columns``.
+            Interrupted: ``stop`` asked for it; likewise.
+            HardwareError: the line failed, or the joint does not stand at the start.
+        """
+        line, batch, reach = self._open_line(), self._batch, self._reach
+        if batch is None or reach.batch is None:
+            raise HardwareError("this controller has no batch application", next_step="see `frictid-hil check`")
+        low_rad, high_rad, torque_nm = self._limits[plan.joint]
+        self._job_number = self._job_number % 65535 + 1
+        self._job = BatchRun(
+            batch,
+            line.host,
+            self._setup.joint(plan.joint),
+            self._units[plan.joint],
+            JobBounds(low_rad, high_rad, torque_nm, self._options.watchdog_s),
+            self._tick_us * 1e-6,
+            self._job_number,
+        )
+        try:
+            self._job.run(plan, self._servo_on, stop, progress)
+        finally:
+            self.batch_columns = self._job.columns
+        line.host.servo(False)
+        return self.batch_columns
+
+    def download_table(
+        self,
+        joint: str,
+        curve: FrictionCurve,
+        *,
+        ratio: float,
+        stiffness_nm_per_rad: float,
+        gravity_cos_nm: float = 0.0,
+        gravity_sin_nm: float = 0.0,
+    ) -> None:
+        """Give the controller one joint's friction curve, to be compensated on its own tick; read back and compared.
+
+        Args:
+            joint: name.
+            curve: phi(v), joint side.
+            ratio: R of (24c).
+            stiffness_nm_per_rad: K of (24a).
+            gravity_cos_nm: what holds the joint: gravity_cos cos(q) + gravity_sin sin(q); used while it floats.
+            gravity_sin_nm: see there.
+
+        Raises:
+            HardwareError: no such application, or the table reads back differently.
+        """
+        batch = self._batch
+        if batch is None or not self.capabilities().table_download:
+            raise HardwareError("this controller takes no friction table", where=f"joint {joint}")
+        batch.download(
+            friction_table(self._units[joint], curve, ratio, stiffness_nm_per_rad, gravity_cos_nm, gravity_sin_nm)
+        )
+
+    def compensate_by_table(self, joints: Sequence[str]) -> None:
+        """Apply the downloaded tables of these joints from now on; none ends it."""
+        if self._batch is None:
+            raise HardwareError("the port is not open")
+        self._batch.compensate(self._mask(joints))
+
+    # -- inside ------------------------------------------------------------------------------------------------
+
+    def _servo_on(self) -> None:
+        """Release a command hold that was left behind, then servo power, and see that it is on."""
+        host = self._open_line().host
+        status = host.status()
+        if "command hold" in status.conditions:
+            host.hold(False)
+        if not status.servo_on:
+            host.servo(True)
+            self._await_power(host)
+
+    def _await_power(self, host: HostControl) -> None:
+        until_s = self._open_line().port.now_s() + _POWER_S
+        while not host.status().servo_on:
+            if self._open_line().port.now_s() > until_s:
+                raise HardwareError(
+                    f"servo power is not on {_POWER_S:g} s after it was ordered",
+                    where="controller",
+                    next_step="look at the pendant: safety circuit, e-stops, alarms",
+                )
+
+    def _mask(self, joints: Iterable[str]) -> int:
+        return sum(1 << self._units[name].axis for name in joints)
+
+    def _open_line(self) -> Line:
+        if self._line is None:
+            raise HardwareError("the port is not open", where=self._path)
+        return self._line
+
+    def _cycling(self) -> StreamCycle:
+        if self._cycle is None:
+            raise HardwareError("nothing is streaming", where=self._path)
+        return self._cycle
+
+    def _log(self, data: bytes, sent: bool) -> None:
+        sink = self._sink
+        if sink is not None:
+            now_ns = self.clock.now_ns()
+            for start in range(0, len(data), _LOGGED_BYTES):
+                sink(now_ns, _SERIAL_BYTES_ID, data[start : start + _LOGGED_BYTES], sent)

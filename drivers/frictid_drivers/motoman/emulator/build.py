@@ -1,0 +1,150 @@
+"""From a robot file to the controller that a supplier would have set up for it.
+
+Every joint's ``simulated`` mapping becomes the joint behind an axis; pulses per degree, gear ratio and limits become
+what the controller knows of the axis. ``options.emulator`` says what kind of controller it is:
+
+=================  ========  ==================================================================================
+key                default   meaning
+=================  ========  ==================================================================================
+averaging_ms       0         moving average on the command
+batch              true      the batch application is installed
+stream             true      the streaming application is installed
+thinking_ms        12        between a command and the bid to reply
+hand_amplitude_rad 0.349     a person guides a floating joint by this much, about where it stands
+hand_frequency_hz  0.5       so many times a second
+=================  ========  ==================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+from frictid_drivers.motoman.emulator.axis import Axis, Plate
+from frictid_drivers.motoman.emulator.faults import FaultPlan
+from frictid_drivers.motoman.emulator.machine import Emulator, Settings
+from frictid_drivers.motoman.emulator.station import Parameters
+from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.servo_loop import ServoLoop
+
+CONTROL_PERIOD_S = 0.001
+_SPEED_MARGIN = 1.1
+
+_DEFAULTS: Mapping[str, float | bool] = {
+    "averaging_ms": 0,
+    "batch": True,
+    "stream": True,
+    "thinking_ms": 12,
+    "hand_amplitude_rad": 0.349,
+    "hand_frequency_hz": 0.5,
+}
+
+
+def build(setup: RobotSetup, faults: FaultPlan | None = None) -> Emulator:
+    """The controller of this robot, switched on, arm at its locked positions, servo power off.
+
+    Raises:
+        InvalidFields: an option of ``options.emulator``, pulses per degree, or a ``simulated`` mapping is wrong.
+    """
+    options = _options(setup.options.get("emulator", {}))
+    settings = _settings(setup, options)
+    by_axis = {joint.address: joint for joint in setup.joints}
+    loops: list[ServoLoop] = []
+    axes: list[Axis] = []
+    for number in range(max(by_axis) + 1):
+        joint = by_axis.get(number)
+        if joint is None:
+            path = ("joints", setup.joints[0].name, "axis")
+            raise InvalidFields([FieldProblem(path, f"axes must be numbered without gaps; no joint has axis {number}")])
+        loop = _loop(setup, joint)
+        loops.append(loop)
+        axes.append(Axis(_plate(joint, settings.tick_s), loop, settings.averaging_ticks))
+
+    def on_guided(number: int, guided: bool) -> None:
+        loop = loops[number]
+        loop.hold_hand(
+            loop.model.hand if guided else None,
+            centre_rad=loop.measured_position_rad,
+            amplitude_rad=float(options["hand_amplitude_rad"]),
+            frequency_hz=float(options["hand_frequency_hz"]),
+        )
+
+    return Emulator(axes, settings, faults, on_guided=on_guided)
+
+
+def _options(given: Any) -> dict[str, float | bool]:
+    if not isinstance(given, Mapping):
+        raise InvalidFields([FieldProblem(("options", "emulator"), "must be a mapping")])
+    problems = []
+    for name, value in given.items():
+        path = ("options", "emulator", str(name))
+        if name not in _DEFAULTS:
+            problems.append(FieldProblem(path, f"is no option of the emulator; there are {', '.join(_DEFAULTS)}"))
+        elif isinstance(_DEFAULTS[name], bool) != isinstance(value, bool):
+            problems.append(FieldProblem(path, f"found {value!r}"))
+        elif not isinstance(value, (int, float)) or not 0 <= value < 10_000:
+            problems.append(FieldProblem(path, f"must be a number from 0 to 10000, found {value!r}"))
+    if problems:
+        raise InvalidFields(problems)
+    return {**_DEFAULTS, **given}
+
+
+def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Settings:
+    tick_s = 1.0 / setup.cycle_hz
+    stream_baud = int(setup.options.get("stream_baud", 0))
+    return Settings(
+        generation=str(setup.options.get("controller", "nx")),
+        baud=int(setup.options.get("baud", 19200)),
+        parity=str(setup.options.get("parity", "E")),
+        stream_bauds=(stream_baud,) if options["stream"] and stream_baud else (),
+        batch=bool(options["batch"]),
+        tick_s=tick_s,
+        averaging_ticks=max(1, round(options["averaging_ms"] * 1e-3 / tick_s)),
+        thinking_s=options["thinking_ms"] * 1e-3,
+        parameters=Parameters(
+            timer_a_s=float(setup.options.get("timer_a_s", 3.0)),
+            timer_b_s=float(setup.options.get("timer_b_s", 20.0)),
+            retry_1=int(setup.options.get("retry_1", 10)),
+            retry_2=int(setup.options.get("retry_2", 3)),
+        ),
+    )
+
+
+def _plate(joint: JointSetup, tick_s: float) -> Plate:
+    per_degree = joint.options.get("pulses_per_degree")
+    if isinstance(per_degree, bool) or not isinstance(per_degree, (int, float)) or not 0 < per_degree < math.inf:
+        path = ("joints", joint.name, "options", "pulses_per_degree")
+        raise InvalidFields([FieldProblem(path, f"must be a positive number, found {per_degree!r}")])
+    per_rad = joint.direction * per_degree * 180.0 / math.pi
+    ends = sorted((joint.position_min_rad * per_rad, joint.position_max_rad * per_rad))
+    return Plate(
+        pulses_per_rad=per_rad,
+        gear_ratio=joint.gear_ratio,
+        rated_torque_nm=joint.rated_torque_nm,
+        lowest=math.floor(ends[0]),
+        highest=math.ceil(ends[1]),
+        step=math.ceil(_SPEED_MARGIN * joint.max_velocity_rad_s * abs(per_rad) * tick_s),
+    )
+
+
+def _loop(setup: RobotSetup, joint: JointSetup) -> ServoLoop:
+    try:
+        model = JointModel.from_mapping(
+            joint.simulated,
+            gear_ratio=joint.gear_ratio,
+            rated_torque_nm=joint.rated_torque_nm,
+            max_torque_nm=joint.max_torque_nm,
+        )
+    except InvalidFields as error:
+        prefix = ("joints", joint.name, "simulated")
+        raise InvalidFields([FieldProblem((*prefix, *p.path), p.message) for p in error.problems]) from None
+    return ServoLoop(
+        model,
+        period_s=CONTROL_PERIOD_S,
+        seed=zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode()),
+        position_rad=joint.locked_position_rad,
+    )

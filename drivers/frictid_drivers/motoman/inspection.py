@@ -1,0 +1,173 @@
+"""What ``identify`` and ``check`` can say of a serial controller without moving anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from frictid_drivers.motoman.controller_errors import ControllerError
+from frictid_drivers.motoman.host_control import HostControl, Status
+from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.layers import Layer, Reach, busy_share, streamed_mask
+from frictid_drivers.motoman.settings import SerialOptions
+from frictid_hil.driver import Finding, JointIdentity, JointSetup, RobotSetup, Severity
+from frictid_hil.errors import PlanRefused
+from frictid_hil.plan import Plan
+from frictid_hil.units import degrees
+
+_LONG_AVERAGING_MS = 20
+
+
+def identity(joint: JointSetup, units: AxisUnits, options: SerialOptions, reach: Reach) -> JointIdentity:
+    """One joint, as far as controller and robot file know it."""
+    settings: dict[str, str | float | int | bool] = {
+        "layer": reach.layer.value,
+        "pulses_per_degree": abs(units.pulses_per_rad) / degrees(1.0),
+    }
+    measured, averaging, firmware, unit = False, None, "", 0
+    if reach.welcome is not None:
+        measured, averaging, unit = reach.welcome.torque_measured, reach.welcome.averaging_ms, reach.welcome.torque_unit
+        settings["tick_us"] = reach.welcome.tick_us
+    if reach.batch is not None:
+        measured, averaging = reach.batch.torque_measured, reach.batch.averaging_ms
+        firmware = reach.batch.name
+        settings["tick_us"] = reach.batch.tick_us
+    if averaging is not None:
+        settings["command_averaging_ms"] = averaging
+    source = ""
+    if reach.layer is not Layer.HOST:
+        source = "controller application, " + ("measured" if measured else "commanded") + " at the motor shaft"
+    return JointIdentity(
+        joint=joint.name,
+        firmware=firmware,
+        product=f"MOTOMAN-class controller, {options.controller.upper()} generation, axis {units.axis}",
+        rated_torque_nm=joint.rated_torque_nm,
+        gear_ratio=joint.gear_ratio,
+        position_resolution_rad=abs(1.0 / units.pulses_per_rad),
+        torque_resolution_nm=abs(units.torque_nm(1.0, unit)),
+        torque_source=source,
+        timing=options.timing,
+        settings=settings,
+    )
+
+
+def findings(
+    setup: RobotSetup,
+    units: Mapping[str, AxisUnits],
+    options: SerialOptions,
+    reach: Reach,
+    host: HostControl,
+    plan: Plan | None,
+) -> list[Finding]:
+    """One line per thing a person should know before motion."""
+    found = [
+        Finding(
+            Severity.WARNING,
+            "driver",
+            "follows public documents and was never run against a controller",
+            "watch the first run with a hand on the emergency stop",
+        ),
+        *_of_status(host.status()),
+        *_of_alarms(host),
+        *_of_layers(setup, options, reach),
+        *_of_positions(setup, units, reach, host),
+    ]
+    if plan is not None and reach.layer is not Layer.HOST and round(1e6 / plan.cycle_hz) != round(1e6 / setup.cycle_hz):
+        found.append(Finding(Severity.ERROR, "rate", f"the plan runs at {plan.cycle_hz:g} Hz, not at the tick's rate"))
+    if reach.layer is Layer.STREAM and reach.welcome is not None:
+        found.append(_of_load(setup, units, options, reach, [entry.joint for entry in plan.joints] if plan else []))
+    return found
+
+
+def _of_status(status: Status) -> list[Finding]:
+    shown = ", ".join(sorted(status.conditions)) or "nothing set"
+    found = [Finding(Severity.OK, "controller", f"RSTATS {status.data_1},{status.data_2}: {shown}")]
+    for hold in status.holds:
+        if hold == "command hold":
+            message = "is on: something stopped the arm; it is released when the run begins"
+            found.append(Finding(Severity.WARNING, hold, message, "make sure that you know what stopped it"))
+        else:
+            found.append(Finding(Severity.ERROR, hold, "is on", "release it at the controller"))
+    if status.faulty:
+        found.append(Finding(Severity.ERROR, "controller", "an alarm or error is pending", "clear it on the pendant"))
+    if status.reports_mode and "play" not in status.conditions:
+        found.append(Finding(Severity.ERROR, "mode", "is not play", "turn the key to play"))
+    if status.reports_mode and "command remote" not in status.conditions:
+        found.append(Finding(Severity.ERROR, "remote", "command remote is not set", "enable it on the pendant"))
+    return found
+
+
+def _of_alarms(host: HostControl) -> list[Finding]:
+    try:
+        text = host.alarms()
+    except ControllerError as refused:
+        return [Finding(Severity.WARNING, "alarms", f"cannot be read: {refused.what}")]
+    return [Finding(Severity.OK, "alarms", f"RALARM {text} (its layout is not public)")]
+
+
+def _of_layers(setup: RobotSetup, options: SerialOptions, reach: Reach) -> list[Finding]:
+    found = [Finding(Severity.OK, "layer", f"{reach.layer.value} is used")]
+    found += [Finding(Severity.OK, f"layer {name}", f"not used: {why}") for name, why in reach.reasons.items()]
+    if reach.layer is Layer.HOST:
+        found.append(
+            Finding(
+                Severity.ERROR,
+                "torque",
+                "stock host control reads no torque, so nothing can be identified through it",
+                "install the controller application (docs/motoman-controller-application.md)",
+            )
+        )
+    ticks = {found_in.tick_us for found_in in (reach.welcome, reach.batch) if found_in is not None}
+    wanted = round(1e6 / setup.cycle_hz)
+    if ticks - {wanted}:
+        message = f"the controller ticks every {max(ticks)} us, the robot file says every {wanted} us"
+        found.append(Finding(Severity.ERROR, "rate", message, f"set `cycle_hz` to {1e6 / max(ticks):g}"))
+    averaging = reach.welcome.averaging_ms if reach.welcome else reach.batch.averaging_ms if reach.batch else 0
+    if averaging is None:
+        found.append(
+            Finding(
+                Severity.WARNING,
+                "averaging",
+                "whether the controller averages the command is not known; achieved over planned peak speed will tell",
+            )
+        )
+    elif averaging > _LONG_AVERAGING_MS:
+        message = f"the controller averages the command over {averaging} ms: fast cycles will fall short of their peak"
+        found.append(Finding(Severity.WARNING, "averaging", message, "shorten the filter, or lower the velocity"))
+    if options.layer == "auto" and reach.layer is Layer.BATCH:
+        found.append(Finding(Severity.OK, "transfer", "a joint's recording takes about half a minute at 19200 baud"))
+    return found
+
+
+def _of_positions(setup: RobotSetup, units: Mapping[str, AxisUnits], reach: Reach, host: HostControl) -> list[Finding]:
+    try:
+        pulses = host.pulses()
+    except ControllerError as refused:
+        return [Finding(Severity.ERROR, "position", refused.what, refused.next_step)]
+    found = []
+    for joint in setup.joints:
+        here_rad = units[joint.name].position_rad(pulses[units[joint.name].axis])
+        inside = joint.position_min_rad <= here_rad <= joint.position_max_rad
+        found.append(
+            Finding(
+                Severity.OK if inside else Severity.ERROR,
+                f"joint {joint.name}",
+                f"stands at {degrees(here_rad):.2f} deg" + ("" if inside else ", outside its limits"),
+                "" if inside else "check `pulses_per_degree`, or jog it back",
+            )
+        )
+    return found
+
+
+def _of_load(
+    setup: RobotSetup, units: Mapping[str, AxisUnits], options: SerialOptions, reach: Reach, moving: Sequence[str]
+) -> Finding:
+    assert reach.welcome is not None
+    everything = sum(1 << unit.axis for unit in units.values())
+    one = 1 << units[moving[0] if moving else setup.joints[0].name].axis
+    try:
+        mask = streamed_mask(everything, one, options.stream_baud, reach.welcome.tick_us)
+    except PlanRefused as refused:
+        return Finding(Severity.ERROR, "line load", refused.what, refused.next_step)
+    share = busy_share(mask.bit_count(), options.stream_baud, reach.welcome.tick_us)
+    joints = "all joints" if mask == everything else "the moving joint alone"
+    return Finding(Severity.OK, "line load", f"{share:.0%} of every tick at {options.stream_baud} baud, {joints}")

@@ -1,0 +1,169 @@
+"""Which of the three layers this controller can do, found out by asking it; every refusal is kept as a reason.
+
+A. host control     status, pulses, servo power, hold; no torque: nothing can be identified
+B. batch            a job at a time, 9600 baud and up
+C. streaming        every tick, 115200 baud and up
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from frictid_drivers.motoman.batch import BatchClient, BatchHello
+from frictid_drivers.motoman.controller_errors import ControllerError
+from frictid_drivers.motoman.host_control import HostControl
+from frictid_drivers.motoman.port import BytePort
+from frictid_drivers.motoman.settings import SerialOptions
+from frictid_drivers.motoman.stream import StreamSession
+from frictid_drivers.motoman.stream_frames import Welcome, feedback_bytes, set_point_bytes
+from frictid_hil.errors import HardwareError, PlanRefused
+
+Sink = Callable[[bytes, bool], None]
+"""Told of every portion of bytes on the wire, with True for ours."""
+
+STREAM_PARITY = "N"
+_BITS_PER_BYTE = 10
+_USABLE_SHARE = 0.9
+"""Of a tick may be spent on either direction's frames."""
+
+
+class Layer(Enum):
+    """What is used."""
+
+    HOST = "host"
+    BATCH = "batch"
+    STREAM = "stream"
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """What the controller can do.
+
+    Attributes:
+        layer: the one to use.
+        reasons: why each better layer is not available, by its name.
+        welcome: of the streaming application, all axes; None where there is none.
+        batch: of the batch application; None where there is none.
+    """
+
+    layer: Layer
+    reasons: dict[str, str] = field(default_factory=dict)
+    welcome: Welcome | None = None
+    batch: BatchHello | None = None
+
+
+class Line:
+    """One port that is either in host control or in a stream.
+
+    Args:
+        port: open, at the host control's speed.
+        host: on that port.
+        options: of the robot file.
+        tick_us: interpolation clock that we ask for.
+        sink: of the stream's bytes.
+    """
+
+    def __init__(self, port: BytePort, host: HostControl, options: SerialOptions, tick_us: int, sink: Sink) -> None:
+        self.port = port
+        self.host = host
+        self._options = options
+        self._tick_us = tick_us
+        self._sink = sink
+        self._session_number = int(port.now_s() * 10.0) % 255
+
+    def begin_stream(self, axis_mask: int) -> StreamSession:
+        """FSTREAM, the other speed, HELLO.
+
+        Raises:
+            ControllerError: streaming refused.
+            LinkError: granted, but nothing is heard at the other speed.
+        """
+        options = self._options
+        self.host.order(f"FSTREAM 1,{options.stream_baud},{self._tick_us},{axis_mask}")
+        self.host.leave()
+        self.port.set_line(options.stream_baud, STREAM_PARITY)
+        session = StreamSession(
+            self.port, lead_ticks=options.lead_ticks, silence_s=options.silence_ms * 1e-3, sink=self._sink
+        )
+        self._session_number = self._session_number % 255 + 1
+        try:
+            session.begin(self._session_number, axis_mask)
+        except HardwareError:
+            self.end_stream(session)
+            raise
+        return session
+
+    def end_stream(self, session: StreamSession) -> None:
+        """STOP, and back to the host control's speed."""
+        session.leave()
+        self.port.set_line(self._options.baud, self._options.parity)
+
+
+def find_layer(line: Line, batch: BatchClient, options: SerialOptions, axis_mask: int) -> Reach:
+    """Ask for streaming, then for batch, unless the robot file insists on one.
+
+    Raises:
+        HardwareError: the robot file insists on a layer that the controller does not have.
+    """
+    reasons: dict[str, str] = {}
+    welcome: Welcome | None = None
+    hello: BatchHello | None = None
+    if options.layer in ("auto", "stream"):
+        welcome = _try_stream(line, options, axis_mask, reasons)
+    else:
+        reasons["stream"] = f"the robot file says layer: {options.layer}"
+    if options.layer == "host":
+        reasons["batch"] = reasons["stream"]
+    else:
+        try:
+            hello = batch.hello()
+        except ControllerError as refused:
+            reasons["batch"] = f"the controller answers {refused.what}"
+    layer = Layer.HOST
+    if welcome is not None:
+        layer = Layer.STREAM
+    elif hello is not None:
+        layer = Layer.BATCH
+    if options.layer not in ("auto", layer.value):
+        raise HardwareError(
+            f"the robot file insists on layer {options.layer}: {reasons[options.layer]}",
+            where="options.layer",
+            next_step="install the controller application, or say `layer: auto`",
+        )
+    return Reach(layer, reasons, welcome, hello)
+
+
+def _try_stream(line: Line, options: SerialOptions, axis_mask: int, reasons: dict[str, str]) -> Welcome | None:
+    if not options.stream_baud:
+        reasons["stream"] = "no `stream_baud` in the robot file: not a gateway port"
+        return None
+    try:
+        session = line.begin_stream(axis_mask)
+    except ControllerError as refused:
+        reasons["stream"] = f"the controller answers {refused.what}"
+        return None
+    line.end_stream(session)
+    return session.welcome
+
+
+def streamed_mask(all_axes: int, active_axes: int, baud: int, tick_us: int) -> int:
+    """All axes where their frames fit into a tick, else only the active ones.
+
+    Raises:
+        PlanRefused: not even those fit.
+    """
+    for mask in (all_axes, active_axes):
+        if busy_share(mask.bit_count(), baud, tick_us) <= _USABLE_SHARE:
+            return mask
+    raise PlanRefused(
+        f"{active_axes.bit_count()} joints do not fit into a tick of {tick_us / 1000:g} ms at {baud} baud",
+        next_step="one joint at a time at 115200, six from about 250000 on",
+    )
+
+
+def busy_share(axes: int, baud: int, tick_us: int) -> float:
+    """Part of a tick that the busier direction needs."""
+    most = max(feedback_bytes(axes), set_point_bytes(axes, torque=True))
+    return most * _BITS_PER_BYTE / baud / (tick_us * 1e-6)

@@ -1,0 +1,135 @@
+"""The driver-wide ``options`` of a serial robot file, checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from frictid_drivers.motoman.bsc import BscTiming
+from frictid_drivers.motoman.host_control import PROFILES
+from frictid_hil.driver import Timing
+from frictid_hil.errors import FieldProblem, InvalidFields
+
+LAYERS = ("auto", "stream", "batch", "host")
+
+
+@dataclass(frozen=True, slots=True)
+class SerialOptions:
+    """What a robot file may say beside its joints; every default is the controller's own or ours where it has none.
+
+    Attributes:
+        controller: generation: erc, xrc, nx, dx.
+        layer: auto takes the best that the controller knows; stream, batch or host insist.
+        baud: of host control (RS032).
+        parity: E, O or N (RS033); hardware says E, a pseudo terminal can only do N.
+        stream_baud: asked of FSTREAM; 0 where the port is no gateway port.
+        lead_ticks: how far ahead of the newest report targets are due.
+        silence_ms: without feedback for so long, the controller counts as lost.
+        command_delay_ms: what controller and queue may delay the motion by; following errors are judged with it.
+        watchdog_s: a batch job stops when it hears nothing from us for so long.
+        reply_s: how long the controller may think about a command.
+        timer_a_s: RS034.
+        timer_b_s: RS035.
+        retry_1: RS036.
+        retry_2: RS037.
+        position_delay_s: of reported positions.
+        velocity_delay_s: of reported velocities.
+        torque_delay_s: of reported torques.
+        delay_uncertainty_s: one standard deviation of torque against velocity.
+        timing_known: the delays were given, not assumed.
+    """
+
+    controller: str = "nx"
+    layer: str = "auto"
+    baud: int = 19200
+    parity: str = "E"
+    stream_baud: int = 0
+    lead_ticks: int = 5
+    silence_ms: float = 100.0
+    command_delay_ms: float = 300.0
+    watchdog_s: float = 5.0
+    reply_s: float = 10.0
+    timer_a_s: float = 3.0
+    timer_b_s: float = 20.0
+    retry_1: int = 10
+    retry_2: int = 3
+    position_delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    torque_delay_s: float = 0.0
+    delay_uncertainty_s: float = 0.0005
+    timing_known: bool = False
+
+    @property
+    def link(self) -> BscTiming:
+        """Timers and retries of the link."""
+        return BscTiming(self.timer_a_s, self.timer_b_s, self.retry_1, self.retry_2)
+
+    @property
+    def timing(self) -> Timing:
+        """When reported figures were true."""
+        source = "robot file" if self.timing_known else "assumed"
+        delays = (self.position_delay_s, self.velocity_delay_s, self.torque_delay_s)
+        return Timing(*delays, self.delay_uncertainty_s, source)
+
+
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "controller": tuple(PROFILES),
+    "layer": LAYERS,
+    "parity": ("E", "O", "N"),
+}
+_BOUNDS: Mapping[str, tuple[float, float]] = {
+    "baud": (300, 4_000_000),
+    "stream_baud": (0, 4_000_000),
+    "lead_ticks": (2, 60),
+    "silence_ms": (10, 10_000),
+    "command_delay_ms": (0, 2_000),
+    "watchdog_s": (0.5, 60),
+    "reply_s": (0.1, 120),
+    "timer_a_s": (0.1, 10),
+    "timer_b_s": (0.1, 25.5),
+    "retry_1": (0, 30),
+    "retry_2": (0, 10),
+    "position_delay_s": (-1, 1),
+    "velocity_delay_s": (-1, 1),
+    "torque_delay_s": (-1, 1),
+    "delay_uncertainty_s": (1e-6, 0.1),
+}
+_OTHERS = frozenset({"emulator"})
+"""Read by the emulator only."""
+
+
+def serial_options(mapping: Mapping[str, Any]) -> SerialOptions:
+    """The options, every one checked.
+
+    Raises:
+        InvalidFields: an unknown option, or a value that is not possible.
+    """
+    problems: list[FieldProblem] = []
+    known = {entry.name: entry for entry in fields(SerialOptions) if entry.name != "timing_known"}
+    values: dict[str, Any] = {}
+    for name, value in mapping.items():
+        if name in _OTHERS:
+            continue
+        problem = _problem(name, value, known)
+        if problem:
+            problems.append(FieldProblem(("options", name), problem))
+        else:
+            values[name] = value
+    if problems:
+        raise InvalidFields(problems)
+    delays = {"position_delay_s", "velocity_delay_s", "torque_delay_s"}
+    return SerialOptions(**values, timing_known=bool(delays & values.keys()))
+
+
+def _problem(name: str, value: Any, known: Mapping[str, Any]) -> str:
+    if name not in known:
+        return f"is no option of the serial driver; there are {', '.join(sorted(known))}"
+    if name in _CHOICES:
+        return "" if value in _CHOICES[name] else f"must be one of {', '.join(_CHOICES[name])}, found {value!r}"
+    low, high = _BOUNDS[name]
+    whole = known[name].type == "int"
+    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not math.isfinite(value):
+        return f"must be a {'whole ' if whole else ''}number, found {value!r}"
+    return "" if low <= value <= high else f"must lie in {low:g}..{high:g}, found {value:g}"

@@ -1,0 +1,248 @@
+"""Layer C, streaming: one session of targets with due ticks, slaved to the controller's interpolation clock.
+
+The controller reports every tick; the host answers each report with the targets that are due ``lead_ticks`` later. A
+late host therefore shows up as a shorter queue on the controller, not as a late motion, until the queue is empty: then
+the controller goes straight on for one tick, slows down, and at the third missed tick stops and latches.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+from frictid_drivers.motoman.controller_errors import LinkError
+from frictid_drivers.motoman.port import BytePort
+from frictid_drivers.motoman.stream_frames import (
+    Flag,
+    Frame,
+    FrameReader,
+    Nack,
+    Refusal,
+    Stopped,
+    TickReport,
+    Welcome,
+    encode_hello,
+    encode_set_point,
+    encode_stop,
+)
+from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
+
+_HELLO_EVERY_S = 0.1
+_HELLO_FOR_S = 1.0
+_GOODBYE_S = 0.2
+_STOP_REPEATS = 3
+
+_RECOVERABLE = frozenset({Refusal.CRC, Refusal.GAP, Refusal.LATE})
+_REFUSED = {
+    Refusal.VERSION: ("it speaks another version of the protocol", "update the controller application"),
+    Refusal.SESSION: ("it knows of no such session", "start again"),
+    Refusal.LIMIT: ("a target exceeds its limits of position or step", "compare the limits of both sides with `check`"),
+    Refusal.NOT_ARMED: ("it is latched, held, or its servo power is off", "look at the pendant, then start again"),
+    Refusal.ALARM: ("an alarm is pending", "clear its cause, reset on the pendant, then start again"),
+}
+
+
+class StreamSession:
+    """One session, from HELLO to STOP.
+
+    Args:
+        port: already at the stream's speed.
+        lead_ticks: between the newest report and the tick that a target is due at.
+        silence_s: without any report for so long, the controller counts as lost.
+        sink: told of every portion of bytes on the wire, with True for ours.
+
+    Attributes:
+        welcome: what the controller answered to HELLO.
+        report: its newest report.
+        arrived_s: when that came, port time.
+        nacks: refused frames by reason.
+        flags_seen: every flag that any report carried since the last look.
+        halted: we asked it to stop; a latched controller is no surprise.
+    """
+
+    def __init__(
+        self,
+        port: BytePort,
+        *,
+        lead_ticks: int,
+        silence_s: float,
+        sink: Callable[[bytes, bool], None] | None = None,
+    ) -> None:
+        self._port = port
+        self._lead_ticks = lead_ticks
+        self._silence_s = silence_s
+        self._sink = sink
+        self._reader = FrameReader()
+        self._seq = 0
+        self._session = 0
+        self._last_due = 0
+        self._error: FrictidError | None = None
+        self._goodbye = False
+        self.welcome: Welcome | None = None
+        self.report: TickReport | None = None
+        self.arrived_s = 0.0
+        self.nacks: Counter[str] = Counter()
+        self.flags_seen = Flag(0)
+        self.halted = False
+
+    @property
+    def damaged(self) -> int:
+        """Frames from the controller that arrived damaged."""
+        return self._reader.damaged
+
+    def age_ns(self) -> int:
+        """How long ago the newest report came."""
+        return round((self._port.now_s() - self.arrived_s) * 1e9)
+
+    def begin(self, session: int, axis_mask: int) -> Welcome:
+        """Say HELLO until the controller answers.
+
+        Raises:
+            LinkError: it does not.
+        """
+        self._session = session
+        until_s = self._port.now_s() + _HELLO_FOR_S
+        while self._port.now_s() < until_s:
+            # All repetitions carry one sequence number: the first to arrive opens the session.
+            self._write(encode_hello(self._seq, session, axis_mask))
+            again_s = self._port.now_s() + _HELLO_EVERY_S
+            while self._port.now_s() < again_s:
+                self._collect(again_s - self._port.now_s())
+                self._raise_error()
+                welcome = self.welcome
+                if welcome is not None and welcome.session == session:
+                    self.report = None
+                    return welcome
+        raise LinkError(
+            f"no HELLO within {_HELLO_FOR_S:g} s after streaming was granted",
+            where="FSTREAM",
+            cause="the port does not follow to the stream's speed",
+            next_step="check `options.stream_baud` against what adapter and gateway can do",
+        )
+
+    def wait_for_tick(self, tick: int) -> TickReport:
+        """The newest report, once one of this tick or later has come.
+
+        Raises:
+            HardwareError: the controller fell silent.
+        """
+        while True:
+            self._collect(0.0)
+            report = self.report
+            if report is not None and report.tick >= tick:
+                return report
+            quiet_until_s = self.arrived_s + self._silence_s
+            if self._port.now_s() >= quiet_until_s:
+                raise HardwareError(
+                    f"no feedback for {self._silence_s * 1e3:.0f} ms",
+                    where="streaming",
+                    cause="the cable, the gateway, or a controller that stopped",
+                    next_step="its watchdog stops the arm without us; check the cable, then start again",
+                )
+            self._collect(quiet_until_s - self._port.now_s())
+
+    def send(self, pulses: Sequence[int], torque: Sequence[int] = ()) -> None:
+        """Targets of all axes of the session, due ``lead_ticks`` after the newest report."""
+        assert self.report is not None and self.welcome is not None
+        self._seq = (self._seq + 1) & 0xFFFF
+        self._last_due = max(self._last_due + 1, self.report.tick + self._lead_ticks)
+        self._write(encode_set_point(self._seq, self._session, self.welcome.axis_mask, self._last_due, pulses, torque))
+
+    def raise_if_stopped(self) -> None:
+        """Raise what the controller has against going on; nothing where we asked it to stop ourselves.
+
+        Raises:
+            SafetyAbort: it stopped the arm, or refused a target.
+        """
+        if self.halted:
+            return
+        self._raise_error()
+        report = self.report
+        if report is None:
+            return
+        if report.alarm:
+            raise SafetyAbort(
+                f"alarm {report.alarm}",
+                where="controller",
+                next_step="read it on the pendant, clear its cause, then start again",
+            )
+        if Flag.STRAYED in report.flags:
+            raise SafetyAbort(
+                "an axis outside this session has moved",
+                where="controller",
+                cause="a locked joint is being dragged, or its brake does not hold",
+            )
+        if Flag.LATCHED in report.flags:
+            late = ", ".join(f"{count} {reason}" for reason, count in self.nacks.items()) or "none refused"
+            raise SafetyAbort(
+                "the controller stopped the arm and latched",
+                where="controller",
+                cause=f"its watchdog missed set-points, or somebody pressed hold (frames refused: {late})",
+                next_step="look at the pendant; free this machine's processor, or raise `options.lead_ticks`",
+            )
+
+    def halt(self) -> None:
+        """STOP, several times over, waiting for nothing; the session is dead after it."""
+        self.halted = True
+        for _ in range(_STOP_REPEATS):
+            self._seq = (self._seq + 1) & 0xFFFF
+            self._write(encode_stop(self._seq, self._session, leave=False))
+
+    def leave(self) -> None:
+        """Give the line back to host control."""
+        self.halted = True
+        for _ in range(_STOP_REPEATS):
+            self._seq = (self._seq + 1) & 0xFFFF
+            self._write(encode_stop(self._seq, self._session, leave=True))
+            until_s = self._port.now_s() + _GOODBYE_S / _STOP_REPEATS
+            while not self._goodbye and self._port.now_s() < until_s:
+                self._collect(until_s - self._port.now_s())
+            if self._goodbye:
+                return
+
+    def _collect(self, timeout_s: float) -> None:
+        data = self._port.read(max(0.0, timeout_s))
+        if not data:
+            return
+        if self._sink is not None:
+            self._sink(data, False)
+        for frame in self._reader.take(data):
+            self._take(frame)
+
+    def _take(self, frame: Frame) -> None:
+        match frame:
+            case TickReport():
+                if frame.session == self._session and (self.report is None or frame.tick > self.report.tick):
+                    self.report = frame
+                    self.arrived_s = self._port.now_s()
+                    self.flags_seen |= frame.flags
+            case Nack():
+                self.nacks[frame.reason] += 1
+                if frame.code not in _RECOVERABLE and self._error is None:
+                    self._error = _refused(frame)
+            case Welcome():
+                self.welcome = frame
+                self.arrived_s = self._port.now_s()
+            case Stopped():
+                self._goodbye = self._goodbye or frame.leaving
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _write(self, data: bytes) -> None:
+        if self._sink is not None:
+            self._sink(data, True)
+        self._port.write(data)
+
+
+def _refused(nack: Nack) -> FrictidError:
+    what, next_step = "", ""
+    if nack.code in _REFUSED:
+        what, next_step = _REFUSED[Refusal(nack.code)]
+    axis = "" if nack.axis == 0xFF else f", axis {nack.axis}"
+    return SafetyAbort(
+        f"the controller refused a frame: {what or nack.reason} (due tick {nack.due_tick}, now {nack.now_tick}{axis})",
+        where="streaming",
+        next_step=next_step,
+    )
