@@ -63,8 +63,12 @@ class Fields:
         """A list of finite numbers, not empty."""
         self._read.append(key)
         value = self._mapping.get(key)
-        if not isinstance(value, list | tuple) or not value or not all(
-            isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item) for item in value
+        if (
+            not isinstance(value, list | tuple)
+            or not value
+            or not all(
+                isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item) for item in value
+            )
         ):
             self.problem(key, f"expected a list of numbers, found {value!r}")
             return []

@@ -216,12 +216,13 @@ def place(parameters: Vector, state: Vector, position_rad: float) -> float:
 
 
 def holding_torque(parameters: Vector, state: Vector) -> float:
-    """The motor torque that holds the link against gravity where it is, without the help of friction."""
+    """The motor torque, within its limit, that holds the link where it is without the help of friction."""
     gravity_nm = gravity_torque(parameters, state[LINK_POSITION])
     # What reaches the shaft is an affine function of the motor's torque.
     nothing = shaft_torque(parameters, 0.0, state[MOTOR_POSITION], parameters[GEAR_RATIO])
     one = shaft_torque(parameters, 1.0, state[MOTOR_POSITION], parameters[GEAR_RATIO])
-    return float((gravity_nm - nothing) / (one - nothing))
+    limit_nm = parameters[TORQUE_LIMIT]
+    return float(min(limit_nm, max(-limit_nm, (gravity_nm - nothing) / (one - nothing))))
 
 
 def encoder_position(parameters: Vector, state: Vector) -> float:
