@@ -1,0 +1,1 @@
+"""Self-contained HTML pages: they open from a USB stick, offline, print well, and follow the reader's light or dark."""

@@ -1,0 +1,89 @@
+"""From figures and facts to one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from frictid_hil.files import write_whole
+from frictid_hil.report.figures import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows under headings; cells are text."""
+
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a page, in reading order: words, verdicts, tables, figures.
+
+    Attributes:
+        title: heading.
+        words: paragraphs.
+        checks: (passed, sentence) pairs.
+        tables: of facts.
+        figures: of data.
+    """
+
+    title: str
+    words: tuple[str, ...] = ()
+    checks: tuple[tuple[bool, str], ...] = ()
+    tables: tuple[Table, ...] = ()
+    figures: tuple[Figure, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A whole page.
+
+    Attributes:
+        title: of the page.
+        headline: the one sentence that a reader must not miss.
+        sections: in order.
+        facts: provenance, by name.
+    """
+
+    title: str
+    headline: str
+    sections: Sequence[Section]
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_page(page: Page, path: Path) -> Path:
+    """Write a page as one self-contained file, whole or not at all.
+
+    Raises:
+        FrictidError: disk full, or no permission.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("frictid_hil.report", "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    specs: list[dict[str, Any]] = []
+    numbered: dict[int, int] = {}
+    for section in page.sections:
+        for figure in section.figures:
+            numbered[id(figure)] = len(specs)
+            specs.append(figure.spec())
+    html = environment.get_template("page.html").render(
+        page=page,
+        number=lambda figure: numbered[id(figure)],
+        plotly=files("plotly").joinpath("package_data", "plotly.min.js").read_text() if specs else "",
+        # "</" would end the script element early.
+        specs=json.dumps(specs, separators=(",", ":")).replace("</", "<\\/"),
+    )
+    write_whole(path, html)
+    return path
