@@ -189,6 +189,7 @@ class Capabilities:
         external_torque: feedback carries a force sensor's torque.
         temperature: feedback carries a motor or gear temperature.
         table_download: a friction table can be compensated on the controller's own tick.
+        command_delay_s: delay from set-point to motion that is normal here; following errors are judged with it.
     """
 
     max_cycle_hz: float
@@ -201,6 +202,7 @@ class Capabilities:
     external_torque: bool = False
     temperature: bool = False
     table_download: bool = False
+    command_delay_s: float = 0.0
 
 
 @dataclass(slots=True)

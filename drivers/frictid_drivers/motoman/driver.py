@@ -124,6 +124,7 @@ class MotomanDriver:
                 lock_step=self._open_line().port.lock_step,
                 cycle_quantum_s=tick_s,
                 table_download=table,
+                command_delay_s=self._options.command_delay_ms * 1e-3,
             )
         if reach.layer is Layer.BATCH:
             return Capabilities(

@@ -26,15 +26,22 @@ ACCEPTED, RUNNING, FINISHED, STOPPED = 1, 2, 3, 4
 REASONS = {"": 0, "watchdog": 1, "hold": 2, "alarm": 3, "limit": 4, "torque": 5, "host": 6, "servo off": 7}
 
 
+def _shifted(byte: int) -> int:
+    """What one byte does to an empty register of CRC-16/CCITT-FALSE, bit by bit as in the standard's text."""
+    register = byte << 8
+    for _ in range(8):
+        register = (register << 1 ^ 0x1021) & 0xFFFF if register & 0x8000 else register << 1
+    return register
+
+
+_SHIFTED = [_shifted(byte) for byte in range(256)]
+
+
 def crc16(raw: bytes) -> int:
-    """CRC-16/CCITT-FALSE, bit by bit as in the standard's text."""
+    """CRC-16/CCITT-FALSE."""
     register = 0xFFFF
     for byte in raw:
-        for bit in range(7, -1, -1):
-            feedback = (register >> 15) ^ (byte >> bit & 1)
-            register = (register << 1) & 0xFFFF
-            if feedback:
-                register ^= 0x1021
+        register = (register << 8 & 0xFF00) ^ _SHIFTED[register >> 8 ^ byte]
     return register
 
 
