@@ -10,6 +10,7 @@ import pytest
 from frictid_drivers.virtual.objects import Key, Value
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.servo import Servo
+from frictid_hil.driver import JointSetup, RobotSetup
 
 MS = 1_000_000
 COUNTS_PER_REVOLUTION = 1_000_000
@@ -174,3 +175,51 @@ def desk() -> Desk:
 @pytest.fixture(scope="session")
 def make_desk():
     return Desk
+
+
+SIMULATED = {
+    "inertia_kg_m2": 0.5,
+    "gravity_cos_nm": 5.0,
+    "friction": {"coulomb_nm": 4.0, "viscous_nm_s_per_rad": 1.0},
+    "payload": {"inertia_kg_m2": 0.2, "gravity_cos_nm": 6.0},
+    "hand": {"stiffness_nm_per_rad": 200.0, "damping_nm_s_per_rad": 10.0},
+}
+
+
+def robot(joints: int = 2, name: str = "bench", **more) -> RobotSetup:
+    """A robot of equal joints, every second one mounted backwards."""
+    return RobotSetup(
+        name=name,
+        bus=f"virtual:{name}",
+        cycle_hz=1000.0,
+        joints=tuple(
+            JointSetup(
+                name=str(at),
+                address=at + 1,
+                gear_ratio=100.0,
+                direction=-1 if at % 2 else 1,
+                max_velocity_rad_s=3.5,
+                max_torque_nm=90.0,
+                rated_torque_nm=30.0,
+                position_min_rad=-2.0,
+                position_max_rad=2.0,
+                start_position_rad=-0.2,
+                locked_position_rad=0.1 * at,
+                simulated=SIMULATED,
+            )
+            for at in range(joints)
+        ),
+        **more,
+    )
+
+
+@pytest.fixture(scope="session")
+def make_robot():
+    return robot
+
+
+@pytest.fixture
+def runtime_folder(tmp_path, monkeypatch):
+    """Locks and sockets of this test alone."""
+    monkeypatch.setenv("FRICTID_RUNTIME_DIR", str(tmp_path))
+    return tmp_path

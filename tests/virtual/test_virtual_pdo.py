@@ -1,4 +1,4 @@
-"""PDOs at the wire: the mapping protocol and its aborts, every transmission type, SYNC counter, inhibit, event timer."""
+"""PDOs at the wire: mapping protocol and aborts, every transmission type, SYNC counter, inhibit, event timer."""
 
 import struct
 

@@ -39,21 +39,21 @@ class LockStepBus(VirtualBus):
     """The host's endpoint.
 
     Args:
-        rack: the drives on this bus.
+        drives: what is on this bus.
         channel: python-can's virtual channel.
         arguments: of ``can.interfaces.virtual.VirtualBus``.
     """
 
-    def __init__(self, rack: Drives, channel: str = "frictid", **arguments: Any) -> None:
+    def __init__(self, drives: Drives, channel: str = "frictid", **arguments: Any) -> None:
         super().__init__(channel=channel, preserve_timestamps=True, **arguments)
         self.channel_info = f"lock-step bus {channel}"
         # Same interface, a tenth of the cost; the old queue is this bus's entry in the channel's list.
         fast = cast("queue.Queue[can.Message]", queue.SimpleQueue())
         self.channel[self.channel.index(self.queue)] = fast
         self.queue = fast
-        self._rack = rack
+        self.drives = drives
         self._lock = threading.RLock()
-        rack.transmit = self._deliver
+        drives.transmit = self._deliver
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Let every drive hear the frame; what they answer is received next."""
@@ -63,12 +63,12 @@ class LockStepBus(VirtualBus):
                 super().send(msg, timeout)
             if not (msg.is_extended_id or msg.is_error_frame or msg.is_fd):
                 # Bytes of its own: the caller may reuse the message.
-                self._rack.process(msg.arbitration_id, bytes(msg.data), remote=msg.is_remote_frame)
+                self.drives.process(msg.arbitration_id, bytes(msg.data), remote=msg.is_remote_frame)
 
     def advance(self, to_ns: int) -> None:
         """Let run time go on."""
         with self._lock:
-            self._rack.advance(to_ns)
+            self.drives.advance(to_ns)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next frame, or None once ``timeout`` seconds of wall clock have passed."""
@@ -82,12 +82,12 @@ class LockStepBus(VirtualBus):
 
     def shutdown(self) -> None:
         """Leave the channel; drives talk to nobody from now on."""
-        self._rack.transmit = _discard
+        self.drives.transmit = _discard
         super().shutdown()
 
     def _deliver(self, can_id: int, data: bytes) -> None:
         message = can.Message(
-            timestamp=self._rack.now_ns * 1e-9,
+            timestamp=self.drives.now_ns * 1e-9,
             arbitration_id=can_id,
             is_extended_id=False,
             dlc=len(data),
