@@ -123,7 +123,7 @@ def _simulate(command, velocity_command, step, substeps, j, shares, gains, blend
         for _ in range(substeps):
             gravity = j.gravity_cos * math.cos(q_link) + j.gravity_sin * math.sin(q_link)
             side = 1.0 + j.asymmetry if v > 0 else 1.0 - j.asymmetry
-            stress = 1.0 + j.load * (abs(gravity) / j.gravity_level - 1.0)
+            stress = 1.0 + j.load * (abs(gravity) / j.gravity_level - 1.0) if j.gravity_level < 1e9 else 1.0
             wave = math.sin(ripple * q) + 0.4 * math.sin(2 * ripple * q + 0.7)
             wave += 0.3 * (abs(math.sin(0.5 * ripple * q + 0.3)) - 2 / math.pi)
             scale = side * stress * heat * (1.0 + j.ripple * wave)
@@ -157,15 +157,15 @@ def record(
     lead_s: float = 0.3,
     repeat: bool = True,
 ) -> CycleRecording:
-    """The joint driven through a hold, the cycles, the last cycle again as drift check, and a hold."""
+    """The joint driven through a hold, the cycles, the third cycle again as drift check, and a hold."""
     lead = round(lead_s / step_s)
-    end_s = procedure.duration_s
-    again_s = float(np.diff(procedure.cycle_starts_s)[-1]) if repeat else 0.0
-    n = lead + math.ceil((end_s + again_s) / step_s) + lead
+    starts = procedure.cycle_starts_s
+    again = min(3, procedure.cycles)
+    again_s = float(starts[again] - starts[again - 1]) if repeat else 0.0
+    n = 2 * lead + math.ceil((procedure.duration_s + again_s) / step_s)
     time = (np.arange(n) - lead) * step_s
-    path = np.where(time < end_s, time, np.minimum(time - end_s, again_s) + procedure.cycle_starts_s[-2])
-    path = np.where((time >= end_s) & (not repeat), -1.0, path)
-    path = np.where((time >= end_s) & (path >= end_s), -1.0, path)
+    after = time - procedure.duration_s
+    path = np.where(after < 0, time, np.where(after < again_s, after + starts[again - 1], -1.0))
     command = joint.start + trajectory.position(procedure, path)
     velocity = trajectory.velocity(procedure, path)
     q, v, f = drive(joint, command, velocity, step_s=step_s, delay=delay, seed=seed)
@@ -179,7 +179,7 @@ def record(
         skew=Skew(torque_delay_s=step_s / 2),
         gear_ratio=joint.gear_ratio,
         torque_limit_nm=joint.max_torque,
-        repeat=Repeat(procedure.cycles, end_s) if repeat else None,
+        repeat=Repeat(again, procedure.duration_s) if repeat else None,
     )
 
 
@@ -194,7 +194,7 @@ def drive(joint: Joint, command, velocity, *, step_s: float = 0.001, delay: int 
     stiffness = (2 * math.pi * joint.link_frequency_hz) ** 2 * link * motor / joint.inertia
     numbers = Numbers(
         **{name: float(getattr(joint, name)) for name in Numbers._fields if hasattr(joint, name)},
-        gravity_level=abs(gravity) + 1e-9,
+        gravity_level=abs(gravity) if gravity else 1e9,
         link_stiffness=stiffness,
         quantum_nm=joint.quantum * joint.rated_torque,
         count_rad=2 * math.pi / joint.counts / joint.gear_ratio,

@@ -1,0 +1,99 @@
+"""The curve from global least squares: which speeds carry a knot, and which of them were observed well enough.
+
+Where Function A uses a fifth of the samples, this uses nearly all, separates inertia by its own column instead of by
+symmetry, and reads the speeds below V_1 as the joint passes through them on its way to rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.regression import COARSE, RIPPLE_ORDERS, Fit, fit
+from frictid_hil.friction.rigid_body import COVERAGE, Measured
+from frictid_hil.friction.trajectory import Array
+
+_SLOW = np.array([0.0, 0.006, 0.0125, 0.019, 0.027, 0.037, 0.055])
+_FAST = np.append(0.0932 * np.arange(1, 10), 1.0)
+"""Knots as shares of V: dense where the Stribeck dip may be, then about the V_n of the standard procedure."""
+_TRUSTED = 0.02
+"""A knot below the standard V_1 is kept while its interval stays below this share of the friction."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RippleTable:
+    """Torque that depends on where the motor stands, repeating over ``period_rad`` of the joint.
+
+    Attributes:
+        period_rad: joint travel after which it repeats.
+        torque_nm: at equal steps over one period, the first at position 0.
+    """
+
+    period_rad: float
+    torque_nm: tuple[float, ...]
+
+
+def curve_knots(recording: CycleRecording) -> Array:
+    """Speeds at which the model may bend, rad/s, the first 0; they do not depend on the number of cycles."""
+    return np.concatenate([_SLOW, _FAST]) * recording.procedure.velocity_rad_s
+
+
+def trusted(recording: CycleRecording, solved: Fit, level_nm: float) -> slice:
+    """The knots that make the curve: all fast ones, and slow ones down to the first that is not known well."""
+    half = COVERAGE * solved.deviation(recording.skew.uncertainty_s)[solved.blocks.odd]
+    fast = solved.knots > 0.09 * recording.procedure.velocity_rad_s
+    good = fast | ((half < _TRUSTED * level_nm) & (solved.knots > 0))
+    return slice(int(np.argmin(good[::-1]) and good.size - np.argmin(good[::-1])), good.size)
+
+
+def curve_of(solved: Fit, kept: slice, where: str) -> FrictionCurve:
+    """phi through the trusted knots."""
+    return FrictionCurve.through(solved.knots[kept], solved.odd_nm[kept], where=where)
+
+
+def link_resonance_hz(recording: CycleRecording, motion: Motion, level_nm: float) -> Measured | None:
+    """Frequency at which the link behind the gear would swing, or None while the joint looks rigid.
+
+    A soft joint's torque follows I a - (I / w_r^2) d2a/dt2 far below its resonance w_r (of the two masses free of each
+    other's support, for a link as heavy as the motor side). A wide kernel keeps the ringing itself out.
+
+    Raises:
+        IdentificationError: as ``regression.fit``.
+    """
+    knots = curve_knots(recording)[[0, 2, 4, 6, *range(7, 17)]]
+    solved = fit(recording, motion, knots, level_nm, width_rad=COARSE, compliance=True)
+    index = solved.blocks.compliance
+    assert index is not None
+    inertia = solved.values[solved.blocks.inertia]
+    softness = -solved.values[index] / inertia
+    half = COVERAGE * np.sqrt(solved.covariance[index, index]) / inertia
+    if softness < 1.5 * half or softness <= 0:
+        return None
+    frequency = 1 / (2 * np.pi * np.sqrt(softness))
+    return Measured(float(frequency), float(frequency * half / softness / 2))
+
+
+def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, points: int = 64) -> RippleTable | None:
+    """The ripple over one motor revolution, or None where it is not known or not larger than its uncertainty.
+
+    Raises:
+        IdentificationError: as ``regression.fit``.
+    """
+    if recording.prismatic or not np.isfinite(recording.gear_ratio):
+        return None
+    knots = curve_knots(recording)[[0, 2, 4, 6, *range(7, 17)]]
+    solved = fit(recording, motion, knots, level_nm, width_rad=0.0)  # the narrowest kernel: ripple is fast
+    count = (solved.blocks.ripple.stop - solved.blocks.ripple.start) // 3
+    plain = slice(solved.blocks.ripple.start, solved.blocks.ripple.start + count)
+    values = solved.values[plain]
+    noise = np.diag(solved.covariance)[plain]
+    if float(values @ values) < 4 * float(noise.sum()):
+        return None
+    period = 2 * np.pi / recording.gear_ratio
+    angle = np.arange(points) / points * 2 * np.pi
+    phase = angle[:, None] * np.array(RIPPLE_ORDERS)
+    table = np.column_stack([np.cos(phase), np.sin(phase)]) @ values
+    return RippleTable(float(period), tuple(map(float, table)))

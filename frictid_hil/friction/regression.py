@@ -1,0 +1,293 @@
+"""One linear model of the whole recording: friction of both directions, inertia, gravity, bias and motor-angle ripple.
+
+    torque = I a + g_c cos q + g_s sin q + bias + sgn(v) sum_k F_k h_k(|v|) + sum_k E_k h_k(|v|) + ripple(q, v)
+
+h_k are hat functions over the speed, so that F_k is the odd part of the friction at knot k and E_k the even part
+(direction asymmetry). E is zero at v = 0: a constant cannot be told from the bias and is counted there. Every column,
+the torque included, goes through the same zero-phase kernel, which therefore changes no coefficient. The first
+milliradians after each reversal are left out, where friction is still a spring.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, gaussian_filter1d
+
+from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.trajectory import Array
+
+RIPPLE_ORDERS = (1.0, 2.0, 4.0)
+"""Periods per motor revolution: an eccentric shaft, the two lobes of a wave generator, their overtone."""
+GUARD_RAD = 0.005
+"""Travel left out after each reversal, where friction is still a spring; at most a twelfth of the amplitude."""
+EVEN_KNOTS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+"""Speeds of the even part as shares of the highest: the asymmetry of directions changes slowly with speed."""
+BIAS_PRIOR = 0.15
+"""Over a short travel a constant and gravity look alike; a bias is expected within this share of the friction."""
+FINE, COARSE = 0.2, 0.5
+"""Widths of the kernel in radians of the fastest cycle: one that keeps the curve, one that keeps vibration out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Which columns of the model mean what.
+
+    Attributes:
+        inertia: index of I.
+        gravity: index of g_c; g_s follows (None on a prismatic axis).
+        bias: index.
+        odd: F_k at the knots.
+        even: E_k at EVEN_KNOTS but the first, times the highest knot.
+        ripple: cos of every order, sin of every order; plain, times direction, times velocity.
+        compliance: index of the second derivative of the acceleration (None where not asked for).
+        size: number of columns.
+    """
+
+    inertia: int
+    gravity: int | None
+    bias: int
+    odd: slice
+    even: slice
+    ripple: slice
+    compliance: int | None
+    size: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """The solved model.
+
+    Attributes:
+        blocks: meaning of the coefficients.
+        knots: speeds of the odd hats that were observed, shape (K,).
+        values: coefficients, shape (size,).
+        covariance: by leaving out one quarter cycle after the other, shape (size, size).
+        per_second_of_skew: change of the coefficients per second of undeclared torque delay, shape (size,).
+        unobserved: speeds of the hats that too few samples saw; they were left out.
+        residual_rms_nm: of the filtered torque.
+    """
+
+    blocks: Blocks
+    knots: Array
+    values: Array
+    covariance: Array
+    per_second_of_skew: Array
+    unobserved: Array
+    residual_rms_nm: float
+
+    @property
+    def odd_nm(self) -> Array:
+        """F_k, shape (K,)."""
+        return self.values[self.blocks.odd]
+
+    def even_nm(self, speed_rad_s: Array) -> Array:
+        """Even part of the friction, 0 at rest, same shape as the speeds."""
+        levels = np.concatenate([[0.0], self.values[self.blocks.even]])
+        even: Array = np.interp(speed_rad_s, self.knots[-1] * EVEN_KNOTS, levels)
+        return even
+
+    def deviation(self, skew_uncertainty_s: float) -> Array:
+        """One standard deviation of every coefficient, undeclared skew included, shape (size,)."""
+        skew = self.per_second_of_skew * skew_uncertainty_s
+        deviation: Array = np.sqrt(np.diag(self.covariance) + skew**2)
+        return deviation
+
+
+def fit(
+    recording: CycleRecording,
+    motion: Motion,
+    knots: Array,
+    level_nm: float,
+    *,
+    width_rad: float = FINE,
+    compliance: bool = False,
+) -> Fit:
+    """Solve the model on every sample of the cycles that is not guarded.
+
+    Args:
+        recording: for its procedure, gear ratio, kind of axis and declared skew.
+        motion: its synchronised columns.
+        knots: speeds of the odd hats, increasing, the first may be 0, shape (k,).
+        level_nm: typical friction torque; scale of the prior on the bias.
+        width_rad: of the kernel, in radians of the fastest cycle.
+        compliance: also ask for the torque that goes with the acceleration's second derivative (a soft link).
+
+    Raises:
+        IdentificationError: too few samples remain, or the columns are linearly dependent.
+    """
+    step_s = motion.smoother.step_s
+    width_s = width_rad / float(recording.procedure.angular_frequencies_rad_s[-1])
+    width = float(np.clip(width_s, 3 * step_s, max(0.02, 3 * step_s))) / step_s
+    quarter, travel = _quarters(recording, motion)
+    guard = min(np.inf if recording.prismatic else GUARD_RAD, recording.procedure.amplitude_rad / 12)
+    spoiled = (quarter < 0) | (travel < guard)
+    kept = ~binary_dilation(spoiled, iterations=int(np.ceil(3 * width)))
+    thin = np.zeros_like(kept)
+    thin[:: max(1, int(width / 2))] = True  # what the kernel leaves is oversampled
+    rows = np.flatnonzero(kept & thin)
+    if rows.size < 100:
+        raise IdentificationError(
+            f"only {rows.size} usable samples for the least-squares model",
+            where=recording.where,
+            cause="cycles too short for this sampling rate",
+        )
+    seen = np.square(hat_functions(np.abs(motion.velocity_rad_s[kept]), knots)).sum(axis=0)
+    observed = seen > 10
+    columns, blocks = _columns(recording, motion, knots[observed], compliance)
+    late = np.gradient(motion.torque_nm, step_s)
+    both = np.column_stack([columns, motion.torque_nm, late])
+    both = gaussian_filter1d(both, width, axis=0, truncate=6.0, mode="nearest")[rows]
+    return _solve(
+        both[:, :-2],
+        both[:, -2:],
+        quarter[rows],
+        blocks,
+        knots[observed],
+        knots[~observed],
+        BIAS_PRIOR * level_nm,
+        recording.where,
+    )
+
+
+def hat_functions(speed: Array, knots: Array) -> Array:
+    """Weights of the hats at each speed, shape (n, k): rows sum to 1; lines go on beyond the outer knots."""
+    n = np.clip(np.searchsorted(knots, speed, side="right") - 1, 0, knots.size - 2)
+    share = (speed - knots[n]) / (knots[n + 1] - knots[n])
+    hats = np.zeros((speed.size, knots.size))
+    row = np.arange(speed.size)
+    hats[row, n] = 1 - share
+    hats[row, n + 1] = share
+    return hats
+
+
+def ripple_waves(recording: CycleRecording, position_rad: Array) -> Array:
+    """cos of every order of the motor angle, then sin, shape (n, 2 * orders); no columns without a gear ratio."""
+    if recording.prismatic or not np.isfinite(recording.gear_ratio):
+        return np.zeros((position_rad.size, 0))
+    angle = recording.gear_ratio * position_rad[:, None] * np.array(RIPPLE_ORDERS)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _columns(recording: CycleRecording, motion: Motion, knots: Array, compliance: bool) -> tuple[Array, Blocks]:
+    q, v, a = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    if knots.size < 3:
+        raise IdentificationError("too few speeds were observed for a curve", where=recording.where)
+    sign, speed = np.sign(v)[:, None], np.abs(v)
+    waves = ripple_waves(recording, q)
+    gravity: Array = np.zeros((q.size, 0)) if recording.prismatic else np.column_stack([np.cos(q), np.sin(q)])
+    snap: Array = np.zeros((q.size, 0))
+    if compliance:
+        snap = gaussian_filter1d(a, 1.0, order=2, truncate=6.0)[:, None] / motion.smoother.step_s**2
+    parts = (
+        a[:, None],
+        gravity,
+        np.ones((q.size, 1)),
+        sign * hat_functions(speed, knots),
+        hat_functions(speed, knots[-1] * EVEN_KNOTS)[:, 1:],
+        np.column_stack([waves, sign * waves, v[:, None] * waves]),
+        snap,
+    )
+    ends = np.cumsum([part.shape[1] for part in parts]).tolist()
+    blocks = Blocks(
+        inertia=0,
+        gravity=None if recording.prismatic else 1,
+        bias=ends[2] - 1,
+        odd=slice(ends[2], ends[3]),
+        even=slice(ends[3], ends[4]),
+        ripple=slice(ends[4], ends[5]),
+        compliance=ends[5] if compliance else None,
+        size=ends[6],
+    )
+    return np.column_stack(parts), blocks
+
+
+def _quarters(recording: CycleRecording, motion: Motion) -> tuple[NDArray[np.int64], Array]:
+    """Quarter cycle of each sample (-1: outside the cycles) and the travel since the last reversal."""
+    procedure, time = recording.procedure, motion.time_s
+    starts = [(float(start), n) for n, start in enumerate(procedure.cycle_starts_s[:-1])]
+    if recording.repeat is not None:
+        starts.append((recording.repeat.start_s, recording.repeat.cycle - 1))
+    quarter = np.full(time.size, -1, dtype=np.int64)
+    travel = np.zeros(time.size)
+    for k, (start, n) in enumerate(starts):
+        length = 2 * np.pi / procedure.angular_frequencies_rad_s[n]
+        edges = np.searchsorted(time, start + length * np.arange(5) / 4)
+        for j in range(4):
+            quarter[edges[j] : edges[j + 1]] = 4 * k + j
+        for j, path in ((0, motion.position_rad), (2, -motion.position_rad)):
+            begin, end = int(edges[j]), int(edges[j + 2])
+            around = slice(max(0, 2 * begin - int(edges[j + 1])), int(edges[j + 1]))
+            if end - begin < 4:
+                continue
+            turn = around.start + int(np.argmin(path[around]))  # the joint lags its command
+            travel[max(begin, turn) : end] = path[max(begin, turn) : end] - path[turn]
+    return quarter, travel
+
+
+def _solve(
+    x: Array,
+    targets: Array,
+    quarter: NDArray[np.int64],
+    blocks: Blocks,
+    knots: Array,
+    unobserved: Array,
+    bias_prior_nm: float,
+    where: str,
+) -> Fit:
+    scale = np.linalg.norm(x, axis=0)
+    scale[scale < 1e-9 * scale.max()] = np.inf  # a column of nothing (ripple filtered away) gets coefficient 0
+    x = x / scale
+    order = np.argsort(quarter, kind="stable")
+    x, targets, quarter = x[order], targets[order], quarter[order]
+    bounds = np.concatenate([[0], np.flatnonzero(np.diff(quarter)) + 1, [quarter.size]])
+    gram = np.array([x[a:b].T @ x[a:b] for a, b in pairwise(bounds)])
+    moment = np.array([x[a:b].T @ targets[a:b] for a, b in pairwise(bounds)])
+    whole, right = gram.sum(axis=0), moment.sum(axis=0)
+
+    tiny = 1e-11 * np.eye(blocks.size)
+    alive = np.isfinite(scale)
+    spectrum = np.linalg.eigvalsh(whole[np.ix_(alive, alive)])
+    if blocks.gravity is None and spectrum[0] < 1e-10 * spectrum[-1]:
+        raise _undetermined(where)
+    first = np.linalg.solve(whole + tiny, right[:, 0])
+    rest = targets[:, 0] - x @ first
+    # One independent piece of evidence per quarter cycle, not per sample.
+    weight = float(np.mean(rest**2)) * x.shape[0] / len(gram)
+    prior = tiny.copy()
+    prior[blocks.bias, blocks.bias] += weight / (bias_prior_nm * scale[blocks.bias]) ** 2
+    spectrum = np.linalg.eigvalsh((whole + prior)[np.ix_(alive, alive)])
+    if spectrum[0] < 1e-10 * spectrum[-1]:
+        raise _undetermined(where)
+
+    solution = np.linalg.solve(whole + prior, right)
+    without = np.linalg.solve(whole - gram + prior, (right - moment)[:, :, :1])[:, :, 0]
+    spread = (without - without.mean(axis=0)) / scale
+    covariance = spread.T @ spread * (len(gram) - 1) / len(gram)
+    # What the prior pulled towards zero may have been as large as the prior allows.
+    unit = np.zeros(blocks.size)
+    unit[blocks.bias] = prior[blocks.bias, blocks.bias] * bias_prior_nm * scale[blocks.bias]
+    pulled = np.linalg.solve(whole + prior, unit) / scale
+    rest = targets[:, 0] - x @ solution[:, 0]
+    return Fit(
+        blocks=blocks,
+        knots=knots,
+        values=solution[:, 0] / scale,
+        covariance=covariance + np.outer(pulled, pulled),
+        per_second_of_skew=-solution[:, 1] / scale,
+        unobserved=unobserved,
+        residual_rms_nm=float(np.sqrt(np.mean(rest**2))),
+    )
+
+
+def _undetermined(where: str) -> IdentificationError:
+    return IdentificationError(
+        "the recording cannot tell the parts of the least-squares model apart",
+        where=where,
+        cause="too few cycles or too little travel",
+        next_step="use --method aligned, or more cycles or travel",
+    )

@@ -1,0 +1,85 @@
+"""What is not friction in the torque: inertia, gravity and bias, from the same recording, with 95 % intervals.
+
+The convention is torque = I a + g_c cos(q) + g_s sin(q) + bias + friction. Over a short travel cos, sin and 1 are
+nearly dependent: single gravity coefficients are then uncertain, and their intervals say so, while their sum over the
+travel is not. A constant direction asymmetry of the friction cannot be told from a bias and is counted as bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.recording import CycleRecording
+from frictid_hil.friction.regression import Fit
+from frictid_hil.friction.trajectory import Array
+
+COVERAGE = 1.96
+"""Standard deviations in half a 95 % interval."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A figure with its 95 % interval.
+
+    Attributes:
+        value: best estimate.
+        half_width: the truth lies within value +- half_width in 95 of 100 cases.
+    """
+
+    value: float
+    half_width: float
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.value - self.half_width
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.value + self.half_width
+
+
+@dataclass(frozen=True, slots=True)
+class RigidBody:
+    """Inertia, gravity and bias of one joint (kg and N on a prismatic axis, where gravity is part of the bias).
+
+    Attributes:
+        inertia_kg_m2: of everything that moves, joint side.
+        gravity_cos_nm: of gravity_cos cos(q) + gravity_sin sin(q).
+        gravity_sin_nm: see there.
+        bias_nm: constant torque, half the constant difference of the directions' friction included.
+    """
+
+    inertia_kg_m2: Measured
+    gravity_cos_nm: Measured
+    gravity_sin_nm: Measured
+    bias_nm: Measured
+
+    def torque_nm(self, position_rad: Array, acceleration_rad_s2: Array) -> Array:
+        """Torque that this body needs without friction, same shape as the arguments."""
+        torque: Array = (
+            self.inertia_kg_m2.value * acceleration_rad_s2
+            + self.gravity_cos_nm.value * np.cos(position_rad)
+            + self.gravity_sin_nm.value * np.sin(position_rad)
+            + self.bias_nm.value
+        )
+        return torque
+
+
+def rigid_body(recording: CycleRecording, fit: Fit) -> RigidBody:
+    """The rigid-body part of a solved model, with the uncertainty of the declared skew."""
+    half = COVERAGE * fit.deviation(recording.skew.uncertainty_s)
+
+    def measured(index: int | None) -> Measured:
+        return Measured(0.0, 0.0) if index is None else Measured(float(fit.values[index]), float(half[index]))
+
+    gravity = fit.blocks.gravity
+    return RigidBody(
+        inertia_kg_m2=measured(fit.blocks.inertia),
+        gravity_cos_nm=measured(gravity),
+        gravity_sin_nm=measured(None if gravity is None else gravity + 1),
+        bias_nm=measured(fit.blocks.bias),
+    )
