@@ -222,6 +222,31 @@ class Plan:
         return sum(joint.duration_s for joint in self.joints)
 
 
+def described(plan: Plan) -> dict[str, Any]:
+    """The plan as plain values: what ``--dry-run --json`` prints and the manifest keeps."""
+    return {
+        "robot": plan.robot,
+        "cycle_hz": plan.cycle_hz,
+        "duration_s": plan.duration_s,
+        "notes": list(plan.notes),
+        "joints": [
+            {
+                "joint": joint.joint,
+                "duration_s": joint.duration_s,
+                "travel_rad": list(joint.travel_rad),
+                "peak_velocity_rad_s": joint.peak_velocity_rad_s,
+                "predicted_torque_nm": joint.predicted_torque_nm or None,
+                "locked_rad": dict(joint.locked),
+                "motions": [
+                    {"name": motion.name, "duration_s": motion.duration_s, **motion.details()}
+                    for motion in joint.motions
+                ],
+            }
+            for joint in plan.joints
+        ],
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Expected:
     """What is expected of a joint before it was measured; enough to predict its peak torque.
