@@ -42,6 +42,7 @@ _SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
 _LOGGED_BYTES = 64
 
 _POWER_S = 5.0
+_SERVO_LAG_S = 0.02
 _URGENT_S = 0.5
 
 
@@ -89,12 +90,13 @@ class MotomanDriver:
         """Take the port exclusively, reach the controller, find out which layer it can do. Nothing moves."""
         self._sink = frame_sink
         options = self._options
-        port = self._port_factory(self._path, options.baud, options.parity)
+        parity = options.parity_on(self._path)
+        port = self._port_factory(self._path, options.baud, parity)
         try:
             host = HostControl(
                 port, PROFILES[options.controller], options.link, reply_s=options.reply_s, sink=self._log
             )
-            self._line = Line(port, host, options, self._tick_us, self._log)
+            self._line = Line(port, host, options, parity, self._tick_us, self._log)
             self._batch = BatchClient(host, port.now_s)
             host.status()
             self._reach = find_layer(self._line, self._batch, options, self._mask(self._units))
@@ -124,7 +126,7 @@ class MotomanDriver:
                 lock_step=self._open_line().port.lock_step,
                 cycle_quantum_s=tick_s,
                 table_download=table,
-                command_delay_s=self._options.command_delay_ms * 1e-3,
+                command_delay_s=self._command_delay_s(),
             )
         if reach.layer is Layer.BATCH:
             return Capabilities(
@@ -375,6 +377,12 @@ class MotomanDriver:
                     where="controller",
                     next_step="look at the pendant: safety circuit, e-stops, alarms",
                 )
+
+    def _command_delay_s(self) -> float:
+        """Queue, averaging and servo; where the controller does not know its averaging, what the robot file allows."""
+        known_ms = self._reach.welcome.averaging_ms if self._reach.welcome is not None else None
+        averaging_ms = self._options.command_delay_ms if known_ms is None else known_ms
+        return self._options.lead_ticks * self._tick_us * 1e-6 + averaging_ms * 1e-3 + _SERVO_LAG_S
 
     def _mask(self, joints: Iterable[str]) -> int:
         return sum(1 << self._units[name].axis for name in joints)

@@ -66,6 +66,12 @@ def findings(
             "follows public documents and was never run against a controller",
             "watch the first run with a hand on the emergency stop",
         ),
+        Finding(
+            Severity.OK,
+            "port",
+            f"{options.baud} baud, parity {options.parity_on(setup.bus.partition(':')[2])}"
+            + ("" if options.parity else " (not given: E on hardware, N on a pseudo terminal)"),
+        ),
         *_of_status(host.status()),
         *_of_alarms(host),
         *_of_layers(setup, options, reach),

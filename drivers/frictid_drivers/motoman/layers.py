@@ -61,12 +61,16 @@ class Line:
         port: open, at the host control's speed.
         host: on that port.
         options: of the robot file.
+        parity: of host control.
         tick_us: interpolation clock that we ask for.
         sink: of the stream's bytes.
     """
 
-    def __init__(self, port: BytePort, host: HostControl, options: SerialOptions, tick_us: int, sink: Sink) -> None:
+    def __init__(
+        self, port: BytePort, host: HostControl, options: SerialOptions, parity: str, tick_us: int, sink: Sink
+    ) -> None:
         self.port = port
+        self._parity = parity
         self.host = host
         self._options = options
         self._tick_us = tick_us
@@ -98,7 +102,7 @@ class Line:
     def end_stream(self, session: StreamSession) -> None:
         """STOP, and back to the host control's speed."""
         session.leave()
-        self.port.set_line(self._options.baud, self._options.parity)
+        self.port.set_line(self._options.baud, self._parity)
 
 
 def find_layer(line: Line, batch: BatchClient, options: SerialOptions, axis_mask: int) -> Reach:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -12,6 +13,7 @@ from frictid_drivers.motoman.host_control import PROFILES
 from frictid_hil.driver import Timing
 from frictid_hil.errors import FieldProblem, InvalidFields
 
+_PSEUDO_TERMINALS = "/dev/pts/"
 LAYERS = ("auto", "stream", "batch", "host")
 
 
@@ -23,11 +25,11 @@ class SerialOptions:
         controller: generation: erc, xrc, nx, dx.
         layer: auto takes the best that the controller knows; stream, batch or host insist.
         baud: of host control (RS032).
-        parity: E, O or N (RS033); hardware says E, a pseudo terminal can only do N.
+        parity: E, O or N (RS033); "" is E on hardware and N on a pseudo terminal, which can do nothing else.
         stream_baud: asked of FSTREAM; 0 where the port is no gateway port.
         lead_ticks: how far ahead of the newest report targets are due.
         silence_ms: without feedback for so long, the controller counts as lost.
-        command_delay_ms: what controller and queue may delay the motion by; following errors are judged with it.
+        command_delay_ms: what the controller may delay the motion by where it does not say how much it averages.
         watchdog_s: a batch job stops when it hears nothing from us for so long.
         reply_s: how long the controller may think about a command.
         timer_a_s: RS034.
@@ -44,7 +46,7 @@ class SerialOptions:
     controller: str = "nx"
     layer: str = "auto"
     baud: int = 19200
-    parity: str = "E"
+    parity: str = ""
     stream_baud: int = 0
     lead_ticks: int = 5
     silence_ms: float = 100.0
@@ -60,6 +62,10 @@ class SerialOptions:
     torque_delay_s: float = 0.0
     delay_uncertainty_s: float = 0.0005
     timing_known: bool = False
+
+    def parity_on(self, path: str) -> str:
+        """The parity of host control on this port: decided by the port's kind, never by trying."""
+        return self.parity or ("N" if os.path.realpath(path).startswith(_PSEUDO_TERMINALS) else "E")
 
     @property
     def link(self) -> BscTiming:

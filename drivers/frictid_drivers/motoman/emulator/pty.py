@@ -1,0 +1,80 @@
+"""The emulator on a pseudo terminal, in real time: any program that opens a serial port can talk to it.
+
+A pseudo terminal ignores speed and parity, so the emulator paces the bytes itself. Where this process is not given the
+processor for a while, the controller's time slips instead of catching up: a real controller would not have stalled, and
+its watchdog must not punish the host for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import time
+import tty
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from frictid_drivers.motoman.emulator.build import build
+from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
+from frictid_drivers.motoman.emulator.machine import Emulator
+from frictid_hil.driver import RobotSetup
+
+_CHUNK = 4096
+_LONGEST_WAIT_S = 0.05
+
+
+def serve(
+    setup: RobotSetup,
+    *,
+    announce: Callable[[str], None],
+    faults: Sequence[str] = (),
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Run until told to stop, or until a fault takes the port away.
+
+    Args:
+        setup: the robot whose joints are behind the controller; its ``options.emulator`` says what kind it is.
+        announce: told the name of the port once it can be opened.
+        faults: ``kind@n`` and so on.
+        stop: asked several times a second.
+
+    Raises:
+        InvalidFields: the robot file has no such controller in it.
+        UsageError: a fault that is none.
+    """
+    plan = FaultPlan(Fault.parse(text) for text in faults)
+    # A pseudo terminal carries no parity bit; bytes are paced as without one.
+    emulator = build(replace(setup, options={**setup.options, "parity": "N"}), plan)
+    ours, theirs = os.openpty()
+    try:
+        tty.setraw(theirs)
+        os.set_blocking(ours, False)
+        announce(os.ttyname(theirs))
+        _run(emulator, ours, stop)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def _run(emulator: Emulator, ours: int, stop: Callable[[], bool]) -> None:
+    tick_s = emulator.settings.tick_s
+    last_s = time.monotonic()
+    while not (emulator.gone or stop()):
+        wait_s = min(_LONGEST_WAIT_S, emulator.next_event_s() - emulator.now_s)
+        # A writer that fills the terminal's buffer must not make us spin.
+        ready, _, _ = select.select([ours], [], [], max(0.0, wait_s))
+        now_s = time.monotonic()
+        passed_s, last_s = now_s - last_s, now_s
+        slack_s = tick_s if wait_s < tick_s else wait_s + tick_s
+        emulator.advance(emulator.now_s + min(passed_s, slack_s))
+        if ready:
+            with contextlib.suppress(BlockingIOError):
+                emulator.hear(os.read(ours, _CHUNK))
+        _write(ours, emulator.take())
+
+
+def _write(ours: int, data: bytes) -> None:
+    """As a UART does: what nobody reads in time is lost."""
+    with contextlib.suppress(BlockingIOError):
+        os.write(ours, data)

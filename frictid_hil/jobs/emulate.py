@@ -1,0 +1,54 @@
+"""``frictid-hil emulate``: a controller that is not there, with the robot's simulated joints behind it."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Sequence
+from importlib.metadata import entry_points
+from types import FrameType
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.errors import InvalidFields, UsageError
+
+_GROUP = "frictid_hil.emulators"
+_DEFAULT_ROBOTS = {"motoman": "hp3j-serial.yaml"}
+
+
+def emulate(
+    kind: str, *, announce: Callable[[str], None], robot_name: str | None = None, faults: Sequence[str] = ()
+) -> None:
+    """Serve until Ctrl-C or SIGTERM.
+
+    Args:
+        kind: name of an installed emulator (``motoman``).
+        announce: told the port once it can be opened.
+        robot_name: robot file; the kind's own shipped one where None.
+        faults: what shall go wrong, in the emulator's words.
+
+    Raises:
+        UsageError: no such emulator, no robot file for it, or a fault that is none.
+        ConfigError: the robot file is wrong.
+    """
+    installed = {point.name: point for point in entry_points(group=_GROUP)}
+    if kind not in installed:
+        raise UsageError(f"no emulator named {kind!r}; installed: {', '.join(sorted(installed)) or 'none'}")
+    name = robot_name or _DEFAULT_ROBOTS.get(kind)
+    if name is None:
+        raise UsageError(f"emulator {kind!r} needs a robot file", next_step="give --robot")
+    robot = load_robot(name)
+    setup = robot.to_setup()
+    serve = installed[kind].load()
+    stopping = False
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal stopping
+        stopping = True
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        serve(setup, announce=announce, faults=faults, stop=lambda: stopping)
+    except InvalidFields as invalid:
+        raise robot.problems_at(invalid.problems) from None
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
