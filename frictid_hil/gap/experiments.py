@@ -2,15 +2,20 @@
 
 Every experiment is a handful of plan motions inside one *envelope* (middle of the travel, travel, speed), so the same
 list runs on a real bus, on the virtual one, and in the generator of the blind check. Two experiments are never fitted:
-on them the gap is reported.
+on them the gap is reported. A few more wait in the catalogue for a diagnosis that cannot decide; it names them in a
+plan file (``schema: frictid.experiments/1``)::
+
+    schema: frictid.experiments/1
+    why: torque_bias and encoder_offset look alike in one posture
+    experiments: [sines_posture]
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,8 +23,21 @@ from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan import Corners, Hold, Motion, Move, Sine
 
+SCHEMA = "frictid.experiments/1"
 CHIRP_LOW_HZ = 0.3
-SHORT = ("triangle_slow", "sines_payload", "chirp", "breakaway", "moves_payload", "sines_repeat")
+
+FULL = (
+    "sines_small",
+    "sines_large",
+    "triangle_slow",
+    "sines_payload",
+    "chirp",
+    "breakaway",
+    "moves_payload",
+    "sines_repeat",
+)
+"""The standard experiments in the order in which they run; a recording on a bus adds ``sines_posture``."""
+SHORT = ("triangle_slow", "chirp", "breakaway", "sines_payload", "moves_payload", "sines_repeat")
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +167,17 @@ class Experiment:
         """Where it begins, at rest."""
         return float(self.motions[0].position_rad(np.zeros(1))[0])
 
+    @property
+    def end_rad(self) -> float:
+        """Where it ends, at rest."""
+        last = self.motions[-1]
+        return float(last.position_rad(np.full(1, last.duration_s))[0])
+
+    @property
+    def marked_motions(self) -> tuple[Motion, ...]:
+        """Its motions, each named ``experiment/motion``, so that marks of a recording tell to which they belong."""
+        return tuple(replace(cast(Any, motion), name=f"{self.name}/{motion.name}") for motion in self.motions)
+
     def position_rad(self, time_s: Array) -> Array:
         """Set-points of all motions, one after the other; the last position afterwards."""
         t = np.asarray(time_s, dtype=np.float64)
@@ -169,8 +198,8 @@ class Experiment:
         }
 
 
-def full_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
-    """Every experiment, in the order in which they run.
+def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
+    """Every experiment by name, the second posture only where there is room for one.
 
     Args:
         envelope: where and how fast.
@@ -178,59 +207,83 @@ def full_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
     """
     e = envelope
     small, large = e.centre_rad - e.travel_rad / 2, e.centre_rad - e.travel_rad
-    identification = [
-        _sines("sines_small", small, e.travel_rad, _rising(e.velocity_rad_s, 8), reveals="the friction curve"),
-        _sines("sines_large", large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6), reveals="speed against position"),
+    shuffled = tuple(e.velocity_rad_s * n / 6 for n in (5, 2, 6, 3, 1, 4))
+    experiments = [
+        _sines("sines_small", small, e.travel_rad, _rising(e.velocity_rad_s, 8), "the friction curve"),
+        _sines("sines_large", large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6), "speed against position"),
         _triangle(e),
         _sines(
             "sines_payload",
             small,
             e.travel_rad,
             _rising(0.8 * e.velocity_rad_s, 5),
+            "load, gravity, inertia, torque constant",
             payload=True,
-            reveals="load, gravity, inertia, torque constant",
         ),
-        _chirp(e),
-        _breakaway(e),
-    ]
-    shuffled = tuple(e.velocity_rad_s * n / 6 for n in (5, 2, 6, 3, 1, 4))
-    validation = [
+        _chirp("chirp", e, e.chirp_velocity_rad_s, e.chirp_high_hz, "delay, lag, elasticity, inertia"),
+        _breakaway("breakaway", e, (0.6, 1.2, 2.4, 0.3, 1.2), "stiction that grows with the dwell, presliding"),
         _moves(e, seed),
-        _sines(
-            "sines_repeat",
-            small,
-            e.travel_rad,
-            shuffled,
-            role="validation",
-            reveals="nothing: the gap is reported here",
-        ),
+        _sines("sines_repeat", small, e.travel_rad, shuffled, "nothing: the gap is reported here", role="validation"),
+        _chirp("chirp_fast", e, 0.6 * e.chirp_velocity_rad_s, 2.5 * e.chirp_high_hz, "delay against lag"),
+        _chirp("chirp_payload", e, e.chirp_velocity_rad_s, e.chirp_high_hz, "inertia against payload", payload=True),
+        _breakaway("breakaway_long", e, (0.2, 1.0, 4.0, 8.0, 0.5), "stiction against a Stribeck curve"),
+        _triangles(e),
     ]
     if e.second_centre_rad is not None:
-        identification.append(second_posture(e))
-    return tuple(identification + validation)
+        start = e.second_centre_rad - e.travel_rad / 2
+        speeds = _rising(0.6 * e.velocity_rad_s, 3)
+        experiments.append(_sines("sines_posture", start, e.travel_rad, speeds, "bias against offset and gravity"))
+    return {experiment.name: experiment for experiment in experiments}
+
+
+def full_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
+    """The standard experiments."""
+    return chosen(FULL, envelope, seed=seed)
 
 
 def short_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
     """The experiments that part most effects in the least time: about 80 s, validation included."""
-    return tuple(experiment for experiment in full_set(envelope, seed=seed) if experiment.name in SHORT)
+    return chosen(SHORT, envelope, seed=seed)
 
 
-def second_posture(envelope: Envelope) -> Experiment:
-    """The small sines elsewhere: parts a torque bias from an encoder offset.
+def chosen(names: Iterable[str], envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
+    """Experiments by name, in the order given.
 
     Raises:
-        UsageError: the envelope has no second centre.
+        UsageError: no such experiment, or no room for it.
     """
-    if envelope.second_centre_rad is None:
-        raise UsageError("the joint's travel leaves no room for a second posture")
-    moved = replace(envelope, centre_rad=envelope.second_centre_rad)
-    return _sines(
-        "sines_posture",
-        moved.centre_rad - moved.travel_rad / 2,
-        moved.travel_rad,
-        _rising(0.6 * moved.velocity_rad_s, 3),
-        reveals="torque bias against encoder offset and gravity",
-    )
+    known = catalogue(envelope, seed=seed)
+    names = list(dict.fromkeys(names))
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise UsageError(
+            f"no experiment {', '.join(map(repr, unknown))}; there are {', '.join(known)}",
+            cause="the joint has no room for a second posture" if unknown == ["sines_posture"] else "",
+        )
+    return tuple(known[name] for name in names)
+
+
+def plan_document(names: Iterable[str], why: str) -> dict[str, Any]:
+    """What a plan file says that asks for these experiments."""
+    return {"schema": SCHEMA, "why": why, "experiments": list(names)}
+
+
+def names_of_plan(document: Any, where: str) -> tuple[str, ...]:
+    """The experiments that a plan file asks for.
+
+    Args:
+        document: as read from YAML.
+        where: the file, for errors.
+
+    Raises:
+        UsageError: it is no plan file.
+    """
+    if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
+        raise UsageError(f"not a plan of experiments (`schema: {SCHEMA}`)", where=where)
+    names = document.get("experiments")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise UsageError("`experiments` must list names of experiments", where=where)
+    return tuple(names)
 
 
 def _rising(velocity_rad_s: float, cycles: int) -> tuple[float, ...]:
@@ -242,10 +295,10 @@ def _sines(
     start_rad: float,
     travel_rad: float,
     speeds_rad_s: tuple[float, ...],
+    reveals: str,
     *,
     role: str = "identification",
     payload: bool = False,
-    reveals: str = "",
 ) -> Experiment:
     cycles = [Sine(start_rad, travel_rad, speed) for speed in speeds_rad_s]
     return _experiment(name, role, payload, cycles, reveals)
@@ -265,15 +318,29 @@ def _triangle(e: Envelope) -> Experiment:
     )
 
 
-def _chirp(e: Envelope) -> Experiment:
-    chirp = Chirp(e.centre_rad + 0.2 * e.triangle_rad, e.chirp_velocity_rad_s, e.chirp_high_hz, 10.0)
-    return _experiment("chirp", "identification", False, [chirp], "delay, lag, elasticity, inertia")
+def _triangles(e: Envelope) -> Experiment:
+    """To and fro at constant speeds, each half the one before."""
+    times, positions = [0.0], [e.centre_rad]
+    for k in range(5):
+        speed = 2.0 * e.triangle_velocity_rad_s / 2**k
+        reach = min(e.triangle_rad, 3.0 * speed)
+        for there in (e.centre_rad + reach, e.centre_rad):
+            times.append(times[-1] + reach / speed)
+            positions.append(there)
+    corners = Corners("triangles", tuple(times), tuple(positions))
+    return _experiment("triangle_speeds", "identification", False, [corners], "friction between rest and sliding", 1.0)
 
 
-def _breakaway(
-    e: Envelope, step_rad: float = 0.014, dwells_s: tuple[float, ...] = (0.6, 1.2, 2.4, 0.3, 1.2)
+def _chirp(
+    name: str, e: Envelope, velocity_rad_s: float, high_hz: float, reveals: str, *, payload: bool = False
 ) -> Experiment:
-    """Creep steps with dwells between them, three one way and three back."""
+    chirp = Chirp(e.centre_rad + 0.2 * e.triangle_rad, velocity_rad_s, high_hz, 10.0)
+    return _experiment(name, "identification", payload, [chirp], reveals)
+
+
+def _breakaway(name: str, e: Envelope, dwells_s: tuple[float, ...], reveals: str) -> Experiment:
+    """Creep steps of 14 mrad with dwells between them, three one way and three back."""
+    step_rad = 0.014
     step_s = step_rad / e.creep_velocity_rad_s
     times, positions = [0.0], [e.centre_rad + 0.1 * e.triangle_rad]
     for k, dwell_s in enumerate((*dwells_s, 0.0)):
@@ -283,9 +350,7 @@ def _breakaway(
             times.append(times[-1] + dwell_s)
             positions.append(positions[-1])
     corners = Corners("breakaway", tuple(times), tuple(positions))
-    return _experiment(
-        "breakaway", "identification", False, [corners], "stiction that grows with the dwell, presliding", 0.8
-    )
+    return _experiment(name, "identification", False, [corners], reveals, 0.8)
 
 
 def _moves(e: Envelope, seed: int) -> Experiment:

@@ -1,0 +1,162 @@
+"""``gap record`` on the virtual robot: a set that a diagnosis can read, with the payload mounted where it says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy import signal
+
+from frictid_hil.errors import UsageError
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, full_set, names_of_plan, plan_document
+from frictid_hil.jobs.gap_record import GapRecordOptions, record
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan import Plan
+from frictid_hil.runner.events import Preflight
+
+HP3J = Path(__file__).resolve().parents[2] / "profiles" / "hp3j.yaml"
+NOISE_NM = 0.005 * 11.4
+
+
+class Refusing(Silent):
+    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+        return False
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The wrist bend of the shipped robot, alone, with one effect."""
+    monkeypatch.chdir(tmp_path)
+    values: dict[str, Any] = yaml.safe_load(HP3J.read_text())
+    joint = {**values["joints"]["4"], "node": 1, "axis": 0}
+    joint["simulated"]["effects"] = {"direction_asymmetry": {"coulomb_share": 0.1, "viscous_share": 0.1}}
+    values.update(name="one", bus=f"virtual:{tmp_path.name}", joints={"0": joint})
+    path = tmp_path / "one.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return str(path)
+
+
+def plan_file(tmp_path: Path, *names: str) -> Path:
+    path = tmp_path / f"plan-{'-'.join(names)}.yaml"
+    path.write_text(yaml.safe_dump(plan_document(names, "a test")))
+    return path
+
+
+def columns(folder: Path, name: str) -> dict[str, np.ndarray[Any, Any]]:
+    header, *rows = (folder / f"{name}.csv").read_text().splitlines()
+    table = np.array([row.split(",") for row in rows], dtype=np.float64)
+    return {key: table[:, k] for k, key in enumerate(header.split(","))}
+
+
+def test_a_recorded_set_loads_and_its_rows_are_timed_as_it_says(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    result = record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "chirp"), out=out), Silent())
+    assert result["outcome"] == "ok"
+    assert result["experiments"] == ["chirp"]
+    assert result["set"] == str(out)
+    loaded = ExperimentSet.load(out)
+    assert loaded.nominal.inertia_kg_m2 == 0.1
+    assert not loaded.experiments[0].validation
+    nominal = yaml.safe_load((out / "nominal.yaml").read_text())
+    assert "effects" not in nominal["joint"]
+    log = columns(out, "chirp")
+    assert np.allclose(np.diff(log["time_s"]), 0.001, atol=1e-12)
+    assert log["time_s"][0] == 0.0
+    assert nominal["experiments"][0]["duration_s"] == pytest.approx(11.0, abs=0.005)
+    # The controller replayed by the set's own words leaves torque noise and nothing else.
+    gains, step_s = nominal["controller"], 0.001
+    error = log["position_command_rad"] - log["position_rad"]
+    assert gains["command_rate"] == "backward"
+    rate = np.diff(log["position_command_rad"], prepend=log["position_command_rad"][0]) / step_s
+    demand = gains["kp"] * error + gains["ki"] * step_s * (np.cumsum(error) - error)
+    demand += gains["kd"] * (rate - log["velocity_rad_s"])
+    left = log["torque_nm"][1:] - demand[:-1]
+    left -= np.median(left[:300])
+    assert left.std() == pytest.approx(NOISE_NM, rel=0.05)
+    low = signal.filtfilt(*signal.butter(2, 25.0 / 500.0), left)
+    assert low.std() < 0.3 * NOISE_NM
+
+
+def test_the_payload_is_mounted_for_its_experiments_alone(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    plan = plan_file(tmp_path, "sines_payload", "sines_repeat")
+    record(GapRecordOptions(robot, "0", plan=plan, out=out), Silent())
+    bare, loaded = columns(out, "sines_repeat"), columns(out, "sines_payload")
+    assert bare["position_rad"][0] == pytest.approx(loaded["position_rad"][0], abs=2e-3)
+    # Friction cancels over a cycle there and back; 0.6 N m of payload stays.
+    more = loaded["torque_nm"][600:-400].mean() - bare["torque_nm"][600:-400].mean()
+    assert more == pytest.approx(0.6 * np.cos(bare["position_rad"][600:-400]).mean(), rel=0.1)
+    flags = {
+        e["name"]: (e["payload"], e["run_order"])
+        for e in yaml.safe_load((out / "nominal.yaml").read_text())["experiments"]
+    }
+    assert flags == {"sines_payload": (True, 0), "sines_repeat": (False, 1)} or flags == {
+        "sines_payload": (True, 1),
+        "sines_repeat": (False, 0),
+    }
+
+
+def test_without_a_payload_validation_runs_bare_and_the_rest_is_left_out(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    plan = plan_file(tmp_path, "sines_payload", "moves_payload")
+    result = record(GapRecordOptions(robot, "0", plan=plan, payload=False, out=out), Silent())
+    assert result["experiments"] == ["moves_payload"]
+    assert not ExperimentSet.load(out).experiments[0].payload
+
+
+def test_a_second_recording_adds_to_the_set_and_none_is_overwritten(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "sines_posture"), out=out), Silent())
+    loaded = ExperimentSet.load(out)
+    assert [(e.name, e.run_order) for e in loaded.experiments] == [("breakaway", 0), ("sines_posture", 1)]
+    with pytest.raises(UsageError, match="has breakaway already"):
+        record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.doc").write_text("mine")
+    with pytest.raises(UsageError, match="something else"):
+        record(GapRecordOptions(robot, "0", out=tmp_path / "other"), Silent())
+
+
+def test_nothing_is_left_behind_when_the_person_says_no(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="nothing has moved"):
+        record(GapRecordOptions(robot, "0", short=True, out=tmp_path / "set"), Refusing())
+    assert not (tmp_path / "set").exists()
+    assert not list((tmp_path / "runs").rglob("manifest.json"))
+
+
+def test_travel_beyond_the_limits_is_refused_before_anything_opens(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="does not fit"):
+        record(GapRecordOptions(robot, "0", centre_rad=2.1, out=tmp_path / "set"), Silent())
+
+
+@pytest.mark.parametrize(
+    "document",
+    [None, [], {"schema": "frictid.robot/1"}, {"schema": SCHEMA}, {"schema": SCHEMA, "experiments": [3]}],
+)
+def test_what_is_no_plan_of_experiments_is_refused(document: object) -> None:
+    with pytest.raises(UsageError):
+        names_of_plan(document, "plan.yaml")
+
+
+def test_every_experiment_starts_and_ends_at_rest_and_in_one_piece() -> None:
+    envelope = Envelope.within(-2.9, 2.9, 3.0, centre_rad=0.2, travel_rad=0.4)
+    experiments = catalogue(envelope)
+    assert {e.name for e in full_set(envelope)} < set(experiments)
+    for experiment in experiments.values():
+        times = np.arange(0.0, experiment.duration_s, 1e-3)
+        position = experiment.position_rad(times)
+        steps = np.abs(np.diff(position))
+        assert steps[:300].max() == 0.0
+        assert steps[-300:].max() == 0.0
+        assert steps.max() <= 1e-3 * max(envelope.velocity_rad_s, 0.4) * 1.001
+        assert position[0] == experiment.start_rad
+        assert position[-1] == pytest.approx(experiment.end_rad, abs=1e-12)
+        parts = np.concatenate([m.position_rad(np.linspace(0.0, m.duration_s, 50)) for m in experiment.marked_motions])
+        assert np.abs(parts).max() <= 2.9
+    with pytest.raises(UsageError, match="no experiment"):
+        chosen(["sines_small", "waltz"], envelope)
