@@ -1,0 +1,150 @@
+"""Column maps: the file that says which column of a foreign recording is which. ``schema: frictid.columns/1``.
+
+::
+
+    schema: frictid.columns/1
+    name: emps
+    time: {column: t, unit: s}
+    joints:
+      axis:
+        prismatic: true
+        meta: {torque_source: motor voltage times drive gain}
+        position: {column: qm, unit: m}
+        position_command: {column: qg, unit: m}
+        torque: {product: [gtau, vir], unit: N}
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from frictid_hil.columns import TIME_UNITS_NS, ColumnMap, JointColumns, Source, si_factor
+from frictid_hil.config.schema import Strict, schema_version, validated
+from frictid_hil.config.search import find
+from frictid_hil.config.yaml import read
+from frictid_hil.errors import FieldProblem, UsageError
+
+KIND = "frictid.columns"
+NEWEST = 1
+
+_Names = Annotated[tuple[str, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v)]
+
+
+class TimeFile(Strict):
+    """The column of time."""
+
+    column: str
+    unit: Literal["s", "ms", "us", "ns"]
+
+
+class SourceFile(Strict):
+    """Where one quantity comes from.
+
+    Attributes:
+        column: name of the only column.
+        product: names of columns (or constants) to be multiplied.
+        unit: of the column or product, before ``scale``.
+        scale: further factor; -1 turns the sign.
+        offset: added last, in the SI unit.
+        index: for cells that hold a list, which of its values, from 0.
+        file: name of the file beside the first that has this column.
+    """
+
+    column: str | None = None
+    product: _Names | None = Field(default=None, min_length=2)
+    unit: str
+    scale: float = 1.0
+    offset: float = 0.0
+    index: int | None = Field(default=None, ge=0)
+    file: str | None = Field(default=None, pattern=r"^[^/\\]+$")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> SourceFile:
+        if (self.column is None) == (self.product is None):
+            raise ValueError("give either `column` or `product`")
+        if self.index is not None and self.product is not None:
+            raise ValueError("`index` is for a single `column`")
+        if self.scale == 0:
+            raise ValueError("`scale: 0` leaves nothing of the column")
+        return self
+
+
+class JointFile(Strict):
+    """One joint's columns; units decide what is read, so the names here carry none."""
+
+    prismatic: bool = False
+    meta: dict[str, str | float] = Field(default_factory=dict)
+    position: SourceFile
+    velocity: SourceFile | None = None
+    torque: SourceFile | None = None
+    position_command: SourceFile | None = None
+    external_torque: SourceFile | None = None
+    rigid_body_torque: SourceFile | None = None
+
+    @model_validator(mode="after")
+    def _something_to_explain(self) -> JointFile:
+        if self.torque is None and self.position_command is None:
+            raise ValueError("give at least one of `torque` and `position_command`")
+        return self
+
+
+class ColumnsFile(Strict):
+    """The whole file."""
+
+    schema_: str = Field(alias="schema")
+    name: str
+    time: TimeFile
+    joints: dict[str, JointFile] = Field(min_length=1)
+
+
+_QUANTITY_OF = {
+    "position": "position_rad",
+    "velocity": "velocity_rad_s",
+    "torque": "torque_nm",
+    "position_command": "position_command_rad",
+    "external_torque": "external_torque_nm",
+    "rigid_body_torque": "rigid_body_torque_nm",
+}
+
+
+def load_columns(name: str | Path) -> ColumnMap:
+    """Read and check a column map.
+
+    Args:
+        name: a path, or the name of one that is shipped or lies in a ``columns`` folder of the search path.
+
+    Raises:
+        ConfigError: not found, or wrong; every problem with file:line:column.
+    """
+    document = read(find(name, folder="columns", what="column map"))
+    schema_version(document, KIND, NEWEST)
+    file = validated(document, ColumnsFile)
+    joints: dict[str, JointColumns] = {}
+    problems: list[FieldProblem] = []
+    for joint, columns in file.joints.items():
+        sources: dict[str, Source] = {}
+        for name_here, quantity in _QUANTITY_OF.items():
+            source: SourceFile | None = getattr(columns, name_here)
+            if source is None:
+                continue
+            try:
+                sources[quantity] = _source(source, quantity, prismatic=columns.prismatic)
+            except UsageError as error:
+                problems.append(FieldProblem(("joints", joint, name_here, "unit"), error.what))
+        joints[joint] = JointColumns(sources, columns.prismatic, columns.meta)
+    if problems:
+        raise document.error(problems)
+    return ColumnMap(file.name, Source((file.time.column,), TIME_UNITS_NS[file.time.unit]), joints)
+
+
+def _source(source: SourceFile, quantity: str, *, prismatic: bool) -> Source:
+    return Source(
+        columns=source.product or (str(source.column),),
+        scale=si_factor(source.unit, quantity, prismatic=prismatic) * source.scale,
+        offset=source.offset,
+        index=source.index,
+        file=source.file,
+    )

@@ -1,0 +1,268 @@
+"""CSV in and out, gzipped or not: for people with other tools.
+
+Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
+command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
+guessed: a header in other words needs a column map. A file may have up to 10,000,000 rows.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import gzip
+import io
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from frictid_hil.columns import ColumnMap
+from frictid_hil.errors import InputFileError
+from frictid_hil.files import write_whole
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.linear_axis import linear_name
+from frictid_hil.recording.samples import Samples
+from frictid_hil.recording.table import mapped, samples_of
+
+MAX_ROWS = 10_000_000
+_MAX_HEADER = 65_536
+
+_ORDER = (
+    "position_rad",
+    "velocity_rad_s",
+    "torque_nm",
+    "position_command_rad",
+    "rigid_body_torque_nm",
+    "external_torque_nm",
+    "temperature_c",
+)
+
+
+def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:
+    """The recording in a CSV file: one joint under the standard header, or what a column map says.
+
+    Args:
+        path: ``.csv`` or ``.csv.gz``.
+        columns: of a foreign file.
+        joint: its name ("0" unless told); with a column map the only one wanted.
+
+    Raises:
+        InputFileError: unreadable, or a value that cannot be used, with line and column.
+    """
+    if columns is not None:
+        return mapped(CsvTable, path, columns, joint)
+    table = CsvTable(path)
+    prismatic = "position_m" in table.names
+    names = {(linear_name(name) if prismatic else name): name for name in _ORDER}
+    present = [name for name in names if name in table.names]
+    _check_header(table, names, present, path)
+    time_s, *values = table.numbers(["time_s", *present])
+    quantities = {names[name]: values[k] for k, name in enumerate(present)}
+    for optional in ("external_torque_nm", "temperature_c"):
+        if optional in quantities and np.isnan(quantities[optional]).all():
+            del quantities[optional]
+    return [samples_of(table, joint or "0", time_s, quantities, unit_ns=1e9, prismatic=prismatic, meta={})]
+
+
+def write_csv(path: Path, samples: Samples) -> None:
+    """Write one joint under the standard header; reading it back gives the same columns bit for bit.
+
+    Raises:
+        FrictidError: disk full, or no permission.
+    """
+    columns = samples.columns()
+    names = [name for name in _ORDER if name in columns]
+    text = io.StringIO()
+    text.write(",".join(["time_s", *(linear_name(name) if samples.prismatic else name for name in names)]) + "\n")
+    for t_ns, *row in zip(samples.time_ns.tolist(), *(columns[name].tolist() for name in names), strict=True):
+        seconds, rest = divmod(t_ns, 1_000_000_000)
+        text.write(f"{seconds}.{rest:09d},{','.join(map(repr, row))}\n")
+    raw = text.getvalue().encode()
+    write_whole(path, gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
+
+
+class CsvTable:
+    """A CSV file with a header; a ``Table``. Blank lines and lines that begin with ``#`` are passed over.
+
+    Raises:
+        InputFileError: unreadable, no header, or a header that cannot be used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._header_lines = 0
+        with _reading(path), _open(path) as file:
+            header = ""
+            while not header.strip() or header.lstrip().startswith("#"):
+                header = file.readline(_MAX_HEADER)
+                self._header_lines += 1
+                if not header:
+                    raise InputFileError("the file is empty", where=str(path))
+        self.names = [name.strip() for name in next(csv.reader([header]))]
+        where = f"{path}, line {self._header_lines}"
+        if len(self.names) == 1 and (";" in header or "\t" in header):
+            raise InputFileError("columns are not separated by commas", where=where, next_step="export it with commas")
+        if all(_is_number(name) for name in self.names):
+            raise InputFileError("no header: the first line holds numbers", where=where)
+        twice = [name for name in self.names if self.names.count(name) > 1]
+        if twice:
+            raise InputFileError(f"column {twice[0]!r} appears twice in the header", where=where)
+
+    def numbers(self, names: Sequence[str]) -> list[Array]:
+        """Columns as float64, shape (n,) each."""
+        at = [self._index(name) for name in names]
+        with _reading(self.path), warnings.catch_warnings():
+            self._check_row_lengths()
+            warnings.simplefilter("ignore", UserWarning)  # "no data": said better by whoever needs rows
+            try:
+                values = np.loadtxt(
+                    self.path,
+                    delimiter=",",
+                    skiprows=self._header_lines,
+                    usecols=at,
+                    quotechar='"',
+                    max_rows=MAX_ROWS + 1,
+                    ndmin=2,
+                    encoding="utf-8",
+                )
+            except UnicodeDecodeError:
+                raise
+            except ValueError as error:
+                raise self._explained(at, error) from None
+        if len(values) > MAX_ROWS:
+            raise InputFileError(f"more than {MAX_ROWS:,} rows", where=str(self.path), next_step="split the recording")
+        return list(np.ascontiguousarray(values.T)) if values.size else [np.empty(0) for _ in names]
+
+    def elements(self, name: str, index: int) -> Array:
+        """One value of each list in a column, shape (n,)."""
+        at = self._index(name)
+        values = []
+        with _reading(self.path):
+            for line, row in self._rows():
+                try:
+                    cell = row[at].strip(" []()")
+                    values.append(float(cell.split(",")[index] if "," in cell else cell.split()[index]))
+                except (IndexError, ValueError):
+                    found = row[at][:40] if at < len(row) else "nothing"
+                    raise InputFileError(
+                        f"line {line}, column {name}: no value number {index} in {found!r}", where=str(self.path)
+                    ) from None
+        return np.array(values)
+
+    def place(self, row: int) -> str:
+        """The line of a row."""
+        with _reading(self.path):
+            for k, (line, _) in enumerate(self._rows()):
+                if k == row:
+                    return f"line {line}"
+        return f"row {row}"
+
+    def _check_row_lengths(self) -> None:
+        """A row with a comma too many would be read as something else."""
+        expected = len(self.names)
+        rows = commas = 0
+        last = b"\n"
+        with _open_bytes(self.path) as file:
+            while block := file.read(1 << 20):
+                rows += block.count(b"\n")
+                commas += block.count(b",")
+                last = block
+        rows += not last.endswith(b"\n")
+        if commas == rows * (expected - 1):
+            return  # the plain case, told by counting alone
+        for line, row in self._rows():
+            if len(row) != expected:
+                raise InputFileError(
+                    f"line {line} has {len(row)} values where the header has {expected}",
+                    where=str(self.path),
+                    cause="the file ends in the middle of a line, or a comma is missing or too many",
+                )
+
+    def _index(self, name: str) -> int:
+        if name not in self.names:
+            raise InputFileError(
+                f"no column {name!r}; the file has {', '.join(self.names)[:300]}",
+                where=f"{self.path}, line {self._header_lines}",
+            )
+        return self.names.index(name)
+
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Line number and cells of each row of data."""
+        with _open(self.path) as file:
+            reader = csv.reader(file)
+            for row in reader:
+                if reader.line_num > self._header_lines and row and not row[0].lstrip().startswith("#"):
+                    yield reader.line_num, row
+
+    def _explained(self, at: Sequence[int], error: ValueError) -> InputFileError:
+        """What is wrong with the file that could not be read as numbers: the first bad cell."""
+        where = str(self.path)
+        for line, row in self._rows():
+            for k in at:
+                if not row[k].strip():
+                    return InputFileError(f"line {line}, column {self.names[k]}: blank", where=where)
+                if not _is_number(row[k]):
+                    return InputFileError(
+                        f"line {line}, column {self.names[k]}: {row[k][:40]!r} is not a number", where=where
+                    )
+        return InputFileError(f"cannot be read as numbers: {error}", where=where)
+
+
+def _check_header(table: CsvTable, names: dict[str, str], present: list[str], path: Path) -> None:
+    """Refuse what is missing, and what looks like a known column in other words."""
+    where = f"{path}, line 1"
+    position = "position_m" if "position_m" in names else "position_rad"
+    missing = [name for name in ("time_s", position) if name not in table.names]
+    for unknown in table.names:
+        near = difflib.get_close_matches(unknown.lower(), [n for n in [*names, "time_s"] if n not in present], n=1)
+        if unknown not in names and near and near[0] not in table.names:
+            raise InputFileError(
+                f"unknown column {unknown!r}; did you mean {near[0]}?",
+                where=where,
+                next_step="rename it, or say by --columns MAP which column is which and in what unit",
+            )
+    if missing:
+        raise InputFileError(
+            f"no column {' and '.join(missing)}; the file has {', '.join(table.names)[:300]}",
+            where=where,
+            next_step="say by --columns MAP which column is which",
+        )
+    torque, command = [name for name, ours in names.items() if ours in ("torque_nm", "position_command_rad")]
+    if torque not in present and command not in present:
+        raise InputFileError(f"neither {torque} nor {command}", where=where)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text
+
+
+def _open_bytes(path: Path) -> io.BufferedReader:
+    return io.BufferedReader(gzip.GzipFile(path)) if path.suffix == ".gz" else path.open("rb")
+
+
+def _open(path: Path) -> IO[str]:
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
+    return path.open(encoding="utf-8-sig", newline="")
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Whatever reading a file can run into, as an ``InputFileError``."""
+    where = str(path)
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        raise InputFileError(f"not UTF-8 text: byte 0x{error.object[error.start]:02x}", where=where) from None
+    except (OSError, EOFError, zlib.error) as error:  # the last two: a gzip file that is cut off or spoilt
+        raise InputFileError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=where) from None
+    except (csv.Error, MemoryError) as error:
+        raise InputFileError(f"not CSV: {error or 'a line larger than memory'}", where=where) from None
