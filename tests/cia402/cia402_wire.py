@@ -157,6 +157,8 @@ class ScriptedDrive:
         self.values[key] = self.reads_back.get(key, value)
         if key == (0x6060, 0) and self.shows_mode:
             self.values[0x6061, 0] = value
+        if key == (0x6040, 0):
+            self.follow(value)
         return struct.pack("<BHBI", 0x60, index, sub, 0)
 
     @staticmethod

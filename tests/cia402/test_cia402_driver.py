@@ -310,8 +310,28 @@ def test_a_powered_drive_is_not_touched():
     drive.values[0x6041, 0] = 0x0237
     b = Bench(drive).open()
     assert any("already on" in finding.message for finding in b.driver.check(None))
+    before = len(b.bus.sent)
     with pytest.raises(HardwareError, match="power stage is already on"):
         b.driver.configure(1000.0, ["0"])
+    assert not [can_id for can_id, data in b.bus.sent[before:] if can_id < 0x600 or data[0] >> 5 == 1]
+
+
+def test_a_drive_that_its_watchdog_stopped_is_switched_off_and_used():
+    drive = ScriptedDrive(1)
+    drive.values[0x6041, 0], drive.values[0x603F, 0] = 0x0217, 0x8130
+    b = Bench(drive).open()
+    findings = b.driver.check(None)
+    assert any("an earlier run was cut off" in finding.message for finding in findings)
+    assert not [finding for finding in findings if finding.severity is Severity.ERROR]
+    b.driver.configure(1000.0, ["0"])
+    assert drive.values[0x6041, 0] == 0x0250
+
+
+def test_a_drive_that_stays_in_quick_stop_is_told():
+    drive = ScriptedDrive(1, refuses={(0x6040, 0): 0x08000021})
+    drive.values[0x6041, 0] = 0x0217
+    with pytest.raises(HardwareError, match="controlword"):
+        Bench(drive).open().driver.configure(1000.0, ["0"])
 
 
 def test_a_layout_that_no_wire_can_carry_is_refused_with_the_rate_that_fits():

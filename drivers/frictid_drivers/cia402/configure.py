@@ -14,7 +14,7 @@ from frictid_drivers.cia402.frame_map import Frame
 from frictid_drivers.cia402.layout import Layout, Pdo
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
-from frictid_drivers.cia402.state import DriveState, drive_state
+from frictid_drivers.cia402.state import DISABLE_VOLTAGE, DriveState, drive_state
 from frictid_hil.errors import HardwareError
 
 _NOT_VALID = 1 << 31
@@ -32,13 +32,30 @@ def refuse_if_powered(drive: Drive) -> None:
     Raises:
         HardwareError: its power stage is on.
     """
-    state = drive_state(drive.read(od.STATUSWORD))
-    if state in (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE):
+    if drive_state(drive.read(od.STATUSWORD)) is DriveState.ENABLED:
         raise HardwareError(
-            f"the power stage is already on ({state.name.lower().replace('_', ' ')})",
+            "the power stage is already on",
             where=drive.where(od.STATUSWORD.address),
-            cause="another controller drives this robot, or an earlier run was cut off",
-            next_step="switch the drive off (or let the other controller do it), then start again",
+            cause="another controller drives this robot",
+            next_step="switch the drive off, or let the other controller do it, then start again",
+        )
+
+
+def end_quick_stop(drive: Drive) -> None:
+    """Switch off a drive that its watchdog stopped when an earlier run was cut off: it stands and holds until told.
+
+    Raises:
+        HardwareError: it stays in quick stop.
+    """
+    if drive_state(drive.read(od.STATUSWORD)) is not DriveState.QUICK_STOP_ACTIVE:
+        return
+    drive.write_blind(od.CONTROLWORD, DISABLE_VOLTAGE)
+    if drive_state(drive.read(od.STATUSWORD)) is DriveState.QUICK_STOP_ACTIVE:
+        raise HardwareError(
+            "does not leave quick stop",
+            where=drive.where(od.STATUSWORD.address),
+            cause="an earlier run was cut off, and the drive is not in remote control",
+            next_step="switch the drive off and on, then start again",
         )
 
 

@@ -1,9 +1,9 @@
 """The CiA-402 driver: one CAN bus, one drive per joint, the driver protocol on top.
 
 This file is the life cycle; what it does at each step lives next door: ``settings`` (the robot file's options),
-``network`` and ``sdo`` (the wire and its objects), ``facts`` (what drives say of themselves), ``layout`` and
-``bus_load`` (which frames, and whether they fit), ``configure`` (writing and reading back), ``cycle`` and ``axis`` (the
-exchange), ``codec`` (bytes to figures), ``inspection`` (``identify`` and ``check``).
+``network`` and ``sdo`` (the wire and its objects), ``fleet`` (all drives, reached), ``facts`` (what a drive says of
+itself), ``layout`` and ``bus_load`` (which frames, and whether they fit), ``configure`` (writing and reading back),
+``cycle`` and ``axis`` (the exchange), ``codec`` (bytes to figures), ``inspection`` (``identify`` and ``check``).
 """
 
 from __future__ import annotations
@@ -14,19 +14,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import can
-import canopen
 
 from frictid_drivers.cia402 import configure, inspection
-from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.axis import Axis
-from frictid_drivers.cia402.bus_load import BusLoad, highest_rate_hz
-from frictid_drivers.cia402.codec import HEARTBEAT_BASE, Decoder
+from frictid_drivers.cia402.codec import Decoder
 from frictid_drivers.cia402.cycle import Cycle
-from frictid_drivers.cia402.facts import Facts, Scale, raise_on_error, read_facts, scale_of
+from frictid_drivers.cia402.fleet import NMT_PRE_OPERATIONAL, NMT_START, Fleet
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
-from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
-from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, Node, Wire, open_bus
-from frictid_drivers.cia402.sdo import Drive
+from frictid_drivers.cia402.layout import Layout
+from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, open_bus
 from frictid_drivers.cia402.settings import read_settings
 from frictid_drivers.cia402.state import DriveState
 from frictid_hil.driver import (
@@ -45,11 +41,13 @@ from frictid_hil.driver import (
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
 from frictid_hil.plan import JointPlan, Plan
 
-_NMT_START, _NMT_PRE_OPERATIONAL = 0x01, 0x80
-_PRE_OPERATIONAL_STATE = b"\x7f"
-_HIGHEST_RATE_HZ = 4000.0
 _SETTLE_S = 2.0
-_MODES = {Mode.POSITION: 8, Mode.VELOCITY: 9, Mode.TORQUE: 10}
+_RESET_S = 0.5
+_MODES = (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE)
+_WIRE_ERRORS = (FrictidError, can.CanError, OSError)
+
+_OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.FAULT, DriveState.UNKNOWN)
+"""States without motor power from which nothing more can be asked; UNKNOWN: never reported, never enabled."""
 
 
 class Cia402Driver:
@@ -71,21 +69,17 @@ class Cia402Driver:
         self._lock_step = not isinstance(self.clock, WallClock)
         self._settings, self._joint_settings = read_settings(setup)
         self._bus_factory = bus_factory
-        self._sink: FrameSink | None = None
-        self._bus: can.BusABC | None = None
-        self._lock: BusLock | None = None
-        self._wire: Wire | None = None
-        self._heartbeat: HeartbeatTimer | None = None
-        self._drives: dict[str, Drive] = {}
-        self._facts: dict[str, Facts] = {}
-        self._scales: dict[str, Scale] = {}
         self._torque_limits_nm = {joint.name: joint.max_torque_nm for joint in setup.joints}
+        self._sink: FrameSink | None = None
+        self._lock: BusLock | None = None
+        self._bus: can.BusABC | None = None
+        self._fleet: Fleet | None = None
+        self._heartbeat: HeartbeatTimer | None = None
         self._layout: Layout | None = None
         self._frame_map: FrameMap | None = None
-        self._axes: dict[str, Axis] = {}
         self._decoder: Decoder | None = None
+        self._axes: dict[str, Axis] = {}
         self._cycle: Cycle | None = None
-        self._frozen_ns = 0
 
     # -- reaching the drives ------------------------------------------------------------------------------------
 
@@ -104,49 +98,37 @@ class Cia402Driver:
                 self._bus = open_bus(self.setup.bus, self.setup.options)
             else:
                 self._bus = self._bus_factory()
-            self._wire = Wire(self._bus, frame_sink, lambda: self._frozen_ns)
-            # Objects are addressed by index; no EDS is needed.
-            empty = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]  # canopen is only partly typed
-            for joint in self.setup.joints:
-                node = Node(joint.address, empty)
-                self._wire.add_node(node)
-                drive = self._drives[joint.name] = Drive(node, joint.name, self._settings.sdo_timeout_s)
-                self._wire.subscribe(HEARTBEAT_BASE + joint.address, _forget_after_boot(drive))
-            for name, drive in self._drives.items():
-                self._facts[name] = read_facts(drive)
+            self._fleet = Fleet(self.setup, self._settings, self._joint_settings, self._bus, frame_sink)
         except BaseException:
             self.close()
             raise
 
     def identify(self) -> dict[str, JointIdentity]:
         """What every drive says of itself, with known manufacturer settings; reads only."""
+        fleet = self._reached()
+        cycle_hz = self._layout.cycle_hz if self._layout else self.setup.cycle_hz
         return {
             joint.name: inspection.identity(
-                joint,
-                self._drive(joint.name),
-                self._facts[joint.name],
-                self._scale(joint, self._told_velocity_unit(joint)),
-                self._joint_settings[joint.name],
-                self._layout.cycle_hz if self._layout else self.setup.cycle_hz,
+                joint, fleet.drives[joint.name], fleet.facts[joint.name], self._joint_settings[joint.name], cycle_hz
             )
             for joint in self.setup.joints
         }
 
     def capabilities(self) -> Capabilities:
         """What drives and bus can do: with the configured joints active, or with one active before ``configure``."""
-        facts = self._facts.values()
-        active = self._layout.active if self._layout else self._names[:1]
-        watchdog = all(fact.heartbeat_consumers for fact in facts)
-        may_torque = watchdog or self._settings.allow_torque_without_watchdog
+        fleet = self._reached()
+        facts = fleet.facts.values()
+        active = self._layout.active if self._layout else [self.setup.joints[0].name]
+        may_torque = fleet.watchdog or self._settings.allow_torque_without_watchdog
         return Capabilities(
-            max_cycle_hz=self._highest_rate_hz(active),
+            max_cycle_hz=fleet.highest_rate_hz(active),
             modes=frozenset(
                 mode
-                for mode, number in _MODES.items()
-                if all(fact.supports(number) for fact in facts) and (mode is not Mode.TORQUE or may_torque)
+                for mode in _MODES
+                if all(fact.supports(mode) for fact in facts) and (mode is not Mode.TORQUE or may_torque)
             ),
             torque_offset=all(fact.torque_offset for fact in facts),
-            drive_watchdog=watchdog,
+            drive_watchdog=fleet.watchdog,
             lock_step=self._lock_step,
             external_torque=any(joint.external_torque for joint in self._joint_settings.values()),
             temperature=any(joint.temperature for joint in self._joint_settings.values()),
@@ -154,16 +136,16 @@ class Cia402Driver:
 
     def check(self, plan: Plan | None) -> list[Finding]:
         """Everything that can be said without moving or writing."""
+        fleet = self._reached()
         cycle_hz = plan.cycle_hz if plan is not None else self.setup.cycle_hz
-        active = [plan.joints[0].joint] if plan is not None and plan.joints else self._names[:1]
-        findings = [inspection.bus_finding(self._load(active, cycle_hz), self._highest_rate_hz(active))]
-        if not self._sync_counter:
-            findings.append(inspection.no_sync_counter(self._facts))
+        active = [plan.joints[0].joint if plan is not None and plan.joints else self.setup.joints[0].name]
+        findings = [inspection.bus_finding(fleet.load(active, cycle_hz), fleet.highest_rate_hz(active))]
+        if not fleet.sync_counter:
+            findings.append(inspection.no_sync_counter(fleet.facts))
         for joint in self.setup.joints:
-            facts = self._facts[joint.name]
-            scale, doubts = scale_of(facts, joint, self._finest_velocity_unit(facts))
-            findings += doubts
-            findings += inspection.joint_findings(joint, self._drive(joint.name), facts, scale, self._settings)
+            findings += inspection.joint_findings(
+                joint, fleet.drives[joint.name], fleet.facts[joint.name], self._settings
+            )
         return findings
 
     # -- configuring --------------------------------------------------------------------------------------------
@@ -175,32 +157,33 @@ class Cia402Driver:
             PlanRefused: the layout does not fit the bus; the message has the numbers and the highest rate that does.
             HardwareError: a drive refuses or does not confirm a setting, or is not what the robot file says.
         """
-        wire = self._open_wire()
+        fleet = self._reached()
         if self._cycle is not None:
             raise HardwareError("configure while cycling", next_step="call stop_cycling first")
         for name in active:
             self.setup.joint(name)
-        load = self._load(active, cycle_hz)
+        load = fleet.load(active, cycle_hz)
         if not load.fits:
             raise PlanRefused(
-                f"{len(active)} of {len(self._names)} joints reporting on every cycle load the bus with {load}",
+                f"{len(active)} of {len(self.setup.joints)} joints reporting on every cycle load the bus with {load}",
                 where="bus load",
                 cause="more than 80 % on average or 100 % in one cycle; frames would come late or not at all",
-                next_step=f"use a rate of at most {self._highest_rate_hz(active):g} Hz, or fewer joints at once",
+                next_step=f"use a rate of at most {fleet.highest_rate_hz(active):g} Hz, or fewer joints at once",
             )
-        layout = self._layout_at(active, cycle_hz)
-        wire.send_message(0, bytes([_NMT_PRE_OPERATIONAL, 0]))
-        frames = []
-        for joint in self.setup.joints:
-            frames.append(self._configure_joint(joint, layout))
+        layout = fleet.layout(active, cycle_hz)
+        self._frame_map = fleet.configure(layout)
         self._layout = layout
-        self._frame_map = FrameMap(tuple(frames), 0x80, round(self._settings.reply_window * 1e9 / cycle_hz))
         self._decoder = Decoder(self._frame_map, layout.active)
         self._axes = {
-            joint.name: self._axis(joint, frame, feedback)
-            for joint, frame, feedback in zip(self.setup.joints, frames, self._decoder.feedback, strict=True)
+            joint.name: self._axis(joint, frames, feedback, fleet, cycle_hz)
+            for joint, frames, feedback in zip(
+                self.setup.joints, self._frame_map.joints, self._decoder.feedback, strict=True
+            )
         }
-        self._keep_alive()
+        # The drives watch over us from now on: be heard, also while nobody cycles.
+        if self._heartbeat is None:
+            self._heartbeat = HeartbeatTimer(fleet.send_heartbeat, self._settings.host_heartbeat_s)
+        self._resume_heartbeat()
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Torque and position limits in the drive, read back (6072, 607D), and the torque limit in the host.
@@ -208,13 +191,12 @@ class Cia402Driver:
         Raises:
             HardwareError: refused or not confirmed.
         """
-        drive, scale = self._drive(joint), self._scales.get(joint)
-        if scale is None:
-            raise HardwareError("set_limits before configure")
-        configure.configure_limits(drive, scale, torque_nm, position_min_rad, position_max_rad)
-        self._torque_limits_nm[joint] = torque_nm
-        if joint in self._axes:
-            self._axes[joint].limit_torque(torque_nm)
+        fleet, name = self._reached(), self.setup.joint(joint).name
+        configure.configure_limits(
+            fleet.drives[name], fleet.scale_of(name), torque_nm, position_min_rad, position_max_rad
+        )
+        self._torque_limits_nm[name] = torque_nm
+        self._axis_of(name).limit_torque(torque_nm)
 
     def frame_map(self) -> FrameMap:
         """Which frame carries what, as read back; for the run's manifest and for replay.
@@ -240,14 +222,14 @@ class Cia402Driver:
         Raises:
             HardwareError: not configured.
         """
-        wire = self._open_wire()
+        fleet = self._reached()
         if self._layout is None or self._frame_map is None or self._decoder is None or self._bus is None:
             raise HardwareError("start_cycling before configure")
-        wire.drain()
+        fleet.wire.drain()
         if self._heartbeat is not None:
             self._heartbeat.stop()
         self._decoder.restart()
-        wire.send_message(0, bytes([_NMT_START, 0]))
+        fleet.nmt(NMT_START)
         restart = getattr(self.clock, "restart", None)
         if restart is not None:
             restart()
@@ -261,7 +243,7 @@ class Cia402Driver:
             self._decoder,
             self._settings,
             lock_step=self._lock_step,
-            other=wire.dispatch,
+            other=fleet.wire.dispatch,
         )
 
     def enable(self, joint: str, mode: Mode) -> None:
@@ -270,9 +252,9 @@ class Cia402Driver:
         Raises:
             HardwareError: the drive lacks this mode, or has no watchdog for torque mode.
         """
-        axis, facts = self._axis_of(joint), self._facts[joint]
+        axis, facts = self._axis_of(joint), self._reached().facts[joint]
         where = f"joint {joint} (node {self.setup.joint(joint).address})"
-        if mode not in _MODES or not facts.supports(_MODES[mode]):
+        if mode not in _MODES or not facts.supports(mode):
             raise HardwareError(f"the drive does not support mode {mode.name} (6502)", where=where)
         if mode is Mode.TORQUE and not facts.heartbeat_consumers and not self._settings.allow_torque_without_watchdog:
             raise HardwareError(
@@ -293,7 +275,7 @@ class Cia402Driver:
         self._axis_of(joint).lock()
 
     def unlock(self, joint: str) -> None:
-        """Follow the set-point again."""
+        """Follow the set-point again, from the moment it is moved."""
         self._axis_of(joint).unlock()
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
@@ -323,16 +305,14 @@ class Cia402Driver:
         cycle = self._cycle
         if cycle is None:
             return
-        powered = self._names
+        powered = [joint.name for joint in self.setup.joints]
         try:
             powered = self._settle(cycle)
         finally:
             if powered:
                 cycle.cut_power()
             self._cycle = None
-            self._frozen_ns = self.clock.now_ns()
             self._end_operation()
-            self._frozen_ns = 0
         if powered:
             raise SafetyAbort(
                 f"did not come to rest and off within {_SETTLE_S:g} s",
@@ -344,150 +324,63 @@ class Cia402Driver:
         """Bring everything to rest and release the bus; safe to call twice and after errors."""
         if self._cycle is not None:
             self.quick_stop()
-            with contextlib.suppress(FrictidError, can.CanError, OSError):
+            with contextlib.suppress(*_WIRE_ERRORS):
                 self.stop_cycling()
-        if self._heartbeat is not None:
-            for drive in self._drives.values():
-                with contextlib.suppress(FrictidError, can.CanError, OSError):
+        if self._heartbeat is not None and self._fleet is not None:
+            for drive in self._fleet.drives.values():
+                with contextlib.suppress(*_WIRE_ERRORS):
                     configure.release_watchdog(drive)
             self._heartbeat.stop()
-            self._heartbeat = None
         if self._bus is not None:
-            with contextlib.suppress(can.CanError, OSError):
+            with contextlib.suppress(*_WIRE_ERRORS):
                 self._bus.shutdown()
         if self._lock is not None:
             self._lock.release()
-        self._bus = self._wire = self._lock = None
-        self._drives.clear()
-        self._axes.clear()
+        self._lock = self._bus = self._fleet = self._heartbeat = None
         self._layout = self._frame_map = self._decoder = None
+        self._axes = {}
 
     # -- parts --------------------------------------------------------------------------------------------------
 
-    @property
-    def _names(self) -> list[str]:
-        return [joint.name for joint in self.setup.joints]
-
-    @property
-    def _sync_counter(self) -> bool:
-        return all(facts.sync_counter for facts in self._facts.values())
-
-    def _open_wire(self) -> Wire:
-        if self._wire is None:
+    def _reached(self) -> Fleet:
+        if self._fleet is None:
             raise HardwareError("the bus is not open", where=self.setup.bus)
-        return self._wire
-
-    def _drive(self, joint: str) -> Drive:
-        self._open_wire()
-        return self._drives[self.setup.joint(joint).name]
+        return self._fleet
 
     def _axis_of(self, joint: str) -> Axis:
-        if joint not in self._axes:
-            self.setup.joint(joint)
-            raise HardwareError(f"joint {joint} is not configured")
-        return self._axes[joint]
+        name = self.setup.joint(joint).name
+        if name not in self._axes:
+            raise HardwareError("not configured yet", where=f"joint {name}")
+        return self._axes[name]
 
-    def _told_velocity_unit(self, joint: JointSetup) -> int | None:
-        return self._drive(joint.name).find(od.VELOCITY_UNIT)
-
-    def _finest_velocity_unit(self, facts: Facts) -> int | None:
-        """What ``configure`` will ask for."""
-        return None if facts.velocity_unit is None else od.MILLI_RPM
-
-    def _scale(self, joint: JointSetup, velocity_unit: int | None) -> Scale:
-        return scale_of(self._facts[joint.name], joint, velocity_unit)[0]
-
-    def _wishes(self) -> list[NodeWish]:
-        return [
-            NodeWish(
-                joint=joint.name,
-                node=joint.address,
-                torque_offset=self._facts[joint.name].torque_offset,
-                torque_target=self._facts[joint.name].target_torque,
-                velocity_target=self._facts[joint.name].supports(_MODES[Mode.VELOCITY]),
-                external_torque=self._joint_settings[joint.name].external_torque,
-                temperature=self._joint_settings[joint.name].temperature,
-            )
-            for joint in self.setup.joints
-        ]
-
-    def _layout_at(self, active: Sequence[str], cycle_hz: float) -> Layout:
-        return plan_layout(
-            self._wishes(),
-            active,
-            cycle_hz,
-            sync_counter=self._sync_counter,
-            host_heartbeat_s=self._settings.host_heartbeat_s,
-            drive_heartbeat_s=self._settings.drive_heartbeat_ms * 1e-3,
-        )
-
-    def _load(self, active: Sequence[str], cycle_hz: float) -> BusLoad:
-        return self._layout_at(active, cycle_hz).load(self._settings.bitrate)
-
-    def _highest_rate_hz(self, active: Sequence[str]) -> float:
-        return highest_rate_hz(lambda hz: self._load(active, hz), _HIGHEST_RATE_HZ)
-
-    def _configure_joint(self, joint: JointSetup, layout: Layout) -> JointFrames:
-        drive, settings = self._drive(joint.name), self._joint_settings[joint.name]
-        configure.refuse_if_powered(drive)
-        if joint.name not in self._scales:
-            unit = configure.configure_velocity_unit(drive, self._facts[joint.name].velocity_unit)
-            scale, findings = scale_of(self._facts[joint.name], joint, unit)
-            raise_on_error(findings)
-            self._scales[joint.name] = scale
-        scale = self._scales[joint.name]
-        configure.configure_timing(drive, layout.cycle_hz, layout.sync_overflow)
-        configure.configure_safety(drive, self._settings)
-        configure.configure_windows(drive, settings, scale.position_rad, active=joint.name in layout.active)
-        configure.configure_set_points(drive, _MODES[Mode.POSITION])
-        frames = configure.configure_pdos(drive, layout, joint.name)
-        return JointFrames(
-            name=joint.name,
-            node=joint.address,
-            position_rad_per_unit=scale.position_rad,
-            velocity_rad_s_per_unit=scale.velocity_rad_s,
-            torque_nm_per_unit=scale.torque_nm,
-            external_torque_nm_per_unit=settings.external_torque_nm_per_unit,
-            temperature_c_per_unit=settings.temperature_c_per_unit,
-            reports=tuple(frame for (transmit, _), frame in frames.items() if transmit),
-            commands=tuple(frame for (transmit, _), frame in frames.items() if not transmit),
-        )
-
-    def _axis(self, joint: JointSetup, frames: JointFrames, feedback: Feedback) -> Axis:
+    def _axis(self, joint: JointSetup, frames: JointFrames, feedback: Feedback, fleet: Fleet, cycle_hz: float) -> Axis:
         primary, secondary = frames.commands
-        assert self._layout is not None
         return Axis(
             joint.name,
-            self._scales[joint.name],
+            fleet.scale_of(joint.name),
             primary,
             secondary,
             feedback,
             max_torque_nm=self._torque_limits_nm[joint.name],
             standstill_rad_s=self._joint_settings[joint.name].standstill_rad_s,
-            reset_cycles=max(3, math.ceil(0.5 * self._layout.cycle_hz)),
+            reset_cycles=max(3, math.ceil(_RESET_S * cycle_hz)),
         )
 
-    def _keep_alive(self) -> None:
-        """The drives watch over us from now on: be heard, also while nobody cycles."""
-        if self._heartbeat is None:
-            wire = self._open_wire()
-            cob_id = HEARTBEAT_BASE + self._settings.host_node
-            self._heartbeat = HeartbeatTimer(
-                lambda: wire.send_message(cob_id, _PRE_OPERATIONAL_STATE), self._settings.host_heartbeat_s
-            )
-        if not self._lock_step:
+    def _resume_heartbeat(self) -> None:
+        """In lock-step time stands still outside the cycle, and nobody misses us."""
+        if self._heartbeat is not None and not self._lock_step:
             self._heartbeat.start()
 
     def _settle(self, cycle: Cycle) -> list[str]:
         """Cycle until every joint is off; names of those that are not in time."""
-        assert self._layout is not None
+        cycle_hz = self._layout.cycle_hz if self._layout else self.setup.cycle_hz
         for axis in self._axes.values():
             axis.disable()
         set_points = [SetPoint() for _ in self._axes]
-        period_ns = round(1e9 / self._layout.cycle_hz)
+        period_ns = round(1e9 / cycle_hz)
         deadline_ns = self.clock.now_ns()
         powered: list[str] = []
-        for _ in range(max(4, math.ceil(_SETTLE_S * self._layout.cycle_hz))):
+        for _ in range(max(4, math.ceil(_SETTLE_S * cycle_hz))):
             deadline_ns = max(deadline_ns + period_ns, self.clock.now_ns())
             self.clock.wait_until(deadline_ns)
             with contextlib.suppress(SafetyAbort):
@@ -495,39 +388,21 @@ class Cia402Driver:
                 cycle.exchange(set_points)
             powered = [name for name, axis in self._axes.items() if axis.state not in _OFF]
             if not powered:
-                return []
+                break
         return powered
 
     def _end_operation(self) -> None:
         """NMT pre-operational, whatever came before; what the cycle changed is no longer known."""
-        wire, decoder = self._wire, self._decoder
-        if wire is None or decoder is None:
+        fleet, decoder = self._fleet, self._decoder
+        if fleet is None or decoder is None:
             return
-        with contextlib.suppress(can.CanError, OSError):
-            wire.send_message(0, bytes([_NMT_PRE_OPERATIONAL, 0]))
-            wire.drain()
-        for at, drive in enumerate(self._drives.values()):
-            drive.forget(od.MODE, od.TARGET_TORQUE, od.TORQUE_OFFSET, od.TARGET_VELOCITY)
+        fleet.stamp_ns = self.clock.now_ns()
+        with contextlib.suppress(*_WIRE_ERRORS):
+            fleet.nmt(NMT_PRE_OPERATIONAL)
+            fleet.wire.drain()
+        fleet.stamp_ns = 0
+        fleet.forget_set_points()
+        for at, drive in enumerate(fleet.drives.values()):
             if decoder.restarted(at):
                 drive.forget()
-        if self._heartbeat is not None and not self._lock_step:
-            self._heartbeat.start()
-
-
-_OFF = (
-    DriveState.SWITCH_ON_DISABLED,
-    DriveState.NOT_READY,
-    DriveState.FAULT,
-    DriveState.UNKNOWN,
-)
-"""States without motor power from which nothing more can be asked; UNKNOWN: never reported, never enabled."""
-
-
-def _forget_after_boot(drive: Drive) -> Any:
-    """A boot-up frame says that nothing we wrote is there any more."""
-
-    def heartbeat(_can_id: int, data: bytearray, _timestamp: float) -> None:
-        if data and data[0] == 0:
-            drive.forget()
-
-    return heartbeat
+        self._resume_heartbeat()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BusLoad
-from frictid_drivers.cia402.facts import Facts, Scale, velocity_unit_rad_s
+from frictid_drivers.cia402.facts import Facts, Scale, scale_of, velocity_unit_rad_s
 from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_of
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
@@ -19,29 +19,28 @@ Said = Callable[..., Finding]
 """Makes a finding of the joint at hand: severity, message, next step."""
 
 _LIMIT_SLACK = 0.01
+_HOST_LOST = 0x8130
 _SLOW_STOP_S = 1.0
 
 
-def identity(
-    joint: JointSetup, drive: Drive, facts: Facts, scale: Scale, settings: JointSettings, cycle_hz: float
-) -> JointIdentity:
+def identity(joint: JointSetup, drive: Drive, facts: Facts, settings: JointSettings, cycle_hz: float) -> JointIdentity:
     """One drive's page of the provenance.
 
     Args:
         joint: of the robot file.
         drive: to read its manufacturer objects.
         facts: as read at ``open``.
-        scale: joint-side factors.
         settings: options of the joint.
         cycle_hz: rate, for the half cycle by which a cycle's torque is older than its SYNC.
     """
+    unit = drive.find(od.VELOCITY_UNIT)
+    scale, _ = scale_of(facts, joint, unit)
     known = read_settings(drive, facts.vendor, facts.product)
     values: dict[str, str | float | int | bool] = {setting.object.name: value for setting, value in known.items()}
     values["motor rated torque (6076), mN m"] = facts.rated_torque_mnm or 0
     for name, ratio in (("encoder (608F)", facts.encoder), ("gear (6091)", facts.gear), ("feed (6092)", facts.feed)):
         if ratio is not None:
             values[name] = f"{ratio[0]}:{ratio[1]}"
-    unit = drive.find(od.VELOCITY_UNIT)
     if unit is not None:
         values["velocity unit (60A9)"] = f"{unit:#010x}"
     assumed = Timing(torque_delay_s=0.5 / cycle_hz, uncertainty_s=0.5 / cycle_hz, source="assumed")
@@ -83,20 +82,23 @@ def no_sync_counter(facts: Mapping[str, Facts]) -> Finding:
     )
 
 
-def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, scale: Scale, settings: BusSettings) -> list[Finding]:
+def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, settings: BusSettings) -> list[Finding]:
     """Everything worth saying of one drive."""
     subject = f"joint {joint.name}"
+    # As ``configure`` will ask for.
+    scale, doubts = scale_of(facts, joint, None if facts.velocity_unit is None else od.MILLI_RPM)
 
     def said(severity: Severity, message: str, next_step: str = "") -> Finding:
         return Finding(severity, subject, message, next_step)
 
     findings = [
+        *doubts,
         said(
             Severity.OK,
             f"node {joint.address}: {facts.name or 'a drive'}, serial {facts.serial}, "
             f"firmware {facts.software or '?'}, {scale.rated_torque_nm:.4g} N m rated, "
             f"{abs(scale.position_rad):.3g} rad per count",
-        )
+        ),
     ]
     if facts.device_type & 0xFFFF != 402:
         findings.append(said(Severity.ERROR, f"device type {facts.device_type:#010x} (1000) is no CiA-402 drive"))
@@ -123,11 +125,20 @@ def _state(drive: Drive, said: Said) -> list[Finding]:
     status = drive.read(od.STATUSWORD)
     state = drive_state(status)
     error = drive.find(od.ERROR_CODE) or 0
-    if state in (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE):
+    if state is DriveState.ENABLED:
         findings.append(
             said(Severity.ERROR, f"the power stage is already on (statusword {status:#06x})", "switch the drive off")
         )
-    if state in (DriveState.FAULT, DriveState.FAULT_REACTION) or error:
+    if state is DriveState.QUICK_STOP_ACTIVE or (error == _HOST_LOST and state is DriveState.SWITCH_ON_DISABLED):
+        findings.append(
+            said(
+                Severity.WARNING,
+                f"an earlier run was cut off: the drive stopped by itself (statusword {status:#06x}, "
+                f"error {error:#06x})",
+                "make sure that nothing holds the arm; the drive is switched off before anything else",
+            )
+        )
+    elif state in (DriveState.FAULT, DriveState.FAULT_REACTION) or error:
         findings.append(
             said(
                 Severity.ERROR,
