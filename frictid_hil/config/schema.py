@@ -100,7 +100,8 @@ def validated(document: Document, model: type[Model], data: Mapping[str, Any] | 
     for error in errors:
         path = _existing(document, error["loc"])
         if error["type"] != "extra_forbidden" and not (error["type"] == "missing" and path in meant):
-            problems.append(FieldProblem(path, _message(path, error)))
+            message = _missing(document, model, path) if error["type"] == "missing" else _message(path, error)
+            problems.append(FieldProblem(path, message))
     raise document.error(problems, at_key=unknown)
 
 
@@ -114,10 +115,15 @@ def _unknown(model: type[Strict], path: KeyPath, near: str | None) -> str:
     return f"unknown key; did you mean {near}?" if near else f"unknown key; known here: {known}"
 
 
+def _missing(document: Document, model: type[Strict], path: KeyPath) -> str:
+    beside, _ = document.deepest(path[:-1])
+    strangers = [str(key) for key in beside.content if key not in _known_keys(model, path[:-1])]
+    near = difflib.get_close_matches(str(path[-1]), strangers, n=1, cutoff=0.7)
+    return f"missing; did you write it as {near[0]}?" if near else "missing"
+
+
 def _message(path: KeyPath, error: ErrorDetails) -> str:
     kind = error["type"]
-    if kind == "missing":
-        return "missing"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
     if kind in ("value_error", "assertion_error"):
         return message

@@ -1,0 +1,193 @@
+"""``nominal.yaml`` of an experiment set: what a simulator believes of one joint, and which recordings test it.
+
+Only ``joint`` and ``experiments`` are required. People keep notes in these files, so keys that mean nothing here are
+left alone - unless one looks like a misspelt key that is missing, which would quietly drop a belief.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+
+from frictid_hil.config.schema import Numbers, Strict, validated
+from frictid_hil.config.yaml import Document, KeyPath, read
+from frictid_hil.errors import ConfigError, FieldProblem
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Open(Strict):
+    """A section that may hold further keys."""
+
+    model_config = ConfigDict(extra="allow", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Friction(Open):
+    """Either pairs of the sliding curve, or Coulomb level and viscosity."""
+
+    velocity_rad_s: Numbers | None = None
+    torque_nm: Numbers | None = None
+    coulomb_nm: float | None = None
+    viscous_nm_s_per_rad: float | None = None
+    presliding_stiffness_nm_per_rad: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_curve(self) -> Friction:
+        if (self.velocity_rad_s is None) != (self.torque_nm is None):
+            raise ValueError("velocity_rad_s and torque_nm belong together")
+        if self.velocity_rad_s is not None and self.torque_nm is not None:
+            if self.coulomb_nm is not None:
+                raise ValueError("give pairs of velocity_rad_s and torque_nm, or coulomb_nm, not both")
+            if len(self.velocity_rad_s) != len(self.torque_nm):
+                raise ValueError(f"{len(self.velocity_rad_s)} velocities and {len(self.torque_nm)} torques")
+            if len(self.velocity_rad_s) < 2:
+                raise ValueError("a curve needs at least 2 pairs")
+            if min(self.velocity_rad_s) <= 0 or len(set(self.velocity_rad_s)) != len(self.velocity_rad_s):
+                raise ValueError("velocity_rad_s must be positive and each given once")
+        return self
+
+
+class Joint(Open):
+    """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's."""
+
+    inertia_kg_m2: Positive | None = None
+    motor_inertia_share: float | None = Field(default=None, ge=0, le=1)
+    gravity_torque_nm: float | None = None
+    gravity_cos_nm: float | None = None
+    gravity_sin_nm: float | None = None
+    gear_ratio: Positive | None = None
+    gear: str | None = None
+    friction: Friction | None = None
+
+    @model_validator(mode="after")
+    def _one_cosine(self) -> Joint:
+        if self.gravity_torque_nm is not None and self.gravity_cos_nm is not None:
+            raise ValueError("gravity_torque_nm and gravity_cos_nm are two names of one figure")
+        return self
+
+
+class Payload(Open):
+    """What is mounted on the link where an experiment says so."""
+
+    inertia_kg_m2: NotNegative | None = None
+    gravity_torque_nm: float | None = None
+
+
+class Controller(Open):
+    """The position loop."""
+
+    rate_hz: Positive
+    kp: NotNegative
+    ki: NotNegative | None = None
+    kd: NotNegative | None = None
+    velocity_filter_s: NotNegative | None = None
+    torque_limit_nm: Positive | None = None
+
+
+class Drive(Open):
+    """What the drive is known to do."""
+
+    rated_torque_nm: Positive | None = None
+    torque_quantum_nm: NotNegative | None = None
+    torque_delay_s: NotNegative | None = None
+    current_lag_s: NotNegative | None = None
+
+
+class Encoder(Open):
+    """What the encoder is known to do."""
+
+    side: str | None = None
+    resolution_rad: NotNegative | None = None
+    zero_offset_rad: float | None = None
+    velocity_filter_s: NotNegative | None = None
+
+
+class Experiment(Open):
+    """One recording."""
+
+    name: str = Field(min_length=1)
+    file: str | None = None
+    role: Literal["identification", "validation"]
+    payload: bool = False
+    run_order: int | None = None
+    duration_s: NotNegative | None = None
+
+
+class NominalFile(Open):
+    """The whole file."""
+
+    joint: Joint
+    payload: Payload | None = None
+    controller: Controller | None = None
+    drive: Drive | None = None
+    encoder: Encoder | None = None
+    experiments: Annotated[
+        tuple[Experiment, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v), Field(min_length=1)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class NominalSet:
+    """A ``nominal.yaml``, read and checked.
+
+    Attributes:
+        file: its values.
+        document: where they stand; ``document.data`` is the plain mapping, further keys included.
+    """
+
+    file: NominalFile
+    document: Document
+
+
+def load_nominal(path: Path) -> NominalSet:
+    """Read and check a ``nominal.yaml``.
+
+    Args:
+        path: of the file, or of the folder that holds it.
+
+    Raises:
+        ConfigError: unreadable or wrong, every problem with file:line:column.
+    """
+    if path.is_dir():
+        path = path / "nominal.yaml"
+        if not path.exists():
+            raise ConfigError("no nominal.yaml in this folder", where=str(path.parent), cause="not an experiment set")
+    document = read(path)
+    file = validated(document, NominalFile)
+    misspelt = list(_misspelt(file, ()))
+    if misspelt:
+        raise document.error(misspelt, at_key=[problem.path for problem in misspelt])
+    twice = list(_named_twice(file))
+    if twice:
+        raise document.error(twice)
+    return NominalSet(file, document)
+
+
+def _misspelt(section: Any, path: KeyPath) -> Iterator[FieldProblem]:
+    """Further keys that look like a known one which is missing."""
+    if isinstance(section, tuple):
+        for index, item in enumerate(section):
+            yield from _misspelt(item, (*path, index))
+    if not isinstance(section, Open):
+        return
+    absent = [name for name in type(section).model_fields if name not in section.model_fields_set]
+    for key in section.model_extra or {}:
+        near = difflib.get_close_matches(key, absent, n=1, cutoff=0.8)
+        if near:
+            yield FieldProblem((*path, key), f"unknown key; did you mean {near[0]}?")
+    for name in section.model_fields_set & set(type(section).model_fields):
+        yield from _misspelt(getattr(section, name), (*path, name))
+
+
+def _named_twice(file: NominalFile) -> Iterator[FieldProblem]:
+    seen: dict[str, int] = {}
+    for index, experiment in enumerate(file.experiments):
+        first = seen.setdefault(experiment.name, index)
+        if first != index:
+            yield FieldProblem(("experiments", index, "name"), f"{experiment.name!r} is also experiment {first}")
