@@ -238,6 +238,49 @@ def _with(drive: Drive, name: str, value: float) -> Drive:
     return Drive(**{**numbers, _FIELD[name]: value})
 
 
+def structured_share(recordings: Sequence[Recording], controller: Controller, drive: Drive) -> float:
+    """Share of what the drive leaves of the actuation channel that follows command and motion, held out.
+
+    Noise follows neither. What does is a fault of the command path that no effect describes (a wrong gain, say).
+    """
+    logs = [r for r in recordings if r.actuation_nm is not None]
+    fit, judge = [], []
+    for recording in logs:
+        e = recording.experiment
+        assert e.position_command_rad is not None
+        low_pass = LowPass.at(1.0 / recording.step_s)
+        error = e.position_command_rad - e.position_rad
+        velocity = np.gradient(e.position_rad, recording.step_s)
+        demand = demand_of(controller, e, recording.step_s, drive.velocity_lag_s)
+        columns = np.stack(
+            [
+                error,
+                np.cumsum(error) * recording.step_s,
+                np.gradient(e.position_command_rad, recording.step_s),
+                velocity,
+                np.sign(velocity),
+                demand - demand[0],
+                np.gradient(demand, recording.step_s),
+                np.ones_like(error),
+            ],
+            axis=1,
+        )
+        table = low_pass(np.concatenate([columns, residual(recording, controller, drive)[:, None]], axis=1))[5:-5:4]
+        half = table.shape[0] // 2
+        fit.append(table[:half])
+        judge.append(table[half:])
+    explained = total = 0.0
+    for one, other in ((fit, judge), (judge, fit)):
+        known, unseen = np.concatenate(one), np.concatenate(other)
+        scale = np.maximum(np.std(known[:, :-1], axis=0), 1e-12)
+        scale[-1] = 1.0
+        weights = np.linalg.lstsq(known[:, :-1] / scale, known[:, -1], rcond=None)[0]
+        left = unseen[:, -1] - unseen[:, :-1] / scale @ weights
+        total += float(np.sum(unseen[:, -1] ** 2))
+        explained += float(np.sum(unseen[:, -1] ** 2) - np.sum(left**2))
+    return max(0.0, explained / total) if total > 0.0 else 0.0
+
+
 def _intervals(
     drive: Drive, found: Mapping[str, float], squares: Callable[[Drive], float], least: float, rows: int
 ) -> dict[str, float]:

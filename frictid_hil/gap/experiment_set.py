@@ -328,7 +328,9 @@ def read_log(path: Path) -> dict[str, Array]:
         raise InputFileError(f"{table.shape[0]} rows of samples; at least 2 are needed", where=where)
     if table.shape[1] != len(header):
         raise InputFileError(f"{len(header)} names in the header, {table.shape[1]} columns", where=where)
-    columns: dict[str, Array] = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(header) if name in COLUMNS}
+    columns: dict[str, Array] = {
+        name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(header) if name in COLUMNS
+    }
     for name in ("time_s", "position_rad"):
         if name not in columns:
             raise InputFileError(f"no column {name}", where=where, cause=f"found {', '.join(header)}")

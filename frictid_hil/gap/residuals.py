@@ -10,6 +10,7 @@ parts differently makes every healthy joint look as if it had backlash.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -73,6 +74,15 @@ class LowPass:
         filtered: Array = signal.filtfilt(b, a, columns, axis=0, padlen=padding)
         return filtered
 
+    def thinned(self, columns: Array) -> Array:
+        """Every ``stride``-th row of the filtered columns, by the filter's own impulse response: shape (m, k)."""
+        taps = _impulse_response(self.rate_hz, self.cutoff_hz)
+        half = min(taps.size // 2, columns.shape[0] - 1)
+        taps = taps[taps.size // 2 - half : taps.size // 2 + half + 1]
+        first, last = 2.0 * columns[0], 2.0 * columns[-1]
+        padded = np.concatenate([first - columns[half:0:-1], columns, last - columns[-2 : -half - 2 : -1]])
+        return _decimated(np.ascontiguousarray(padded), taps, self.stride)
+
     @property
     def stride(self) -> int:
         """Thinning that loses nothing after the filter."""
@@ -84,6 +94,27 @@ class LowPass:
         b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
         _, response = signal.freqz(b, a, worN=2048)
         return float(np.sqrt(np.mean(np.abs(response) ** 4)))
+
+
+@functools.cache
+def _impulse_response(rate_hz: float, cutoff_hz: float) -> Array:
+    b, a = signal.butter(4, cutoff_hz / (0.5 * rate_hz))
+    half = int(3.0 * rate_hz / cutoff_hz)
+    pulse = np.zeros(4 * half + 1)
+    pulse[2 * half] = 1.0
+    response: Array = signal.filtfilt(b, a, pulse)[half : 3 * half + 1]
+    return response
+
+
+@njit(cache=True, fastmath=True)
+def _decimated(padded: Array, taps: Array, stride: int) -> Array:
+    rows = (padded.shape[0] - taps.size) // stride + 1
+    out = np.zeros((rows, padded.shape[1]))
+    for row in range(rows):
+        for tap in range(taps.size):
+            for column in range(padded.shape[1]):
+                out[row, column] += taps[tap] * padded[row * stride + tap, column]
+    return out
 
 
 def rms(values: Array) -> float:

@@ -63,6 +63,18 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
+def fall(shape: Shape, coefficients: Array) -> dict[str, float]:
+    """Shares at the power that makes the larger one 0.3: a recording knows only the product of share and warmth."""
+    coulomb, viscous = float(coefficients[0]), float(coefficients[1])
+    scale = 0.3 / max(abs(coulomb), abs(viscous), 1e-12)
+    return {
+        "coulomb_share": coulomb * scale,
+        "viscous_share": viscous * scale,
+        "power_w": POWER_W * scale,
+        "time_constant_s": shape["time_constant_s"],
+    }
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -110,12 +122,7 @@ EFFECT = Effect(
     inverse=InverseForm(
         shapes=grid(time_constant_s=(15.0, 40.0, 100.0, 300.0)),
         regressors=regressors,
-        parameters=lambda shape, coefficients: {
-            "coulomb_share": float(coefficients[0]),
-            "viscous_share": float(coefficients[1]),
-            "power_w": POWER_W,
-            **shape,
-        },
+        parameters=fall,
     ),
     state_size=1,
     carried=True,

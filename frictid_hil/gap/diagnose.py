@@ -1,0 +1,378 @@
+"""The diagnosis: which effects a simulator lacks, found on the identification logs and judged on the validation logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share
+from frictid_hil.gap.confidence import confidence
+from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
+from frictid_hil.gap.evidence import Evidence, acceleration_gain
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.forward import Replay, Replayed, pooled, why_not
+from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, needed, shares
+from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
+from frictid_hil.gap.next_experiment import next_experiment
+from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
+from frictid_hil.gap.where import where
+from frictid_hil.gap.which import Ranking, rank, replacements
+from frictid_hil.simulation.effects import all_effects
+
+FAMILY_SHARE = 0.25
+"""Share of what is left that a family without a cause may explain before the answer is unknown."""
+FAMILY_AHEAD = 0.07
+"""How far such a family alone may be ahead of the library's effects."""
+HELD_SHARE = 0.002
+"""Share of repeated positions in motion from which the position itself is in doubt."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Channels:
+    kinematic: KinematicFit
+    actuation: ActuationFit | None
+    drive: dict[str, dict[str, float]]
+    unexplained_actuation: float
+
+
+def diagnose(
+    experiments: ExperimentSet, *, time_budget_s: float | None = None, library: Collection[str] | None = None
+) -> Diagnosis:
+    """Diagnose one joint; deterministic.
+
+    Args:
+        experiments: nominal joint and recordings.
+        time_budget_s: stop refining rivals after this time; None for as long as it takes.
+        library: names of the effects that may be used; all of them unless given.
+    """
+    from frictid_hil.gap.partial import diagnose_without_replay
+
+    del time_budget_s
+    allowed = tuple(n for n in all_effects() if library is None or n in library)
+    logs = recordings(experiments)
+    reason = why_not(experiments)
+    usable = [r for r in logs if r.plant_nm is not None]
+    if reason is not None or not usable or not any(not r.experiment.validation for r in usable):
+        return diagnose_without_replay(experiments, logs, allowed, reason)
+    return _full(experiments, logs, allowed)
+
+
+def _full(experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[str, ...]) -> Diagnosis:
+    nominal = experiments.nominal
+    channels = drive_channels(experiments, logs, allowed)
+    evidence = Evidence(logs, channels.kinematic.step_rad, allowed, None)
+    ranking = rank(evidence)
+    replay = Replay(experiments)
+    judged = [r for r in logs if r.experiment.validation] or list(logs)
+    has_validation = any(r.experiment.validation for r in logs)
+    low_pass = LowPass.at(1.0 / logs[0].step_s)
+    coulomb, _ = friction_scales(nominal)
+    noise = _actuation_left(judged, experiments, channels, low_pass)
+    floor = math.hypot(noise, TOLERANCE_SHARE * coulomb)
+
+    bare = replay({}, validation=True if has_validation else None)
+    before_nm = pooled(bare, "torque_nm")
+    drive = _needed_drive(replay, channels, judged, low_pass, before_nm, floor, experiments, has_validation)
+    judge = Judge(replay, evidence, drive, has_validation)
+    hypothesis = needed(judge, choose(judge, ranking, floor), floor)
+    after = judge.judged(hypothesis.effects)
+    after_nm = pooled(after, "torque_nm")
+    effects = sorted({g[0] for g in evidence.groups if not g[0].startswith("family ")})
+    from frictid_hil.gap.which import Model, best_family
+
+    bare_score = evidence.score(())
+    model = Model(hypothesis.groups, evidence.score(hypothesis.groups) - bare_score)
+    rivals = replacements(evidence, model, effects, bare_score)
+    family = best_family(evidence, hypothesis.groups)
+    family_share = family[0] / max(1.0, 0.5 * evidence.misfit_ratio(hypothesis.groups) * ranking.rows)
+    names = (*drive, *hypothesis.names)
+    features = Features(
+        before=before_nm / floor,
+        after=after_nm / floor,
+        misfit=evidence.misfit_ratio(hypothesis.groups),
+        misfit_before=ranking.misfit,
+        family_share=family_share,
+        family_gain=family[0],
+        family_name=family[1],
+        family_alone=ranking.family_alone[0] / max(1.0, model.gain),
+        actuation_left=channels.unexplained_actuation,
+        held_share=channels.kinematic.held_share,
+        names=names,
+        gain=model.gain,
+        rivals=rivals,
+        rival_drive=dict(channels.actuation.rivals) if channels.actuation is not None else {},
+        coarse=channels.kinematic.step_factor,
+        floor_nm=floor,
+    )
+    return _conclude(
+        experiments,
+        logs,
+        judged,
+        judge,
+        hypothesis,
+        drive,
+        features,
+        bare,
+        after,
+        evidence,
+        ranking,
+        noise,
+        low_pass,
+        channels,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """The figures that the verdict rests on."""
+
+    before: float
+    after: float
+    misfit: float
+    misfit_before: float
+    family_share: float
+    family_gain: float
+    family_name: str
+    family_alone: float
+    actuation_left: float
+    held_share: float
+    names: tuple[str, ...]
+    gain: float
+    rivals: Mapping[str, tuple[float, str]]
+    rival_drive: Mapping[str, float]
+    coarse: float
+    floor_nm: float
+
+
+def verdict_of(f: Features) -> tuple[str, str]:
+    """(verdict, where it lives if unknown)."""
+    if f.actuation_left > 0.3:
+        return "unknown", "actuation"
+    if f.held_share > HELD_SHARE:
+        return "unknown", "kinematics: positions repeat while the joint moves"
+    if not f.names:
+        return ("unknown", f.family_name) if f.before > 1.6 else ("none", "")
+    plant = bool(f.rivals)
+    if plant and f.family_alone > 1.0 + FAMILY_AHEAD and f.after > 1.15:
+        return "unknown", f.family_name
+    if f.after > 1.25 and f.family_share > FAMILY_SHARE:
+        return "unknown", f.family_name
+    if f.after > 2.0 and f.misfit > 3.0 and f.coarse <= 1.5 and f.after > 0.25 * f.before:
+        return "unknown", f.family_name
+    return "explained", ""
+
+
+def drive_channels(experiments: ExperimentSet, logs: Sequence[Recording], allowed: Sequence[str]) -> _Channels:
+    """What the kinematic and the actuation channel say."""
+    nominal = experiments.nominal
+    kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s)
+    drive: dict[str, dict[str, float]] = {}
+    lag_s = 0.0
+    if "velocity_lag" in allowed and kinematic.lag_share > 0.5 and kinematic.before_rad_s > 1e-3:
+        lag_s = kinematic.velocity_lag_s
+        drive["velocity_lag"] = {"time_constant_s": lag_s}
+    if "encoder_quantisation" in allowed and kinematic.step_factor > 1.5:
+        drive["encoder_quantisation"] = {"step_rad": kinematic.step_rad}
+    actuation = None
+    left = 0.0
+    if nominal.controller is not None and any(r.actuation_nm is not None for r in logs):
+        believed = Drive(nominal.torque_delay_s, nominal.current_lag_s)
+        # The controller's own velocity may lag too; that is a fact of the recording, whatever effect it is called.
+        actuation = fit_actuation(logs, nominal.controller, believed, allowed, lag_s)
+        left = structured_share(logs, nominal.controller, actuation.drive)
+        if "torque_delay" in actuation.found:
+            drive["torque_delay"] = {"delay_s": actuation.drive.delay_s}
+        if "electrical_lag" in actuation.found:
+            drive["electrical_lag"] = {"time_constant_s": actuation.drive.lag_s}
+        if "torque_saturation" in actuation.found:
+            limit = nominal.controller.torque_limit_nm
+            if math.isfinite(limit):
+                drive["torque_saturation"] = {"limit_share": min(1.0, actuation.drive.limit_nm / limit)}
+    return _Channels(kinematic, actuation, drive, left)
+
+
+def _actuation_left(
+    judged: Sequence[Recording], experiments: ExperimentSet, channels: _Channels, low_pass: LowPass
+) -> float:
+    """RMS that the actuation channel keeps once the drive is right: the noise of the torque, low-passed."""
+    controller = experiments.nominal.controller
+    if channels.actuation is None or controller is None:
+        return 0.0
+    return rms(np.concatenate([low_pass(channels.actuation.residual(r, controller)) for r in judged]))
+
+
+def _needed_drive(
+    replay: Replay,
+    channels: _Channels,
+    judged: Sequence[Recording],
+    low_pass: LowPass,
+    before_nm: float,
+    floor: float,
+    experiments: ExperimentSet,
+    has_validation: bool,
+) -> dict[str, dict[str, float]]:
+    """Drive effects without those that matter less than the floor."""
+    kept: dict[str, dict[str, float]] = {}
+    controller = experiments.nominal.controller
+    for name, values in channels.drive.items():
+        if name == "velocity_lag":
+            kept[name] = values
+        elif name == "encoder_quantisation":
+            view = judged[0].view
+            assert view is not None
+            inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
+            noise = inertia * values["step_rad"] / math.sqrt(12.0) * acceleration_gain(low_pass)
+            stuck = view.stiffness_nm_per_rad * values["step_rad"] / math.sqrt(12.0) * 0.2
+            if math.hypot(noise, stuck) > 0.6 * floor:
+                kept[name] = values
+        else:
+            assert channels.actuation is not None and controller is not None
+            left = rms(np.concatenate([low_pass(r.actuation_nm) for r in judged if r.actuation_nm is not None]))
+            fitted = rms(np.concatenate([low_pass(channels.actuation.residual(r, controller)) for r in judged]))
+            single = len(channels.actuation.found) <= 1
+            if left**2 - fitted**2 > (0.6 * fitted) ** 2 or (not single and left > 1.2 * fitted):
+                kept[name] = values
+    return kept
+
+
+def _conclude(
+    experiments: ExperimentSet,
+    logs: Sequence[Recording],
+    judged: Sequence[Recording],
+    judge: Judge,
+    hypothesis: Hypothesis,
+    drive: Mapping[str, Mapping[str, float]],
+    features: Features,
+    bare: Mapping[str, Replayed],
+    after: Mapping[str, Replayed],
+    evidence: Evidence,
+    ranking: Ranking,
+    noise_nm: float,
+    low_pass: LowPass,
+    channels: _Channels,
+) -> Diagnosis:
+    verdict, place = verdict_of(features)
+    names = features.names
+    shapley = shares(judge, hypothesis, names) if names else {}
+    inverse_before, inverse_after = _inverse(evidence, hypothesis)
+    view = judged[0].view
+    assert view is not None
+    inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
+    step = experiments.nominal.encoder_resolution_rad or 0.0
+    encoder = inertia * step / math.sqrt(12.0) * acceleration_gain(low_pass)
+    floor = Figures(math.hypot(noise_nm, encoder), noise_nm, step / math.sqrt(12.0) if step else None)
+    before = Figures(inverse_before, pooled(bare, "torque_nm"), pooled(bare, "position_rad"))
+    closed = 0.0
+    if before.forward_torque_nm and before.forward_torque_nm > noise_nm:
+        rest = pooled(after, "torque_nm") ** 2 - noise_nm**2
+        closed = 100.0 * (1.0 - max(0.0, rest) / max(1e-30, before.forward_torque_nm**2 - noise_nm**2))
+    causes = []
+    for name in names:
+        rival_gain, rival = features.rivals.get(name, (0.0, ""))
+        chance, confusable = confidence(name, features)
+        causes.append(
+            Cause(
+                effect=name,
+                confidence=chance if verdict == "explained" else min(chance, 0.4),
+                parameters=_values(name, hypothesis, channels, drive),
+                confusable_with=confusable,
+                gap_closed_percent=round(closed * shapley.get(name, 0.0), 2),
+            )
+        )
+        del rival_gain, rival
+    causes.sort(key=lambda c: -(c.gap_closed_percent or 0.0) * (0.25 + c.confidence))
+    reasons: dict[str, str] = {}
+    upcoming = None
+    if verdict == "explained" and causes and causes[0].confidence < 0.6 and causes[0].confusable_with:
+        verdict = "ambiguous"
+        rival = causes[0].confusable_with[0]
+        upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
+        if len(causes) == 1:
+            causes.append(Cause(rival, round(min(0.5, 1.0 - causes[0].confidence), 3), {}, (causes[0].effect,), None))
+    applied = verdict == "explained"
+    result = Figures(inverse_after, pooled(after, "torque_nm"), pooled(after, "position_rad")) if applied else before
+    if verdict == "unknown":
+        reasons["cause"] = f"no effect of the library explains the gap; it lives in: {place}"
+    if verdict in ("unknown", "ambiguous"):
+        reasons["after"] = "nothing is applied on this verdict, so the gap after is the gap before"
+    if not any(r.experiment.validation for r in logs):
+        reasons["gap"] = "the set has no validation log; figures are of the logs that were fitted"
+    places = where(judged, encoder)
+    return Diagnosis(
+        name=experiments.name,
+        verdict=verdict,
+        causes=tuple(causes) if verdict != "none" else (),
+        where=places,
+        before=before,
+        after=result,
+        noise_floor=floor,
+        per_log=_per_log(bare, after if applied else bare),
+        next_experiment=upcoming,
+        reasons=reasons,
+        summary=_summary(experiments.name, verdict, causes, places, closed, place),
+        model=judge.replay.model(hypothesis.effects if applied else {}),
+        held_out={m.effects[0]: round(100.0 * (_ratio(evidence, m) - 1.0), 2) for m in ranking.singles},
+    )
+
+
+def _ratio(evidence: Evidence, model: object) -> float:
+    from frictid_hil.gap.which import Model
+
+    assert isinstance(model, Model)
+    return evidence.misfit_ratio(model.groups) / evidence.misfit_ratio(())
+
+
+def _inverse(evidence: Evidence, hypothesis: Hypothesis) -> tuple[float, float]:
+    """(before, after) RMS of the plant channel on the validation logs (all where there are none), N m."""
+    chosen = [k for k, r in enumerate(evidence.recordings) if r.experiment.validation]
+    chosen = chosen or list(range(len(evidence.recordings)))
+    left = np.concatenate([evidence.explained_nm(k, hypothesis.groups)[0] for k in chosen])
+    there = np.concatenate([evidence.explained_nm(k, hypothesis.groups)[1] for k in chosen])
+    return rms(there), rms(left)
+
+
+def _values(
+    name: str, hypothesis: Hypothesis, channels: _Channels, drive: Mapping[str, Mapping[str, float]]
+) -> dict[str, Value]:
+    result = {}
+    limits = {p.name: p for p in all_effects()[name].parameters}
+    for parameter, value in hypothesis.effects.get(name, drive.get(name, {})).items():
+        width = hypothesis.intervals.get((name, parameter))
+        if name in drive and channels.actuation is not None and name in channels.actuation.intervals:
+            width = channels.actuation.intervals[name]
+        if parameter not in limits:
+            continue
+        if width is None or not math.isfinite(width):
+            result[parameter] = Value(value)
+        else:
+            result[parameter] = Value(value, value - width, value + width)
+    return result
+
+
+def _per_log(bare: Mapping[str, Replayed], after: Mapping[str, Replayed]) -> dict[str, dict[str, Figures]]:
+    def figures(d: Replayed) -> Figures:
+        return Figures(None, rms(d.torque_nm), rms(d.position_rad))
+
+    return {log: {"before": figures(bare[log]), "after": figures(after[log])} for log in bare}
+
+
+def _summary(
+    name: str, verdict: str, causes: Sequence[Cause], places: Sequence[object], closed: float, place: str
+) -> str:
+    from frictid_hil.gap.diagnosis import Where
+
+    first = places[0] if places else None
+    lives = f"{100 * first.share_of_gap:.0f} % of the gap sits {first.description}" if isinstance(first, Where) else ""
+    if verdict == "none":
+        return f"{name}: no gap beyond noise and the nominal model's tolerances."
+    if verdict == "unknown":
+        return f"{name}: {lives}; no known effect explains it ({place})."
+    effects = " and ".join(f"{c.effect} ({c.confidence:.2f})" for c in causes)
+    if verdict == "ambiguous":
+        return f"{name}: {lives}; these recordings cannot decide between {effects}."
+    return (
+        f"{name}: {lives}; {effects} explains it; adding it closes {closed:.0f} % on recordings not used for fitting."
+    )

@@ -1,0 +1,162 @@
+"""The result of a diagnosis as a value, and its JSON form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from frictid_hil.simulation.joint import JointModel
+
+SCHEMA = "frictid.gap_diagnosis/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A fitted number with its 95 % interval; ends are None where no interval can be formed."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One effect that explains a part of the gap.
+
+    Attributes:
+        effect: name.
+        confidence: calibrated chance that this effect is really there, 0..1.
+        parameters: by name with unit; empty for an alternative that was not taken.
+        confusable_with: effects that this recording can hardly tell from it.
+        gap_closed_percent: its own part of what closing the gap achieved, or None.
+    """
+
+    effect: str
+    confidence: float
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    confusable_with: tuple[str, ...] = ()
+    gap_closed_percent: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """A part of the recordings and its share of the squared gap; the shares of a diagnosis add up to 1."""
+
+    region: str
+    share_of_gap: float
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """RMS differences on validation logs; None where they cannot be formed."""
+
+    inverse_nm: float | None = None
+    forward_torque_nm: float | None = None
+    forward_position_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NextExperiment:
+    """What to record to decide between two causes."""
+
+    description: str
+    duration_s: float
+    separates: tuple[str, ...]
+    plan: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Where the gap lies, what causes it, how far it closes.
+
+    Attributes:
+        name: of the experiment set.
+        verdict: ``none``, ``explained``, ``ambiguous`` or ``unknown``.
+        causes: ranked, the likeliest first.
+        where: shares of the gap.
+        before: gap of the nominal joint.
+        after: gap with the causes added.
+        noise_floor: what noise alone leaves.
+        per_log: before and after by validation log.
+        next_experiment: where the verdict is ambiguous.
+        reasons: why a figure is None, or what could not be concluded, by subject.
+        summary: one sentence.
+        model: the joint with its causes added, where the closed loop can be simulated.
+        held_out: by effect, change of the held-out squares when it alone is added, percent.
+    """
+
+    name: str
+    verdict: str
+    causes: tuple[Cause, ...]
+    where: tuple[Where, ...]
+    before: Figures
+    after: Figures
+    noise_floor: Figures
+    per_log: Mapping[str, Mapping[str, Figures]] = field(default_factory=dict)
+    next_experiment: NextExperiment | None = None
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    summary: str = ""
+    model: JointModel | None = None
+    held_out: Mapping[str, float] = field(default_factory=dict)
+
+    def improved_model(self) -> JointModel | None:
+        """The joint with the named causes added; the nominal joint where nothing is applied; None without a controller.
+
+        Nothing is applied when the verdict is ``unknown`` or ``ambiguous``.
+        """
+        return self.model
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for ``gap diagnose --json``."""
+        return {
+            "schema": SCHEMA,
+            "set": self.name,
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "causes": [
+                {
+                    "effect": c.effect,
+                    "confidence": c.confidence,
+                    "parameters": {
+                        n: {"value": v.value, "interval_95": None if v.low is None else [v.low, v.high]}
+                        for n, v in c.parameters.items()
+                    },
+                    "confusable_with": list(c.confusable_with),
+                    "gap_closed_percent": c.gap_closed_percent,
+                }
+                for c in self.causes
+            ],
+            "where": [
+                {"region": w.region, "share_of_gap": w.share_of_gap, "description": w.description} for w in self.where
+            ],
+            "gap": {
+                "before": _figures(self.before),
+                "after": _figures(self.after),
+                "noise_floor": _figures(self.noise_floor),
+                "per_log": {
+                    log: {when: _figures(f) for when, f in figures.items()} for log, figures in self.per_log.items()
+                },
+            },
+            "next_experiment": None
+            if self.next_experiment is None
+            else {
+                "description": self.next_experiment.description,
+                "duration_s": self.next_experiment.duration_s,
+                "separates": list(self.next_experiment.separates),
+                "plan": dict(self.next_experiment.plan),
+            },
+            "held_out_change_percent": dict(self.held_out),
+            "reasons": dict(self.reasons),
+        }
+
+
+def _figures(figures: Figures) -> dict[str, float | None]:
+    values = {
+        "inverse_nm": figures.inverse_nm,
+        "forward_torque_nm": figures.forward_torque_nm,
+        "forward_position_rad": figures.forward_position_rad,
+    }
+    return {name: value if value is None or math.isfinite(value) else None for name, value in values.items()}

@@ -1,0 +1,260 @@
+"""The joint simulated again along the recorded commands, with and without effects: the product's own simulator.
+
+Closed loop only: the controller pulls a simulated joint back to its command as it does the real one, so a small error
+of the model stays a small difference of torque and does not grow into another motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.residuals import LowPass, friction_scales, rms
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
+from frictid_hil.simulation.replay import Controller, closed_loop
+
+Effects = Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """Recorded minus simulated, low-passed once; arrays of shape (n,)."""
+
+    torque_nm: Array
+    position_rad: Array
+
+
+def why_not(experiments: ExperimentSet) -> str | None:
+    """Why nothing can be simulated again, or None where it can."""
+    nominal = experiments.nominal
+    if nominal.controller is None:
+        return "the nominal joint names no controller, so its closed loop cannot be simulated again"
+    if nominal.inertia_kg_m2 is None or nominal.inertia_kg_m2 <= 0.0:
+        return "the nominal joint has no inertia"
+    if nominal.curve is None:
+        return "the nominal joint has no friction curve"
+    if any(e.rigid_body_torque_nm is not None for e in experiments.experiments):
+        return "the rigid-body torque comes from elsewhere, so the joint alone cannot be simulated"
+    if any(e.position_command_rad is None for e in experiments.experiments):
+        return "a log has no position command"
+    return None
+
+
+def nominal_model(nominal: Nominal) -> JointModel:
+    """The nominal joint as the simulator's own value; call only where ``why_not`` is None."""
+    assert nominal.inertia_kg_m2 is not None and nominal.curve is not None and nominal.controller is not None
+    gear_ratio = nominal.gear_ratio or 1.0
+    step = nominal.encoder_resolution_rad or 0.0
+    _, stiffness = friction_scales(nominal)
+    rated = nominal.rated_torque_nm or 1.0
+    quantum = nominal.torque_quantum_nm or 0.0
+    effects: dict[str, dict[str, float]] = {}
+    if nominal.torque_delay_s > 0.0:
+        effects["torque_delay"] = {"delay_s": nominal.torque_delay_s}
+    if nominal.current_lag_s > 0.0:
+        effects["electrical_lag"] = {"time_constant_s": nominal.current_lag_s}
+    payload = nominal.payload
+    return JointModel(
+        inertia_kg_m2=nominal.inertia_kg_m2,
+        motor_inertia_share=nominal.motor_inertia_share or 0.3,
+        gravity_cos_nm=nominal.gravity_cos_nm,
+        gravity_sin_nm=nominal.gravity_sin_nm,
+        gear_ratio=gear_ratio,
+        friction=nominal.curve,
+        presliding_stiffness_nm_per_rad=stiffness,
+        encoder=Encoder("motor", 2.0 * math.pi / (step * gear_ratio) if step > 0.0 else 0.0),
+        drive=Drive(
+            rated, nominal.controller.torque_limit_nm, 1000.0 * quantum / rated, 0.0, nominal.velocity_filter_s
+        ),
+        servo=ServoGains(
+            nominal.controller.kp_nm_per_rad, nominal.controller.ki_nm_per_rad_s, nominal.controller.kd_nm_s_per_rad
+        ),
+        payload=None if payload is None else Payload(payload.inertia_kg_m2, payload.gravity_cos_nm),
+    ).with_effects(effects)
+
+
+def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
+    """The effect's own parameters among ``values``, within its bounds."""
+    limits = {p.name: p for p in all_effects()[name].parameters}
+    return {k: float(np.clip(v, limits[k].lower, limits[k].upper)) for k, v in values.items() if k in limits}
+
+
+class Replay:
+    """Replays of one experiment set; the nominal model may carry any effects."""
+
+    def __init__(self, experiments: ExperimentSet) -> None:
+        self._experiments = experiments.experiments
+        self._nominal = nominal_model(experiments.nominal)
+        controller = experiments.nominal.controller
+        assert controller is not None
+        self._controller = Controller(
+            kp_nm_per_rad=controller.kp_nm_per_rad,
+            ki_nm_per_rad_s=controller.ki_nm_per_rad_s,
+            kd_nm_s_per_rad=controller.kd_nm_s_per_rad,
+            rate_hz=controller.rate_hz,
+            velocity_filter_s=controller.velocity_filter_s,
+            torque_limit_nm=controller.torque_limit_nm,
+        )
+
+    def model(self, effects: Effects) -> JointModel:
+        """The nominal joint with effects added (to those it already has)."""
+        merged = {name: dict(values) for name, values in self._nominal.effects.items()}
+        for name, values in effects.items():
+            merged[name] = {**merged.get(name, {}), **bounded(name, values)}
+        return self._nominal.with_effects(merged)
+
+    def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
+        """Differences by experiment name.
+
+        Args:
+            effects: parameters by effect.
+            validation: only those logs, only the others, or all (None). Warmth carries over in run order, so earlier
+                logs are simulated too where an effect remembers.
+        """
+        model = self.model(effects)
+        carried = any(all_effects()[name].carried for name in effects)
+        state = None
+        result: dict[str, Replayed] = {}
+        for experiment in self._experiments:
+            wanted = validation is None or experiment.validation == validation
+            if not wanted and not carried:
+                continue
+            difference, state = self._one(model, experiment, state)
+            if wanted:
+                result[experiment.name] = difference
+        return result
+
+    def _one(self, model: JointModel, experiment: Experiment, state: object) -> tuple[Replayed, object]:
+        command = experiment.position_command_rad
+        assert command is not None
+        rows = closed_loop(
+            model,
+            self._controller,
+            experiment.time_s,
+            command,
+            payload=experiment.payload,
+            state=state,  # type: ignore[arg-type]
+        )
+        low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
+        measured = experiment.torque_nm
+        torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
+        return Replayed(low_pass(torque), low_pass(experiment.position_rad - rows.position_rad)), rows.state
+
+
+def pooled(differences: Mapping[str, Replayed], part: str) -> float:
+    """RMS over all rows of the given logs of ``torque_nm`` or ``position_rad``."""
+    return rms(np.concatenate([getattr(d, part) for d in differences.values()]))
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Effects with parameters refined by replay.
+
+    Attributes:
+        effects: parameters by effect.
+        intervals: half widths of 95 % intervals by (effect, parameter).
+        squares_before: mean square of the torque difference on the identification logs, before refinement.
+        squares: after.
+    """
+
+    effects: dict[str, dict[str, float]]
+    intervals: dict[tuple[str, str], float]
+    squares_before: float
+    squares: float
+
+
+FIXED = frozenset(
+    {
+        "cycles_per_motor_revolution",
+        "second_cycles_per_motor_revolution",
+        "power_w",
+        "rise_c",
+        "contact_relaxation_s",
+        "relaxation_s",
+        "step_rad",
+        "quadratic_per_nm",
+        "limit_share",
+        "loop_beta",
+    }
+)
+"""Parameters that a replay is not asked to refine: read elsewhere, or without a clear trace of their own."""
+
+
+def refine(replay: Replay, effects: Effects, rounds: int = 3) -> Refined:
+    """Refine parameters by damped Gauss-Newton steps on the identification logs' torque, within the effects' bounds.
+
+    Drive effects are left alone: the actuation channel sees them sample by sample, which a replay does not do better.
+    """
+    drive = {"torque_delay", "electrical_lag", "torque_saturation", "velocity_lag", "encoder_quantisation"}
+    current = {name: all_effects()[name].complete(bounded(name, values)) for name, values in effects.items()}
+    free: list[tuple[str, str, float, float, float]] = []
+    for name in current:
+        if name in drive:
+            continue
+        for p in all_effects()[name].parameters:
+            if p.name in FIXED or p.name not in effects[name]:
+                continue
+            if p.name.startswith("second_") and current[name].get("second_amplitude_nm", 0.0) == 0.0:
+                continue
+            free.append((name, p.name, p.lower, p.upper, p.typical))
+
+    def difference(values: Effects) -> Array:
+        logs = replay(values, validation=False)
+        return np.concatenate([d.torque_nm[::8] for d in logs.values()])
+
+    base = difference(current)
+    before = least = float(np.mean(base**2))
+    if not free:
+        return Refined(current, {}, before, least)
+    jacobian = np.zeros((base.size, len(free)))
+    damping = 1e-3
+    for _ in range(rounds):
+        for k, (name, parameter, lower, upper, typical) in enumerate(free):
+            value = current[name][parameter]
+            step = 0.04 * abs(value) if abs(value) > 1e-3 * abs(typical) else 0.02 * max(abs(typical), 1e-4)
+            if value + step > upper:
+                step = -step
+            if value + step < lower:
+                continue
+            jacobian[:, k] = (difference(_changed(current, name, parameter, value + step)) - base) / step
+        inner = jacobian.T @ jacobian
+        scale = np.diag(inner).copy()
+        scale[scale <= 0.0] = 1.0
+        improved = False
+        for _ in range(3):
+            move = -np.linalg.solve(inner + np.diag(damping * scale + 1e-30), jacobian.T @ base)
+            trial = {name: dict(values) for name, values in current.items()}
+            for k, (name, parameter, lower, upper, _typical) in enumerate(free):
+                value = current[name][parameter]
+                # Shapes may double or halve in one step; beyond that the linear picture is not to be trusted.
+                reach = max(0.7 * abs(value), 1e-3 * abs(_typical))
+                trial[name][parameter] = float(np.clip(value + np.clip(move[k], -reach, reach), lower, upper))
+            tried = difference(trial)
+            squares = float(np.mean(tried**2))
+            if squares < least:
+                improved = squares < 0.995 * least
+                current, base, least = trial, tried, squares
+                damping = max(1e-6, 0.3 * damping)
+                break
+            damping *= 10.0
+        if not improved:
+            break
+    return Refined(current, _half_widths(jacobian, least, free), before, least)
+
+
+def _changed(effects: Mapping[str, dict[str, float]], name: str, parameter: str, value: float) -> Effects:
+    return {**effects, name: {**effects[name], parameter: value}}
+
+
+def _half_widths(
+    jacobian: Array, mean_square: float, free: Sequence[tuple[str, str, float, float, float]]
+) -> dict[tuple[str, str], float]:
+    # Thinned rows of a 20 Hz residual are correlated: about two thirds of them count.
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) * mean_square / 0.64
+    return {(name, p): float(1.96 * math.sqrt(max(0.0, covariance[k, k]))) for k, (name, p, *_) in enumerate(free)}

@@ -1,0 +1,190 @@
+"""How far: hypotheses refined by replay, and the gap before and after on recordings that no fit has seen.
+
+An effect stays only if the simulated joint needs it: what it takes off the torque difference of the validation logs
+must stand out of what noise and the nominal model's tolerances leave anyway. Statistical significance alone is the
+wrong criterion: every healthy joint has real traces below that floor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from frictid_hil.gap.evidence import Evidence, Group
+from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled, refine
+from frictid_hil.gap.which import Model, Ranking
+from frictid_hil.simulation.effects import all_effects
+
+TOLERANCE_SHARE = 0.004
+"""Part of a joint's Coulomb level that tolerances and sub-floor traces leave in its torque."""
+STANDS_ALONE = 1.0
+"""Torque that the first effect must take off, over the floor."""
+STANDS_BESIDE = 0.45
+"""The same for an effect beside others."""
+CLOSE_RIVAL = 0.80
+"""Gain over the best one's from which a rival is replayed too."""
+AT_FLOOR = 1.15
+"""Torque difference over the floor at which nothing more is sought."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Effects with refined parameters and what they leave.
+
+    Attributes:
+        groups: plant effects and their (refined) shapes.
+        effects: parameters of all effects, drive included.
+        intervals: half widths of 95 % intervals by (effect, parameter).
+        fitted_nm: torque difference left on the identification logs, RMS.
+        judged_nm: on the validation logs.
+        misfit: of the plant channel, held-out squares per row.
+    """
+
+    groups: tuple[Group, ...]
+    effects: dict[str, dict[str, float]]
+    intervals: dict[tuple[str, str], float]
+    fitted_nm: float
+    judged_nm: float
+    misfit: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Plant effects."""
+        return tuple(g[0] for g in self.groups)
+
+    @property
+    def cost(self) -> float:
+        """Log of what replay and inverse dynamics leave together; smaller is better."""
+        replayed = 0.5 * (self.fitted_nm**2 + self.judged_nm**2)
+        return math.log(max(replayed, 1e-30)) + math.log(self.misfit)
+
+
+class Judge:
+    """Refines hypotheses once and remembers them."""
+
+    def __init__(self, replay: Replay, evidence: Evidence, drive: Effects, has_validation: bool) -> None:
+        self.replay = replay
+        self.evidence = evidence
+        self.drive = {name: dict(values) for name, values in drive.items()}
+        self._has_validation = has_validation
+        self._known: dict[frozenset[str], Hypothesis] = {}
+
+    def judged(self, effects: Effects) -> dict[str, Replayed]:
+        """Differences on the validation logs; on all where there are none."""
+        return self.replay(effects, validation=True if self._has_validation else None)
+
+    def __call__(self, groups: Sequence[Group]) -> Hypothesis:
+        """The hypothesis of these plant effects, refined; their shapes join the evidence."""
+        key = frozenset(g[0] for g in groups)
+        if key not in self._known:
+            self._known[key] = self._refined(tuple(groups))
+        return self._known[key]
+
+    def _refined(self, groups: tuple[Group, ...]) -> Hypothesis:
+        start = {**self.drive, **self.evidence.parameters(groups)}
+        if not groups:
+            fitted = pooled(self.replay(start, validation=False), "torque_nm")
+            return Hypothesis(
+                (), start, {}, fitted, pooled(self.judged(start), "torque_nm"), self.evidence.misfit_ratio(())
+            )
+        refined = refine(self.replay, start)
+        best = list(groups)
+        for k, group in enumerate(groups):
+            form = all_effects()[group[0]].inverse
+            if form is None or len(form.shapes) < 3 or group[0] == "torque_ripple":
+                continue
+            shape = {name: refined.effects[group[0]][name] for name in self.evidence.shape(group)}
+            added = self.evidence.refine(group[0], shape)
+            trial = [*best[:k], added, *best[k + 1 :]]
+            if self.evidence.score(trial) > self.evidence.score(best):
+                best = trial
+        judged = pooled(self.judged(refined.effects), "torque_nm")
+        return Hypothesis(
+            groups=tuple(best),
+            effects=refined.effects,
+            intervals=refined.intervals,
+            fitted_nm=math.sqrt(refined.squares),
+            judged_nm=judged,
+            misfit=self.evidence.misfit_ratio(best),
+        )
+
+
+def choose(judge: Judge, ranking: Ranking, floor_nm: float) -> Hypothesis:
+    """The hypothesis that replays best with as few effects as it takes."""
+    current = judge(())
+    if not ranking.singles or ranking.singles[0].gain < 12.0 * max(1.0, ranking.misfit_chosen):
+        return current
+    top = ranking.singles[0].gain
+    singles = [judge(m.groups) for m in ranking.singles[:3] if m.gain >= CLOSE_RIVAL * top]
+    best = min(singles, key=lambda h: h.cost)
+    if _stands_out(current, best, floor_nm, 0.5 * STANDS_BESIDE):
+        current = best
+    wider: list[Model] = [m for m in ranking.pairs if m.gain > 1.02 * top][:3]
+    if current.judged_nm > AT_FLOOR * floor_nm or not current.groups or (wider and wider[0].gain > 1.15 * top):
+        pairs = [judge(m.groups) for m in wider[:2] if m.gain >= 0.9 * wider[0].gain]
+        if pairs:
+            pair = min(pairs, key=lambda h: h.cost)
+            if _stands_out(current, pair, floor_nm, STANDS_BESIDE):
+                current = pair
+    if len(current.groups) == 2 and current.judged_nm > 1.3 * floor_nm and len(ranking.widest.groups) == 3:
+        triple = judge(ranking.widest.groups)
+        if set(current.names) < set(triple.names) and _stands_out(current, triple, floor_nm, STANDS_BESIDE):
+            current = triple
+    return current
+
+
+def _stands_out(before: Hypothesis, after: Hypothesis, floor_nm: float, share: float) -> bool:
+    taken = before.judged_nm**2 - after.judged_nm**2
+    return taken > (share * floor_nm) ** 2 and after.cost < before.cost
+
+
+def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[str, float]:
+    """Shapley share of each effect in the closed part of the gap (squared torque difference), adding up to 1."""
+    cached: dict[frozenset[str], float] = {}
+
+    def left(kept: frozenset[str]) -> float:
+        if kept not in cached:
+            effects = {n: v for n, v in hypothesis.effects.items() if n in kept or n not in names}
+            cached[kept] = pooled(judge.judged(effects), "torque_nm") ** 2
+        return cached[kept]
+
+    total = left(frozenset()) - left(frozenset(names))
+    result = {}
+    for name in names:
+        others = [n for n in names if n != name]
+        value = 0.0
+        for size in range(len(others) + 1):
+            weight = math.factorial(size) * math.factorial(len(others) - size) / math.factorial(len(names))
+            for chosen in combinations(others, size):
+                kept = frozenset(chosen)
+                value += weight * (left(kept) - left(kept | {name}))
+        result[name] = value / total if total > 0.0 else 0.0
+    return result
+
+
+def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
+    """The hypothesis without effects that the validation replays do not need; the rest is fitted again."""
+    while hypothesis.groups:
+        taken: dict[str, float] = {}
+        for group in hypothesis.groups:
+            others = tuple(g for g in hypothesis.groups if g != group)
+            without = {**judge.drive, **judge.evidence.parameters(others)}
+            judged = pooled(judge.judged(without), "torque_nm")
+            taken[group[0]] = (judged**2 - hypothesis.judged_nm**2) / floor_nm**2
+        alone = len(hypothesis.groups) == 1 and not judge.drive
+        least = STANDS_ALONE if alone else STANDS_BESIDE
+        weakest = min(taken, key=lambda n: taken[n])
+        if taken[weakest] >= least**2:
+            return hypothesis
+        rest = judge(tuple(g for g in hypothesis.groups if g[0] != weakest))
+        if (rest.judged_nm**2 - hypothesis.judged_nm**2) / floor_nm**2 >= least**2:
+            return hypothesis
+        hypothesis = rest
+    return hypothesis
+
+
+def gap_figures(differences: Mapping[str, Replayed]) -> tuple[float, float]:
+    """(forward torque in N m, forward position in rad) over all rows of the given logs."""
+    return pooled(differences, "torque_nm"), pooled(differences, "position_rad")
