@@ -46,11 +46,12 @@ class TickClock:
         return (tick - self._first_tick) * self._tick_ns
 
     def now_ns(self) -> int:
-        """Run time that targets sent now are due at."""
+        """Run time that targets sent now are due at; it goes in whole ticks, by the clock while a report is overdue."""
         session = self._session
         if session is None or session.report is None:
             return 0
-        return self.tick_ns(session.report.tick + self._lead_ticks) + session.age_ns()
+        overdue_ticks = session.overdue_ns() // self._tick_ns
+        return self.tick_ns(session.report.tick + self._lead_ticks + overdue_ticks)
 
     def wait_until(self, deadline_ns: int) -> None:
         """Return when the report has come after which targets for the deadline are to be sent.

@@ -67,10 +67,11 @@ class SerialPort:
             self._serial: serial.Serial | None = serial.Serial(
                 path, baud, bytesize=8, parity=parity, stopbits=1, timeout=0, write_timeout=1.0, exclusive=True
             )
+            self._verify(baud, parity)
         except serial.SerialException as error:
             raise _not_opened(path, error) from None
         except termios.error as error:
-            raise _bad_line(path, baud, parity, error) from None
+            raise _bad_line(path, baud, parity, str(error)) from None
 
     def now_s(self) -> float:
         """The machine's monotonic clock."""
@@ -106,10 +107,11 @@ class SerialPort:
             port.flush()
             port.baudrate = baud
             port.parity = parity
+            self._verify(baud, parity)
         except (serial.SerialException, OSError) as error:
             raise self._gone(error) from None
         except (termios.error, ValueError) as error:
-            raise _bad_line(self._path, baud, parity, error) from None
+            raise _bad_line(self._path, baud, parity, str(error)) from None
 
     def close(self) -> None:
         """Release the port and its lock."""
@@ -120,6 +122,14 @@ class SerialPort:
             except (serial.SerialException, OSError, termios.error):
                 # It was unplugged; the kernel has taken it back already.
                 return
+
+    def _verify(self, baud: int, parity: str) -> None:
+        """Read back: a pseudo terminal may drop the parity bit without a word."""
+        flags = termios.tcgetattr(self._open().fileno())[2]
+        odd = "O" if flags & termios.PARODD else "E"
+        if (odd if flags & termios.PARENB else "N") != parity:
+            self.close()
+            raise _bad_line(self._path, baud, parity, "it reads back another parity")
 
     def _open(self) -> serial.Serial:
         if self._serial is None:
@@ -149,9 +159,9 @@ def _not_opened(path: str, error: serial.SerialException) -> HardwareError:
     return HardwareError(f"cannot be opened: {error.strerror or error}", where=path, next_step=next_step)
 
 
-def _bad_line(path: str, baud: int, parity: str, error: Exception) -> HardwareError:
+def _bad_line(path: str, baud: int, parity: str, why: str) -> HardwareError:
     return HardwareError(
-        f"does not accept {baud} baud with parity {parity}: {error}",
+        f"does not accept {baud} baud with parity {parity}: {why}",
         where=path,
         cause="a pseudo terminal carries no parity, and not every adapter every speed",
         next_step="set `options.parity` (N for an emulator) and `options.baud` in the robot file",

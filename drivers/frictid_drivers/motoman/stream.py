@@ -1,13 +1,14 @@
 """Layer C, streaming: one session of targets with due ticks, slaved to the controller's interpolation clock.
 
-The controller reports every tick; the host answers each report with the targets that are due ``lead_ticks`` later. A
-late host therefore shows up as a shorter queue on the controller, not as a late motion, until the queue is empty: then
-the controller goes straight on for one tick, slows down, and at the third missed tick stops and latches.
+The controller reports every tick; the host answers each report in turn with the targets that are due ``lead_ticks``
+later. A late host therefore shows up as a shorter queue on the controller, not as a late motion and not as a gap in the
+recording, until the queue is nearly empty: then the host skips to the newest report. With nothing left in the queue the
+controller goes straight on for one tick, slows down, and at the third missed tick stops and latches.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from frictid_drivers.motoman.controller_errors import LinkError
@@ -31,6 +32,8 @@ _HELLO_EVERY_S = 0.1
 _HELLO_FOR_S = 1.0
 _GOODBYE_S = 0.2
 _STOP_REPEATS = 3
+_SHORTEST_WAIT_TICKS = 2
+"""A target must reach the controller this many ticks before it is due."""
 
 _RECOVERABLE = frozenset({Refusal.CRC, Refusal.GAP, Refusal.LATE})
 _REFUSED = {
@@ -53,8 +56,8 @@ class StreamSession:
 
     Attributes:
         welcome: what the controller answered to HELLO.
-        report: its newest report.
-        arrived_s: when that came, port time.
+        report: the one that is to be answered now.
+        arrived_s: when the newest came, port time.
         nacks: refused frames by reason.
         flags_seen: every flag that any report carried since the last look.
         halted: we asked it to stop; a latched controller is no surprise.
@@ -80,6 +83,8 @@ class StreamSession:
         self._goodbye = False
         self.welcome: Welcome | None = None
         self.report: TickReport | None = None
+        self._newest: TickReport | None = None
+        self._reports: deque[TickReport] = deque()
         self.arrived_s = 0.0
         self.nacks: Counter[str] = Counter()
         self.flags_seen = Flag(0)
@@ -90,9 +95,9 @@ class StreamSession:
         """Frames from the controller that arrived damaged."""
         return self._reader.damaged
 
-    def age_ns(self) -> int:
-        """How long ago the newest report came."""
-        return round((self._port.now_s() - self.arrived_s) * 1e9)
+    def overdue_ns(self) -> int:
+        """How long ago the report came that is to be answered now; 0 while others wait behind it."""
+        return 0 if self._reports else round((self._port.now_s() - self.arrived_s) * 1e9)
 
     def begin(self, session: int, axis_mask: int) -> Welcome:
         """Say HELLO until the controller answers.
@@ -111,7 +116,6 @@ class StreamSession:
                 self._raise_error()
                 welcome = self.welcome
                 if welcome is not None and welcome.session == session:
-                    self.report = None
                     return welcome
         raise LinkError(
             f"no HELLO within {_HELLO_FOR_S:g} s after streaming was granted",
@@ -121,16 +125,16 @@ class StreamSession:
         )
 
     def wait_for_tick(self, tick: int) -> TickReport:
-        """The newest report, once one of this tick or later has come.
+        """The first report of this tick or a later one; of a later one also where too many wait to be answered.
 
         Raises:
             HardwareError: the controller fell silent.
         """
         while True:
             self._collect(0.0)
-            report = self.report
-            if report is not None and report.tick >= tick:
-                return report
+            self._go_on_to(tick)
+            if self.report is not None and self.report.tick >= tick:
+                return self.report
             quiet_until_s = self.arrived_s + self._silence_s
             if self._port.now_s() >= quiet_until_s:
                 raise HardwareError(
@@ -142,7 +146,7 @@ class StreamSession:
             self._collect(quiet_until_s - self._port.now_s())
 
     def send(self, pulses: Sequence[int], torque: Sequence[int] = ()) -> None:
-        """Targets of all axes of the session, due ``lead_ticks`` after the newest report."""
+        """Targets of all axes of the session, due ``lead_ticks`` after the report that they answer."""
         assert self.report is not None and self.welcome is not None
         self._seq = (self._seq + 1) & 0xFFFF
         self._last_due = max(self._last_due + 1, self.report.tick + self._lead_ticks)
@@ -157,7 +161,7 @@ class StreamSession:
         if self.halted:
             return
         self._raise_error()
-        report = self.report
+        report = self._newest
         if report is None:
             return
         if report.alarm:
@@ -212,8 +216,9 @@ class StreamSession:
     def _take(self, frame: Frame) -> None:
         match frame:
             case TickReport():
-                if frame.session == self._session and (self.report is None or frame.tick > self.report.tick):
-                    self.report = frame
+                if frame.session == self._session and (self._newest is None or frame.tick > self._newest.tick):
+                    self._newest = frame
+                    self._reports.append(frame)
                     self.arrived_s = self._port.now_s()
                     self.flags_seen |= frame.flags
             case Nack():
@@ -225,6 +230,16 @@ class StreamSession:
                 self.arrived_s = self._port.now_s()
             case Stopped():
                 self._goodbye = self._goodbye or frame.leaving
+
+    def _go_on_to(self, tick: int) -> None:
+        """Make the report of this tick the current one, if it has come."""
+        reports = self._reports
+        while reports and (self.report is None or self.report.tick < tick):
+            self.report = reports.popleft()
+        if self.report is not None and self._newest is not None:
+            if self._newest.tick - self.report.tick > self._lead_ticks - _SHORTEST_WAIT_TICKS:
+                self.report = self._newest
+                reports.clear()
 
     def _raise_error(self) -> None:
         if self._error is not None:
