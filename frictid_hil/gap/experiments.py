@@ -3,11 +3,11 @@
 Every experiment is a handful of plan motions inside one *envelope* (middle of the travel, travel, speed), so the same
 list runs on a real bus, on the virtual one, and in the generator of the blind check. Two experiments are never fitted:
 on them the gap is reported. A few more wait in the catalogue for a diagnosis that cannot decide; it names them in a
-plan file (``schema: frictid.experiments/1``)::
+plan file (``schema: frictid.gap_plan/1``)::
 
-    schema: frictid.experiments/1
+    schema: frictid.gap_plan/1
     why: torque_bias and encoder_offset look alike in one posture
-    experiments: [sines_posture]
+    experiments: [second_posture]
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan import Corners, Hold, Motion, Move, Sine
 
-SCHEMA = "frictid.experiments/1"
+SCHEMA = "frictid.gap_plan/1"
 CHIRP_LOW_HZ = 0.3
 
 FULL = (
@@ -36,7 +36,7 @@ FULL = (
     "moves_payload",
     "sines_repeat",
 )
-"""The standard experiments in the order in which they run; a recording on a bus adds ``sines_posture``."""
+"""The standard experiments in the order in which they run; a recording on a bus adds ``second_posture``."""
 SHORT = ("triangle_slow", "chirp", "breakaway", "sines_payload", "moves_payload", "sines_repeat")
 
 
@@ -211,7 +211,7 @@ def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
     experiments = [
         _sines("sines_small", small, e.travel_rad, _rising(e.velocity_rad_s, 8), "the friction curve"),
         _sines("sines_large", large, 2 * e.travel_rad, _rising(e.velocity_rad_s, 6), "speed against position"),
-        _triangle(e),
+        _triangle("triangle_slow", e, "ripple, the shape of gravity, hysteresis at reversals"),
         _sines(
             "sines_payload",
             small,
@@ -230,9 +230,8 @@ def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
         _triangles(e),
     ]
     if e.second_centre_rad is not None:
-        start = e.second_centre_rad - e.travel_rad / 2
-        speeds = _rising(0.6 * e.velocity_rad_s, 3)
-        experiments.append(_sines("sines_posture", start, e.travel_rad, speeds, "bias against offset and gravity"))
+        aside = replace(e, centre_rad=e.second_centre_rad)
+        experiments.append(_triangle("second_posture", aside, "bias against encoder offset and gravity"))
     return {experiment.name: experiment for experiment in experiments}
 
 
@@ -258,7 +257,7 @@ def chosen(names: Iterable[str], envelope: Envelope, *, seed: int = 0) -> tuple[
     if unknown:
         raise UsageError(
             f"no experiment {', '.join(map(repr, unknown))}; there are {', '.join(known)}",
-            cause="the joint has no room for a second posture" if unknown == ["sines_posture"] else "",
+            cause="the joint has no room for a second posture" if unknown == ["second_posture"] else "",
         )
     return tuple(known[name] for name in names)
 
@@ -304,18 +303,11 @@ def _sines(
     return _experiment(name, role, payload, cycles, reveals)
 
 
-def _triangle(e: Envelope) -> Experiment:
+def _triangle(name: str, e: Envelope, reveals: str) -> Experiment:
     quarter_s = e.triangle_rad / e.triangle_velocity_rad_s
     c, a = e.centre_rad, e.triangle_rad
     corners = Corners("triangle", (0.0, quarter_s, 3 * quarter_s, 4 * quarter_s), (c, c + a, c - a, c))
-    return _experiment(
-        "triangle_slow",
-        "identification",
-        False,
-        [corners],
-        "ripple, the shape of gravity, hysteresis at reversals",
-        1.0,
-    )
+    return _experiment(name, "identification", False, [corners], reveals, 1.0)
 
 
 def _triangles(e: Envelope) -> Experiment:

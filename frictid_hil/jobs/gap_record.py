@@ -18,7 +18,7 @@ import yaml
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.driver import Driver, JointIdentity, JointSetup, RobotSetup, WallClock, load_driver
-from frictid_hil.errors import FrictidError, GateFailed, InputFileError, PlanRefused
+from frictid_hil.errors import FrictidError, GateFailed, InputFileError, PlanRefused, UsageError
 from frictid_hil.gap.experiments import (
     FULL,
     SHORT,
@@ -57,7 +57,7 @@ class GapRecordOptions:
         travel_rad: of the small sines; None: the joint's procedure's.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise and of the validation moves.
-        out: folder of the set; experiments are added to a set of the same joint that is there.
+        out: folder of the set; what a plan file asks for is added to the set of the same joint that is there.
     """
 
     robot: str
@@ -98,7 +98,13 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
     )
     loaded_too = belief.payload and (simulated if options.payload is None else options.payload)
     experiments = _experiments(options, envelope_of(robot, joint, options), payload=loaded_too)
-    earlier = existing_set(options.out, robot.name, joint.name, experiments) if options.out else None
+    earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
+    if earlier is not None and options.plan is None:
+        raise UsageError(
+            "holds an experiment set already",
+            where=str(options.out),
+            next_step="choose another --out, or add what a diagnosis asked for with --plan",
+        )
     plans = _plans(robot, setup, joint, experiments, belief)
     for plan, expected in plans:
         refuse_beyond_limits(plan, setup, expected)
@@ -164,7 +170,7 @@ def _experiments(options: GapRecordOptions, envelope: Envelope, *, payload: bool
     elif options.short:
         names = SHORT
     else:
-        names = (*FULL, *(name for name in ("sines_posture",) if name in catalogue(envelope)))
+        names = (*FULL, *(name for name in ("second_posture",) if name in catalogue(envelope)))
     experiments = chosen(names, envelope, seed=options.seed)
     if payload:
         return experiments

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,11 @@ _TIMING = (
 _CONVENTION = "tau = inertia*acc + gravity_cos*cos(position) + gravity_sin*sin(position) + friction"
 
 
-def existing_set(folder: Path, robot: str, joint: str, experiments: Sequence[Experiment]) -> Mapping[str, Any] | None:
+def existing_set(folder: Path, robot: str, joint: str) -> Mapping[str, Any] | None:
     """``nominal.yaml`` of a set that experiments shall be added to; None where there is no set yet.
 
     Raises:
-        UsageError: the folder holds something else, a set of another joint, or one of the experiments already.
+        UsageError: the folder holds something else, or a set of another joint.
     """
     path = folder / "nominal.yaml"
     if not path.exists():
@@ -41,10 +42,6 @@ def existing_set(folder: Path, robot: str, joint: str, experiments: Sequence[Exp
         raise UsageError(
             f"this set is not of {robot}, joint {joint}", where=str(path), next_step="choose another --out"
         )
-    listed = {str(entry.get("name")) for entry in document.get("experiments", [])}
-    again = [e.name for e in experiments if e.name in listed]
-    if again:
-        raise UsageError(f"this set has {', '.join(again)} already", where=str(path), next_step="choose another --out")
     return document
 
 
@@ -57,7 +54,9 @@ def write_set(
     *,
     earlier: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write logs, then ``nominal.yaml`` that lists them; to ``earlier`` experiments they are added.
+    """Write logs, then ``nominal.yaml`` that lists them.
+
+    Experiments are added to ``earlier`` ones; one that is there already goes on as ``chirp_2``, ``chirp_3``, ...
 
     Raises:
         FrictidError: disk full, or no permission.
@@ -68,11 +67,12 @@ def write_set(
         raise FrictidError(f"cannot be created: {error.strerror}", where=str(folder)) from error
     listed = list(earlier["experiments"]) if earlier else []
     for experiment, samples in logs:
-        write_csv(folder / f"{experiment.name}.csv", samples)
+        name = _unused(experiment.name, {str(entry["name"]) for entry in listed})
+        write_csv(folder / f"{name}.csv", samples)
         listed.append(
             {
-                "name": experiment.name,
-                "file": f"{experiment.name}.csv",
+                "name": name,
+                "file": f"{name}.csv",
                 "role": experiment.role,
                 "payload": experiment.payload,
                 "run_order": len(listed),
@@ -89,3 +89,8 @@ def write_set(
         **belief.sections,
     }
     write_whole(folder / "nominal.yaml", dump({**document, "experiments": listed}))
+
+
+def _unused(name: str, taken: Set[str]) -> str:
+    names = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(2)))
+    return next(candidate for candidate in names if candidate not in taken)

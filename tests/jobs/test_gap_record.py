@@ -106,11 +106,13 @@ def test_without_a_payload_validation_runs_bare_and_the_rest_is_left_out(robot: 
 def test_a_second_recording_adds_to_the_set_and_none_is_overwritten(robot: str, tmp_path: Path) -> None:
     out = tmp_path / "set"
     record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
-    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "sines_posture"), out=out), Silent())
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "second_posture"), out=out), Silent())
     loaded = ExperimentSet.load(out)
-    assert [(e.name, e.run_order) for e in loaded.experiments] == [("breakaway", 0), ("sines_posture", 1)]
-    with pytest.raises(UsageError, match="has breakaway already"):
-        record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
+    assert [(e.name, e.run_order) for e in loaded.experiments] == [("breakaway", 0), ("second_posture", 1)]
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
+    assert [e.name for e in ExperimentSet.load(out).experiments] == ["breakaway", "second_posture", "breakaway_2"]
+    with pytest.raises(UsageError, match="experiment set already"):
+        record(GapRecordOptions(robot, "0", short=True, out=out), Silent())
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.doc").write_text("mine")
     with pytest.raises(UsageError, match="something else"):
