@@ -221,7 +221,7 @@ def changed(before: Physics, after: Physics) -> Mapping[str, float]:
 
 def _believed(rng: np.random.Generator, physics: Physics, payload: Payload) -> tuple[Physics, Payload]:
     def near(value: float) -> float:
-        return value * (1.0 + rng.uniform(-TOLERANCE, TOLERANCE))
+        return value * (1.0 + float(np.clip(rng.normal(0.0, 0.45 * TOLERANCE), -TOLERANCE, TOLERANCE)))
 
     friction = near(1.0)
     belief = physics._replace(
@@ -240,7 +240,7 @@ def _with_traces(rng: np.random.Generator, physics: Physics, floor_nm: float) ->
     """Three effects at a fraction of the noise floor."""
 
     def trace() -> float:
-        return floor_nm * rng.uniform(0.05, 0.35)
+        return floor_nm * rng.uniform(0.05, 0.3)
 
     kinds: dict[str, dict[str, Any]] = {
         "ripple": {"ripple": trace(), "ripple_phase": rng.uniform(0.0, 6.28)},
