@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import json
 import select
 import subprocess
 import sys
+from typing import Any
 
-from frictid_drivers.virtual.rack_process import READY, encode_setup
-from frictid_hil.driver import RobotSetup
+from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import HardwareError
+
+READY = "ready"
+"""What the process says once its drives are on the bus."""
+
+DISMISSAL = "end"
+"""What the owner says when it needs the drives no longer."""
 
 _START_S = 120.0
 _END_S = 5.0
@@ -26,9 +35,11 @@ class RunningRack:
         return self._process.pid
 
     def stop(self) -> None:
-        """Ask it to end by closing its standard input; insist after a while."""
+        """Dismiss it; insist after a while."""
         if self._process.stdin is not None:
-            self._process.stdin.close()
+            with contextlib.suppress(OSError):
+                self._process.stdin.write(f"{DISMISSAL}\n")
+                self._process.stdin.close()
         try:
             self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
@@ -65,3 +76,15 @@ def start_rack(setup: RobotSetup) -> RunningRack:
         rack.stop()
         raise HardwareError(f"the simulated drives did not start: {answer or 'their process ended'}", where=setup.bus)
     return rack
+
+
+def encode_setup(setup: RobotSetup) -> str:
+    """The robot as one line of JSON."""
+    return json.dumps(dataclasses.asdict(setup), default=dict)
+
+
+def decode_setup(line: str) -> RobotSetup:
+    """The robot of ``encode_setup``."""
+    mapping: dict[str, Any] = json.loads(line)
+    joints = tuple(JointSetup(**joint) for joint in mapping.pop("joints"))
+    return RobotSetup(joints=joints, **mapping)

@@ -2,9 +2,9 @@
 
 ``python -m frictid_drivers.virtual.rack_process``: its owner writes one JSON line with the robot to its standard input
 and reads one line back (``ready``, or what is wrong); from then on the drives are on the bus ``frictid:CHANNEL``. The
-process ends when the owner says so by closing its standard input. When the owner disappears instead - SIGKILL of the
-host loop - the drives live on until their own watchdogs have brought every joint to rest, so that what drives do
-without their host happens here as it does in a robot.
+process ends when the owner says ``end``. When the owner disappears instead - SIGKILL of the host loop - the drives live
+on until their own watchdogs have brought every joint to rest, so that what drives do without their host happens here as
+it does in a robot.
 
 The drives' time follows SYNC where there is one, as in drives that lock their control loops to it: a SYNC is taken to
 be exactly on its grid, so that the jitter of two processes' scheduling does not become motion.
@@ -13,26 +13,23 @@ be exactly on its grid, so that the jitter of two processes' scheduling does not
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import gc
-import json
 import os
 import select
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from frictid_drivers.virtual import channel
 from frictid_drivers.virtual.faults import Fault, faults_of, missing_objects
 from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.rack import Rack
+from frictid_drivers.virtual.rack_launcher import DISMISSAL, READY, decode_setup
 from frictid_drivers.virtual.socket_bus import ERROR, EXTENDED, REMOTE, Hub
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import FrictidError
 
-READY = "ready"
 SYNC_ID = 0x80
 SYNC_GAP_TENTHS = 500
 """2010h:01 on the wall clock: 50 periods. An ordinary operating system loses the processor for tens of milliseconds now
@@ -87,14 +84,37 @@ class SyncGrid:
         return raw_ns
 
 
+class Wire(Protocol):
+    """What the drives need of the bus between processes: a ``Hub``."""
+
+    heard: Callable[[int, bytes, int], None]
+
+    @property
+    def members(self) -> int:
+        """How many are connected."""
+        ...
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """To all members."""
+        ...
+
+    def wait(self, longest_s: float) -> None:
+        """For something to serve."""
+        ...
+
+    def serve(self) -> None:
+        """All that has arrived."""
+        ...
+
+
 class RackProcess:
     """The drives, their bus and their clock."""
 
-    def __init__(self, rack: Rack, hub: Hub, faults: Sequence[Fault] = ()) -> None:
+    def __init__(self, rack: Rack, hub: Wire, faults: Sequence[Fault] = (), *, now_ns: int | None = None) -> None:
         self._rack = rack
         self._drives = FaultyRack(rack, faults) if faults else rack
         self._hub = hub
-        self._origin_ns = time.monotonic_ns() - rack.now_ns
+        self._origin_ns = (time.monotonic_ns() if now_ns is None else now_ns) - rack.now_ns
         self._grid = SyncGrid()
         self._drives.transmit = hub.send
         hub.heard = self._heard
@@ -110,21 +130,26 @@ class RackProcess:
             self._drives.advance(self._grid.time_ns(wall_ns))
         self._drives.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
 
-    def run(self, owner_pid: int) -> None:
-        """Serve until the owner closes our standard input, or is gone and the robot stands still."""
+    def serve_until(self, now_ns: int) -> int:
+        """Deal with what was sent until a moment of the monotonic clock, then let run time reach it; returns it."""
+        wall_ns = now_ns - self._origin_ns
+        self._hub.serve()
+        self._drives.advance(self._grid.time_ns(wall_ns))
+        return wall_ns
+
+    def run(self, owner: Owner) -> None:
+        """Serve until the owner says so, or is gone and the robot stands still."""
         self._drives.power_on()
         farewell = _Farewell()
         while True:
             wait_s = (self._drives.next_event_ns - self._drives.now_ns) * 1e-9
             self._hub.wait(min(_LONGEST_WAIT_S, max(_SHORTEST_WAIT_S, wait_s)))
             # First the time, then the frames: none that was sent before it is left when run time reaches it.
-            wall_ns = time.monotonic_ns() - self._origin_ns
-            self._hub.serve()
-            self._drives.advance(self._grid.time_ns(wall_ns))
-            if os.getppid() == owner_pid:
-                if _closed(sys.stdin.fileno()):
-                    return
-            elif farewell.over(wall_ns, resting=self._rack.at_rest and not self._hub.members):
+            wall_ns = self.serve_until(time.monotonic_ns())
+            owner.listen()
+            if owner.dismissed or (
+                owner.gone and farewell.over(wall_ns, resting=self._rack.at_rest and not self._hub.members)
+            ):
                 return
 
 
@@ -146,28 +171,38 @@ class _Farewell:
         return rested or now_ns - self._since_ns > _FAREWELL_NS
 
 
-def _closed(descriptor: int) -> bool:
-    readable, _, _ = select.select([descriptor], [], [], 0)
-    return bool(readable) and not os.read(descriptor, 4096)
+class Owner:
+    """The process that started this one, at the other end of our standard input.
 
+    Attributes:
+        dismissed: it said that the drives are no longer needed.
+        gone: it ended without saying so.
+    """
 
-def encode_setup(setup: RobotSetup) -> str:
-    """The robot as one line of JSON."""
-    return json.dumps(dataclasses.asdict(setup), default=dict)
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._pid = os.getppid()
+        self.dismissed = False
+        self.gone = False
 
-
-def decode_setup(line: str) -> RobotSetup:
-    """The robot of ``encode_setup``."""
-    mapping: dict[str, Any] = json.loads(line)
-    joints = tuple(JointSetup(**joint) for joint in mapping.pop("joints"))
-    return RobotSetup(joints=joints, **mapping)
+    def listen(self) -> None:
+        """Look whether there is word of it."""
+        if self.gone:
+            return
+        readable, _, _ = select.select([self._descriptor], [], [], 0)
+        if readable:
+            word = os.read(self._descriptor, 64)
+            self.dismissed = DISMISSAL.encode() in word
+            self.gone = not word
+        # A child of the owner may have inherited the pipe and hold it open.
+        self.gone = self.gone or os.getppid() != self._pid
 
 
 def main() -> int:
     """Entry of the process."""
-    # Ctrl-C is for the owner, who then closes our standard input.
+    # Ctrl-C is for the owner, who then dismisses us.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    owner_pid = os.getppid()
+    owner = Owner(sys.stdin.fileno())
     setup = decode_setup(sys.stdin.readline())
     rack = Rack()
     try:
@@ -185,7 +220,7 @@ def main() -> int:
     process = RackProcess(rack, hub, faults)
     print(READY, flush=True)
     try:
-        process.run(owner_pid)
+        process.run(owner)
     finally:
         with contextlib.suppress(OSError):
             hub.close()
