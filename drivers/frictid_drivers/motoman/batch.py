@@ -199,7 +199,7 @@ class BatchClient:
                 name=name,
             )
         except ValueError:
-            raise BadReply(f"{reply!r}", where="FHELLO") from None
+            raise self._host.bad_reply(f"{reply!r} instead of a greeting", "FHELLO") from None
 
     def send(self, order: JobOrder) -> None:
         """FJOB. ``ControllerError`` where the controller refuses it."""
@@ -220,7 +220,7 @@ class BatchClient:
         try:
             state = JobState(*map(int, reply.split(",")))
         except (ValueError, TypeError):
-            raise BadReply(f"{reply!r}", where="FSTAT") from None
+            raise self._host.bad_reply(f"{reply!r} instead of a job's state", "FSTAT") from None
         if state.number != number:
             raise BadReply(f"state of job {state.number} instead of {number}", where="FSTAT")
         return state

@@ -102,6 +102,9 @@ class BscLink:
 
     Args:
         timing: timers and retries.
+
+    Attributes:
+        contended: the peer bid at the same moment as our newest message did.
     """
 
     def __init__(self, timing: BscTiming | None = None) -> None:
@@ -119,6 +122,7 @@ class BscLink:
         self._asked_again = False
         self._answer_due_s = 0.0
         self._contentions = 0
+        self.contended = False
         self._dle_seen = False
         # As a receiver
         self._reader = BlockReader()
@@ -170,6 +174,7 @@ class BscLink:
             raise RuntimeError("a message is being sent already")
         self._blocks = encode_blocks(message)
         self._waiting = message
+        self.contended = False
         if self._state is _State.IDLE:
             self._bid(now_s)
 
@@ -301,6 +306,7 @@ class BscLink:
         That ends it against a controller that yields at once as well as against one that never does.
         """
         self._contentions += 1
+        self.contended = True
         if self._contentions == 1:
             self._garbled(now_s)
         else:

@@ -163,7 +163,7 @@ class HostControl:
         """
         reply = self._exchange(text, within_s=within_s)
         if reply.header != _RESULT:
-            raise BadReply(f"{reply.header} {reply.text!r} instead of a result", where=text)
+            raise self.bad_reply(f"{reply.header} {reply.text!r} instead of a result", text)
 
     def ask(self, text: str, on_text: Callable[[str, int], None] | None = None) -> str:
         """A command that is answered by data.
@@ -178,7 +178,7 @@ class HostControl:
         """
         reply = self._exchange(text, on_text)
         if reply.header != _DATA:
-            raise BadReply(f"{reply.header} {reply.text!r} instead of data", where=text)
+            raise self.bad_reply(f"{reply.header} {reply.text!r} instead of data", text)
         return reply.text
 
     def _figures(self, command: str, count: int) -> list[int]:
@@ -188,8 +188,13 @@ class HostControl:
         except ValueError:
             figures = []
         if len(figures) != count:
-            raise BadReply(f"{reply!r} is not {count} whole numbers", where=command)
+            raise self.bad_reply(f"{reply!r} is not {count} whole numbers", command)
         return figures
+
+    def bad_reply(self, what: str, where: str) -> BadReply:
+        """The error for a reply that cannot belong to the command ``where``."""
+        cause = "both sides bid for the line at once, and the controller's own message came first"
+        return BadReply(what, where=where, cause=cause if self._link.contended else "", next_step="start again")
 
     def _exchange(
         self, text: str, on_text: Callable[[str, int], None] | None = None, *, within_s: float | None = None
@@ -198,6 +203,9 @@ class HostControl:
         if self._owed_reply and within_s is None:
             # Replies carry no name: one that comes late must not be taken for the answer to this command.
             self.listen(self._timing.sequence_s)
+        if self._link.busy_sending:
+            # The port failed in the middle of the message before this one.
+            self._link.abort()
         self._owed_reply = True
         self._link.send(Message(_COMMAND, text), self._port.now_s())
         reply = self._await_reply(where, on_text, within_s)

@@ -13,7 +13,7 @@ from enum import Enum
 
 from frictid_drivers.motoman.batch import BatchClient, BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
-from frictid_drivers.motoman.host_control import HostControl
+from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_drivers.motoman.port import BytePort
 from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.stream import StreamSession
@@ -89,7 +89,11 @@ class Line:
         self.host.leave()
         self.port.set_line(options.stream_baud, STREAM_PARITY)
         session = StreamSession(
-            self.port, lead_ticks=options.lead_ticks, silence_s=options.silence_ms * 1e-3, sink=self._sink
+            self.port,
+            PROFILES[options.controller],
+            lead_ticks=options.lead_ticks,
+            silence_s=options.silence_ms * 1e-3,
+            sink=self._sink,
         )
         self._session_number = self._session_number % 255 + 1
         try:

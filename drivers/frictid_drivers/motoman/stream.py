@@ -12,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from frictid_drivers.motoman.controller_errors import LinkError
+from frictid_drivers.motoman.host_control import ControllerProfile, decode_status
 from frictid_drivers.motoman.port import BytePort
 from frictid_drivers.motoman.stream_frames import (
     Flag,
@@ -50,6 +51,7 @@ class StreamSession:
 
     Args:
         port: already at the stream's speed.
+        profile: generation of the controller, for the bits of its status.
         lead_ticks: between the newest report and the tick that a target is due at.
         silence_s: without any report for so long, the controller counts as lost.
         sink: told of every portion of bytes on the wire, with True for ours.
@@ -66,12 +68,14 @@ class StreamSession:
     def __init__(
         self,
         port: BytePort,
+        profile: ControllerProfile,
         *,
         lead_ticks: int,
         silence_s: float,
         sink: Callable[[bytes, bool], None] | None = None,
     ) -> None:
         self._port = port
+        self._profile = profile
         self._lead_ticks = lead_ticks
         self._silence_s = silence_s
         self._sink = sink
@@ -177,13 +181,24 @@ class StreamSession:
                 cause="a locked joint is being dragged, or its brake does not hold",
             )
         if Flag.LATCHED in report.flags:
-            late = ", ".join(f"{count} {reason}" for reason, count in self.nacks.items()) or "none refused"
-            raise SafetyAbort(
+            raise self._latched(report)
+
+    def _latched(self, report: TickReport) -> SafetyAbort:
+        holds = set(decode_status(self._profile, report.data_1, report.data_2).holds) - {"command hold"}
+        if holds:
+            return SafetyAbort(
                 "the controller stopped the arm and latched",
                 where="controller",
-                cause=f"its watchdog missed set-points, or somebody pressed hold (frames refused: {late})",
-                next_step="look at the pendant; free this machine's processor, or raise `options.lead_ticks`",
+                cause=f"somebody pressed hold ({', '.join(sorted(holds))})",
+                next_step="release it at the controller, then start again",
             )
+        refused = ", ".join(f"{count} for {reason}" for reason, count in self.nacks.items()) or "none"
+        return SafetyAbort(
+            "the controller stopped the arm and latched",
+            where="controller",
+            cause=f"its watchdog missed set-points (refused by it: {refused}; damaged on the way here: {self.damaged})",
+            next_step="check the cable; free this machine's processor, or raise `options.lead_ticks`",
+        )
 
     def halt(self) -> None:
         """STOP, several times over, waiting for nothing; the session is dead after it."""
@@ -236,10 +251,10 @@ class StreamSession:
         reports = self._reports
         while reports and (self.report is None or self.report.tick < tick):
             self.report = reports.popleft()
-        if self.report is not None and self._newest is not None:
-            if self._newest.tick - self.report.tick > self._lead_ticks - _SHORTEST_WAIT_TICKS:
-                self.report = self._newest
-                reports.clear()
+        report, newest = self.report, self._newest
+        if report and newest and newest.tick - report.tick > self._lead_ticks - _SHORTEST_WAIT_TICKS:
+            self.report = newest
+            reports.clear()
 
     def _raise_error(self) -> None:
         if self._error is not None:

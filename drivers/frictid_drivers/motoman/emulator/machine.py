@@ -63,7 +63,7 @@ class Emulator:
     Attributes:
         panel: what a person sees; tests press its buttons.
         line: speed and parity now.
-        gone: the port has disappeared.
+        gone: the port has disappeared; the controller behind it has not.
         now_s: time of this controller.
     """
 
@@ -106,6 +106,8 @@ class Emulator:
 
     def hear(self, chunk: bytes) -> None:
         """The host puts bytes on the wire now; they arrive when the line has carried them."""
+        if self.gone:
+            return
         begin_s = max(self.now_s, self._in_free_s)
         self._in_free_s = begin_s + len(chunk) * self._byte_s
         self._incoming.append((self._in_free_s, chunk))
@@ -136,7 +138,7 @@ class Emulator:
 
     def advance(self, to_s: float) -> None:
         """Let everything happen that happens until then."""
-        while not self.gone:
+        while True:
             event_s = self.next_event_s()
             if event_s > to_s:
                 break
@@ -300,6 +302,8 @@ class Emulator:
             struck |= self.faults.occasion(kind)
         if "close" in struck:
             self.gone = True
+        if self.gone:
+            return
         if "silence" in struck:
             self._mute_until_s = self.now_s + (struck["silence"].value or 4.0)
         if struck.keys() & {"lost_ack", "lost_block", "lost_frame"} or self.now_s < self._mute_until_s:

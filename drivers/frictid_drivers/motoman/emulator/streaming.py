@@ -316,6 +316,8 @@ class StreamApplication:
             here = [self._axes[number].issued for number in self._numbers]
             self._go([a + b for a, b in zip(here, speed, strict=True)])
             self._speed = speed
+        else:
+            self._panel.operating = False
         self._feed_forward([])
 
     def _slow_down(self) -> None:
