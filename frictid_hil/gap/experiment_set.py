@@ -46,6 +46,8 @@ class Controller:
         kd_nm_s_per_rad: gain on the velocity error.
         velocity_filter_s: time constant of the velocity's first-order filter.
         torque_limit_nm: limit of the demand.
+        command_rate: how dcommand/dt is formed, ``central`` or ``backward`` (a drive that follows set-points as they
+            come).
     """
 
     rate_hz: float
@@ -54,6 +56,7 @@ class Controller:
     kd_nm_s_per_rad: float
     velocity_filter_s: float = 0.0
     torque_limit_nm: float = float("inf")
+    command_rate: str = "central"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +210,7 @@ def nominal_from_mapping(document: Mapping[str, Any], where: str) -> Nominal:
             kd_nm_s_per_rad=number.optional(controller, "kd") or 0.0,
             velocity_filter_s=number.optional(controller, "velocity_filter_s") or 0.0,
             torque_limit_nm=number.optional(controller, "torque_limit_nm") or float("inf"),
+            command_rate=_command_rate(controller, where),
         ),
         rated_torque_nm=number.optional(drive, "rated_torque_nm"),
         torque_quantum_nm=number.optional(drive, "torque_quantum_nm"),
@@ -237,6 +241,13 @@ class _Numbers:
         if value is None:
             raise ConfigError(f"`{key}` is missing", where=self._where)
         return value
+
+
+def _command_rate(controller: Mapping[str, Any], where: str) -> str:
+    value = controller.get("command_rate", "central")
+    if value not in ("central", "backward"):
+        raise ConfigError(f"`command_rate` is {value!r}; it is central or backward", where=where)
+    return str(value)
 
 
 def _section(document: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any] | None:

@@ -17,7 +17,6 @@ def serve(requests: TextIO, answers: TextIO) -> None:
     """Answer every request until the requests end."""
     # Imported here so that the process reports its import failure as any other.
     from frictid_hil.gap.diagnose import diagnose
-
     from frictid_hil.gap.experiment_set import ExperimentSet
     from frictid_hil.simulation.effects import all_effects
 
