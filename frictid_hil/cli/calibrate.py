@@ -93,8 +93,9 @@ def calibrate(
 ) -> None:
     """Identify the friction of every joint, one at a time, and write a friction profile."""
     from frictid_hil.cli.progress import TerminalWatcher, print_plan
-    from frictid_hil.jobs.calibrate import CalibrateOptions
+    from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
     from frictid_hil.jobs.calibrate import calibrate as job
+    from frictid_hil.plan import described
 
     output = Output(as_json, quiet)
     options = CalibrateOptions(
@@ -106,12 +107,20 @@ def calibrate(
         cycles=cycles,
         ratio=ratio,
         method=method,
-        dry_run=dry_run,
         realtime=realtime,
         seed=seed,
         resume=resume,
         out=out,
     )
+    if dry_run:
+
+        def plan_only() -> Result:
+            planned = plan_calibration(options)
+            print_plan(output.out, planned.plan, planned.setup)
+            return {"outcome": "ok", "dry_run": True, "plan": described(planned.plan)}
+
+        output.run("calibrate", plan_only)
+
     watcher = TerminalWatcher(output, yes=yes)
 
     def run() -> Result:
@@ -120,13 +129,7 @@ def calibrate(
         finally:
             watcher.close()
 
-    def show(result: Result) -> None:
-        if "plan" in result:
-            print_plan(output.out, result["plan"], result["setup"])
-            return
-        print_joints(output, result)
-
-    output.run("calibrate", run, show)
+    output.run("calibrate", run, lambda result: print_joints(output, result))
 
 
 def identify(

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import DriveIdentity, FrictionProfile, JointProfile
+from frictid_hil.config.profile import DriveIdentity, FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.driver import JointIdentity, RobotSetup
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
+from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.identify import identify_joint, joint_result
+from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import calibration_plan, expected_of
+from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, refuse_beyond_limits
 from frictid_hil.runner.events import Event, JointRun, Preflight
@@ -38,7 +40,6 @@ class CalibrateOptions:
         cycles: N.
         ratio: c.
         method: estimator.
-        dry_run: plan only.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise.
         resume: run folder to continue.
@@ -53,7 +54,6 @@ class CalibrateOptions:
     cycles: int | None = None
     ratio: float | None = None
     method: str = "aligned"
-    dry_run: bool = False
     realtime: bool = False
     seed: int = 0
     resume: Path | None = None
@@ -70,6 +70,46 @@ class _Progress:
     ended: FrictidError | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A calibration that was checked and not yet begun.
+
+    Attributes:
+        robot: its file.
+        setup: as the driver knows it.
+        plan: within every limit.
+        resumed: the run folder to go on with.
+    """
+
+    robot: Robot
+    setup: RobotSetup
+    plan: Plan
+    resumed: RunFolder | None
+
+
+def plan_calibration(options: CalibrateOptions) -> Planned:
+    """Read the robot file and plan; opens no bus and writes nothing.
+
+    Raises:
+        UsageError: refused (arguments, files, limits).
+    """
+    robot = load_robot(options.robot)
+    if options.method not in METHODS:
+        raise UsageError(f"no estimator {options.method!r}; there are {', '.join(METHODS)}")
+    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    wanted = options.joints or robot.joint_names
+    robot.check_joints(wanted)
+    resumed = RunFolder.resume(options.resume, robot) if options.resume else None
+    kept = resumed.kept_joints() if resumed else {}
+    procedures = {name: _procedure(robot, name, options) for name in dict.fromkeys(wanted) if name not in kept}
+    expected = expected_of(robot)
+    rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
+    notes = _notes(procedures, expected, rehearse)
+    plan = calibration_plan(robot, setup, procedures, expected, rehearse=rehearse, notes=notes)
+    refuse_beyond_limits(plan, setup, expected)
+    return Planned(robot, setup, plan, resumed)
+
+
 def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
     """Plan, check, ask, run, identify, write.
 
@@ -81,23 +121,11 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
         The JSON of the verb. A safety abort or an interruption after motion began is an outcome, not an exception: what
         was measured until then is in the run folder and in the result.
     """
-    robot = load_robot(options.robot)
-    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
-    wanted = options.joints or robot.joint_names
-    robot.check_joints(wanted)
-    resumed = RunFolder.resume(options.resume, robot) if options.resume else None
-    kept = resumed.kept_joints() if resumed else {}
-    procedures = {name: _procedure(robot, name, options) for name in dict.fromkeys(wanted) if name not in kept}
-    expected = expected_of(robot)
-    rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
-    plan = calibration_plan(
-        robot, setup, procedures, expected, rehearse=rehearse, notes=_notes(procedures, expected, rehearse)
-    )
-    refuse_beyond_limits(plan, setup, expected)
-    if options.dry_run:
-        return {"outcome": "ok", "dry_run": True, "robot": robot.name, "plan": plan, "setup": setup}
+    planned = plan_calibration(options)
+    robot, setup, plan = planned.robot, planned.setup, planned.plan
     watcher.plan(plan, setup)
-    folder = resumed or RunFolder.create(robot, VERB, options.out)
+    folder = planned.resumed or RunFolder.create(robot, VERB, options.out)
+    kept = folder.kept_joints()
     progress = _Progress(
         joints={name: profile for name, (profile, _) in kept.items()},
         results={name: result for name, (_, result) in kept.items()},
@@ -137,7 +165,8 @@ def _run(
             )
         except FrictidError as error:
             if isinstance(error, UsageError) or not keeper.rows:
-                folder.discard()
+                if options.resume is None:
+                    folder.discard()
                 raise
             progress.ended = error
             return 0
@@ -233,6 +262,8 @@ def _finish(
             "next_step": ended.next_step,
         }
     folder.finish(result)
+    if profile_path is not None:
+        result["report"] = str(write_run_page(folder.path, load_profile(profile_path), folder.manifest).resolve())
     return result
 
 

@@ -1,55 +1,284 @@
-"""``frictid-hil identify``: the same mathematics on recorded data as on a live run."""
+"""``frictid-hil identify``: the same mathematics on recorded data as on a live run, for one recording or thousands."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import Estimate, JointProfile, PairList, ProcedureUsed
-from frictid_hil.driver import JointSetup
-from frictid_hil.errors import IdentificationError
-from frictid_hil.friction.identify import function_a
+from frictid_hil.columns import ColumnMap
+from frictid_hil.config.columns import load_columns
+from frictid_hil.config.profile import FrictionProfile, JointProfile
+from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
+from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import RobotSetup
+from frictid_hil.errors import FrictidError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.jobs.joint_profile import identify_joint, joint_result
+from frictid_hil.recording.read import read
+from frictid_hil.recording.samples import Samples
+
+_SERIAL_UP_TO = 3
+_READABLE = (".mcap", ".csv", ".csv.gz", ".mat")
 
 
-def identify_joint(samples: Samples, joint: JointSetup | None, *, method: str, late_cycles: int = 0) -> JointProfile:
-    where = f"joint {samples.joint}"
-    (mark,) = samples.marked("cycles")
-    cycles = samples.during(mark)
-    procedure = procedure_of(mark)
-    pairs = function_a((cycles.time_ns - mark.start_ns) * 1e-9, cycles.velocity_rad_s, cycles.torque_nm, procedure, where=where)
-    curve = pairs.curve(where=where)
-    return JointProfile(
-        method="function-a",
-        velocity_rad_s=curve.velocity_rad_s,
-        torque_nm=curve.torque_nm,
-        coulomb_nm=Estimate(value=curve.coulomb_nm),
-        torque_source=str(samples.meta.get("torque_source", "")),
-        procedure=ProcedureUsed(
-            amplitude_rad=procedure.amplitude_rad,
-            velocity_rad_s=procedure.velocity_rad_s,
-            cycles=procedure.cycles,
-            ratio=procedure.ratio,
+@dataclass(frozen=True, slots=True)
+class IdentifyOptions:
+    """What a person asked for.
+
+    Attributes:
+        logs: run folders, files, folders of files, globs.
+        robot: robot file for limits and gear; None where the recording says enough.
+        joints: only these; all when empty.
+        amplitude_rad: A, where the recording does not carry it.
+        velocity_rad_s: V.
+        cycles: N.
+        ratio: c.
+        method: estimator.
+        columns: column map of foreign files.
+        executor: ``processes:N`` or ``dask://host:port``; None chooses.
+        out: folder for profiles.
+    """
+
+    logs: tuple[Path, ...]
+    robot: str | None = None
+    joints: tuple[str, ...] = ()
+    amplitude_rad: float | None = None
+    velocity_rad_s: float | None = None
+    cycles: int | None = None
+    ratio: float | None = None
+    method: str = "aligned"
+    columns: str | None = None
+    executor: str | None = None
+    out: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One recording's identification; crosses process and host borders."""
+
+    log: Path
+    joints: tuple[str, ...]
+    setup: RobotSetup | None
+    procedure: Procedure | None
+    method: str
+    columns: ColumnMap | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Identified:
+    """What came of one recording."""
+
+    joints: dict[str, JointProfile]
+    failed: dict[str, str]
+    error: FrictidError | None = None
+
+
+def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Identify every joint of every recording.
+
+    Raises:
+        UsageError: nothing to read, or options that contradict each other.
+        InputFileError: the only recording is unreadable or unusable.
+        IdentificationError: the only recording gives no curve.
+    """
+    logs = recordings(options.logs)
+    tasks = [_task(log, options) for log in logs]
+    results: list[_Identified] = []
+    with _executor(options.executor, len(tasks)) as run:
+        for task, result in zip(tasks, run(_identified, tasks), strict=True):
+            results.append(result)
+            if len(tasks) > 1:
+                said = str(result.error) if result.error else f"{len(result.joints)} joints"
+                note(f"{len(results)}/{len(tasks)} {task.log}: {said}")
+    if len(results) == 1 and results[0].error is not None:
+        raise results[0].error
+    return _result(tasks, results, options)
+
+
+def recordings(named: Sequence[Path]) -> list[Path]:
+    """Every recording that is meant by files, folders, run folders and globs, each once, in order.
+
+    Raises:
+        UsageError: a name that means nothing.
+    """
+    found: list[Path] = []
+    for name in named:
+        base = Path(name.anchor)
+        here = sorted(base.glob(str(name.relative_to(base)))) if any(c in str(name) for c in "*?[") else [name]
+        if not here:
+            raise UsageError("no recording matches", where=str(name))
+        for path in here:
+            found.extend(_in_folder(path) if path.is_dir() else [path])
+    return list(dict.fromkeys(found))
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """The folder itself where it is a run; else every run and every readable file below it."""
+    if any(folder.glob("samples*.mcap")):
+        return [folder]
+    inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name.endswith(_READABLE)]
+    if not inside:
+        raise UsageError(
+            f"holds no recording ({', '.join(_READABLE)})",
+            where=str(folder),
+            next_step="name a run folder, or a file",
+        )
+    return [path.parent if path.name.startswith("samples") and path.suffix == ".mcap" else path for path in inside]
+
+
+def _task(log: Path, options: IdentifyOptions) -> _Task:
+    robot = load_robot(options.robot) if options.robot else None
+    setup = robot.to_setup() if robot else None
+    given = (options.amplitude_rad, options.velocity_rad_s)
+    procedure: Procedure | None = None
+    if all(value is not None for value in given):
+        assert options.amplitude_rad is not None and options.velocity_rad_s is not None
+        try:
+            procedure = Procedure(
+                options.amplitude_rad, options.velocity_rad_s, options.cycles or 10, options.ratio or 0.8
+            )
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    elif any(value is not None for value in (*given, options.cycles, options.ratio)):
+        raise UsageError(
+            "--amplitude and --velocity belong together, and --cycles and --ratio to them",
+            next_step="give the procedure as it was commanded, or leave all four out",
+        )
+    columns = load_columns(options.columns) if options.columns else None
+    return _Task(log, options.joints, setup, procedure, options.method, columns)
+
+
+def _identified(task: _Task) -> _Identified:
+    """Read and identify one recording; what goes wrong is part of the answer, so that others go on."""
+    try:
+        every = read(task.log, task.columns)
+    except FrictidError as error:
+        return _Identified({}, {}, error)
+    wanted = [samples for samples in every if not task.joints or samples.joint in task.joints]
+    if not wanted:
+        names = ", ".join(samples.joint for samples in every)
+        return _Identified({}, {}, InputFileError(f"no such joint; it has {names}", where=str(task.log)))
+    joints: dict[str, JointProfile] = {}
+    failed: dict[str, str] = {}
+    last: FrictidError | None = None
+    for samples in wanted:
+        if len(wanted) > 1 and not task.joints and samples.marks == () and _has_marks(wanted):
+            continue  # the joints that stood still in a run of another one
+        try:
+            joints[samples.joint] = _joint(samples, task)
+        except FrictidError as error:
+            failed[samples.joint] = str(error)
+            last = error
+    return _Identified(joints, failed, None if joints else last)
+
+
+def _joint(samples: Samples, task: _Task) -> JointProfile:
+    joint = None
+    if task.setup is not None:
+        joint = task.setup.joint(samples.joint)
+    return identify_joint(samples, joint, method=task.method, procedure=task.procedure)
+
+
+def _has_marks(every: Sequence[Samples]) -> bool:
+    return any(samples.marks for samples in every)
+
+
+def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOptions) -> dict[str, Any]:
+    entries: list[dict[str, Any]] = []
+    for task, result in zip(tasks, results, strict=True):
+        joints = {name: joint_result(profile) for name, profile in result.joints.items()}
+        joints.update(
+            {
+                name: {"outcome": "gate_failed", "remarks": [why], "velocity_rad_s": [], "torque_nm": []}
+                for name, why in result.failed.items()
+            }
+        )
+        profile_path = _write(task, result, options.out, alone=len(tasks) == 1)
+        entries.append(
+            {
+                "log": str(task.log.resolve()),
+                "profile": str(profile_path.resolve()) if profile_path else None,
+                "error": str(result.error) if result.error else None,
+                "joints": joints,
+            }
+        )
+    every = [joint for entry in entries for joint in entry["joints"].values()]
+    bad = [entry for entry in entries if entry["error"]]
+    outcome = "ok" if every and all(joint["outcome"] == "ok" for joint in every) and not bad else "gate_failed"
+    whole: dict[str, Any] = {"outcome": outcome, "recordings": entries if len(entries) > 1 else []}
+    if len(entries) == 1:
+        whole.update(run=None, profile=entries[0]["profile"], joints=entries[0]["joints"])
+    else:
+        whole.update(run=None, profile=None, joints={})
+    if outcome != "ok":
+        failures = [f"{Path(entry['log']).name}: {entry['error']}" for entry in bad]
+        failures += [
+            f"{name}: {'; '.join(joint['remarks'])}"
+            for entry in entries
+            for name, joint in entry["joints"].items()
+            if joint["outcome"] != "ok" and not entry["error"]
+        ]
+        whole["error"] = {
+            "what": f"{len(failures)} of {max(len(entries), len(every))} failed: {'; '.join(failures[:5])}",
+            "where": "",
+            "cause": "",
+            "next_step": "results of the others stand",
+        }
+    return whole
+
+
+def _write(task: _Task, result: _Identified, out: Path | None, *, alone: bool) -> Path | None:
+    if out is None or not result.joints:
+        return None
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / ("profile.yaml" if alone else f"{task.log.parent.name}-{task.log.stem}.yaml")
+    robot = task.setup.name if task.setup else task.log.stem
+    FrictionProfile(
+        robot=robot,
+        joints=result.joints,
+        provenance=Provenance(
+            created_utc=utc_now(),
+            git_revision=git_revision(),
+            run=str(task.log.resolve()),
+            log_sha256={path.name: file_sha256(path) for path in _files(task.log)},
         ),
-    )
+    ).save(path)
+    return path
 
 
-def procedure_of(mark: Mark) -> Procedure:
-    d = mark.details
-    return Procedure(d["amplitude_rad"], d["velocity_rad_s"], int(d["cycles"]), d["ratio"])
+def _files(log: Path) -> list[Path]:
+    return sorted(log.glob("samples*.mcap")) if log.is_dir() else [log]
 
 
-def joint_result(profile: JointProfile) -> dict[str, Any]:
-    """A joint's entry in the JSON."""
-    return {
-        "outcome": "ok" if all(gate.passed for gate in profile.gates) else "gate_failed",
-        "velocity_rad_s": list(profile.velocity_rad_s),
-        "torque_nm": list(profile.torque_nm),
-        "coulomb_nm": profile.coulomb_nm.value,
-        "inertia_kg_m2": profile.inertia_kg_m2.value,
-        "prismatic": profile.prismatic,
-        "remarks": [gate.message for gate in profile.gates if not gate.passed],
-    }
+_Map = Callable[[Callable[[_Task], _Identified], list[_Task]], Iterator[_Identified]]
+
+
+@contextlib.contextmanager
+def _executor(named: str | None, tasks: int) -> Iterator[_Map]:
+    """A ``map`` that runs here, over processes, or over a cluster; results in order of the tasks."""
+    if named is None and tasks <= _SERIAL_UP_TO:
+        yield lambda function, items: map(function, items)
+        return
+    with _pool(named) as pool:
+        yield lambda function, items: pool.map(function, items)
+
+
+def _pool(named: str | None) -> Executor:
+    kind, _, rest = (named or "processes:").partition(":")
+    if kind == "processes" and (not rest or (rest.isdigit() and int(rest) > 0)):
+        return ProcessPoolExecutor(int(rest) if rest else None)
+    if kind == "dask" and rest.startswith("//"):
+        try:
+            from distributed import Client
+        except ImportError:
+            raise UsageError(
+                "dask:// needs the package distributed", next_step="pip install 'frictid-hil[cluster]'"
+            ) from None
+        client = Client(f"tcp:{rest}", timeout="10s")
+        executor: Executor = client.get_executor()
+        return executor
+    raise UsageError(f"no executor {named!r}", next_step="processes:4, or dask://host:port")

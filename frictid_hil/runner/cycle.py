@@ -173,8 +173,13 @@ class CyclicLoop:
             self._pump()
         return feedback
 
-    def run(self, source: SetPointSource, joint: int) -> None:
+    def run(self, source: SetPointSource, joint: int, *, ending: SetPointSource | None = None) -> None:
         """Stream one motion of one joint to its end.
+
+        Args:
+            source: of its set-points.
+            joint: index.
+            ending: brings the joint to rest when asked to; without one its commanded position is decelerated.
 
         Raises:
             SafetyAbort: by the supervisor.
@@ -185,7 +190,7 @@ class CyclicLoop:
         while True:
             level = self._stop.level
             if level:
-                self._end_early(joint, set_point.position_rad - previous_rad, level)
+                self._end_early(joint, set_point.position_rad - previous_rad, level, ending)
             previous_rad = set_point.position_rad
             if not source.update(self.feedback[joint], set_point):
                 return
@@ -210,10 +215,13 @@ class CyclicLoop:
         for _ in range(cycles):
             self.cycle(supervised=False)
 
-    def _end_early(self, joint: int, step_rad: float, level: int) -> None:
+    def _end_early(self, joint: int, step_rad: float, level: int, ending: SetPointSource | None) -> None:
         """Bring the commanded position to rest at constant deceleration within a tenth of a second."""
         set_point = self.set_points[joint]
-        if level < QUICK_STOP and step_rad:
+        if ending is not None:
+            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], set_point):
+                self.cycle()
+        elif level < QUICK_STOP and step_rad:
             steps = max(2, round(0.1 / self.period_s))
             for k in range(steps):
                 if self._stop.level >= QUICK_STOP:

@@ -115,7 +115,7 @@ class RunFolder:
     def __init__(self, path: Path, robot: Robot, manifest: dict[str, Any]) -> None:
         self.path = path
         self._robot = robot
-        self._manifest = manifest
+        self.manifest = manifest
         self._keeper: RowKeeper | None = None
         self._joints: list[str] = []
 
@@ -184,7 +184,7 @@ class RunFolder:
     def keeping(self, setup: RobotSetup, at: Callable[[float], None]) -> Iterator[RowKeeper]:
         """The files of a run, closed whatever happens."""
         self._joints = [joint.name for joint in setup.joints]
-        part = len(self._manifest["sessions"])
+        part = len(self.manifest["sessions"])
         suffix = f"-{part}" if part else ""
         meta = {"robot": self._robot.name, "config_sha256": self._robot.digest, "started_utc": utc_now()}
         keeper = RowKeeper(
@@ -203,16 +203,16 @@ class RunFolder:
         """Write what happened into the manifest."""
         if isinstance(event, Preflight):
             identities = {name: _finite(asdict(identity)) for name, identity in event.identities.items()}
-            self._manifest["identities"] = identities
+            self.manifest["identities"] = identities
             if self._keeper is not None:
                 self._keeper.identify(identities)
-            self._manifest["findings"] = [
+            self.manifest["findings"] = [
                 {"severity": f.severity.value, "subject": f.subject, "message": f.message} for f in event.findings
             ]
         elif isinstance(event, JointRun):
-            self._manifest["sessions"].append(_finite(asdict(event)))
+            self.manifest["sessions"].append(_finite(asdict(event)))
         elif isinstance(event, Warned):
-            self._manifest["warnings"].append(event.message)
+            self.manifest["warnings"].append(event.message)
         else:
             if isinstance(event, Marked) and self._keeper is not None:
                 self._keeper.mark(event.joint, event.mark)
@@ -267,9 +267,9 @@ class RunFolder:
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write how the run ended."""
-        self._manifest["ended_utc"] = utc_now()
-        self._manifest["outcome"] = result["outcome"]
-        self._manifest["error"] = result.get("error")
+        self.manifest["ended_utc"] = utc_now()
+        self.manifest["outcome"] = result["outcome"]
+        self.manifest["error"] = result.get("error")
         self._save()
 
     def discard(self) -> None:
@@ -279,7 +279,7 @@ class RunFolder:
         self.path.rmdir()
 
     def _save(self) -> None:
-        write_whole(self.path / "manifest.json", json.dumps(self._manifest, indent=1))
+        write_whole(self.path / "manifest.json", json.dumps(self.manifest, indent=1))
 
 
 def load_manifest(path: Path) -> dict[str, Any]:

@@ -21,12 +21,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from frictid_hil.control import Compensated, Probe
 from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode, RobotSetup, SetPoint, Severity
-from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, ProfileMismatch, SafetyAbort
 from frictid_hil.plan import JointPlan, Motion, Move, Plan
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, StopRequest, Stream
-from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
+from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.law_runner import LawRunner
+from frictid_hil.runner.probe import ProbeWatch
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 from frictid_hil.units import degrees, format_angle
@@ -160,7 +163,7 @@ class Scheduler:
         for joint in self._setup.joints:
             driver.set_limits(
                 joint.name,
-                torque_nm=joint.max_torque_nm,
+                torque_nm=_drive_torque_nm(joint, plan),
                 position_min_rad=joint.position_min_rad,
                 position_max_rad=joint.position_max_rad,
             )
@@ -233,10 +236,19 @@ class Scheduler:
                 self._stream(loop, index, approach)
         self._lock_all_but(moving, loop, supervisor)
         self._see_standstill(loop)
-        motions = self._from_here(loop.set_points[moving].position_rad, plan)
+        motions = self._from_here(loop.set_points[moving].position_rad, plan.motions)
+        joint = self._setup.joints[moving]
+        laws = LawRunner(self._driver, loop, supervisor, joint, moving, self._limits(joint, plan))
         for motion in motions:
+            if not isinstance(motion, Compensated) and laws.leave():
+                for back in self._from_here(loop.set_points[moving].position_rad, [motion])[:-1]:
+                    self._stream(loop, moving, back)
             self._notify(PhaseStarted(plan.joint, motion.name, motion.duration_s))
-            if motion.name == "rehearsal":
+            if isinstance(motion, Compensated):
+                mark = laws.run(motion)
+            elif isinstance(motion, Probe):
+                mark = self._probe(loop, moving, motion)
+            elif motion.name == "rehearsal":
                 mark = self._rehearse(loop, supervisor, moving, plan, motion)
             else:
                 mark = self._stream(loop, moving, motion)
@@ -244,12 +256,12 @@ class Scheduler:
             marks.append(mark)
         return marks
 
-    def _from_here(self, here_rad: float, plan: JointPlan) -> list[Motion]:
+    def _from_here(self, here_rad: float, motions: Sequence[Motion]) -> list[Motion]:
         """The planned motions, after a small approach where the joint does not stand exactly at their beginning."""
-        first_rad = float(plan.motions[0].position_rad(np.zeros(1))[0])
+        first_rad = float(motions[0].position_rad(np.zeros(1))[0])
         if abs(first_rad - here_rad) <= _AT_RAD:
-            return list(plan.motions)
-        return [Move.within(here_rad, first_rad, self._care.approach_rad_s, name="approach"), *plan.motions]
+            return list(motions)
+        return [Move.within(here_rad, first_rad, self._care.approach_rad_s, name="approach"), *motions]
 
     def _stream(self, loop: CyclicLoop, index: int, motion: Motion) -> Mark:
         steps = max(1, math.ceil(motion.duration_s / loop.period_s))
@@ -279,6 +291,22 @@ class Scheduler:
                 next_step="check `direction` in the robot file and the drive's own friction compensation",
             )
         return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+
+    def _probe(self, loop: CyclicLoop, moving: int, probe: Probe) -> Mark:
+        """A slow sine whose torque must be what the profile says."""
+        steps = max(1, math.ceil(probe.duration_s / loop.period_s))
+        watch = ProbeWatch(
+            Stream(probe.position_rad(np.arange(steps) * loop.period_s).tolist()), probe, self._names[moving]
+        )
+        start_ns = loop.now_ns()
+        loop.run(watch, moving)
+        try:
+            watch.judge()
+        except ProfileMismatch as mismatch:
+            if probe.enforced:
+                raise
+            self._notify(Warned(f"forced in spite of: {mismatch}"))
+        return Mark(probe.name, start_ns, loop.now_ns(), probe.details())
 
     # -- power and locks ----------------------------------------------------------------------------------------
 
@@ -368,6 +396,11 @@ class Scheduler:
         except FrictidError:
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self._driver.quick_stop()
+
+
+def _drive_torque_nm(joint: JointSetup, plan: JointPlan) -> float:
+    """The limit set in a drive: the plan's own for the joint that moves, where it has one."""
+    return min(joint.max_torque_nm, plan.torque_limit_nm) if joint.name == plan.joint else joint.max_torque_nm
 
 
 class _SignWatch:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.units import degrees, format_angle, format_torque, format_velocity
 
 
@@ -58,6 +59,7 @@ class Supervisor:
         self._locked_at: dict[int, float] = {}
         self._torque_high = [0] * len(self._names)
         self._max_age = [limit.max_age_cycles for limit in limits]
+        self._runaway: RunawayWatch | None = None
 
     def watch(self, moving: int | None, mode: Mode, locked_at: dict[int, float]) -> None:
         """Say what is allowed from now on.
@@ -70,6 +72,14 @@ class Supervisor:
         self._moving = moving
         self._mode = mode
         self._locked_at = dict(locked_at)
+
+    def expect_mode(self, mode: Mode) -> None:
+        """The moving joint is in another mode from now on."""
+        self._mode = mode
+
+    def watch_runaway(self, watch: RunawayWatch | None) -> None:
+        """The moving joint is free, held by nothing but friction, from now on; None when it no longer is."""
+        self._runaway = watch
 
     def set_limits(self, joint: int, limits: JointLimits) -> None:
         """Replace one joint's bounds (rehearsal is watched more closely)."""
@@ -139,6 +149,16 @@ class Supervisor:
             self._torque_high[index] = 0
         if abs(torque * velocity) > limits.power_w:
             raise self._abort(index, f"power {torque * velocity:.1f} W above the bound {limits.power_w:.1f} W")
+        if self._runaway is not None:
+            wrong = self._runaway.verdict(velocity, report.external_torque_nm)
+            if wrong:
+                raise self._abort(
+                    index,
+                    f"a free joint runs away: {wrong}",
+                    cause="compensation gives more than the friction takes: a wrong profile, a warmer gear, or too "
+                    "high a ratio R; or gravity is not what the profile says",
+                    next_step="calibrate the joint again, or lower --compensation-ratio",
+                )
         if self._mode is Mode.POSITION:
             error = set_point.position_rad - position
             if not abs(error) <= limits.following_error_rad:

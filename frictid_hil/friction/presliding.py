@@ -1,0 +1,132 @@
+"""Presliding stiffness from a slow small reversal: how steeply torque turns over before the joint slides again.
+
+After a turning point friction goes from one sliding level to the other over a short travel, (20): a spring until it
+yields. Two shapes of that passage are fitted, x being the travel since the turning point, D the whole change of torque,
+
+    yields at once       f(x) = f_r -/+ min(sigma x, D)
+    yields gradually     f(x) = f_r -/+ D (1 - exp(-sigma x / D))          (Dahl)
+
+and the one that leaves less decides. sigma is the stiffness at the turning point in both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.optimize import curve_fit
+from scipy.stats import t as student
+
+from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.rigid_body import Measured
+from frictid_hil.friction.trajectory import Array
+
+_SMOOTHING_S = 0.02
+_TURN_SHARE = 0.3
+"""A turning point is followed by at least this share of the whole travel in the other direction."""
+_LEAST_ROWS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Passage:
+    travel: Array  # since the turning point, positive
+    drop: Array  # torque, signed so that it falls
+
+
+def presliding_stiffness(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Measured:
+    """Stiffness of the joint before it slides, N m/rad, with its 95 % interval.
+
+    Args:
+        time_s: increasing, shape (n,).
+        position_rad: measured, shape (n,); several slow reversals, each a few times longer than the presliding travel.
+        torque_nm: as reported, shape (n,).
+        where: what to name in an error.
+
+    Raises:
+        IdentificationError: fewer than two reversals, or no passage from one sliding level to the other in them.
+    """
+    step_s = float(np.median(np.diff(time_s)))
+    smooth = uniform_filter1d(np.asarray(position_rad, dtype=np.float64), max(1, round(_SMOOTHING_S / step_s)))
+    turns = _turning_points(smooth)
+    if len(turns) < 2:
+        raise IdentificationError(
+            "the slow reversal holds fewer than two turning points, so presliding cannot be seen", where=where
+        )
+    bounds = [*turns, smooth.size - 1]
+    passages = [
+        _passage(smooth, np.asarray(torque_nm, dtype=np.float64), start, stop) for start, stop in pairwise(bounds)
+    ]
+    passages = [passage for passage in passages if passage.travel.size >= _LEAST_ROWS]
+    shapes = [fitted for shape in (_at_once, _gradually) if (fitted := _fit_all(shape, passages)) is not None]
+    if not shapes:
+        raise IdentificationError(
+            "torque does not pass from one sliding level to the other at the reversals",
+            where=where,
+            cause="the reversal is shorter than the presliding travel, or torque is too noisy",
+        )
+    stiffness, _ = min(shapes, key=lambda fitted: fitted[1])
+    half = float(student.ppf(0.975, stiffness.size - 1) * stiffness.std(ddof=1) / np.sqrt(stiffness.size))
+    return Measured(float(stiffness.mean()), half)
+
+
+def _turning_points(position: Array) -> list[int]:
+    """Rows at which the motion turns, by a zigzag that ignores wiggles smaller than a share of the travel."""
+    least = _TURN_SHARE * float(np.ptp(position))
+    turns: list[int] = []
+    extreme, direction = 0, 0
+    for row in range(position.size):
+        moved = position[row] - position[extreme]
+        if direction == 0:
+            if abs(moved) > least:
+                direction, extreme = (1 if moved > 0 else -1), row
+        elif moved * direction > 0:
+            extreme = row
+        elif abs(moved) > least:
+            turns.append(extreme)
+            direction, extreme = -direction, row
+    return turns
+
+
+def _passage(position: Array, torque: Array, start: int, stop: int) -> _Passage:
+    direction = np.sign(position[stop] - position[start])
+    travel = (position[start:stop] - position[start]) * direction
+    return _Passage(travel, -direction * torque[start:stop])
+
+
+def _at_once(travel: Array, start: float, stiffness: float, change: float) -> Array:
+    falling: Array = start - np.minimum(stiffness * travel, change)
+    return falling
+
+
+def _gradually(travel: Array, start: float, stiffness: float, change: float) -> Array:
+    falling: Array = start - change * (1.0 - np.exp(-stiffness * travel / change))
+    return falling
+
+
+def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Array, float] | None:
+    """Stiffness of every passage that could be fitted, and the mean square left; None where fewer than two could."""
+    found: list[float] = []
+    left = 0.0
+    for passage in passages:
+        travel, drop = passage.travel, passage.drop
+        top, bottom = np.quantile(drop, 0.98), np.quantile(drop, 0.1)
+        change = float(top - bottom)
+        if change <= 0:
+            continue
+        half_way = travel[np.argmax(drop < (top + bottom) / 2)]
+        guess = (float(top), change / (2.0 * max(float(half_way), 1e-9)), change)
+        try:
+            values, spread = curve_fit(
+                shape, travel, drop, p0=guess, bounds=([-np.inf, 0.0, 0.2 * change], [np.inf, np.inf, 3.0 * change])
+            )
+        except (RuntimeError, ValueError):
+            continue
+        if np.sqrt(spread[1, 1]) < 0.5 * values[1]:
+            found.append(float(values[1]))
+            left += float(np.mean((shape(travel, *values) - drop) ** 2))
+    if len(found) < 2:
+        return None
+    return np.array(found), left / len(found)

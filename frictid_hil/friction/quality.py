@@ -1,0 +1,186 @@
+"""Quality gates: questions that a measurement must pass before its curve may replace another one.
+
+Each gate says what was measured, against which limit, and what a failure usually means. A failed gate keeps the result
+and forbids its promotion.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from frictid_hil.friction.estimate import Estimate
+from frictid_hil.friction.intervals import Drift
+from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
+from frictid_hil.friction.trajectory import Array
+
+LEAST_TRACKING = 0.95
+MOST_TRACKING = 1.3
+MOST_SATURATED = 0.005
+MOST_ROUGHNESS = 0.25
+MOST_DRIFT = 0.05
+RESONANCE_SHARE = 0.2
+LEAST_SAMPLES = 8
+MOST_LATE = 0.02
+
+_ROUGH_S = 0.008
+_AT_LIMIT = 0.98
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """One question and its answer.
+
+    Attributes:
+        name: of the gate.
+        passed: the answer.
+        value: what was measured.
+        limit: what was allowed.
+        reason: a sentence for a person, whether passed or not.
+    """
+
+    name: str
+    passed: bool
+    value: float
+    limit: float
+    reason: str
+
+
+def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
+    """All gates that this recording allows to ask."""
+    motion = synchronised(recording)
+    asked = [
+        _tracking(recording, motion),
+        _roughness(recording, result),
+        _samples(result),
+        _lateness(recording),
+    ]
+    if math.isfinite(recording.torque_limit_nm):
+        asked.append(_saturation(recording))
+    if result.drift is not None:
+        asked.append(_drift(result.drift))
+    if result.link_resonance_hz is not None:
+        asked.append(_resonance(recording, result.link_resonance_hz.value))
+    return tuple(asked)
+
+
+def achieved_over_commanded(recording: CycleRecording, motion: Motion) -> Array:
+    """Peak speed of each cycle, mean of both directions, over nV/N, shape (N,)."""
+    starts = np.searchsorted(motion.time_s, recording.procedure.cycle_starts_s)
+    commanded = recording.procedure.peak_velocities_rad_s
+    reached = [
+        (float(v.max()) - float(v.min())) / 2 if (v := motion.velocity_rad_s[a:b]).size else 0.0
+        for a, b in pairwise(starts)
+    ]
+    return np.array(reached) / commanded
+
+
+def _tracking(recording: CycleRecording, motion: Motion) -> Gate:
+    ratios = achieved_over_commanded(recording, motion)
+    worst = int(np.argmax(np.abs(ratios - 1.0)))
+    ratio = float(ratios[worst])
+    passed = LEAST_TRACKING <= ratio <= MOST_TRACKING
+    said = f"cycle {worst + 1} reached {100 * ratio:.1f} % of its commanded peak speed"
+    if passed:
+        return Gate("tracking", True, ratio, LEAST_TRACKING, f"tracking: {said} at worst")
+    cause = (
+        "the command is averaged or filtered on its way, or torque saturates"
+        if ratio < 1
+        else "the position loop overshoots or hunts"
+    )
+    return Gate(
+        "tracking",
+        False,
+        ratio,
+        LEAST_TRACKING if ratio < 1 else MOST_TRACKING,
+        f"tracking: {said} (allowed {100 * LEAST_TRACKING:.0f} to {100 * MOST_TRACKING:.0f} %): {cause}",
+    )
+
+
+def _roughness(recording: CycleRecording, result: Estimate) -> Gate:
+    step_s = float(np.median(np.diff(recording.time_s)))
+    torque = np.asarray(recording.torque_nm, dtype=np.float64)
+    fast = torque - uniform_filter1d(torque, max(3, round(_ROUGH_S / step_s) | 1))
+    level = float(np.mean(result.curve.torque_nm))
+    share = float(np.sqrt(np.mean(fast**2))) / level
+    passed = share <= MOST_ROUGHNESS
+    said = f"fast torque is {100 * share:.1f} % of the friction (allowed {100 * MOST_ROUGHNESS:.0f} %)"
+    return Gate(
+        "high_frequency_torque",
+        passed,
+        share,
+        MOST_ROUGHNESS,
+        said if passed else f"{said}: the position loop oscillates, or the torque signal is too noisy",
+    )
+
+
+def _samples(result: Estimate) -> Gate:
+    fewest = int(min(result.pairs.samples_plus.min(), result.pairs.samples_minus.min()))
+    passed = fewest >= LEAST_SAMPLES
+    said = f"the smallest window holds {fewest} samples (at least {LEAST_SAMPLES})"
+    return Gate(
+        "samples_per_window",
+        passed,
+        float(fewest),
+        float(LEAST_SAMPLES),
+        said if passed else f"{said}: raise the rate or the travel, or lower the peak speed",
+    )
+
+
+def _lateness(recording: CycleRecording) -> Gate:
+    share = recording.late_cycles / len(recording.time_s)
+    passed = share <= MOST_LATE
+    late = recording.late_cycles
+    said = f"{late} control cycles were late or missed, {100 * share:.2f} % (allowed {100 * MOST_LATE:.0f} %)"
+    return Gate(
+        "late_cycles",
+        passed,
+        share,
+        MOST_LATE,
+        said if passed else f"{said}: give the process real-time priority, or lower the rate",
+    )
+
+
+def _saturation(recording: CycleRecording) -> Gate:
+    high = np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm
+    share = float(np.mean(high))
+    passed = share <= MOST_SATURATED
+    said = f"torque stood at its limit of {recording.torque_limit_nm:.4g} during {100 * share:.2f} % of the samples"
+    return Gate(
+        "saturation",
+        passed,
+        share,
+        MOST_SATURATED,
+        said if passed else f"{said}: raise the travel (peak torque grows as V^2/A) or lower the peak speed",
+    )
+
+
+def _drift(drift: Drift) -> Gate:
+    change = abs(drift.change)
+    passed = change <= MOST_DRIFT
+    said = (
+        f"friction changed by {100 * drift.change:+.1f} % (allowed {100 * MOST_DRIFT:.0f} %) "
+        f"when cycle {drift.cycle} ran again {drift.apart_s:.0f} s later"
+    )
+    return Gate("drift", passed, change, MOST_DRIFT, said if passed else f"{said}: warm the joint up first")
+
+
+def _resonance(recording: CycleRecording, resonance_hz: float) -> Gate:
+    fastest_hz = float(recording.procedure.angular_frequencies_rad_s[-1]) / (2 * math.pi)
+    share = fastest_hz / resonance_hz
+    passed = share <= RESONANCE_SHARE
+    said = (
+        f"the fastest cycle, {fastest_hz:.2f} Hz, is {100 * share:.0f} % (allowed {100 * RESONANCE_SHARE:.0f} %) "
+        f"of the link's resonance at {resonance_hz:.1f} Hz"
+    )
+    return Gate(
+        "link_resonance",
+        passed,
+        share,
+        RESONANCE_SHARE,
+        said if passed else f"{said}: raise the travel, or lower the peak speed",
+    )

@@ -1,0 +1,243 @@
+"""From one joint's samples to its entry in a profile: estimator, rigid body, presliding, quality gates.
+
+Live runs and recordings come through here alike, so that the same samples give the same profile to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.profile import Estimate as Figure
+from frictid_hil.config.profile import Gate, JointProfile, PairList, ProcedureUsed, Ripple
+from frictid_hil.driver import JointSetup
+from frictid_hil.errors import IdentificationError, UsageError
+from frictid_hil.friction import quality
+from frictid_hil.friction.estimate import Estimate, estimate
+from frictid_hil.friction.identify import IdentifiedPairs
+from frictid_hil.friction.onset import cycles_start_s
+from frictid_hil.friction.plateaus import plateaus
+from frictid_hil.friction.presliding import presliding_stiffness
+from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
+from frictid_hil.friction.rigid_body import Measured
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.recording.samples import Mark, Samples
+
+_PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
+
+
+def identify_joint(
+    samples: Samples,
+    joint: JointSetup | None,
+    *,
+    method: str,
+    procedure: Procedure | None = None,
+    late_cycles: int = 0,
+) -> JointProfile:
+    """Identify one joint.
+
+    Args:
+        samples: of the whole run of the joint, with marks; or of a foreign recording, without.
+        joint: limits and gear, where a robot file tells.
+        method: estimator.
+        procedure: instead of the one that the marks carry; without either, plateaus of constant speed are looked for.
+        late_cycles: control cycles that came late or were missed.
+
+    Raises:
+        IdentificationError: no curve can be formed; the reason names cycle or speed.
+    """
+    if samples.torque_nm is None:
+        raise IdentificationError("the recording has no torque", where=f"joint {samples.joint}")
+    marks = samples.marked("cycles")
+    if marks:
+        used = procedure_of(marks[0])
+        if procedure is not None and procedure != used:
+            raise UsageError(
+                "the recording was made with another procedure than the one asked for; leave the options out",
+                where=f"joint {samples.joint}",
+            )
+        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles)
+    if procedure is not None:
+        path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
+        start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
+        return _from_cycles(samples, procedure, start_s, joint, method, late_cycles)
+    return _from_plateaus(samples)
+
+
+def procedure_of(mark: Mark) -> Procedure:
+    """V, A, N, c that a recording carries."""
+    amplitude, velocity, cycles, ratio = (mark.details[key] for key in _PROCEDURE_KEYS)
+    return Procedure(float(amplitude), float(velocity), int(cycles), float(ratio))
+
+
+def joint_result(profile: JointProfile) -> dict[str, Any]:
+    """A joint's entry in the JSON of ``calibrate`` and ``identify``."""
+    failed = [gate for gate in profile.gates if not gate.passed]
+    return {
+        "outcome": "gate_failed" if failed else "ok",
+        "method": profile.method,
+        "velocity_rad_s": list(profile.velocity_rad_s),
+        "torque_nm": list(profile.torque_nm),
+        "torque_interval_nm": [list(pair) for pair in profile.torque_interval_nm or ()],
+        "coulomb_nm": profile.coulomb_nm.value,
+        "inertia_kg_m2": profile.inertia_kg_m2.value,
+        "presliding_stiffness_nm_per_rad": profile.presliding_stiffness_nm_per_rad.value,
+        "prismatic": profile.prismatic,
+        "remarks": [gate.message for gate in failed],
+        "notes": list(profile.quality.get("notes", ())),
+    }
+
+
+def _from_cycles(
+    samples: Samples, procedure: Procedure, start_s: float, joint: JointSetup | None, method: str, late_cycles: int
+) -> JointProfile:
+    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    result = estimate(recording, method)
+    gates = quality.gates(recording, result)
+    body = result.rigid_body
+    curve = result.curve
+    half = result.half_width_nm
+    temperature = samples.temperature_c
+    return JointProfile(
+        method=result.method,
+        prismatic=samples.prismatic,
+        velocity_rad_s=curve.velocity_rad_s,
+        torque_nm=curve.torque_nm,
+        torque_interval_nm=tuple(
+            (float(f - h), float(f + h)) for f, h in zip(curve.torque_nm, half.tolist(), strict=True)
+        ),
+        coulomb_nm=_figure(result.coulomb_nm),
+        presliding_stiffness_nm_per_rad=_presliding(samples, recording, result),
+        inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, "inertia and gravity could not be separated"),
+        gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, "inertia and gravity could not be separated"),
+        gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, "inertia and gravity could not be separated"),
+        bias_nm=_figure(body.bias_nm if body else None, "inertia and gravity could not be separated"),
+        forward=_pair_list(result.pairs.velocity_plus_rad_s, result.pairs.torque_plus_nm),
+        backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
+        published=_published(result.published),
+        ripple=Ripple(period_rad=result.ripple.period_rad, torque_nm=result.ripple.torque_nm)
+        if result.ripple
+        else None,
+        torque_source=str(samples.meta.get("torque_source", "")),
+        time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s,
+        temperature_c=None if temperature is None else round(float(np.nanmean(temperature)), 2),
+        procedure=ProcedureUsed(
+            amplitude_rad=procedure.amplitude_rad,
+            velocity_rad_s=procedure.velocity_rad_s,
+            cycles=procedure.cycles,
+            ratio=procedure.ratio,
+        ),
+        quality={
+            **{name: float(value) for name, value in result.figures.items()},
+            "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
+            "drift_percent": 100 * result.drift.change if result.drift else None,
+            "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
+            "notes": list(result.notes),
+        },
+        gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
+    )
+
+
+def _from_plateaus(samples: Samples) -> JointProfile:
+    assert samples.torque_nm is not None  # by the caller
+    skew = _skew(samples)
+    pairs = plateaus(
+        samples.time_s,
+        samples.position_rad,
+        samples.torque_nm,
+        command_rad=samples.position_command_rad,
+        torque_delay_s=skew.torque_delay_s - skew.position_delay_s,
+        where=f"joint {samples.joint}",
+    )
+    curve = pairs.curve(where=f"joint {samples.joint}")
+    return JointProfile(
+        method="plateaus",
+        prismatic=samples.prismatic,
+        velocity_rad_s=curve.velocity_rad_s,
+        torque_nm=curve.torque_nm,
+        coulomb_nm=Figure(value=curve.coulomb_nm),
+        forward=_pair_list(pairs.velocity_plus_rad_s, pairs.torque_plus_nm),
+        backward=_pair_list(-pairs.velocity_minus_rad_s, pairs.torque_minus_nm),
+        torque_source=str(samples.meta.get("torque_source", "")),
+        time_skew_s=skew.torque_delay_s - skew.position_delay_s,
+        quality={"notes": ["no sine cycles: windows are stretches of constant speed, both ways"]},
+    )
+
+
+def _recording(
+    samples: Samples, procedure: Procedure, start_s: float, joint: JointSetup | None, late_cycles: int
+) -> CycleRecording:
+    kept = samples.select(_around_cycles(samples, procedure, start_s))
+    assert kept.torque_nm is not None  # by the caller
+    drift = samples.marked("drift")
+    quantum = samples.meta.get("torque_resolution_nm")
+    return CycleRecording(
+        time_s=kept.time_s - start_s,
+        position_rad=kept.position_rad,
+        torque_nm=kept.torque_nm,
+        procedure=procedure,
+        velocity_rad_s=kept.velocity_rad_s,
+        command_rad=kept.position_command_rad,
+        skew=_skew(samples),
+        gear_ratio=joint.gear_ratio if joint else math.nan,
+        prismatic=samples.prismatic,
+        torque_limit_nm=joint.max_torque_nm if joint else math.inf,
+        torque_quantum_nm=float(quantum) if quantum else 0.0,
+        repeat=Repeat(procedure.cycles // 2 + 1, drift[0].start_ns * 1e-9 - start_s) if drift else None,
+        late_cycles=late_cycles,
+        where=f"joint {samples.joint}",
+    )
+
+
+def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """From the hold before the cycles to the end of the repeated cycle; half a second around where no marks tell."""
+    first_s, last_s = start_s - 0.5, start_s + procedure.duration_s + 0.5
+    holds = [mark for mark in samples.marked("hold") if mark.end_ns * 1e-9 <= start_s + 1e-6]
+    if holds:
+        first_s = holds[-1].start_ns * 1e-9
+    drift = samples.marked("drift")
+    if drift:
+        last_s = drift[0].end_ns * 1e-9
+    time_s = samples.time_s
+    inside: np.ndarray[Any, np.dtype[np.bool_]] = (time_s >= first_s) & (time_s < last_s)
+    return inside
+
+
+def _skew(samples: Samples) -> Skew:
+    timing = samples.meta.get("timing")
+    if not isinstance(timing, Mapping):
+        return Skew()
+    keys = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
+    return Skew(**{key: float(timing[key]) for key in keys if timing.get(key) is not None})
+
+
+def _presliding(samples: Samples, recording: CycleRecording, result: Estimate) -> Figure:
+    reversals = samples.marked("reversal")
+    if not reversals:
+        return Figure.none("the recording has no slow reversal")
+    part = samples.during(reversals[0])
+    assert part.torque_nm is not None  # by the caller
+    try:
+        stiffness = presliding_stiffness(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
+    except IdentificationError as problem:
+        return Figure.none(problem.what)
+    return _figure(stiffness)
+
+
+def _figure(measured: Measured | None, reason: str = "") -> Figure:
+    if measured is None:
+        return Figure.none(reason)
+    if not math.isfinite(measured.half_width):
+        return Figure(value=measured.value, reason="no interval could be formed")
+    return Figure(value=measured.value, low=measured.low, high=measured.high)
+
+
+def _published(pairs: IdentifiedPairs | None) -> PairList | None:
+    return None if pairs is None else _pair_list(pairs.velocity_rad_s, pairs.torque_nm)
+
+
+def _pair_list(velocity: Any, torque: Any) -> PairList:
+    return PairList(velocity_rad_s=tuple(map(float, velocity)), torque_nm=tuple(map(float, torque)))

@@ -1,0 +1,101 @@
+"""The command line as its users meet it: exit codes, one JSON object, errors that tell what to do."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+VERBS = ["check", "calibrate", "identify", "compare", "report", "profile", "gap"]
+
+
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    program = Path(sys.executable).parent / "frictid-hil"
+    return subprocess.run(
+        [str(program), *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=200,
+        check=False,
+    )
+
+
+def as_json(result: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    (only_line,) = result.stdout.splitlines()
+    value = json.loads(only_line)
+    assert isinstance(value, dict)
+    return value
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(verb: str) -> None:
+    result = run(verb, "--help")
+    assert result.returncode == 0
+    assert "Usage" in result.stdout
+
+
+def test_no_arguments_show_the_verbs() -> None:
+    result = run()
+    assert "calibrate" in result.stdout + result.stderr
+
+
+def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path: Path) -> None:
+    result = run("calibrate", "--robot", "hp3j.yaml", "--dry-run", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "115 deg/s" in result.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_in_json_carries_the_plan() -> None:
+    plan = as_json(run("calibrate", "--robot", "hp3j.yaml", "--dry-run", "--joint", "1", "--json"))
+    assert plan["schema"] == "frictid.calibrate/1"
+    assert plan["outcome"] == "ok"
+    assert plan["plan"]["joints"][0]["joint"] == "1"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["calibrate", "--robot", "no-such.yaml", "--yes"], "no-such.yaml"),
+        (["calibrate", "--robot", "hp3j", "--joint", "7", "--yes"], "no joint named '7'"),
+        (["calibrate", "--robot", "hp3j", "--amplitude", "20", "--yes"], "has no unit"),
+        (["calibrate", "--robot", "hp3j", "--velocity", "2rad", "--yes"], "is not a unit of angular velocity"),
+        (["calibrate", "--robot", "hp3j", "--amplitude", "400deg", "--yes"], "leaves its limits"),
+        (["calibrate", "--robot", "hp3j", "--velocity", "150deg/s", "--joint", "1", "--yes"], "planned speed"),
+        (["calibrate", "--robot", "hp3j", "--method", "magic", "--yes", "--joint", "5"], "magic"),
+        (["calibrate", "--robot", "hp3j"], "--yes"),
+        (["identify", "no-such.csv"], "no-such.csv"),
+        (["compare", "no-such.yaml", "--truth", "hp3j"], "no-such.yaml"),
+    ],
+)
+def test_a_users_mistake_is_exit_2_with_a_reason(arguments: list[str], said: str, tmp_path: Path) -> None:
+    result = run(*arguments, cwd=tmp_path)
+    assert result.returncode == 2, result.stderr
+    assert said in " ".join(result.stderr.split())
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    assert not list(tmp_path.rglob("samples*")), "nothing may have been started"
+
+
+def test_a_travel_too_short_for_the_torque_is_refused_beforehand(tmp_path: Path) -> None:
+    result = run("calibrate", "--robot", "hp3j", "--joint", "1", "--amplitude", "5deg", "--yes", "--json", cwd=tmp_path)
+    assert result.returncode == 2
+    refusal = as_json(result)
+    assert refusal["outcome"] == "refused"
+    assert "predicted torque" in refusal["error"]["what"]
+    assert "213.1 N m" in refusal["error"]["what"]
+
+
+def test_errors_keep_file_line_and_column(tmp_path: Path) -> None:
+    site = tmp_path / "site.yaml"
+    site.write_text("schema: frictid.robot/1\nextends: hp3j.yaml\nname: mine\njoints:\n  '1':\n    gear_ration: 224\n")
+    result = run("check", "--robot", str(site))
+    assert result.returncode == 2
+    assert "site.yaml:6:5" in result.stderr
+    assert "gear_ratio" in result.stderr, "the nearest known key is suggested"
