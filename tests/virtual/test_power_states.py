@@ -22,7 +22,7 @@ def bring(desk, state):
     for word in words[state]:
         desk.control(word)
     if state == FAULT:
-        desk.servo.fault(0x5000)
+        desk.servo.fail(0x5000, desk.rack.now_ns)
     assert desk.state() == state
 
 
@@ -69,7 +69,7 @@ def test_every_pair_of_state_and_command(desk, state, word):
 def test_fault_is_transition_13_then_14_then_reset_15(desk, state):
     bring(desk, state)
     desk.plant.velocity_rad_s = 0.5 if state == ENABLED else 0.0
-    desk.servo.fault(0x5000)
+    desk.servo.fail(0x5000, desk.rack.now_ns)
     if state in (ENABLED, QUICK):
         assert desk.state() == REACTION
         assert desk.plant.powered, "power stays on for the ramp"
@@ -85,7 +85,7 @@ def test_fault_is_transition_13_then_14_then_reset_15(desk, state):
 
 def test_fault_reset_needs_a_rising_edge(desk):
     desk.control(RESET)
-    desk.servo.fault(0x5000)
+    desk.servo.fail(0x5000, desk.rack.now_ns)
     assert desk.control(RESET) == FAULT
     assert desk.control(0) == FAULT
     assert desk.control(RESET) == DISABLED

@@ -98,7 +98,7 @@ class Bench:
         return list(self.heard)
 
     def state(self, joint):
-        return self.rack.servos[joint].statusword() & 0x6F
+        return self.rack.servos[joint].state.value
 
 
 @pytest.fixture
@@ -149,11 +149,11 @@ def test_switches_of_a_drive(make_bench):
         Fault("missing", joints=("1",), index=0x1016),
     )
     servo = bench.rack.servos["0"]
-    assert servo.interlock_closed
+    assert servo.power.interlock_closed
     assert (1, 0x081, "1042090000000000") in bench.run(2)
-    assert not servo.interlock_closed and servo.axis.encoder_stuck
+    assert not servo.power.interlock_closed and servo.axis.encoder_stuck
     bench.run(2)
-    assert servo.interlock_closed
+    assert servo.power.interlock_closed
     bench.heard.clear()
     bench.drives.process(0x602, bytes.fromhex("4016100000000000"))
     assert bench.heard[0][2] == "8016100000000206"

@@ -105,6 +105,7 @@ class Axis:
         ramping: decelerating to standstill.
         internal_limit: a set-point was cut by a limit (statusword bit 11).
         following_error: outside the window right now (statusword bit 13).
+        max_torque_per_mille: 6072h as taken over last.
         encoder_stuck: report the last position for ever (a fault to play).
     """
 
@@ -158,7 +159,8 @@ class Axis:
         self._rad_s_per_unit = unit_rad_s / further_gear * self._direction
         self._nm_per_mille = number[key(0x6076)] * 1e-6 * self._gear_ratio * self._direction
         self._speed_limit_rad_s = number[key(0x6080)] * _RPM / self._gear_ratio
-        self._torque_limit_nm = abs(self._nm_per_mille) * number[key(0x6072)]
+        self.max_torque_per_mille = number[key(0x6072)]
+        self._torque_limit_nm = abs(self._nm_per_mille) * self.max_torque_per_mille
         self._interpolation_ns = round(number[key(0x60C2, 1)] * 10.0 ** (number[key(0x60C2, 2)] + 9))
         self._torque_filter_s = number[key(0x2022, 2)] * 1e-6
         # The drive's own helpers, in SI on the joint side; all zero unless somebody switched them on.

@@ -128,7 +128,7 @@ class VirtualDriver:
             with SocketBus(self._channel) as bus:
                 side_channel.write(bus, self._setup.joint(joint).address, index, subindex, value)
         else:
-            self._rack.servos[joint].write(index, subindex, value)
+            self._rack.servos[joint].write(index, subindex, value, self._rack.now_ns)
 
     # -- forwarded -----------------------------------------------------------------------------------------------------
 
@@ -149,6 +149,10 @@ class VirtualDriver:
         self._host.set_limits(
             joint, torque_nm=torque_nm, position_min_rad=position_min_rad, position_max_rad=position_max_rad
         )
+
+    def frame_map_values(self) -> Mapping[str, Any]:
+        """As ``driver.FrameMapped``."""
+        return self._host.frame_map_values()
 
     def start_cycling(self) -> None:
         """As ``Driver.start_cycling``."""

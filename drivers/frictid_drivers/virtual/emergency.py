@@ -45,18 +45,18 @@ class Emergency:
     def __init__(self, dictionary: ObjectDictionary, send: Callable[[bytes], None]) -> None:
         self._dictionary = dictionary
         self._send = send
-        self._present: list[int] = []
+        self._present: tuple[int, ...] = ()
 
     @property
     def present(self) -> tuple[int, ...]:
         """Error codes present, oldest first."""
-        return tuple(self._present)
+        return self._present
 
     def report(self, code: int, detail: int = 0) -> None:
         """An error appears; said once while it stays."""
         if code in self._present:
             return
-        self._present.append(code)
+        self._present += (code,)
         values = self._dictionary.values
         count = min(self._dictionary.number(key(0x1003)) + 1, ERROR_HISTORY)
         for sub in range(count, 1, -1):
@@ -68,12 +68,12 @@ class Emergency:
     def clear(self, code: int) -> None:
         """One error is gone."""
         if code in self._present:
-            self._present.remove(code)
+            self._present = tuple(other for other in self._present if other != code)
             self._publish(0, 0)
 
     def forget(self) -> None:
         """Power was off: nothing is present, nothing is said."""
-        self._present.clear()
+        self._present = ()
 
     def _publish(self, code: int, detail: int) -> None:
         register = 0

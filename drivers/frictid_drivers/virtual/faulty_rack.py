@@ -141,7 +141,7 @@ class FaultyRack:
             servo.block_brake(on, self.now_ns)
 
         def interlock(on: bool) -> None:
-            servo.interlock_closed = not on
+            servo.power.interlock_closed = not on
 
         switches: dict[str, Callable[[bool], None]] = {
             "mute": mute, "reset": reset, "emcy": warn, "fault": fail, "stuck_encoder": stick, "blocked": block,

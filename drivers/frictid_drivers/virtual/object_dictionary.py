@@ -80,16 +80,15 @@ class ObjectDictionary:
         records: Iterable[Record] = OBJECTS,
     ) -> None:
         absent = frozenset(missing)
-        present = [record for record in records if record.index not in absent]
-        self.entries: dict[Key, Entry] = {entry.key: entry for record in present for entry in record.entries}
-        self.indices = frozenset(record.index for record in present)
+        every = [entry for record in records for entry in record.entries]
+        # Objects that are missing keep their values: the drive acts by its defaults, it only does not let anybody see.
+        self.entries: dict[Key, Entry] = {entry.key: entry for entry in every if entry.key >> 8 not in absent}
+        self.indices = frozenset(address >> 8 for address in self.entries)
         self.guards: dict[Key, Guard] = {}
         self.effects: dict[Key, Effect] = {}
         self.before_upload: Callable[[], None] = _nothing
-        self._defaults: dict[Key, Value] = {entry.key: _with_node(entry, node_id) for entry in self.entries.values()}
-        for address, value in (overrides or {}).items():
-            if address in self.entries:
-                self._defaults[address] = value
+        self._defaults: dict[Key, Value] = {entry.key: _with_node(entry, node_id) for entry in every}
+        self._defaults |= overrides or {}
         self._stored: dict[Key, Value] | None = None
         self.values: dict[Key, Value] = dict(self._defaults)
 
@@ -100,18 +99,16 @@ class ObjectDictionary:
 
     def store(self) -> None:
         """Keep the writable values over a reset (1010h)."""
-        self._stored = {
-            address: self.values[address] if entry.access == "rw" else self._defaults[address]
-            for address, entry in self.entries.items()
-        }
+        kept = {address: self.values[address] for address, entry in self.entries.items() if entry.access == "rw"}
+        self._stored = self._defaults | kept
 
     def forget(self) -> None:
         """Let the next reset restore the defaults (1011h)."""
         self._stored = None
 
     def number(self, address: Key) -> int:
-        """The value of a numeric object; 0 where this drive does not have it."""
-        value = self.values.get(address, 0)
+        """The value of a numeric object."""
+        value = self.values[address]
         assert isinstance(value, int)
         return value
 

@@ -1,0 +1,63 @@
+"""Listening for other nodes' heartbeats (object 1016h): armed by the first one, lost when none came in time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+_MS = 1_000_000
+
+
+@dataclass(slots=True)
+class Consumer:
+    """One node listened for.
+
+    Attributes:
+        node: its id.
+        timeout_ns: longest silence.
+        deadline_ns: when it counts as lost; None until it was heard.
+        lost: it fell silent and has not been heard again.
+    """
+
+    node: int
+    timeout_ns: int
+    deadline_ns: int | None = None
+    lost: bool = False
+
+
+class HeartbeatWatch:
+    """All nodes listened for."""
+
+    def __init__(self) -> None:
+        self.consumers: list[Consumer] = []
+
+    def configure(self, entries: Iterable[int]) -> None:
+        """Take over the entries of 1016h; one that stays the same keeps its state."""
+        known = {(consumer.node, consumer.timeout_ns): consumer for consumer in self.consumers}
+        self.consumers = []
+        for entry in entries:
+            node, timeout_ns = entry >> 16 & 0x7F, (entry & 0xFFFF) * _MS
+            if node and timeout_ns:
+                self.consumers.append(known.get((node, timeout_ns)) or Consumer(node, timeout_ns))
+
+    @property
+    def any_lost(self) -> bool:
+        """Somebody is missing."""
+        return any(consumer.lost for consumer in self.consumers)
+
+    def next_deadline_ns(self, otherwise_ns: int) -> int:
+        """When the next one counts as lost."""
+        return min(
+            (consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None),
+            default=otherwise_ns,
+        )
+
+    def newly_lost(self, now_ns: int) -> list[int]:
+        """Nodes whose time has run out; each is told once."""
+        found = []
+        for consumer in self.consumers:
+            if consumer.deadline_ns is not None and now_ns >= consumer.deadline_ns:
+                consumer.deadline_ns = None
+                consumer.lost = True
+                found.append(consumer.node)
+        return found

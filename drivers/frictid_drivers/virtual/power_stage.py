@@ -1,0 +1,284 @@
+"""The power stage of a drive: CiA 402's state machine at work on one axis - ramps, halt, faults, brake, statusword.
+
+``power_state`` says which transition a controlword asks for; here is what each one does to the motor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+from frictid_drivers.virtual import emergency
+from frictid_drivers.virtual.axis import CSP, MODES, Axis, Plant
+from frictid_drivers.virtual.emergency import Emergency
+from frictid_drivers.virtual.object_dictionary import ObjectDictionary
+from frictid_drivers.virtual.objects import Key, key
+from frictid_drivers.virtual.power_state import FAULT_RESET, HALT, PowerState, next_state
+
+_K6040, _K6041, _K6060, _K6061 = key(0x6040), key(0x6041), key(0x6060), key(0x6061)
+_K6072, _K60FD, _K60FE, _K60FE_MASK = key(0x6072), key(0x60FD), key(0x60FE, 1), key(0x60FE, 2)
+_INTERLOCK_CLOSED = 1 << 3
+_BRAKE_ENGAGED = 1 << 16
+_OUTPUT_BRAKE = 1 << 0
+
+_DECELERATIONS = {1: key(0x6084), 2: key(0x6085)}
+
+
+class PowerStage:
+    """One power stage.
+
+    Args:
+        dictionary: of the node.
+        axis: the motor.
+        plant: the joint, for its brake.
+        errors: of the node.
+        host_missing: asked before power is given: a watched heartbeat is missing.
+
+    Attributes:
+        state: of the state machine.
+        interlock_closed: bit 3 of the digital inputs.
+        changed: something that event-driven PDOs may carry changed; the node clears it.
+    """
+
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        axis: Axis,
+        plant: Plant,
+        errors: Emergency,
+        host_missing: Callable[[], bool],
+    ) -> None:
+        self._values = cast("dict[Key, int]", dictionary.values)
+        self._axis = axis
+        self._plant = plant
+        self._errors = errors
+        self._host_missing = host_missing
+        self.state = PowerState.NOT_READY
+        self.interlock_closed = True
+        self.changed = False
+        self._after_ramp: PowerState | None = None
+        self._halted = False
+        self._controlword = 0
+        self._outputs = 0
+        self._brake_blocked = False
+        plant.power(False)
+        plant.brake(True)
+
+    def boot(self) -> None:
+        """Transitions 0 and 1: power-on, without motor power; the objects have their defaults again."""
+        self._power_off()
+        self._controlword = 0
+        self._outputs = 0
+        self._axis.encoder_stuck = False
+        self._axis.mode = 0
+        self._axis.units_changed()
+        self.state = PowerState.SWITCH_ON_DISABLED
+
+    def run_to(self, now_ns: int) -> None:
+        """Let the motor run to now; faults and ends of ramps act."""
+        axis = self._axis
+        axis.catch_up(now_ns)
+        if axis.alarm:
+            code, axis.alarm = axis.alarm, 0
+            self.fault(code)
+        if axis.ramping and axis.ramp_done:
+            self._ramp_ended()
+
+    # -- commands ------------------------------------------------------------------------------------------------------
+
+    def fault(self, code: int) -> None:
+        """Transition 13: something is wrong; the fault reaction (605Eh) runs where the motor has power."""
+        self.changed = True
+        self._errors.report(code)
+        if self.state in (PowerState.FAULT, PowerState.FAULT_REACTION):
+            return
+        option = self._values[key(0x605E)]
+        if option and self._axis.powered:
+            self.state = PowerState.FAULT_REACTION
+            self._after_ramp = PowerState.FAULT
+            self._ramp(option)
+        else:
+            self._power_off()
+            self.state = PowerState.FAULT
+
+    def follow_commands(self) -> None:
+        """Controlword, mode, outputs or set-points may have been written; physics has caught up."""
+        values = self._values
+        controlword = values[_K6040]
+        if controlword != self._controlword:
+            self._follow_controlword(controlword)
+        mode = values[_K6060]
+        if mode != values[_K6061] and (mode in MODES or mode == 0):
+            values[_K6061] = mode
+            self.changed = True
+            self._axis.set_mode(mode)
+        if values[_K60FE] != self._outputs:
+            self._outputs = values[_K60FE]
+            self.apply_brake()
+        if values[_K6072] != self._axis.max_torque_per_mille:
+            self._axis.units_changed()
+        self._axis.take_set_points()
+
+    def _follow_controlword(self, controlword: int) -> None:
+        rising = controlword & ~self._controlword
+        self._controlword = controlword
+        self.changed = True
+        if rising & FAULT_RESET:
+            self._reset_fault()
+        while (step := next_state(self.state, controlword)) is not None:
+            transition, target = step
+            if not self._may(transition):
+                break
+            before = self.state
+            self._take(transition, target)
+            if self.state is before:
+                break
+        if self.state is PowerState.ENABLED and self._after_ramp is None:
+            self._follow_halt(bool(controlword & HALT))
+
+    def _may(self, transition: int) -> bool:
+        if transition in (4, 16) and self._host_missing():
+            return False  # no power while the host's heartbeat is missing
+        return not (transition == 16 and self._values[key(0x605A)] not in (5, 6, 7))
+
+    def _take(self, transition: int, target: PowerState) -> None:
+        if transition in (5, 8):
+            # Leaving "enabled" in good order; the option says whether a ramp comes first.
+            option = self._values[key(0x605C if transition == 5 else 0x605B)]
+            if option and not self._axis.at_rest:
+                self._after_ramp = target
+                self._ramp(1)
+                return
+            self._go(target)
+        elif transition == 11:
+            self.quick_stop()
+        elif transition == 4:
+            self.state = target
+            self._power_on()
+        elif transition == 16:
+            self.state = target
+            self._after_ramp = None
+            self._axis.resume()
+        else:
+            self._go(target)
+
+    def _go(self, target: PowerState) -> None:
+        """Enter a state without motor power."""
+        self.changed = True
+        if self._axis.powered:
+            self._power_off()
+        self.state = target
+
+    def disable_voltage(self) -> None:
+        """Take the power away, from whatever state has it."""
+        if self._axis.powered:
+            self._go(PowerState.SWITCH_ON_DISABLED)
+
+    def quick_stop(self) -> None:
+        """605Ah: decelerate, then hold or switch off."""
+        self.changed = True
+        option = self._values[key(0x605A)]
+        if option == 0:
+            self._go(PowerState.SWITCH_ON_DISABLED)
+            return
+        self.state = PowerState.QUICK_STOP_ACTIVE
+        self._after_ramp = PowerState.SWITCH_ON_DISABLED if option < 5 else PowerState.QUICK_STOP_ACTIVE
+        self._ramp(option if option < 5 else option - 4)
+
+    def _ramp(self, option: int) -> None:
+        """1: profile deceleration, 2: quick-stop deceleration, 3 and 4: as fast as the torque limit lets."""
+        self._halted = False
+        deceleration = _DECELERATIONS.get(option)
+        self._axis.start_ramp(None if deceleration is None else self._values[deceleration])
+
+    def _ramp_ended(self) -> None:
+        self._axis.end_ramp()
+        self.changed = True
+        target, self._after_ramp = self._after_ramp, None
+        if target in (None, PowerState.QUICK_STOP_ACTIVE):
+            return  # halted, or held in quick-stop-active
+        self._go(target)
+        if target is PowerState.SWITCHED_ON or target is PowerState.READY:
+            # What the controlword asked for meanwhile.
+            self._controlword = ~self._values[_K6040] & FAULT_RESET
+            self._follow_controlword(self._values[_K6040])
+
+    def _follow_halt(self, halt: bool) -> None:
+        if halt and not self._halted:
+            self._ramp(self._values[key(0x605D)])
+            self._halted = True
+        elif not halt and self._halted:
+            self._halted = False
+            self._axis.resume()
+
+    def _reset_fault(self) -> None:
+        """Transition 15; in other states warnings are forgotten."""
+        if self.state is PowerState.FAULT_REACTION:
+            return
+        if self.state is PowerState.FAULT:
+            self.state = PowerState.SWITCH_ON_DISABLED
+        missing = self._host_missing()
+        for code in self._errors.present:
+            if not (missing and code == emergency.HEARTBEAT_LOST):
+                self._errors.clear(code)
+
+    def _power_on(self) -> None:
+        self._halted = False
+        self._after_ramp = None
+        self._axis.switch(True)
+        self.apply_brake()
+
+    def _power_off(self) -> None:
+        self._after_ramp = None
+        self._halted = False
+        self._axis.switch(False)
+        self.apply_brake()
+
+    def _brake_wanted(self, powered: bool) -> bool:
+        """The drive works the brake with its power, unless the host masked the output to work it itself."""
+        if self._values[_K60FE_MASK] & _OUTPUT_BRAKE:
+            return bool(self._values[_K60FE] & _OUTPUT_BRAKE)
+        return not powered
+
+    def apply_brake(self) -> None:
+        """Work the brake as the power state and the outputs say."""
+        self._plant.brake(self._brake_blocked or self._brake_wanted(self._axis.powered))
+
+    # -- readings ------------------------------------------------------------------------------------------------------
+
+    def block_brake(self, blocked: bool) -> None:
+        """The brake's coil breaks: it stays closed, whatever the drive says; or it is mended."""
+        self._brake_blocked = blocked
+        self.apply_brake()
+
+    def latch(self, *, remote: bool) -> None:
+        """Actual values, statusword and inputs of this moment into their objects; ``remote``: NMT lets us be driven."""
+        values = self._values
+        self._axis.latch()
+        inputs = _INTERLOCK_CLOSED if self.interlock_closed else 0
+        if self._brake_wanted(self._axis.powered):
+            inputs |= _BRAKE_ENGAGED
+        status = self.statusword(remote=remote)
+        if status != values[_K6041] or inputs != values[_K60FD]:
+            values[_K6041], values[_K60FD] = status, inputs
+            self.changed = True
+
+    def statusword(self, *, remote: bool) -> int:
+        """6041h."""
+        axis = self._axis
+        word = self.state.value | 0x0010  # voltage enabled
+        if self._errors.present and self.state is not PowerState.FAULT:
+            word |= 0x0080
+        if remote:
+            word |= 0x0200
+        if self.state is PowerState.ENABLED:
+            mode = axis.mode
+            if self._halted:
+                word |= 0x0400 if not axis.ramping else 0
+            elif mode and not axis.ramping:
+                word |= 0x1000
+            if axis.internal_limit or axis.saturated:
+                word |= 0x0800
+            if mode == CSP and axis.following_error:
+                word |= 0x2000
+        return word
