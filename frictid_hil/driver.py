@@ -190,6 +190,8 @@ class Capabilities:
         temperature: feedback carries a motor or gear temperature.
         table_download: a friction table can be compensated on the controller's own tick.
         command_delay_s: delay from set-point to motion that is normal here; following errors are judged with it.
+        digital_inputs: a joint with the option ``digital_inputs: true`` reports its inputs in the feedback, so that an
+            interlock can be watched.
     """
 
     max_cycle_hz: float
@@ -203,6 +205,7 @@ class Capabilities:
     temperature: bool = False
     table_download: bool = False
     command_delay_s: float = 0.0
+    digital_inputs: bool = False
 
 
 @dataclass(slots=True)
@@ -226,6 +229,10 @@ class Feedback:
         torque_nm: the drive's own torque.
         external_torque_nm: force sensor, NaN where there is none.
         temperature_c: NaN where unknown.
+        position_command_rad: the set-point in force at ``t_ns`` as it went out, rounded to the drive's counts; NaN
+            where the driver does not tell, or none was sent yet.
+        digital_inputs: bits of the drive's inputs (60FD), None before their first report or where none is configured.
+        digital_inputs_age_cycles: cycles since they were reported.
         state: of the power stage.
         mode: as displayed by the drive (6061), NONE where not yet reported.
         status_raw: statusword or controller status as sent.
@@ -240,6 +247,9 @@ class Feedback:
     torque_nm: float = NAN
     external_torque_nm: float = NAN
     temperature_c: float = NAN
+    position_command_rad: float = NAN
+    digital_inputs: int | None = None
+    digital_inputs_age_cycles: int = 0
     state: JointState = JointState.UNKNOWN
     mode: Mode = Mode.NONE
     status_raw: int = 0
@@ -385,6 +395,15 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Bring everything to rest and release the bus; safe to call twice and after errors."""
+        ...
+
+
+@runtime_checkable
+class FrameMapped(Protocol):
+    """A driver whose frames can be decoded again from a log (see ``frictid_hil.frames``)."""
+
+    def frame_map_values(self) -> Mapping[str, Any]:
+        """Which frame carries what, as configured, as plain values that name their ``schema``; after ``configure``."""
         ...
 
 

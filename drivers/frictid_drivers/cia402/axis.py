@@ -173,6 +173,10 @@ class Axis:
         secondary.set("target_velocity", velocity)
         secondary.pack()
 
+    def sent(self) -> None:
+        """The primary command went out: its target is in force from the next SYNC on."""
+        self.feedback.position_command_rad = self.primary.value("target_position") * self._scale.position_rad
+
     def emergency(self) -> tuple[Command, Command]:
         """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
         self.target = Target.STOPPED

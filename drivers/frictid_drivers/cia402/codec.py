@@ -13,7 +13,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import fields
 
-from frictid_drivers.cia402.frame_map import ERROR, FIGURES, MODE, STATUS, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.frame_map import ERROR, FIGURES, INPUTS, MODE, STATUS, Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.packing import packing
 from frictid_drivers.cia402.state import JOINT_STATES
 from frictid_hil.driver import Feedback, JointState, Mode
@@ -40,6 +40,7 @@ class _Report:
         "cycle",
         "error_at",
         "figures",
+        "inputs_at",
         "joint",
         "mode_at",
         "size",
@@ -63,6 +64,7 @@ class _Report:
         self.status_at = _position_of(STATUS, frame)
         self.mode_at = _position_of(MODE, frame)
         self.error_at = _position_of(ERROR, frame)
+        self.inputs_at = _position_of(INPUTS, frame)
         self.figures = tuple(
             (at, _ATTRIBUTES[meaning], float(getattr(joint, FIGURES[meaning])))
             for at, meaning in enumerate(frame.meanings)
@@ -73,11 +75,12 @@ class _Report:
 class _Joint:
     """What is known of one joint."""
 
-    __slots__ = ("cyclic", "feedback", "heartbeat_ns", "position_at", "restarted", "taken_cycle")
+    __slots__ = ("cyclic", "feedback", "heartbeat_ns", "inputs", "position_at", "restarted", "taken_cycle")
 
     def __init__(self, frames: JointFrames) -> None:
         self.feedback = Feedback()
         self.cyclic: tuple[_Report, ...] = ()
+        self.inputs: _Report | None = None
         self.position_at: tuple[_Report, int] | None = None
         self.taken_cycle = -1
         self.heartbeat_ns: int | None = None
@@ -107,6 +110,8 @@ class Decoder:
                 report.joint = joint
                 if "position" in frame.meanings:
                     joint.position_at = (report, frame.meanings.index("position"))
+                if INPUTS in frame.meanings:
+                    joint.inputs = report
                 if not report.slow:
                     joint.cyclic = (*joint.cyclic, report)
                     report.awaited = frames.name in awaited
@@ -160,6 +165,8 @@ class Decoder:
             feedback.state = JOINT_STATES[status & 0x6F]
         if report.error_at >= 0:
             feedback.error_code = values[report.error_at]
+        if report.inputs_at >= 0:
+            feedback.digital_inputs = values[report.inputs_at]
         if report.mode_at >= 0:
             feedback.mode = _MODES.get(values[report.mode_at], Mode.NONE)
         if report.slow:
@@ -188,6 +195,8 @@ class Decoder:
                     for at, attribute, factor in report.figures:
                         setattr(feedback, attribute, values[at] * factor)
             feedback.age_cycles = cycle - joint.taken_cycle
+            if joint.inputs is not None:
+                feedback.digital_inputs_age_cycles = cycle - joint.inputs.cycle
         return self.feedback
 
     def position_units(self, joint: int) -> int | None:
@@ -253,6 +262,11 @@ class Command:
             low, high = self._bounds[at]
             self._values[at] = low if value < low else high if value > high else value
 
+    def value(self, meaning: str) -> int:
+        """One entry as it goes out; 0 where the frame does not carry it."""
+        at = self._at.get(meaning)
+        return 0 if at is None else self._values[at]
+
     def pack(self) -> bytearray:
         """All entries into the frame's own buffer."""
         self._pack(self.data, 0, *self._values)
@@ -267,15 +281,18 @@ class CommandDecoder:
     """
 
     def __init__(self, frame_map: FrameMap) -> None:
-        count = len(frame_map.joints)
-        self.position_rad = [float("nan")] * count
-        self.velocity_rad_s = [float("nan")] * count
-        self.torque_nm = [float("nan")] * count
-        self.torque_offset_nm = [float("nan")] * count
+        self._count = len(frame_map.joints)
+        self.restart()
         self._frames: dict[int, tuple[int, JointFrames, Frame]] = {
             frame.cob_id: (at, joint, frame) for at, joint in enumerate(frame_map.joints) for frame in joint.commands
         }
         self._unpack = {cob_id: packing(item[2].types).unpack_from for cob_id, item in self._frames.items()}
+
+    def restart(self) -> None:
+        """Forget every set-point, as at the start of cycling."""
+        nothing = [float("nan")] * self._count
+        self.position_rad, self.velocity_rad_s = list(nothing), list(nothing)
+        self.torque_nm, self.torque_offset_nm = list(nothing), list(nothing)
 
     def feed(self, cob_id: int, data: bytes | bytearray) -> bool:
         """Take one frame; False when it is no command of ours."""

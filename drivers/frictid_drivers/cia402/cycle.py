@@ -201,7 +201,7 @@ class Cycle:
                     raise
             if self._active[at]:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
-                self._send_command(regular)
+                self._send_command(regular, axis)
                 changed = changed or other.data != other.told
             else:
                 changed = changed or primary.data != primary.told or secondary.data != secondary.told
@@ -216,12 +216,14 @@ class Cycle:
             for outgoing in (self._secondary[at], self._primary[at]):
                 if outgoing.data != outgoing.told and self._decoder.position_units(at) is not None:
                     self._turn = at + 1
-                    self._send_command(outgoing)
+                    self._send_command(outgoing, self._axes[at])
                     return
 
-    def _send_command(self, outgoing: _Outgoing) -> None:
+    def _send_command(self, outgoing: _Outgoing, axis: Axis) -> None:
         self._send(outgoing.message, self._clock.now_ns())
         outgoing.told = bytes(outgoing.data)
+        if outgoing.command is axis.primary:
+            axis.sent()
 
     def _send(self, message: can.Message, t_ns: int) -> None:
         if self._sink is not None:

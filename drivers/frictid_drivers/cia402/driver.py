@@ -132,6 +132,7 @@ class Cia402Driver:
             lock_step=self._lock_step,
             external_torque=any(joint.external_torque for joint in self._joint_settings.values()),
             temperature=any(joint.temperature for joint in self._joint_settings.values()),
+            digital_inputs=True,
         )
 
     def check(self, plan: Plan | None) -> list[Finding]:
@@ -207,6 +208,10 @@ class Cia402Driver:
         if self._frame_map is None:
             raise HardwareError("frame_map before configure")
         return self._frame_map
+
+    def frame_map_values(self) -> Mapping[str, Any]:
+        """The same as plain values (``driver.FrameMapped``)."""
+        return self.frame_map().to_mapping()
 
     def report_interval_cycles(self, joint: str) -> int:
         """Cycles between two reports of this joint as configured: 1 where active."""

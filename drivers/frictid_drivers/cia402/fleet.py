@@ -121,6 +121,7 @@ class Fleet:
             velocity_target=facts.supports(Mode.VELOCITY),
             external_torque=settings.external_torque,
             temperature=settings.temperature,
+            digital_inputs=settings.digital_inputs,
         )
 
     # -- writing ------------------------------------------------------------------------------------------------
@@ -141,7 +142,8 @@ class Fleet:
             configure.end_quick_stop(drive)
         self.nmt(NMT_PRE_OPERATIONAL)
         frames = tuple(self._configure_joint(joint, layout) for joint in self._setup.joints)
-        return FrameMap(frames, SYNC_COB_ID, round(self._settings.reply_window * 1e9 / layout.cycle_hz))
+        window_ns = round(self._settings.reply_window * 1e9 / layout.cycle_hz)
+        return FrameMap(frames, SYNC_COB_ID, window_ns, self._settings.host_node)
 
     def scale_of(self, joint: str) -> Scale:
         """Joint-side factors.

@@ -38,7 +38,7 @@ from frictid_hil.errors import FieldProblem, InvalidFields
 
 SCHEMA = "frictid.frames/1"
 
-STATUS, MODE, ERROR = "status", "mode", "error"
+STATUS, MODE, ERROR, INPUTS = "status", "mode", "error", "digital_inputs"
 FIGURES = {
     "position": "position_rad_per_unit",
     "velocity": "velocity_rad_s_per_unit",
@@ -52,6 +52,7 @@ _MEANINGS = {
     od.STATUSWORD.index: STATUS,
     od.MODE_DISPLAY.index: MODE,
     od.ERROR_CODE.index: ERROR,
+    od.DIGITAL_INPUTS.index: INPUTS,
     od.POSITION_ACTUAL.index: "position",
     od.VELOCITY_ACTUAL.index: "velocity",
     od.TORQUE_ACTUAL.index: "torque",
@@ -166,11 +167,13 @@ class FrameMap:
         joints: in the order of the robot file.
         sync_cob_id: identifier of SYNC, which begins a row; None: a row begins where a report comes a second time.
         window_ns: a report that comes later than this after SYNC belongs to the next row; 0: no such bound.
+        host_node: node id of the host's own heartbeat; 0 where unknown.
     """
 
     joints: tuple[JointFrames, ...]
     sync_cob_id: int | None = 0x80
     window_ns: int = 0
+    host_node: int = 0
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values for YAML or JSON; ``from_mapping`` gives back an equal map."""
@@ -178,6 +181,7 @@ class FrameMap:
             "schema": SCHEMA,
             "sync_cob_id": self.sync_cob_id,
             "window_ns": self.window_ns,
+            "host_node": self.host_node,
             "joints": {joint.name: _joint_mapping(joint) for joint in self.joints},
         }
 
@@ -209,13 +213,14 @@ class _Reader:
         self._problems: list[FieldProblem] = []
 
     def frame_map(self, mapping: Mapping[str, Any]) -> FrameMap:
-        self._known_keys((), mapping, {"schema", "sync_cob_id", "window_ns", "joints"})
+        self._known_keys((), mapping, {"schema", "sync_cob_id", "window_ns", "host_node", "joints"})
         if mapping.get("schema") != SCHEMA:
             self._problem(("schema",), f"expected {SCHEMA}, found {mapping.get('schema')!r}")
         sync = mapping.get("sync_cob_id", 0x80)
         if sync is not None:
             sync = self._integer(("sync_cob_id",), sync, 0, 0x7FF)
         window_ns = self._integer(("window_ns",), mapping.get("window_ns", 0), 0, 2**63)
+        host_node = self._integer(("host_node",), mapping.get("host_node", 0), 0, 127)
         joints = mapping.get("joints")
         if not isinstance(joints, Mapping) or not joints:
             self._problem(("joints",), "expected at least one joint")
@@ -231,7 +236,7 @@ class _Reader:
                     )
         if self._problems:
             raise InvalidFields(self._problems)
-        return FrameMap(read, sync, window_ns)
+        return FrameMap(read, sync, window_ns, host_node)
 
     def _joint(self, name: str, mapping: Any) -> JointFrames:
         path = ("joints", name)

@@ -8,6 +8,7 @@ RPDO2       6060 6071 60FF (7 bytes)             every cycle in torque and veloc
 TPDO1       6041 6064 6077 (8 bytes)             active joint: every SYNC; locked joint: at least every 10 ms
 TPDO2       606C, force sensor (4 to 8 bytes)    together with TPDO1
 TPDO3       6061 603F, temperature (3 to 5)      active joint: every 10 ms; locked joint: every sixth of those
+TPDO4       60FD (4), where an interlock is on   at least every 10 ms
 ==========  ===================================  ==========================================================
 
 The mapping is the same for every joint, active or locked, so that going on to the next joint changes transmission
@@ -71,6 +72,7 @@ class NodeWish:
         velocity_target: 60FF exists.
         external_torque: vendor object of a force sensor, None for none.
         temperature: vendor object of a temperature, None for none.
+        digital_inputs: 60FD is to be reported.
     """
 
     joint: str
@@ -80,6 +82,7 @@ class NodeWish:
     velocity_target: bool = True
     external_torque: Entry | None = None
     temperature: Entry | None = None
+    digital_inputs: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,13 +207,18 @@ def _pdos(wish: NodeWish, *, every: int, start: int, slow_every: int, slow_start
     velocity = [Entry.of(od.VELOCITY_ACTUAL)] + ([wish.external_torque] if wish.external_torque else [])
     display = [Entry.of(od.MODE_DISPLAY), Entry.of(od.ERROR_CODE)] + ([wish.temperature] if wish.temperature else [])
     node = wish.node
-    return (
+    pdos = (
         Pdo(False, 1, 0x200 + node, tuple(command)),
         Pdo(False, 2, 0x300 + node, tuple(other)),
         Pdo(True, 1, 0x180 + node, tuple(fast), every, start),
         Pdo(True, 2, 0x280 + node, tuple(velocity), every, start),
         Pdo(True, 3, 0x380 + node, tuple(display), slow_every, slow_start),
     )
+    if not wish.digital_inputs:
+        return pdos
+    # As often as a locked joint reports: an active joint's inputs go with its slow report, others with the fast ones.
+    inputs_every, inputs_start = (slow_every, slow_start) if every == 1 else (every, start)
+    return (*pdos, Pdo(True, 4, 0x480 + node, (Entry.of(od.DIGITAL_INPUTS),), inputs_every, inputs_start))
 
 
 def load_at(layout_at: Callable[[float], Layout], bitrate: int) -> Callable[[float], BusLoad]:

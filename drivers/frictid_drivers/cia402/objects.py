@@ -145,6 +145,7 @@ ACCELERATION_UNIT = _object(0x60AA, 0, "u32", "SI unit acceleration")
 TORQUE_OFFSET = _object(0x60B2, 0, "i16", "torque offset")
 INTERPOLATION_VALUE = _object(0x60C2, 1, "u8", "interpolation time period, value")
 INTERPOLATION_INDEX = _object(0x60C2, 2, "i8", "interpolation time period, index")
+DIGITAL_INPUTS = _object(0x60FD, 0, "u32", "digital inputs")
 TARGET_VELOCITY = _object(0x60FF, 0, "i32", "target velocity")
 SUPPORTED_MODES = _object(0x6502, 0, "u32", "supported drive modes")
 

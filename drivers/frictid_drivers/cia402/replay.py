@@ -31,7 +31,7 @@ class Row:
 
     Attributes:
         t_ns: SYNC.
-        feedback: of all joints, in the order of the frame map; reused from row to row.
+        feedback: of all joints, in the order of the frame map, with the set-points in force; reused from row to row.
         commands: last set-points of all joints; reused from row to row.
     """
 
@@ -48,6 +48,7 @@ class LogDecoder:
 
     Attributes:
         unknown: frames that are neither reports, commands, nor services of our nodes, counted by name.
+        services: NMT, TIME, SDO and heartbeats around the cycles, counted by name.
         repeated: reports that came a second time in their row (with SYNC only).
         backwards: frames whose time is before that of the frame before them.
     """
@@ -59,7 +60,11 @@ class LogDecoder:
         self._commands = CommandDecoder(frame_map)
         self._reports = {frame.cob_id for joint in frame_map.joints for frame in joint.reports}
         self._command_ids = {frame.cob_id for joint in frame_map.joints for frame in joint.commands}
+        self._services = {_NMT, _TIME} | {base + joint.node for joint in frame_map.joints for base in (0x580, 0x600)}
+        if frame_map.host_node:
+            self._services.add(0x700 + frame_map.host_node)
         self.unknown: Counter[str] = Counter()
+        self.services: Counter[str] = Counter()
         self.repeated = 0
         self.backwards = 0
 
@@ -91,12 +96,15 @@ class LogDecoder:
                 begins, counter = not repeats, data
             if restarts:
                 decoder.restart()
+                commands.restart()
                 waiting.clear()
                 counter = b""
             if begins:
                 for cob_id, command in waiting:
                     commands.feed(cob_id, command)
                 waiting.clear()
+                for report, position_rad in zip(decoder.feedback, commands.position_rad, strict=True):
+                    report.position_command_rad = position_rad
                 decoder.begin(t_ns)
                 opened_ns = t_ns
                 answered = False
@@ -108,8 +116,8 @@ class LogDecoder:
             answered = answered or is_report
             if again and self._sync is not None:
                 self.repeated += 1
-            if not decoder.feed(t_ns, can_id, data) and not restarts:
-                self.unknown[_name(can_id)] += 1
+            if not decoder.feed(t_ns, can_id, data):
+                (self.services if can_id in self._services else self.unknown)[_name(can_id)] += 1
         if opened_ns is not None:
             yield Row(opened_ns, decoder.finish(), commands)
 

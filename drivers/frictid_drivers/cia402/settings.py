@@ -25,6 +25,7 @@ external_torque_object                  -         force sensor, e.g. ``"2030:00 
 external_torque_nm_per_unit             -         what its unit is worth, joint side
 temperature_object                      -         e.g. ``"2031:00 i16"``
 temperature_c_per_unit                  -         what its unit is worth
+digital_inputs                          false     60FD is reported at least every 10 ms (an interlock hangs there)
 position_units_per_revolution           -         of the joint; where 6092 and 608F do not tell
 velocity_unit_rad_s                     -         joint side; where 60A9 does not tell
 rated_torque_side                       motor     6076 is ``motor`` or ``joint`` side
@@ -83,6 +84,7 @@ class JointSettings:
     external_torque_nm_per_unit: float
     temperature: Entry | None
     temperature_c_per_unit: float
+    digital_inputs: bool
     torque_source: str
     timing: Timing | None
 
@@ -134,6 +136,7 @@ class _Reader:
             external_torque_nm_per_unit=external_unit,
             temperature=temperature,
             temperature_c_per_unit=temperature_unit,
+            digital_inputs=bool(options.get("digital_inputs", False)),
             torque_source=str(options.get("torque_source", "6077 actual torque")),
             timing=self._timing(at, options),
         )
