@@ -28,7 +28,8 @@ def confidence(name: str, features: Features) -> tuple[float, tuple[str, ...]]:
         margin = 1000.0 * (1.0 - share)
     chance = 1.0 - 0.65 * math.exp(-max(0.0, margin) / 60.0)
     # What is left to explain could be the true cause.
-    chance *= 1.0 - min(0.6, 2.0 * max(0.0, features.family_share - 0.03))
-    chance *= 1.0 - min(0.5, 0.35 * max(0.0, features.after - 1.4))
+    chance *= 1.0 - min(0.6, 1.5 * max(0.0, features.family_share - 0.06))
+    if features.misfit > 2.0:
+        chance *= 1.0 - min(0.5, 0.2 * max(0.0, features.after - 1.5))
     confusable = (rival,) if rival and (margin < CONFUSABLE_MARGIN or share > 0.97) else ()
     return round(max(0.05, min(0.99, chance)), 3), confusable

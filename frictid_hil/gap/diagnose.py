@@ -1,4 +1,4 @@
-"""The diagnosis: which effects a simulator lacks, found on the identification logs and judged on the validation logs."""
+"""The diagnosis: which effects a simulator lacks, found on identification logs and judged on validation logs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from frictid_hil.simulation.effects import all_effects
 
 FAMILY_SHARE = 0.25
 """Share of what is left that a family without a cause may explain before the answer is unknown."""
-FAMILY_AHEAD = 0.07
+FAMILY_AHEAD = 0.03
 """How far such a family alone may be ahead of the library's effects."""
 HELD_SHARE = 0.002
 """Share of repeated positions in motion from which the position itself is in doubt."""
@@ -65,13 +65,15 @@ def _full(experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[
     channels = drive_channels(experiments, logs, allowed)
     evidence = Evidence(logs, channels.kinematic.step_rad, allowed, None)
     ranking = rank(evidence)
-    replay = Replay(experiments)
+    found = channels.actuation.found if channels.actuation is not None else {}
+    replay = Replay(experiments, controller_lags="velocity_lag" in found)
     judged = [r for r in logs if r.experiment.validation] or list(logs)
     has_validation = any(r.experiment.validation for r in logs)
     low_pass = LowPass.at(1.0 / logs[0].step_s)
     coulomb, _ = friction_scales(nominal)
     noise = _actuation_left(judged, experiments, channels, low_pass)
-    floor = math.hypot(noise, TOLERANCE_SHARE * coulomb)
+    gravity = math.hypot(nominal.gravity_cos_nm, nominal.gravity_sin_nm)
+    floor = math.hypot(noise, TOLERANCE_SHARE * (coulomb + gravity))
 
     bare = replay({}, validation=True if has_validation else None)
     before_nm = pooled(bare, "torque_nm")
@@ -154,11 +156,10 @@ def verdict_of(f: Features) -> tuple[str, str]:
     if f.held_share > HELD_SHARE:
         return "unknown", "kinematics: positions repeat while the joint moves"
     if not f.names:
-        return ("unknown", f.family_name) if f.before > 1.6 else ("none", "")
-    plant = bool(f.rivals)
-    if plant and f.family_alone > 1.0 + FAMILY_AHEAD and f.after > 1.15:
+        return ("unknown", f.family_name) if f.before > 1.6 and f.misfit_before > 1.5 else ("none", "")
+    if f.rivals and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1:
         return "unknown", f.family_name
-    if f.after > 1.25 and f.family_share > FAMILY_SHARE:
+    if f.family_share > FAMILY_SHARE and f.misfit > 1.3 and f.after > 1.2:
         return "unknown", f.family_name
     if f.after > 2.0 and f.misfit > 3.0 and f.coarse <= 1.5 and f.after > 0.25 * f.before:
         return "unknown", f.family_name

@@ -253,8 +253,22 @@ class Evidence:
         return [group for group in self.groups if group[0] == effect]
 
     def best_shape(self, effect: str, given: Sequence[Group] = ()) -> tuple[float, Group]:
-        """(score, group) of the best shape of an effect beside given groups."""
-        return max((self.score([*given, group]), group) for group in self.shapes(effect))
+        """(score, group) of the best shape of an effect beside given groups, among those that make physical sense."""
+        ranked = sorted(((self.score([*given, group]), group) for group in self.shapes(effect)), reverse=True)
+        for score, group in ranked[:5]:
+            if self.sensible([*given, group]):
+                return score, group
+        # None does: then the effect explains nothing.
+        return self.score(given), ranked[0][1]
+
+    def sensible(self, model: Sequence[Group]) -> bool:
+        """Whether the last group's first coefficient lies in its physical range."""
+        form = all_effects()[model[-1][0]].inverse
+        if form is None:
+            return True
+        low, high = form.first_coefficient
+        first = self.coefficients(model)[-len(self.groups[model[-1]])]
+        return bool(low <= first <= high)
 
     def _solve(self, normal: Normal, columns: Sequence[int]) -> Array:
         """Coefficients under the nuisances' priors and hard bounds (an active set)."""

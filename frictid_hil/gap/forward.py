@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,9 +17,12 @@ from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, friction_scales, rms
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
-from frictid_hil.simulation.replay import Controller, closed_loop
+from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, closed_loop
 
 Effects = Mapping[str, Mapping[str, float]]
+
+SEARCH_SUBSTEP_S = 5e-4
+"""Sub-step of replays that only compare neighbours; what is reported uses the simulator's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +91,8 @@ def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
 class Replay:
     """Replays of one experiment set; the nominal model may carry any effects."""
 
-    def __init__(self, experiments: ExperimentSet) -> None:
+    def __init__(self, experiments: ExperimentSet, controller_lags: bool = False) -> None:
+        self._lagging = controller_lags
         self._experiments = experiments.experiments
         self._nominal = nominal_model(experiments.nominal)
         controller = experiments.nominal.controller
@@ -100,6 +104,7 @@ class Replay:
             rate_hz=controller.rate_hz,
             velocity_filter_s=controller.velocity_filter_s,
             torque_limit_nm=controller.torque_limit_nm,
+            command_rate=controller.command_rate,
         )
 
     def model(self, effects: Effects) -> JointModel:
@@ -109,37 +114,51 @@ class Replay:
             merged[name] = {**merged.get(name, {}), **bounded(name, values)}
         return self._nominal.with_effects(merged)
 
-    def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
+    def __call__(
+        self, effects: Effects, *, validation: bool | None = None, substep_s: float = SUBSTEP_S
+    ) -> dict[str, Replayed]:
         """Differences by experiment name.
 
         Args:
             effects: parameters by effect.
             validation: only those logs, only the others, or all (None). Warmth carries over in run order, so earlier
                 logs are simulated too where an effect remembers.
+            substep_s: of the physics.
         """
         model = self.model(effects)
+        lag_s = effects.get("velocity_lag", {}).get("time_constant_s", 0.0) if self._lagging else 0.0
+        # Two first-order lags in a row are close to one of their summed time constants.
+        controller = replace(self._controller, velocity_filter_s=self._controller.velocity_filter_s + lag_s)
         carried = any(all_effects()[name].carried for name in effects)
-        state = None
+        state: CarryOver | None = None
         result: dict[str, Replayed] = {}
         for experiment in self._experiments:
             wanted = validation is None or experiment.validation == validation
             if not wanted and not carried:
                 continue
-            difference, state = self._one(model, experiment, state)
+            difference, state = self._one(model, controller, experiment, state, substep_s)
             if wanted:
                 result[experiment.name] = difference
         return result
 
-    def _one(self, model: JointModel, experiment: Experiment, state: object) -> tuple[Replayed, object]:
+    def _one(
+        self,
+        model: JointModel,
+        controller: Controller,
+        experiment: Experiment,
+        state: CarryOver | None,
+        substep_s: float,
+    ) -> tuple[Replayed, CarryOver]:
         command = experiment.position_command_rad
         assert command is not None
         rows = closed_loop(
             model,
-            self._controller,
+            controller,
             experiment.time_s,
             command,
             payload=experiment.payload,
-            state=state,  # type: ignore[arg-type]
+            state=state,
+            substep_s=substep_s,
         )
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
@@ -205,7 +224,7 @@ def refine(replay: Replay, effects: Effects, rounds: int = 3) -> Refined:
             free.append((name, p.name, p.lower, p.upper, p.typical))
 
     def difference(values: Effects) -> Array:
-        logs = replay(values, validation=False)
+        logs = replay(values, validation=False, substep_s=SEARCH_SUBSTEP_S)
         return np.concatenate([d.torque_nm[::8] for d in logs.values()])
 
     base = difference(current)

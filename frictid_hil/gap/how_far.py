@@ -17,8 +17,8 @@ from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled, refine
 from frictid_hil.gap.which import Model, Ranking
 from frictid_hil.simulation.effects import all_effects
 
-TOLERANCE_SHARE = 0.004
-"""Part of a joint's Coulomb level that tolerances and sub-floor traces leave in its torque."""
+TOLERANCE_SHARE = 0.0025
+"""Part of a joint's Coulomb level and gravity that tolerances and sub-floor traces leave in its torque."""
 STANDS_ALONE = 1.0
 """Torque that the first effect must take off, over the floor."""
 STANDS_BESIDE = 0.45

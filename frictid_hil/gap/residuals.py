@@ -69,7 +69,7 @@ class LowPass:
 
     def __call__(self, columns: Array) -> Array:
         """Filtered along the first axis; shape unchanged."""
-        b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
+        b, a = _butterworth(self.rate_hz, self.cutoff_hz)
         padding = min(15, columns.shape[0] - 1)
         filtered: Array = signal.filtfilt(b, a, columns, axis=0, padlen=padding)
         return filtered
@@ -94,6 +94,12 @@ class LowPass:
         b, a = signal.butter(4, self.cutoff_hz / (0.5 * self.rate_hz))
         _, response = signal.freqz(b, a, worN=2048)
         return float(np.sqrt(np.mean(np.abs(response) ** 4)))
+
+
+@functools.cache
+def _butterworth(rate_hz: float, cutoff_hz: float) -> tuple[Array, Array]:
+    b, a = signal.butter(4, cutoff_hz / (0.5 * rate_hz))
+    return b, a
 
 
 @functools.cache
@@ -273,7 +279,10 @@ def controller_demand(
     """
     difference = np.diff(position_rad, prepend=position_rad[0]) / step_s
     velocity = lagged(lagged(difference, step_s, velocity_lag_s), step_s, controller.velocity_filter_s)
-    feed = np.gradient(command_rad, step_s)
+    if controller.command_rate == "backward":
+        feed = np.diff(command_rad, prepend=command_rad[0]) / step_s
+    else:
+        feed = np.gradient(command_rad, step_s)
     error = command_rad - position_rad
     direct = controller.kp_nm_per_rad * error + controller.kd_nm_s_per_rad * (feed - velocity)
     return _integrated(direct, controller.ki_nm_per_rad_s * step_s * error, controller.torque_limit_nm, integral_nm)

@@ -7,6 +7,7 @@ linearly, and knows how to read the effect's own parameters from shape and coeff
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -72,11 +73,13 @@ class InverseForm:
         shapes: grid of the nonlinear parameters; ``({},)`` where there are none.
         regressors: (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
         parameters: (shape, coefficients (k,)) -> the effect's own parameters.
+        first_coefficient: range of the first coefficient that makes physical sense; outside it is another effect.
     """
 
     shapes: tuple[Shape, ...]
     regressors: Callable[[Sequence[View], Shape], list[Array]]
     parameters: Callable[[Shape, Array], dict[str, float]]
+    first_coefficient: tuple[float, float] = (-math.inf, math.inf)
 
 
 def grid(**axes: Sequence[float]) -> tuple[Shape, ...]:

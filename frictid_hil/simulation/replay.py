@@ -36,6 +36,8 @@ class Controller:
         rate_hz: of the loop.
         velocity_filter_s: time constant of the filter.
         torque_limit_nm: of the demand.
+        command_rate: how d cmd/dt is formed: ``central`` where the controller knows its command ahead, ``backward``
+            where it follows set-points as they come.
     """
 
     kp_nm_per_rad: float
@@ -44,6 +46,7 @@ class Controller:
     rate_hz: float
     velocity_filter_s: float = 0.0
     torque_limit_nm: float = math.inf
+    command_rate: str = "central"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +83,7 @@ def closed_loop(
     seed: int | None = None,
     state: CarryOver | None = None,
     start_rad: float | None = None,
+    substep_s: float = SUBSTEP_S,
 ) -> Simulated:
     """The joint under a controller that follows the recorded commands.
 
@@ -92,6 +96,7 @@ def closed_loop(
         seed: of the noise on the reported torque, which is then rounded as the drive does; None for neither.
         state: warmth left by the recording before; None for a cold joint.
         start_rad: where the joint rests at the first row; None for its first command.
+        substep_s: longest sub-step of the physics; longer ones are for searches that only compare.
     """
     time = np.asarray(time_s, dtype=np.float64)
     command = np.asarray(position_command_rad, dtype=np.float64)
@@ -100,10 +105,12 @@ def closed_loop(
     commands = np.zeros((ticks, plant.COMMANDS))
     tick_times = time[0] + period_s * np.arange(ticks)
     commands[:, plant.POSITION_COMMAND] = np.interp(tick_times, time, command)
-    # The controller knows its command as a function of time: a central difference is its derivative.
-    after = np.interp(tick_times + period_s, time, command)
     before = np.interp(tick_times - period_s, time, command)
-    commands[:, plant.VELOCITY_COMMAND] = (after - before) / (2 * period_s)
+    if controller.command_rate == "backward":
+        commands[:, plant.VELOCITY_COMMAND] = (commands[:, plant.POSITION_COMMAND] - before) / period_s
+    else:
+        after = np.interp(tick_times + period_s, time, command)
+        commands[:, plant.VELOCITY_COMMAND] = (after - before) / (2 * period_s)
 
     parameters = packing.parameters(model, payload=payload)
     parameters[plant.KP] = controller.kp_nm_per_rad
@@ -112,7 +119,7 @@ def closed_loop(
     parameters[plant.CONTROL_FILTER_S] = controller.velocity_filter_s
     parameters[plant.TORQUE_LIMIT] = min(controller.torque_limit_nm, model.drive.torque_limit_nm)
     start = float(command[0]) if start_rad is None else start_rad
-    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start, state, time)
+    rows = _simulate(parameters, commands, period_s, plant.POSITION_MODE, start, state, time, substep_s)
     return rows if seed is None else _noisy(rows, model, seed)
 
 
@@ -156,13 +163,14 @@ def _simulate(
     start_rad: float,
     carried: CarryOver | None,
     time: Array,
+    substep_s: float = SUBSTEP_S,
 ) -> Simulated:
     vector = packing.state()
     functions = kernel()
     holding_nm = functions.place(parameters, vector, float(start_rad))
     _restore(vector, carried)
     first_rad = vector[plant.MEASURED]
-    substeps = max(1, math.ceil(period_s / SUBSTEP_S - 1e-6))
+    substeps = max(1, math.ceil(period_s / substep_s - 1e-6))
     readings = np.empty((len(commands), plant.READINGS))
     functions.run(parameters, vector, commands, readings, mode, substeps, period_s / substeps)
 

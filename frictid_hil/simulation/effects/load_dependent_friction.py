@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -72,5 +73,6 @@ EFFECT = Effect(
             "linear_share": float(coefficients[0]),
             "quadratic_per_nm": float(coefficients[1]) if coefficients.size > 1 else 0.0,
         },
+        first_coefficient=(0.0, math.inf),
     ),
 )

@@ -110,6 +110,7 @@ EFFECT = Effect(
         ),
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+        first_coefficient=(0.0, math.inf),
     ),
     state_size=1,
 )

@@ -86,6 +86,7 @@ EFFECT = Effect(
         shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+        first_coefficient=(0.0, math.inf),
     ),
     state_size=1,
 )

@@ -82,5 +82,6 @@ EFFECT = Effect(
         shapes=grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+        first_coefficient=(0.0, math.inf),
     ),
 )
