@@ -8,7 +8,6 @@ transfer goes on with the first sample that is missing.
 from __future__ import annotations
 
 import base64
-import binascii
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -346,7 +345,7 @@ class _BlockCollector:
     def _keep(self, coded: str) -> None:
         try:
             raw = base64.b64decode(coded, validate=True)
-        except binascii.Error:
+        except ValueError:
             return
         if len(raw) < _BLOCK_HEAD.size + 2 or crc16(raw[:-2]) != int.from_bytes(raw[-2:], "little"):
             return

@@ -191,10 +191,10 @@ class MotomanDriver:
         welcome = self._reach.welcome
         if welcome is None:
             raise HardwareError("this controller does not stream", next_step="use run_batch")
-        self._servo_on()
-        pulses = line.host.pulses()
         active = self._mask(self._active or self._units)
         mask = streamed_mask(self._mask(self._units), active, self._options.stream_baud, welcome.tick_us)
+        self._servo_on()
+        pulses = line.host.pulses()
         session = line.begin_stream(mask)
         self._cycle = StreamCycle(
             session, self._setup.joints, self._units, self._limits, pulses, self.clock, self._options.lead_ticks

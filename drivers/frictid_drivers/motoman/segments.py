@@ -4,6 +4,7 @@
 segment            command at tick k = 1..n, from p, where the segment before it ended; rounded to whole pulses
 =================  ==============================================================================================
 ``H:n``            p
+``G:n``            none: the position loop is open, a person guides the axis; it is held again where it then stands
 ``L:n:q``          p + (q - p) k/n
 ``M:n:q``          p + (q - p) (10 u^3 - 15 u^4 + 6 u^5), u = k/n
 ``C:a:n1:n2...``   per cycle of n_i ticks: p + a/2 (1 - cos(2 pi k / n_i)); ends at p
@@ -22,6 +23,9 @@ from numpy.typing import NDArray
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_hil.errors import PlanRefused
 from frictid_hil.plan import Corners, Cycles, Hold, Motion, Move, Sine
+
+GUIDED = "guided"
+"""Name of a ``Hold`` during which a person guides the joint by hand, the friction table in force."""
 
 _WHOLE_TICK = 1e-3
 """How far a cycle may be from whole ticks, in ticks."""
@@ -66,7 +70,7 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
     ticks = max(1, math.ceil(motion.duration_s / tick_s - _WHOLE_TICK))
     match motion:
         case Hold():
-            return [f"H:{ticks}"]
+            return [f"{'G' if motion.name == GUIDED else 'H'}:{ticks}"]
         case Move():
             return [f"M:{ticks}:{units.pulses(motion.to_rad)}"]
         case Sine():
@@ -100,7 +104,7 @@ def _command(text: str, here: int) -> list[int]:
     """The command of one segment, tick by tick, as the table above says."""
     kind, *rest = text.split(":")
     figures = [int(figure) for figure in rest]
-    if kind == "H":
+    if kind in ("H", "G"):
         return [here] * figures[0]
     if kind == "C":
         path: list[NDArray[np.int64]] = []

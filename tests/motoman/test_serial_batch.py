@@ -1,0 +1,288 @@
+"""Layer B: the job message, its segments, the transfer and its resumption, the friction table."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from serial_bench import START_RAD, make_bench
+
+from frictid_drivers.motoman.batch import BatchClient, JobOrder, _BlockCollector
+from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold
+from frictid_drivers.motoman.emulator import jobs
+from frictid_drivers.motoman.emulator.compensation import Compensator, Table
+from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.segments import motion_segments
+from frictid_drivers.motoman.stream_frames import crc16
+from frictid_drivers.motoman.table import friction_table
+from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.plan import Corners, Cycles, Hold, JointPlan, Motion, Move, Sine
+
+UNITS = AxisUnits(axis=0, pulses_per_rad=math.degrees(1000.0), gear_ratio=100.0, rated_torque_nm=20.0, direction=1)
+TICK_S = 0.004
+
+
+class WholeTicks(Procedure):
+    """Cycle lengths rounded to four ticks, so that both peaks and both zero crossings fall on ticks."""
+
+    __slots__ = ()
+
+    @property
+    def cycle_starts_s(self):  # type: ignore[no-untyped-def]
+        exact = 2 * math.pi / self.angular_frequencies_rad_s
+        return np.concatenate([[0.0], np.cumsum(4 * np.round(exact / (4 * TICK_S)))]) * TICK_S
+
+
+PROCEDURE = WholeTicks(math.radians(20), math.radians(115), 10)
+
+
+def test_the_papers_cycles_become_the_published_tick_counts() -> None:
+    made = motion_segments([Cycles(START_RAD, PROCEDURE)], UNITS, TICK_S)
+    assert made.segments == ("C:20000:1364:684:456:340:272:228:196:172:152:136",)
+    assert made.motion_ticks == (0, 4000)
+
+
+def test_cycles_that_are_no_whole_ticks_are_refused() -> None:
+    with pytest.raises(PlanRefused, match="4 ms ticks"):
+        motion_segments([Cycles(START_RAD, Procedure(0.3, 2.0))], UNITS, TICK_S)
+
+
+MOTIONS = st.lists(
+    st.one_of(
+        st.builds(Hold, st.just(START_RAD), st.floats(0.01, 0.2)),
+        st.builds(Move, st.just(START_RAD), st.floats(-0.5, 0.5), st.floats(0.1, 0.5)),
+        st.builds(Sine, st.just(START_RAD), st.floats(0.01, 0.3), st.floats(0.5, 2.0), st.integers(1, 3)),
+        st.builds(
+            lambda a, b: Corners("reversal", (0.0, 0.1, 0.25), (START_RAD, a, b)),
+            st.floats(-0.5, 0.5),
+            st.floats(-0.5, 0.5),
+        ),
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(MOTIONS)
+def test_both_sides_make_the_same_command_of_the_same_segments(motions: list[Motion]) -> None:
+    made = motion_segments(motions, UNITS, TICK_S)
+    path, floating = [made.start], [False]
+    for segment in made.segments:
+        jobs._append_segment(segment, path, floating)
+    assert len(path) == len(made.command)
+    # Half pulses may round either way.
+    assert np.abs(np.array(path) - made.command).max() <= 1
+
+
+@pytest.mark.parametrize(
+    "motion", [Hold(START_RAD, 0.1), Move(START_RAD, 0.4, 0.4), Sine(START_RAD, 0.1, 0.785398163, 1)]
+)
+def test_the_command_is_the_plans_own_path(motion: Motion) -> None:
+    made = motion_segments([motion], UNITS, TICK_S)
+    planned = motion.position_rad(np.arange(len(made.command)) * TICK_S)
+    assert np.abs(made.command / UNITS.pulses_per_rad - planned).max() < 1e-4
+
+
+def order(**changes: object) -> JobOrder:
+    figures = {
+        **{"number": 7, "axis": 0, "start": 11459, "lowest": 0, "highest": 40000, "step": 700},
+        **{"torque_micro": 500_000, "watchdog_ticks": 1250, "segments": ["H:50", "C:20000:1364:684", "H:50"]},
+        **changes,
+    }
+    return JobOrder(**figures)  # type: ignore[arg-type]
+
+
+def test_the_job_is_one_message_closed_by_its_crc() -> None:
+    text = order().text()
+    covered, _, check = text.rpartition(",")
+    assert text.startswith("FJOB 1,7,0,11459,0,40000,700,500000,1250,H:50,C:20000:1364:684,H:50,")
+    assert int(check, 16) == crc16((covered + ",").encode())
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({}, None),
+        ({"highest": 20000}, OperandOutOfRange),
+        ({"step": 10}, OperandOutOfRange),
+        ({"axis": 3}, OperandOutOfRange),
+        ({"segments": ["X:4"]}, OperandOutOfRange),
+        ({"segments": ["H:0"]}, OperandOutOfRange),
+    ],
+)
+def test_the_controller_checks_the_job_as_well(changes: dict[str, object], error: type[Exception] | None) -> None:
+    bench = make_bench()
+    client = BatchClient(bench.host(), lambda: bench.emulator.now_s)
+    if error is None:
+        client.send(order(**changes))
+    else:
+        with pytest.raises(error):
+            client.send(order(**changes))
+
+
+def test_a_job_with_one_wrong_character_is_refused() -> None:
+    bench = make_bench()
+    with pytest.raises(FormatMistake):
+        bench.host().order(order().text().replace("20000", "20001"))
+
+
+def plan(*motions: Motion) -> JointPlan:
+    return JointPlan("0", motions or (Hold(START_RAD, 0.1), Sine(START_RAD, 0.2, 1.0), Hold(START_RAD, 0.1)), {})
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_job_comes_back_in_joint_units(direction: int) -> None:
+    bench = make_bench(layer="batch", direction=direction)
+    driver = bench.driver()
+    driver.open()
+    told: list[str] = []
+    columns = driver.run_batch(plan(), progress=lambda phase, share: told.append(f"{phase} {share:.1f}"))
+    driver.close()
+    assert columns["position_rad"].max() == pytest.approx(START_RAD + 0.2, abs=1e-3)
+    assert columns["velocity_rad_s"].max() == pytest.approx(1.0, rel=0.02)
+    moving = np.abs(columns["velocity_rad_s"]) > 0.1
+    velocity = columns["velocity_rad_s"][moving]
+    assert columns["torque_nm"][moving] == pytest.approx(10 * np.tanh(velocity / 0.01) + 3 * velocity, abs=2e-3)
+    assert np.all(np.diff(columns["time_ns"]) == 4_000_000)
+    assert np.abs(columns["position_rad"] - columns["position_command_rad"]).max() < 1e-2
+    assert list(columns["motion_starts_ns"]) == [0, 25 * 4e6, (25 + 157) * 4e6, (25 + 157 + 25) * 4e6]
+    assert told[-1] == "transfer 1.0"
+
+
+def test_a_broken_transfer_goes_on_where_it_broke() -> None:
+    healthy = make_bench(layer="batch")
+    driver = healthy.driver()
+    driver.open()
+    whole = driver.run_batch(plan(Sine(START_RAD, 0.3, 0.4)))
+    driver.close()
+    assert len(whole["time_ns"]) > 32 * 18
+    blocks = healthy.emulator.faults.counted["block"]
+    # Four lost blocks in a row exhaust the retries of one message; the message before and after it are whole.
+    broken = make_bench(layer="batch", retry_1=2, faults=[f"lost_block@{blocks - 12}x4"], timer_a_s=0.5)
+    driver = broken.driver()
+    driver.open()
+    resumed = driver.run_batch(plan(Sine(START_RAD, 0.3, 0.4)))
+    driver.close()
+    assert broken.emulator.faults.counted["block heard"] > healthy.emulator.faults.counted["block heard"]
+    assert np.array_equal(resumed["position_rad"], whole["position_rad"])
+
+
+@given(st.binary(max_size=60), st.integers(0, 200), st.integers(0, 255))
+def test_damaged_blocks_never_become_samples(garbage: bytes, position: int, replaced: int) -> None:
+    raw = (7).to_bytes(2, "little") + (0).to_bytes(4, "little") + b"\x02" + bytes(range(20))
+    coded = bytearray(base64.b64encode(raw + crc16(raw).to_bytes(2, "little")))
+    clean = bytes(coded)
+    coded[position % len(coded)] = replaced
+    rows: dict[int, tuple[int, int, int]] = {}
+    collector = _BlockCollector(7, 0, 0, rows)
+    collector.take(coded.decode("latin-1") + ",", 0)
+    collector.take(base64.b64encode(garbage).decode(), 1)
+    collector.finish()
+    assert bool(rows) == (bytes(coded) == clean)
+
+
+@pytest.mark.parametrize(("speed", "torque"), [(1_000, 500_000), (90_000_000, -12_000_000)])
+def test_figures_beyond_24_bits_are_shifted_and_come_back(speed: int, torque: int) -> None:
+    job = jobs.Job(1, 0, [0], [False], 0, 1, samples=[(-5, speed, torque), (2**31 - 1, -speed, -torque)])
+    velocity_shift, torque_shift = job.shifts()
+    assert abs(speed) >> velocity_shift < 2**23
+    bench = make_bench()
+    job.state = jobs.FINISHED
+    bench.emulator.batch._job = job
+    client = BatchClient(bench.host(), lambda: bench.emulator.now_s)
+    record = client.fetch(1, client.state(1), 2, lambda share: None)
+    assert list(record.pulses) == [-5, 2**31 - 1]
+    assert record.speed_tenths[1] == pytest.approx(-speed, abs=2**velocity_shift)
+    assert record.torque_micro[0] == pytest.approx(torque, abs=2**torque_shift)
+
+
+def test_a_stop_on_request_brings_the_joint_to_rest_and_keeps_the_record() -> None:
+    bench = make_bench(layer="batch")
+    driver = bench.driver()
+    driver.open()
+    asked = iter([False] * 30 + [True] * 1000)
+    with pytest.raises(Interrupted):
+        driver.run_batch(plan(Sine(START_RAD, 0.3, 0.1)), stop=lambda: next(asked))
+    assert len(driver.batch_columns["time_ns"]) > 100
+    driver.close()
+    assert not bench.still_moving()
+
+
+def test_a_job_does_not_start_from_elsewhere_or_against_a_hold() -> None:
+    bench = make_bench(layer="batch")
+    driver = bench.driver()
+    driver.open()
+    with pytest.raises(HardwareError, match=re.escape("stands at 11.46 deg, the job starts at 17.19 deg")):
+        driver.run_batch(plan(Hold(0.3, 0.1)))
+    bench.emulator.panel.press_hold("pendant")
+    with pytest.raises(PendantHold):
+        driver.run_batch(plan())
+    with pytest.raises(PlanRefused, match="travel"):
+        driver.run_batch(plan(Move(START_RAD, 1.5, 2.0)))
+    with pytest.raises(PlanRefused, match="velocity"):
+        driver.run_batch(plan(Move(START_RAD, 0.9, 0.1)))
+
+
+# -- the friction table ----------------------------------------------------------------------------------------------
+
+CURVE = FrictionCurve.through(np.linspace(0.2, 2.0, 10), 5.0 + 2.0 * np.sqrt(np.linspace(0.2, 2.0, 10)))
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_downloaded_table_gives_the_curve_back(direction: int) -> None:
+    bench = make_bench(layer="batch", direction=direction)
+    driver = bench.driver()
+    driver.open()
+    driver.download_table("0", CURVE, ratio=0.9, stiffness_nm_per_rad=8000.0, gravity_cos_nm=4.0, gravity_sin_nm=3.0)
+    table: Table = bench.emulator.batch._tables[0][1]
+    per_rad = math.degrees(1000.0)
+    for speed in np.linspace(0.0, 2.2, 50):
+        curve_nm = table.curve_micro(speed * per_rad * 10) * 1e-6 * 100.0
+        assert curve_nm == pytest.approx(float(CURVE.magnitude(np.array([speed]))[0]), rel=2e-3)
+    compensator = Compensator(table, 0)
+    q = 0.7
+    pulses = round(direction * q * per_rad)
+    moved = compensator.torque_micro(pulses, direction * 1.0 * per_rad * 10, gravity=True) * 1e-6 * 100.0 * direction
+    friction = 0.9 * float(CURVE.magnitude(np.array([1.0]))[0])
+    assert moved == pytest.approx(friction + 4.0 * math.cos(q) + 3.0 * math.sin(q), rel=2e-3)
+    driver.close()
+
+
+def test_a_damaged_table_is_refused() -> None:
+    bench = make_bench()
+    coded = friction_table(UNITS, CURVE, 0.9, 8000.0, 0.0, 0.0).encoded()
+    with pytest.raises(FormatMistake):
+        bench.host().order(f"FTABLE 1,{coded[:20]}{'A' if coded[20] != 'A' else 'B'}{coded[21:]}")
+    bench.host().order(f"FTABLE 1,{coded}")
+    assert len(f"FTABLE 1,{coded}") + 1 <= 256
+
+
+def test_compensation_is_applied_on_the_controllers_tick() -> None:
+    bench = make_bench(layer="batch")
+    driver = bench.driver()
+    driver.open()
+    driver.download_table("0", CURVE, ratio=1.0, stiffness_nm_per_rad=8000.0)
+    driver.compensate_by_table(["0"])
+    seen: list[float] = []
+    axis = bench.emulator.axes[0]
+    run = axis.run
+
+    def watch(duration_s: float) -> None:
+        seen.append(axis.feed_forward_nm)
+        run(duration_s)
+
+    axis.run = watch  # type: ignore[method-assign]
+    driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0)))
+    driver.compensate_by_table([])
+    assert max(seen) == pytest.approx(7.0, rel=0.01)
+    assert min(seen) == pytest.approx(-7.0, rel=0.01)
+    assert axis.feed_forward_nm == 0.0
+    driver.close()
