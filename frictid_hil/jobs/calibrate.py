@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from frictid_hil.config.profile import DriveIdentity, FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import JointIdentity, RobotSetup
+from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure
@@ -20,7 +18,7 @@ from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, refuse_beyond_limits
-from frictid_hil.runner.events import Event, JointRun, Preflight
+from frictid_hil.runner.events import Event, JointRun
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
 
@@ -64,7 +62,6 @@ class CalibrateOptions:
 class _Progress:
     """What a run has come to, so that an error halfway loses nothing."""
 
-    identities: dict[str, JointIdentity] = field(default_factory=dict)
     joints: dict[str, JointProfile] = field(default_factory=dict)
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     ended: FrictidError | None = None
@@ -148,9 +145,7 @@ def _run(
     def notify(event: Event) -> None:
         watcher.event(event)
         folder.note(event)
-        if isinstance(event, Preflight):
-            progress.identities = event.identities
-        elif isinstance(event, JointRun):
+        if isinstance(event, JointRun):
             _identify(event, folder, setup, options, watcher, progress)
 
     with folder.keeping(setup, watcher.at) as keeper:
@@ -180,8 +175,7 @@ def _identify(
     watcher: Watcher,
     progress: _Progress,
 ) -> None:
-    identity = progress.identities[run.joint]
-    samples = folder.samples(run, identity)
+    samples = folder.samples(run)
     result: dict[str, Any] = {
         "duration_s": run.duration_s,
         "rate_hz": run.rate_hz,
@@ -196,7 +190,6 @@ def _identify(
         progress.results[run.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
         watcher.joint(run.joint, str(error), ok=False)
         return
-    profile = profile.model_copy(update={"drive": _drive(identity)})
     progress.joints[run.joint] = profile
     progress.results[run.joint] = {**joint_result(profile), **result}
     folder.keep_joint(run.joint, profile, progress.results[run.joint])
@@ -206,17 +199,6 @@ def _identify(
 
 
 _NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
-
-
-def _drive(identity: JointIdentity) -> DriveIdentity:
-    return DriveIdentity(
-        serial=identity.serial,
-        firmware=identity.firmware,
-        product=identity.product,
-        rated_torque_nm=identity.rated_torque_nm if np.isfinite(identity.rated_torque_nm) else None,
-        gear_ratio=identity.gear_ratio if np.isfinite(identity.gear_ratio) else None,
-        settings=dict(identity.settings),
-    )
 
 
 def _finish(

@@ -24,6 +24,7 @@ from frictid_hil.gap.experiments import (
     SHORT,
     Envelope,
     Experiment,
+    Relax,
     catalogue,
     chosen,
     names_of_plan,
@@ -234,7 +235,7 @@ def _motions(joint: JointSetup, experiments: Sequence[Experiment], *, rehearse: 
         motions.append(Sine(low, high - low, APPROACH_RAD_S, name="rehearsal"))
     for experiment in experiments:
         move_to(experiment.start_rad)
-        motions += experiment.marked_motions
+        motions += [Relax(experiment.start_rad), *experiment.marked_motions]
         here = experiment.end_rad
     return [*motions, Move.within(here, home, APPROACH_RAD_S, name="return"), Hold(home, 0.2)]
 

@@ -20,6 +20,7 @@ from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
+from frictid_hil.runner.run_folder import load_manifest
 
 _SERIAL_UP_TO = 3
 _READABLE = (".mcap", ".csv", ".csv.gz", ".mat")
@@ -180,7 +181,17 @@ def _joint(samples: Samples, task: _Task) -> JointProfile:
     joint = None
     if task.setup is not None:
         joint = task.setup.joint(samples.joint)
-    return identify_joint(samples, joint, method=task.method, procedure=task.procedure)
+    return identify_joint(
+        samples, joint, method=task.method, procedure=task.procedure, late_cycles=_late_cycles(task.log, samples.joint)
+    )
+
+
+def _late_cycles(log: Path, joint: str) -> int:
+    """Late and missed cycles of a joint, where the recording is a run folder."""
+    if not (log / "manifest.json").exists():
+        return 0
+    sessions = load_manifest(log)["sessions"]
+    return sum(int(run["late_cycles"] + run["missed_cycles"]) for run in sessions if run["joint"] == joint)
 
 
 def _has_marks(every: Sequence[Samples]) -> bool:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from frictid_hil.config.profile import DriveIdentity, Gate, JointProfile, PairList, ProcedureUsed, Ripple
 from frictid_hil.config.profile import Estimate as Figure
-from frictid_hil.config.profile import Gate, JointProfile, PairList, ProcedureUsed, Ripple
 from frictid_hil.driver import JointSetup
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
@@ -51,6 +51,8 @@ def identify_joint(
     """
     if samples.torque_nm is None:
         raise IdentificationError("the recording has no torque", where=f"joint {samples.joint}")
+    if samples.marks:
+        samples = samples.during(Mark("whole run", samples.marks[0].start_ns, samples.marks[-1].end_ns))
     marks = samples.marked("cycles")
     if marks:
         used = procedure_of(marks[0])
@@ -130,6 +132,7 @@ def _from_cycles(
             cycles=procedure.cycles,
             ratio=procedure.ratio,
         ),
+        drive=_drive(samples.meta),
         quality={
             **{name: float(value) for name, value in result.figures.items()},
             "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
@@ -212,6 +215,17 @@ def _skew(samples: Samples) -> Skew:
         return Skew()
     keys = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
     return Skew(**{key: float(timing[key]) for key in keys if timing.get(key) is not None})
+
+
+def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
+    return DriveIdentity(
+        serial=str(meta.get("serial") or ""),
+        firmware=str(meta.get("firmware") or ""),
+        product=str(meta.get("product") or ""),
+        rated_torque_nm=meta.get("rated_torque_nm"),
+        gear_ratio=meta.get("gear_ratio"),
+        settings=dict(meta.get("settings") or {}),
+    )
 
 
 def _presliding(samples: Samples, recording: CycleRecording, result: Estimate) -> Figure:

@@ -31,7 +31,7 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import file_sha256, utc_now
 from frictid_hil.config.robot import Robot
 from frictid_hil.config.write import dump, plain
-from frictid_hil.driver import JointIdentity, RobotSetup
+from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import write_whole
 from frictid_hil.recording.bus_log import BusLogWriter
@@ -219,11 +219,12 @@ class RunFolder:
             return
         self._save()
 
-    def samples(self, run: JointRun, identity: JointIdentity) -> Samples:
+    def samples(self, run: JointRun) -> Samples:
         """The moving joint's samples of one session, with its marks."""
         assert self._keeper is not None, "inside `keeping`"
         start_ns, end_ns = run.marks[0].start_ns, run.marks[-1].end_ns
         rows = self._keeper.taken(self._joints.index(run.joint), start_ns, end_ns)
+        identity = self.manifest["identities"][run.joint]
         return samples_from_rows(run.joint, rows, run.marks, identity, self._robot.name)
 
     def keep_joint(self, joint: str, profile: JointProfile, result: Mapping[str, Any]) -> None:
@@ -297,8 +298,10 @@ def load_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def samples_from_rows(joint: str, rows: Rows, marks: tuple[Mark, ...], identity: JointIdentity, robot: str) -> Samples:
-    """Rows of ``ring.SAMPLE_ROW`` of one joint as samples."""
+def samples_from_rows(
+    joint: str, rows: Rows, marks: tuple[Mark, ...], identity: Mapping[str, Any], robot: str
+) -> Samples:
+    """Rows of ``ring.SAMPLE_ROW`` of one joint as samples, with what its drive says of itself as meta."""
 
     def optional(name: str) -> Any:
         column = rows[name]
@@ -314,12 +317,7 @@ def samples_from_rows(joint: str, rows: Rows, marks: tuple[Mark, ...], identity:
         external_torque_nm=optional("external_torque_nm"),
         temperature_c=optional("temperature_c"),
         marks=marks,
-        meta={
-            "robot": robot,
-            "torque_source": identity.torque_source,
-            "torque_resolution_nm": identity.torque_resolution_nm,
-            "timing": asdict(identity.timing),
-        },
+        meta={"robot": robot, **identity},
     )
 
 
