@@ -10,7 +10,7 @@ from pathlib import Path
 from frictid_hil.errors import FrictidError
 
 
-def write_whole(path: Path, text: str | bytes, *, replace: bool = True) -> None:
+def write_whole(path: Path, text: str | bytes) -> None:
     """Write a file so that every reader, at any moment and after any crash, sees the old content or the new, whole.
 
     The new content is staged in the same folder (a rename works only within one file system), synced, and named last.
@@ -18,11 +18,9 @@ def write_whole(path: Path, text: str | bytes, *, replace: bool = True) -> None:
     Args:
         path: of the file; its folder must exist.
         text: the whole content.
-        replace: False to leave an existing file untouched and raise ``FileExistsError``.
 
     Raises:
         FrictidError: disk full, or no permission.
-        FileExistsError: see ``replace``.
     """
     content = text.encode() if isinstance(text, str) else text
     staged = None
@@ -34,13 +32,8 @@ def write_whole(path: Path, text: str | bytes, *, replace: bool = True) -> None:
             file.write(content)
             file.flush()
             os.fsync(handle)
-        if replace:
-            staged.replace(path)
-        else:
-            path.hardlink_to(staged)
+        staged.replace(path)
         sync_folder(path.parent)
-    except FileExistsError:
-        raise
     except OSError as error:
         raise could_not_write(path, error) from error
     finally:

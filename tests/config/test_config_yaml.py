@@ -194,13 +194,10 @@ def test_writer_refuses_what_is_not_finite() -> None:
         dump({"a": math.nan})
 
 
-def test_write_whole_replaces_or_refuses(tmp_path: Path) -> None:
+def test_write_whole_replaces(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     write_whole(path, "old")
     write_whole(path, "new")
-    assert path.read_text() == "new"
-    with pytest.raises(FileExistsError):
-        write_whole(path, "newer", replace=False)
     assert path.read_text() == "new"
     assert [p.name for p in tmp_path.iterdir()] == ["a.yaml"], "nothing staged is left behind"
 

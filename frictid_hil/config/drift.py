@@ -1,0 +1,82 @@
+"""How two profiles of one robot differ, joint by joint: has the friction changed, and by more than it is known to?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.config.profile import FrictionProfile, JointProfile
+from frictid_hil.friction.metrics import curve_distance
+
+
+@dataclass(frozen=True, slots=True)
+class JointDrift:
+    """The newer profile of one joint against the older one.
+
+    Attributes:
+        distance_nm: E of (15) over [0, V], V the highest measured speed of both.
+        distance_percent: of the older curve's mean.
+        coulomb_change_percent: of F_0; None where one of them has none.
+        overlap_share: share of the newer pairs whose interval meets the older curve's; None without intervals.
+        temperature_change_c: None where one was not measured.
+        other_changes: what else differs and could explain it (estimator, drive, gear, torque source), old -> new.
+    """
+
+    distance_nm: float
+    distance_percent: float
+    coulomb_change_percent: float | None
+    overlap_share: float | None
+    temperature_change_c: float | None
+    other_changes: Mapping[str, str]
+
+
+def drift(older: FrictionProfile, newer: FrictionProfile) -> dict[str, JointDrift]:
+    """Every joint that both profiles have."""
+    return {
+        name: joint_drift(older.joints[name], joint) for name, joint in newer.joints.items() if name in older.joints
+    }
+
+
+def joint_drift(older: JointProfile, newer: JointProfile) -> JointDrift:
+    """One joint."""
+    top = min(older.velocity_rad_s[-1], newer.velocity_rad_s[-1])
+    distance = curve_distance(newer.curve(), older.curve(), top)
+    before, after = older.coulomb_nm.value, newer.coulomb_nm.value
+    return JointDrift(
+        distance_nm=distance.e_nm,
+        distance_percent=distance.e_percent,
+        coulomb_change_percent=None if before is None or after is None else 100.0 * (after - before) / abs(before),
+        overlap_share=_overlap_share(older, newer),
+        temperature_change_c=None
+        if older.temperature_c is None or newer.temperature_c is None
+        else newer.temperature_c - older.temperature_c,
+        other_changes={
+            name: f"{was} -> {now}" for name, (was, now) in _circumstances(older, newer).items() if was != now
+        },
+    )
+
+
+def _overlap_share(older: JointProfile, newer: JointProfile) -> float | None:
+    if older.torque_interval_nm is None or newer.torque_interval_nm is None:
+        return None
+    velocity = np.array(newer.velocity_rad_s)
+    common = (velocity >= older.velocity_rad_s[0]) & (velocity <= older.velocity_rad_s[-1])
+    if not common.any():
+        return None
+    low, high = np.array(newer.torque_interval_nm)[common].T
+    was = np.array(older.torque_interval_nm)
+    was_low, was_high = (np.interp(velocity[common], older.velocity_rad_s, was[:, side]) for side in (0, 1))
+    return float(np.mean((low <= was_high) & (high >= was_low)))
+
+
+def _circumstances(older: JointProfile, newer: JointProfile) -> dict[str, tuple[object, object]]:
+    return {
+        "method": (older.method, newer.method),
+        "torque_source": (older.torque_source, newer.torque_source),
+        "drive serial": (older.drive.serial, newer.drive.serial),
+        "drive firmware": (older.drive.firmware, newer.drive.firmware),
+        "gear_ratio": (older.drive.gear_ratio, newer.drive.gear_ratio),
+        "rated_torque_nm": (older.drive.rated_torque_nm, newer.drive.rated_torque_nm),
+    }

@@ -1,0 +1,411 @@
+"""The profile store: every profile a robot ever had, which one is active, and how that came to be.
+
+::
+
+    <root>/<robot>/
+        profiles/<UTC>-<hash>.yaml   named by content, written once, never changed
+        index.jsonl                  a summary line per profile; can be rebuilt from the profiles
+        promotions.jsonl             a line per promotion, rollback and pinned baseline; the last whole line rules
+
+A profile is on the disk before a line names it, and a line counts once its last byte is there. A process killed at any
+moment therefore leaves the old active profile or the new one, whole; what it left unfinished is passed over by readers
+and tidied by the next writer. Writers exclude each other by a lock that dies with its process; readers need none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+from frictid_hil.config.drift import joint_drift
+from frictid_hil.config.journal import append_line, journal_lines
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.provenance import utc_now
+from frictid_hil.config.search import user_data_dir
+from frictid_hil.errors import ConfigError, FrictidError, UsageError
+from frictid_hil.files import could_not_write, write_whole
+
+_LOCK_TIMEOUT_S = 30.0
+_ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}")
+
+
+@dataclass(frozen=True, slots=True)
+class JointSummary:
+    """One joint of one profile, as far as history shows it.
+
+    Attributes:
+        coulomb_nm: F_0, None where it could not be formed.
+        coulomb_low_nm: its interval.
+        coulomb_high_nm: its interval.
+        temperature_c: during the cycles, None where not measured.
+        gates_failed: names of failed quality gates.
+        distance_percent: (15) from the baseline's curve, in percent of its mean; None where it has none.
+    """
+
+    coulomb_nm: float | None
+    coulomb_low_nm: float | None
+    coulomb_high_nm: float | None
+    temperature_c: float | None
+    gates_failed: Sequence[str]
+    distance_percent: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A profile in the store.
+
+    Attributes:
+        id: ``<UTC>-<first 12 digits of sha256>``; sorts by time.
+        robot: name.
+        created_utc: from its provenance.
+        baseline: id of the profile that the distances are from, None before the first promotion.
+        joints: summaries by name.
+    """
+
+    id: str
+    robot: str
+    created_utc: str
+    baseline: str | None
+    joints: Mapping[str, JointSummary]
+
+
+@dataclass(frozen=True, slots=True)
+class Promotion:
+    """A line of the journal.
+
+    Attributes:
+        action: ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from).
+        id: the profile that is active, or the baseline, from here on.
+        sha256: of its file.
+        utc: when.
+        by: person or job.
+        reason: in words.
+    """
+
+    action: str
+    id: str
+    sha256: str
+    utc: str
+    by: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TrendPoint:
+    """One joint at one time.
+
+    Attributes:
+        id: of the profile.
+        created_utc: when.
+        joint: its figures; ``distance_percent`` is from the baseline of today.
+    """
+
+    id: str
+    created_utc: str
+    joint: JointSummary
+
+
+class ProfileStore:
+    """All robots' profiles below one folder.
+
+    Args:
+        root: the folder; the user's data folder unless told. It is made when something is added.
+    """
+
+    def __init__(self, root: Path | None = None) -> None:
+        self.root = user_data_dir() / "store" if root is None else root
+
+    def robots(self) -> list[str]:
+        """Names of the robots that have profiles here, sorted."""
+        return sorted(path.name for path in self.root.glob("*") if (path / "profiles").is_dir())
+
+    def add(self, profile: FrictionProfile) -> str:
+        """Keep a profile; adding the same bytes again changes nothing.
+
+        Returns:
+            Its id.
+
+        Raises:
+            FrictidError: disk full, no permission, or another process holds the store for too long.
+        """
+        text = profile.to_yaml().encode()
+        sha256 = hashlib.sha256(text).hexdigest()
+        utc = re.sub(r"[-:]", "", profile.provenance.created_utc)
+        identity = f"{utc}-{sha256[:12]}"
+        with self._locked(profile.robot) as folder:
+            _tidy(folder)
+            path = _profile_path(folder, identity)
+            if not path.exists():
+                write_whole(path, text)
+                path.chmod(0o444)
+            if identity not in self._index(profile.robot):
+                append_line(folder / "index.jsonl", _line(_summary(identity, profile, self._reference(profile.robot))))
+        return identity
+
+    def path(self, robot: str, identity: str) -> Path:
+        """The file of a profile.
+
+        Args:
+            robot: name.
+            identity: id, or a beginning of one that fits no other.
+
+        Raises:
+            UsageError: there is none, or more than one.
+        """
+        folder = self._folder(robot)
+        found = [name for name in _profile_ids(folder) if name.startswith(identity)]
+        if len(found) != 1 or not identity:
+            count = "no profile" if not found else f"{len(found)} profiles"
+            raise UsageError(
+                f"{count} of {robot} with id {identity!r} in the store",
+                where=str(folder),
+                next_step=f"see `frictid-hil profile history {robot}`",
+            )
+        return _profile_path(folder, found[0])
+
+    def load(self, robot: str, identity: str) -> FrictionProfile:
+        """A profile by its id (or the beginning of it).
+
+        Raises:
+            UsageError: there is none.
+            ConfigError: its file is not what was added.
+        """
+        path = self.path(robot, identity)
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        if not path.stem.endswith(sha256[:12]):
+            raise ConfigError(
+                "the file was changed after it was stored",
+                where=str(path),
+                next_step="restore it from a backup, or roll back to another profile",
+            )
+        return load_profile(path)
+
+    def active(self, robot: str) -> Promotion | None:
+        """What is active, and since when; None where nothing was ever promoted."""
+        stack = _active_stack(self.promotions(robot))
+        return stack[-1] if stack else None
+
+    def active_profile(self, robot: str) -> FrictionProfile | None:
+        """The active profile itself; None where nothing was ever promoted."""
+        active = self.active(robot)
+        return None if active is None else self.load(robot, active.id)
+
+    def baseline(self, robot: str) -> str | None:
+        """Id of the profile that drift is measured from: the pinned one, else the first ever promoted."""
+        journal = self.promotions(robot)
+        pinned = [line.id for line in journal if line.action == "baseline"]
+        return pinned[-1] if pinned else journal[0].id if journal else None
+
+    def promote(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
+        """Make a stored profile the active one; promoting the active one again changes nothing.
+
+        Raises:
+            UsageError: there is none of that id.
+            FrictidError: as ``add``.
+        """
+        first = self.active(robot) is None
+        promotion = self._write_promotion("promote", robot, identity, by, reason)
+        if first:
+            self.rebuild_index(robot)
+        return promotion
+
+    def pin_baseline(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
+        """Measure drift from this profile from now on; what is active stays.
+
+        Raises:
+            UsageError: there is none of that id, or nothing was promoted yet.
+        """
+        if self.active(robot) is None:
+            raise UsageError(f"no profile of {robot} was promoted yet", where=str(self._folder(robot)))
+        pinned = self._write_promotion("baseline", robot, identity, by, reason)
+        self.rebuild_index(robot)
+        return pinned
+
+    def rollback(self, robot: str, *, by: str = "", reason: str = "") -> Promotion:
+        """Make the profile active again that was so before the present one; again for the one before that.
+
+        Raises:
+            UsageError: there is none before.
+        """
+        with self._locked(robot) as folder:
+            stack = _active_stack(self.promotions(robot))
+            if len(stack) < 2:
+                raise UsageError(
+                    f"no profile of {robot} was active before the present one",
+                    where=str(folder),
+                    next_step=f"see `frictid-hil profile history {robot}` and promote one by its id",
+                )
+            line = Promotion("rollback", stack[-2].id, stack[-2].sha256, utc_now(), by, reason)
+            self.load(robot, line.id)
+            append_line(folder / "promotions.jsonl", asdict(line))
+        return line
+
+    def promotions(self, robot: str) -> list[Promotion]:
+        """The journal, oldest first."""
+        lines = journal_lines(self._folder(robot) / "promotions.jsonl")
+        return [Promotion(**line) for line in lines if line.keys() == Promotion.__dataclass_fields__.keys()]
+
+    def history(self, robot: str) -> list[Stored]:
+        """Every profile of a robot, oldest first; those that the index lost are read anew."""
+        index = self._index(robot)
+        lost = [identity for identity in _profile_ids(self._folder(robot)) if identity not in index]
+        if lost:
+            reference = self._reference(robot)
+            index |= {identity: _summary(identity, self.load(robot, identity), reference) for identity in lost}
+        return [index[identity] for identity in sorted(index)]
+
+    def rebuild_index(self, robot: str) -> None:
+        """Write the index anew from the profiles; needed where it was lost, and when the baseline changes.
+
+        Raises:
+            ConfigError: a profile's file was changed.
+        """
+        with self._locked(robot) as folder:
+            reference = self._reference(robot)
+            every = [
+                _summary(identity, self.load(robot, identity), reference) for identity in sorted(_profile_ids(folder))
+            ]
+            write_whole(folder / "index.jsonl", "".join(json.dumps(_line(stored)) + "\n" for stored in every))
+
+    def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
+        """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
+        reference = self._reference(robot)
+        trends: dict[str, list[TrendPoint]] = {}
+        for stored in self.history(robot):
+            if stored.baseline != reference.id:
+                stored = _summary(stored.id, self.load(robot, stored.id), reference)
+            for name, joint in stored.joints.items():
+                trends.setdefault(name, []).append(TrendPoint(stored.id, stored.created_utc, joint))
+        return trends
+
+    def _folder(self, robot: str) -> Path:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", robot):
+            raise UsageError(f"{robot!r} is no name of a robot")
+        return self.root / robot
+
+    def _write_promotion(self, action: str, robot: str, identity: str, by: str, reason: str) -> Promotion:
+        with self._locked(robot) as folder:
+            path = self.path(robot, identity)
+            active = self.active(robot)
+            if action == "promote" and active is not None and active.id == path.stem:
+                return active
+            self.load(robot, path.stem)  # what is promoted must be readable
+            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+            line = Promotion(action, path.stem, sha256, utc_now(), by, reason)
+            append_line(folder / "promotions.jsonl", asdict(line))
+        return line
+
+    def _reference(self, robot: str) -> _Reference:
+        baseline = self.baseline(robot)
+        return _Reference(baseline, None if baseline is None else self.load(robot, baseline))
+
+    def _index(self, robot: str) -> dict[str, Stored]:
+        """The summaries whose profiles are there, by id."""
+        folder = self._folder(robot)
+        present = _profile_ids(folder)
+        index = {}
+        for line in journal_lines(folder / "index.jsonl"):
+            stored = _stored(line, robot)
+            if stored is not None and stored.id in present:
+                index[stored.id] = stored
+        return index
+
+    @contextmanager
+    def _locked(self, robot: str) -> Iterator[Path]:
+        folder = self._folder(robot)
+        try:
+            (folder / "profiles").mkdir(parents=True, exist_ok=True)
+            lock = filelock.FileLock(folder / ".lock", timeout=_LOCK_TIMEOUT_S)
+            with lock:
+                yield folder
+        except filelock.Timeout:
+            raise FrictidError(
+                f"another process has held the profile store for {_LOCK_TIMEOUT_S:.0f} s",
+                where=str(folder),
+                next_step="see who with `lsof`; the lock ends with that process",
+            ) from None
+        except OSError as error:
+            raise could_not_write(folder, error) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _Reference:
+    """The baseline and its profile, read once."""
+
+    id: str | None
+    profile: FrictionProfile | None
+
+
+def _summary(identity: str, profile: FrictionProfile, reference: _Reference) -> Stored:
+    joints = {name: _joint_summary(name, joint, reference) for name, joint in profile.joints.items()}
+    return Stored(identity, profile.robot, profile.provenance.created_utc, reference.id, joints)
+
+
+def _joint_summary(name: str, joint: JointProfile, reference: _Reference) -> JointSummary:
+    known = None if reference.profile is None else reference.profile.joints.get(name)
+    return JointSummary(
+        coulomb_nm=joint.coulomb_nm.value,
+        coulomb_low_nm=joint.coulomb_nm.low,
+        coulomb_high_nm=joint.coulomb_nm.high,
+        temperature_c=joint.temperature_c,
+        gates_failed=[gate.name for gate in joint.gates if not gate.passed],
+        distance_percent=None if known is None else joint_drift(known, joint).distance_percent,
+    )
+
+
+def _active_stack(journal: list[Promotion]) -> list[Promotion]:
+    """Those active one after the other, as far as they were not rolled back; the last is active."""
+    stack: list[Promotion] = []
+    for line in journal:
+        if line.action == "promote":
+            stack.append(line)
+        elif line.action == "rollback" and stack:
+            stack.pop()
+    return stack
+
+
+def _profile_path(folder: Path, identity: str) -> Path:
+    return folder / "profiles" / f"{identity}.yaml"
+
+
+def _profile_ids(folder: Path) -> set[str]:
+    """Ids of the profiles on disk."""
+    try:
+        names = [path.name for path in (folder / "profiles").iterdir()]
+    except FileNotFoundError:
+        return set()
+    except OSError as error:
+        raise FrictidError(f"cannot be read: {error.strerror}", where=str(folder)) from error
+    return {name[:-5] for name in names if name.endswith(".yaml") and _ID.fullmatch(name[:-5])}
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what killed writers had staged; only under the lock."""
+    for staged in [*folder.glob(".*.part"), *(folder / "profiles").glob(".*.part")]:
+        staged.unlink(missing_ok=True)
+
+
+def _line(stored: Stored) -> dict[str, Any]:
+    """A line of the index; a joint is a list of its figures, because a store may have 60,000 of them."""
+    joints = {
+        name: [getattr(joint, field) for field in JointSummary.__slots__] for name, joint in stored.joints.items()
+    }
+    return {"index": 1, "id": stored.id, "utc": stored.created_utc, "baseline": stored.baseline, "joints": joints}
+
+
+def _stored(line: dict[str, Any], robot: str) -> Stored | None:
+    try:
+        if line["index"] != 1:
+            return None  # written by another version: the profile itself is read instead
+        joints = {name: JointSummary(*figures) for name, figures in line["joints"].items()}
+        return Stored(line["id"], robot, line["utc"], line["baseline"], joints)
+    except (KeyError, TypeError, AttributeError):
+        return None
