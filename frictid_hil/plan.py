@@ -148,6 +148,52 @@ class Sine:
 
 
 @dataclass(frozen=True, slots=True)
+class WarmUp:
+    """One cycle repeated until friction has settled, or for the whole duration.
+
+    Attributes:
+        start_rad: where a cycle begins and ends.
+        amplitude_rad: peak-to-peak travel.
+        peak_velocity_rad_s: of every cycle.
+        longest_s: at most; rounded up to whole cycles.
+        settled_percent_per_min: it ends earlier once friction changes by less than this; None: never earlier.
+        name: as in marks.
+    """
+
+    start_rad: float
+    amplitude_rad: float
+    peak_velocity_rad_s: float
+    longest_s: float
+    settled_percent_per_min: float | None = None
+    name: str = "warm_up"
+
+    @property
+    def cycle_s(self) -> float:
+        """pi A / v."""
+        return math.pi * self.amplitude_rad / self.peak_velocity_rad_s
+
+    @property
+    def duration_s(self) -> float:
+        """Whole cycles."""
+        return max(1, math.ceil(self.longest_s / self.cycle_s)) * self.cycle_s
+
+    def position_rad(self, time_s: Array) -> Array:
+        """start + A/2 (1 - cos)."""
+        phase = 2.0 * math.pi / self.cycle_s * np.asarray(time_s)
+        travelled: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase))
+        return self.start_rad + travelled
+
+    def details(self) -> Mapping[str, Any]:
+        """Travel, speed, when it ends."""
+        return {
+            "start_rad": self.start_rad,
+            "amplitude_rad": self.amplitude_rad,
+            "peak_velocity_rad_s": self.peak_velocity_rad_s,
+            "settled_percent_per_min": self.settled_percent_per_min,
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Corners:
     """Set-points through given corners, joined by straight lines of constant speed (triangles, dwells, steps).
 
@@ -185,6 +231,7 @@ class JointPlan:
         peak_velocity_rad_s: largest commanded speed of all motions.
         predicted_torque_nm: largest torque expected, by the best model at hand (0 where none is).
         travel_rad: (lowest, highest) commanded position.
+        torque_limit_nm: set in the moving joint's drive (6072) where it is below the joint's own limit.
     """
 
     joint: str
@@ -193,6 +240,7 @@ class JointPlan:
     peak_velocity_rad_s: float = 0.0
     predicted_torque_nm: float = 0.0
     travel_rad: tuple[float, float] = (0.0, 0.0)
+    torque_limit_nm: float = math.inf
 
     @property
     def duration_s(self) -> float:
@@ -264,6 +312,10 @@ class Expected:
     source: str = "robot file"
 
 
+_ENDLESS_S = 10.0
+"""As much of an endless motion is looked at."""
+
+
 def joint_plan(
     joint: JointSetup, motions: Sequence[Motion], locked: Mapping[str, float], expected: Expected | None
 ) -> JointPlan:
@@ -274,12 +326,14 @@ def joint_plan(
     travel = [math.inf, -math.inf]
     peak_rad_s = peak_rad_s2 = 0.0
     for motion in motions:
-        step_s = min(1e-3, motion.duration_s / 2)
-        positions = motion.position_rad(np.arange(0.0, motion.duration_s + step_s / 2, step_s))
+        span_s = motion.duration_s if math.isfinite(motion.duration_s) else _ENDLESS_S
+        step_s = min(1e-3, span_s / 2)
+        positions = motion.position_rad(np.arange(0.0, span_s + step_s / 2, step_s))
         travel = [min(travel[0], float(positions.min())), max(travel[1], float(positions.max()))]
         speeds = np.diff(positions) / step_s
         peak_rad_s = max(peak_rad_s, float(np.abs(speeds).max(initial=0.0)))
-        if not isinstance(motion, Corners):
+        # A motion under a control law carries the path that it is meant to follow.
+        if not isinstance(getattr(motion, "path", motion), Corners):
             peak_rad_s2 = max(peak_rad_s2, float(np.abs(np.diff(speeds)).max(initial=0.0)) / step_s)
     torque_nm = 0.0
     if expected is not None:

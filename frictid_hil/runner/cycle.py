@@ -7,6 +7,7 @@ that the joint never sees a jump.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -155,7 +156,7 @@ class CyclicLoop:
                     report.position_rad,
                     report.velocity_rad_s,
                     report.torque_nm,
-                    set_point.position_rad,
+                    set_point.position_rad if math.isnan(report.position_command_rad) else report.position_command_rad,
                     set_point.torque_nm + set_point.torque_offset_nm,
                     report.external_torque_nm,
                     report.temperature_c,
@@ -206,7 +207,9 @@ class CyclicLoop:
         for _ in range(max(1, round(timeout_s / self.period_s))):
             if self._stop.level:
                 raise Interrupted("stopped on request before the motion began")
-            if done(self.cycle(supervised=False)):
+            feedback = self.cycle(supervised=False)
+            self._supervisor.check_interlock(feedback)
+            if done(feedback):
                 return
         raise SafetyAbort(f"{what} not seen within {timeout_s:g} s", next_step="run `frictid-hil check`")
 

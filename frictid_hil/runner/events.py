@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from frictid_hil.driver import Capabilities, Finding, JointIdentity
 from frictid_hil.recording.samples import Mark
@@ -21,6 +23,17 @@ class Preflight:
     identities: dict[str, JointIdentity]
     capabilities: Capabilities
     findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Configured:
+    """The drives were configured for the first time in this run; kept so that the log of frames can be decoded again.
+
+    Attributes:
+        frame_map: which frame carries what (``driver.FrameMapped``).
+    """
+
+    frame_map: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,4 +98,4 @@ class Warned:
     message: str
 
 
-Event = Preflight | PhaseStarted | Marked | JointRun | Warned
+Event = Preflight | Configured | PhaseStarted | Marked | JointRun | Warned

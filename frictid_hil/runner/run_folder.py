@@ -37,7 +37,7 @@ from frictid_hil.files import write_whole
 from frictid_hil.recording.bus_log import BusLogWriter
 from frictid_hil.recording.mcap import SampleWriter
 from frictid_hil.recording.samples import Mark, Samples
-from frictid_hil.runner.events import Event, JointRun, Marked, Preflight, Warned
+from frictid_hil.runner.events import Configured, Event, JointRun, Marked, Preflight, Warned
 from frictid_hil.runner.ring import Rows
 
 SCHEMA = "frictid.run/1"
@@ -118,6 +118,7 @@ class RunFolder:
         self.manifest = manifest
         self._keeper: RowKeeper | None = None
         self._joints: list[str] = []
+        self._bus_log = ""
 
     @staticmethod
     def create(robot: Robot, verb: str, out: Path | None = None) -> RunFolder:
@@ -187,9 +188,10 @@ class RunFolder:
         part = len(self.manifest["sessions"])
         suffix = f"-{part}" if part else ""
         meta = {"robot": self._robot.name, "config_sha256": self._robot.digest, "started_utc": utc_now()}
+        self._bus_log = f"bus{suffix}.blf"
         keeper = RowKeeper(
             SampleWriter(self.path / f"samples{suffix}.mcap", self._joints, meta),
-            BusLogWriter(self.path / f"bus{suffix}.blf"),
+            BusLogWriter(self.path / self._bus_log),
             self._joints,
             at,
         )
@@ -209,6 +211,9 @@ class RunFolder:
             self.manifest["findings"] = [
                 {"severity": f.severity.value, "subject": f.subject, "message": f.message} for f in event.findings
             ]
+        elif isinstance(event, Configured):
+            # One per part of a resumed run: the drives may have been mapped otherwise in between.
+            self.manifest.setdefault("frame_maps", {})[self._bus_log] = event.frame_map
         elif isinstance(event, JointRun):
             self.manifest["sessions"].append(_finite(asdict(event)))
         elif isinstance(event, Warned):

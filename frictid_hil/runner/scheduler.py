@@ -22,16 +22,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.control import Compensated, Probe
-from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode, RobotSetup, SetPoint, Severity
+from frictid_hil.driver import (
+    Driver,
+    Feedback,
+    FrameMapped,
+    JointSetup,
+    JointState,
+    Mode,
+    RobotSetup,
+    SetPoint,
+    Severity,
+)
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, ProfileMismatch, SafetyAbort
-from frictid_hil.plan import JointPlan, Motion, Move, Plan
+from frictid_hil.plan import JointPlan, Motion, Move, Plan, WarmUp
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, StopRequest, Stream
-from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.law_runner import LawRunner
 from frictid_hil.runner.probe import ProbeWatch
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.runner.warm_up import WarmUpWatch
 from frictid_hil.units import degrees, format_angle
 
 _POWER_TIMEOUT_S = 3.0
@@ -57,6 +69,7 @@ class Care:
         velocity_margin: measured speed may exceed the planned peak by this factor ...
         velocity_slack_rad_s: ... plus this.
         travel_slack_rad: measured position may leave the planned travel by this.
+        interlock: must be closed before and during motion; None where a person watches.
     """
 
     reference_tolerance_rad: float = math.radians(10.0)
@@ -67,6 +80,7 @@ class Care:
     velocity_margin: float = 1.25
     velocity_slack_rad_s: float = math.radians(10.0)
     travel_slack_rad: float = math.radians(2.0)
+    interlock: Interlock | None = None
 
 
 class Recorder:
@@ -151,7 +165,14 @@ class Scheduler:
                 "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
                 next_step=errors[0].next_step or "run `frictid-hil check`",
             )
-        return Preflight(identities, self._driver.capabilities(), tuple(findings))
+        capabilities = self._driver.capabilities()
+        if self._care.interlock is not None and not capabilities.digital_inputs:
+            raise HardwareError(
+                "this driver cannot watch a digital input, and the robot file names one as interlock",
+                where=self._setup.bus,
+                next_step="run `frictid-hil calibrate` with a person watching",
+            )
+        return Preflight(identities, capabilities, tuple(findings))
 
     # -- one joint ----------------------------------------------------------------------------------------------
 
@@ -160,6 +181,8 @@ class Scheduler:
         moving = self._names.index(plan.joint)
         self._notify(PhaseStarted(plan.joint, "configure", 0.0))
         driver.configure(self._plan.cycle_hz, [plan.joint])
+        if session == 0 and isinstance(driver, FrameMapped):
+            self._notify(Configured(driver.frame_map_values()))
         for joint in self._setup.joints:
             driver.set_limits(
                 joint.name,
@@ -167,7 +190,8 @@ class Scheduler:
                 position_min_rad=joint.position_min_rad,
                 position_max_rad=joint.position_max_rad,
             )
-        supervisor = Supervisor(self._names, [self._limits(joint, plan) for joint in self._setup.joints])
+        limits = [self._limits(joint, plan) for joint in self._setup.joints]
+        supervisor = Supervisor(self._names, limits, self._care.interlock)
         for index in range(len(self._names)):
             if index != moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
@@ -223,6 +247,7 @@ class Scheduler:
     def _motions(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan) -> list[Mark]:
         self._notify(PhaseStarted(plan.joint, "reference", 0.0))
         self._verify_reference(loop, plan)
+        self._verify_interlock(loop, supervisor)
         self._notify(PhaseStarted(plan.joint, "enable", 0.0))
         self._enable_all(loop)
         marks: list[Mark] = []
@@ -248,6 +273,8 @@ class Scheduler:
                 mark = laws.run(motion)
             elif isinstance(motion, Probe):
                 mark = self._probe(loop, moving, motion)
+            elif isinstance(motion, WarmUp):
+                mark = self._warm_up(loop, moving, motion)
             elif motion.name == "rehearsal":
                 mark = self._rehearse(loop, supervisor, moving, plan, motion)
             else:
@@ -308,6 +335,22 @@ class Scheduler:
             self._notify(Warned(f"forced in spite of: {mismatch}"))
         return Mark(probe.name, start_ns, loop.now_ns(), probe.details())
 
+    def _warm_up(self, loop: CyclicLoop, moving: int, motion: WarmUp) -> Mark:
+        """Repeated cycles until friction settles, or the time is over."""
+        steps = max(1, math.ceil(motion.duration_s / loop.period_s))
+        positions = motion.position_rad(np.arange(steps) * loop.period_s)
+        watch = WarmUpWatch(Stream(positions.tolist()), motion, loop.period_s)
+        start_ns = loop.now_ns()
+        loop.run(watch, moving)
+        if watch.settled is False:
+            rate = watch.percent_per_min
+            changing = "could not be told" if rate is None else f"still changed by {rate:.2g} % per minute"
+            self._notify(
+                Warned(f"joint {self._names[moving]}: friction {changing} after {motion.duration_s:.0f} s of warm-up")
+            )
+        ended = {"settled": watch.settled, "percent_per_min": watch.percent_per_min, "cycles": watch.cycles}
+        return Mark(motion.name, start_ns, loop.now_ns(), {**motion.details(), **ended})
+
     # -- power and locks ----------------------------------------------------------------------------------------
 
     def _verify_reference(self, loop: CyclicLoop, plan: JointPlan) -> None:
@@ -328,6 +371,17 @@ class Scheduler:
                     f"stands at {degrees(report.position_rad):.2f} deg, outside its limits", where=f"joint {joint.name}"
                 )
             set_point.position_rad = report.position_rad
+
+    def _verify_interlock(self, loop: CyclicLoop, supervisor: Supervisor) -> None:
+        """Closed before anything gets power, watched in every cycle from here on."""
+        interlock = self._care.interlock
+        if interlock is None:
+            return
+        index = self._names.index(interlock.joint)
+        loop.wait_for(
+            lambda feedback: feedback[index].digital_inputs is not None, 1.0, f"the inputs of joint {interlock.joint}"
+        )
+        supervisor.arm_interlock(loop.feedback)
 
     def _enable_all(self, loop: CyclicLoop) -> None:
         for joint in self._setup.joints:

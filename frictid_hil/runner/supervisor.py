@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.units import degrees, format_angle, format_torque, format_velocity
 
@@ -49,9 +50,10 @@ class Supervisor:
     Args:
         names: joint names, order of the feedback.
         limits: one per joint, same order.
+        interlock: must be closed from ``arm_interlock`` on.
     """
 
-    def __init__(self, names: Sequence[str], limits: Sequence[JointLimits]) -> None:
+    def __init__(self, names: Sequence[str], limits: Sequence[JointLimits], interlock: Interlock | None = None) -> None:
         self._names = list(names)
         self._limits = list(limits)
         self._moving: int | None = None
@@ -60,6 +62,8 @@ class Supervisor:
         self._torque_high = [0] * len(self._names)
         self._max_age = [limit.max_age_cycles for limit in limits]
         self._runaway: RunawayWatch | None = None
+        self._interlock = interlock
+        self._interlock_armed = False
 
     def watch(self, moving: int | None, mode: Mode, locked_at: dict[int, float]) -> None:
         """Say what is allowed from now on.
@@ -81,6 +85,24 @@ class Supervisor:
         """The moving joint is free, held by nothing but friction, from now on; None when it no longer is."""
         self._runaway = watch
 
+    def arm_interlock(self, feedback: Sequence[Feedback]) -> None:
+        """The interlock must be closed now and in every cycle from now on.
+
+        Raises:
+            SafetyAbort: it is open, or its input is not reported.
+        """
+        self._interlock_armed = True
+        self.check_interlock(feedback)
+
+    def check_interlock(self, feedback: Sequence[Feedback]) -> None:
+        """Pass one cycle's inputs.
+
+        Raises:
+            SafetyAbort: the interlock is open, or its input was not reported for too long.
+        """
+        if self._interlock is not None and self._interlock_armed:
+            self._interlock.check(feedback[self._names.index(self._interlock.joint)])
+
     def set_limits(self, joint: int, limits: JointLimits) -> None:
         """Replace one joint's bounds (rehearsal is watched more closely)."""
         self._limits[joint] = limits
@@ -96,6 +118,7 @@ class Supervisor:
         Raises:
             SafetyAbort: naming joint, quantity, value and bound.
         """
+        self.check_interlock(feedback)
         moving = self._moving
         if moving is not None:
             self._check_moving(moving, set_points[moving], feedback[moving])

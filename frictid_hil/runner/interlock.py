@@ -1,0 +1,51 @@
+"""The interlock: a digital input that says that the cell is closed and empty, read from the drive that it is wired to.
+
+It is a check of ours on top of the robot's own safety circuit, and replaces no part of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from frictid_hil.driver import Feedback
+from frictid_hil.errors import SafetyAbort
+
+
+@dataclass(frozen=True, slots=True)
+class Interlock:
+    """One bit of one drive's digital inputs.
+
+    Attributes:
+        joint: whose drive reports it.
+        bit: of 60FD.
+        closed_when: level of the bit when the cell is closed.
+        max_age_cycles: a report older than this is as good as none.
+    """
+
+    joint: str
+    bit: int
+    closed_when: int = 1
+    max_age_cycles: int = 100
+
+    def check(self, report: Feedback) -> None:
+        """Pass one report of that joint.
+
+        Raises:
+            SafetyAbort: open, or not reported.
+        """
+        where = f"interlock (joint {self.joint}, input bit {self.bit})"
+        inputs = report.digital_inputs
+        if inputs is None or report.digital_inputs_age_cycles > self.max_age_cycles:
+            raise SafetyAbort(
+                f"its input was not reported for {report.digital_inputs_age_cycles} cycles",
+                where=where,
+                cause="the drive does not send its digital inputs (60FD), or frames are lost",
+                next_step="run `frictid-hil check`; correct `policy.unattended.interlock_input` in the robot file",
+            )
+        if (inputs >> self.bit & 1) != self.closed_when:
+            raise SafetyAbort(
+                "the interlock is open; nothing may move with nobody watching",
+                where=where,
+                cause="a door or gate of the cell is open, or somebody is in it",
+                next_step="close the cell and make sure that it is empty, then start again",
+            )
