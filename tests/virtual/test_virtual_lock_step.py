@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
+from frictid_drivers.virtual.objects import OBJECTS, SIZE_BYTES, DataType
 from frictid_drivers.virtual.power_state import PowerState
 from frictid_drivers.virtual.rack import Rack
 
@@ -213,11 +214,49 @@ def test_no_frame_breaks_a_drive_or_leaves_it_powered_without_its_watchdog(frame
         assert not (minds and servo.state is PowerState.ENABLED)
 
 
+NUMBERS = [
+    entry
+    for record in OBJECTS
+    for entry in record.entries
+    if entry.access == "rw" and entry.kind is not DataType.STRING
+]
+EDGES = st.sampled_from([0, 1, 2, 7, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF])
+MAPPINGS = st.sampled_from([0x60400010, 0x60410010, 0x60640020, 0x607A0020, 0x60600008, 0x00050008, 0x60FE0120])
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    writes=st.lists(
+        st.tuples(st.sampled_from(NUMBERS), st.one_of(EDGES, MAPPINGS, st.integers(0, 0xFFFFFFFF)), st.integers(0, 12)),
+        max_size=40,
+    )
+)
+def test_any_value_in_any_object_is_taken_or_refused(writes):
+    """Every download is answered, what was taken is read back, and time and SYNC go on."""
+    host = ENABLED_HOST[0]
+    host.fresh()
+    for entry, value, wait_ms in writes:
+        index, subindex, size = entry.key >> 8, entry.key & 0xFF, SIZE_BYTES[entry.kind]
+        value &= (1 << 8 * size) - 1
+        header = struct.pack("<BHB", 0x23 | (4 - size) << 2, index, subindex)
+        replies = [data for can_id, data in host.send(0x601, header + value.to_bytes(4, "little")) if can_id == 0x581]
+        assert len(replies) == 1 and replies[0][0] in (0x60, 0x80)
+        if replies[0][0] == 0x60 and index not in (0x1010, 0x1011, 0x6040):
+            answers = dict(host.send(0x601, b"\x40" + header[1:] + bytes(4)))
+            reply = answers[0x581]
+            assert int.from_bytes(reply[4 : 4 + size], "little") == value
+        host.send(0x080, b"")
+        host.send(0x77F, b"\x05")
+        host.clock.wait_until(host.clock.now_ns() + wait_ms * MS)
+
+
 class FuzzHost(Host):
     """Two drives, enabled and watched, brought back to that before every example."""
 
     def fresh(self):
         self.rack.now_ns += MS
+        for node in (1, 2):
+            self.send(0x600 + node, bytes.fromhex("23111001") + b"load")
         self.send(0x000, b"\x81\x00")
         self.at = {}
         self.start()

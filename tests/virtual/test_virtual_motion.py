@@ -142,6 +142,14 @@ class TestVelocityAndTorque:
         cycle(150)
         assert desk.plant.calls[-1]["torque_nm"] == pytest.approx(0.8) and desk.read(0x6041) & 0x0800
 
+    def test_torque_limit_may_come_by_pdo(self, desk):
+        desk.write(0x6076, 0, 4000, 4)
+        desk.map_pdo(True, 1, [CONTROL, 0x60720010], 1)
+        desk.enable(10)
+        desk.send(0x000, "0105")
+        desk.cycle(struct.pack("<HH", 0x0F, 150))
+        assert desk.plant.torque_limit_nm == pytest.approx(0.6)
+
     def test_overspeed_is_a_fault(self, desk):
         desk.write(0x6080, 0, 60, 4)
         cycle = cyclic(desk, 10, 0x60710010, "h")
@@ -294,6 +302,14 @@ def test_payload_and_hand_objects_reach_the_joint(make_desk):
     desk.write(0x2040, 4, 500, 4)
     desk.write(0x2040, 1, 1, 1)
     assert held[-1] == (True, -0.5, pytest.approx(0.349066), 0.5)
+
+
+def test_missing_objects_act_by_their_defaults(make_desk):
+    desk = make_desk(missing=(0x60B2, 0x6072, 0x605A, 0x6007, 0x60A9, 0x1019))
+    assert desk.abort_of_read(0x60B2) == 0x06020000
+    assert desk.write(0x1600, 1, 0x60B20010, 4) == 0x06020000
+    cycle = cyclic(desk, 8, 0x607A0020)
+    assert cycle(50) == 50
 
 
 def test_stuck_encoder_reports_one_position_for_ever(desk):

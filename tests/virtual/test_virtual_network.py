@@ -140,6 +140,13 @@ class TestSyncLoss:
         assert desk.said(0x085, desk.wait(50)) == ["0087110000000000"]
         assert desk.state() == ENABLED and desk.read(0x6041) & 0x80
 
+    def test_warning_ends_when_sync_returns(self, desk):
+        self.start(desk, reaction=1)
+        desk.sync()
+        desk.wait(50)
+        assert desk.said(0x085, desk.sync()) == ["0000000000000000"]
+        assert desk.said(0x085, desk.wait(50)) == ["0087110000000000"], "and is supervised again"
+
     def test_not_before_the_first_sync_nor_when_off(self, desk):
         self.start(desk)
         assert desk.wait(100) == []

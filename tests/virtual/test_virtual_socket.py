@@ -87,6 +87,16 @@ def test_absent_bus_and_lost_bus_are_errors(runtime_folder):
     bus.shutdown()
 
 
+def test_a_hub_that_ends_late_leaves_its_successor_alone(runtime_folder):
+    old = Hub(runtime_folder / "heir.sock")
+    new = Hub(runtime_folder / "heir.sock")
+    old.close()
+    bus = SocketBus("heir")
+    bus.shutdown()
+    new.close()
+    assert not (runtime_folder / "heir.sock").exists()
+
+
 def test_slow_reader_loses_frames_and_holds_up_nobody(hub):
     slow, quick = connected(hub, 2)
     began_s = time.monotonic()

@@ -16,6 +16,7 @@ import can
 from frictid_drivers.virtual import channel, side_channel
 from frictid_drivers.virtual.faults import faults_of, missing_objects
 from frictid_drivers.virtual.faulty_rack import FaultyRack
+from frictid_drivers.virtual.joint_drive import model_of
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
@@ -64,6 +65,8 @@ class VirtualDriver:
         self._lock = channel.take(self._channel)
         try:
             if self._setup.realtime:
+                for joint in self._setup.joints:
+                    model_of(joint)  # a mistake is better told here than by another process
                 self._process = start_rack(self._setup)
             else:
                 self._rack.install(self._setup, missing=missing_objects(self._faults))

@@ -42,7 +42,7 @@ def servo_for(
     Raises:
         InvalidFields: the joint's ``simulated`` mapping is wrong.
     """
-    model = _model(joint)
+    model = model_of(joint)
     gear = Fraction(joint.gear_ratio).limit_denominator(1000)
     counts = Fraction(model.encoder.counts_per_revolution).limit_denominator(1)
     if counts <= 0:
@@ -102,7 +102,12 @@ def servo_for(
     )
 
 
-def _model(joint: JointSetup) -> JointModel:
+def model_of(joint: JointSetup) -> JointModel:
+    """The simulated joint of a robot file.
+
+    Raises:
+        InvalidFields: what is wrong with it, by ``joints.NAME.simulated.KEY``.
+    """
     try:
         return JointModel.from_mapping(
             joint.simulated,

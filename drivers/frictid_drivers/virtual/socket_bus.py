@@ -154,6 +154,7 @@ class Hub:
         path.unlink(missing_ok=True)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(path))
+        self._inode = path.stat().st_ino
         self._listener.listen(16)
         self._listener.setblocking(False)
         self._poll = select.poll()
@@ -187,7 +188,10 @@ class Hub:
         for number in list(self._members):
             self._drop(number)
         self._listener.close()
-        self._path.unlink(missing_ok=True)
+        # A later hub may have taken the name while this one waited for its drives to come to rest.
+        with contextlib.suppress(FileNotFoundError):
+            if self._path.stat().st_ino == self._inode:
+                self._path.unlink()
 
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError, ConnectionError):
