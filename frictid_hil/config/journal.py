@@ -29,7 +29,7 @@ def journal_lines(path: Path) -> list[dict[str, Any]]:
         try:
             value = json.loads(line)
         except ValueError:
-            continue  # spoilt; the profiles themselves are still there
+            continue  # spoilt, and passed over: one line lost must not lose the rest
         if isinstance(value, dict):
             values.append(value)
     return values
@@ -47,7 +47,9 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
         try:
             # What a crash cut off never counted; it must not begin to by getting its line end now.
             file.truncate(end)
-            file.write(json.dumps(value).encode() + b"\n")
+            line = memoryview(json.dumps(value).encode() + b"\n")
+            while line:
+                line = line[file.write(line) :]
             os.fsync(file.fileno())
         except OSError as error:
             file.truncate(end)
