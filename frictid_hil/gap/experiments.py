@@ -140,6 +140,37 @@ class Chirp:
 
 
 @dataclass(frozen=True, slots=True)
+class Relax:
+    """A wiggle that fades away: friction keeps no trace of the direction from which a joint came.
+
+    Every experiment shall begin with the torque that holds the joint, and none that friction holds; a model that is
+    simulated along the recording begins so. Each half cycle is 6 % smaller than the one before, so that the last one
+    that slips leaves little; peak acceleration is constant until the frequency reaches its limit.
+    """
+
+    at_rad: float
+    amplitude_rad: float = 0.010
+    acceleration_rad_s2: float = 8.0
+    duration_s: float = 4.2
+    name: str = "relax"
+
+    def position_rad(self, time_s: Array) -> Array:
+        """at + a sin(phase), a = amplitude 0.94^(phase / pi), d phase/dt = sqrt(acceleration / a) up to 15 Hz."""
+        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)
+        decay = -math.log(0.94) / math.pi
+        first, last = math.sqrt(self.acceleration_rad_s2 / self.amplitude_rad), 2 * math.pi * 15.0
+        turn_s = 2.0 / decay * (1.0 / first - 1.0 / last)
+        rising = -2.0 / decay * np.log1p(-0.5 * decay * first * np.minimum(t, turn_s))
+        phase = rising + last * np.maximum(t - turn_s, 0.0)
+        wiggle = self.amplitude_rad * np.exp(-decay * phase) * np.sin(phase)
+        return self.at_rad + np.where(t < self.duration_s, wiggle * _smooth(t / 0.1), 0.0)
+
+    def details(self) -> Mapping[str, Any]:
+        """Where and how far."""
+        return {"at_rad": self.at_rad, "amplitude_rad": self.amplitude_rad}
+
+
+@dataclass(frozen=True, slots=True)
 class Experiment:
     """One recording: motions in order, and what it is for. Itself a motion, so that one mark covers it.
 

@@ -316,8 +316,7 @@ class _Run:
         if isinstance(event, Preflight):
             self.identity = event.identities[self._joint]
         elif isinstance(event, JointRun):
-            assert self.identity is not None, "the preflight comes first"
-            self.logs.update(_cut(self._folder.samples(event, self.identity)))
+            self.logs.update(_cut(self._folder.samples(event)))
             self._session += 1
             if self._in_lock_step() and self._session < len(self._loaded):
                 self._mount()
