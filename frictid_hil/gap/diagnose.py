@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share
 from frictid_hil.gap.confidence import confidence
-from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
+from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, Replayed, pooled, why_not
 from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, needed, shares
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
+from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
+from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.where import where
-from frictid_hil.gap.which import Ranking, rank, replacements
+from frictid_hil.gap.which import Model, Ranking, best_family, rank, replacements
 from frictid_hil.simulation.effects import all_effects
 
 FAMILY_SHARE = 0.25
@@ -48,19 +50,22 @@ def diagnose(
         time_budget_s: stop refining rivals after this time; None for as long as it takes.
         library: names of the effects that may be used; all of them unless given.
     """
-    from frictid_hil.gap.partial import diagnose_without_replay
-
     del time_budget_s
     allowed = tuple(n for n in all_effects() if library is None or n in library)
-    logs = recordings(experiments)
     reason = why_not(experiments)
+    experiments, hints = completed(checked(experiments))
+    if (open_question := one_sided(experiments)) is not None:
+        hints["motion"] = open_question
+    logs = recordings(experiments)
     usable = [r for r in logs if r.plant_nm is not None]
     if reason is not None or not usable or not any(not r.experiment.validation for r in usable):
-        return diagnose_without_replay(experiments, logs, allowed, reason)
-    return _full(experiments, logs, allowed)
+        return diagnose_without_replay(experiments, logs, allowed, reason, hints)
+    return _full(experiments, logs, allowed, hints)
 
 
-def _full(experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[str, ...]) -> Diagnosis:
+def _full(
+    experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[str, ...], hints: Mapping[str, str]
+) -> Diagnosis:
     nominal = experiments.nominal
     channels = drive_channels(experiments, logs, allowed)
     evidence = Evidence(logs, channels.kinematic.step_rad, allowed, None)
@@ -83,8 +88,6 @@ def _full(experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[
     after = judge.judged(hypothesis.effects)
     after_nm = pooled(after, "torque_nm")
     effects = sorted({g[0] for g in evidence.groups if not g[0].startswith("family ")})
-    from frictid_hil.gap.which import Model, best_family
-
     bare_score = evidence.score(())
     model = Model(hypothesis.groups, evidence.score(hypothesis.groups) - bare_score)
     rivals = replacements(evidence, model, effects, bare_score)
@@ -124,6 +127,7 @@ def _full(experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[
         noise,
         low_pass,
         channels,
+        hints,
     )
 
 
@@ -254,6 +258,7 @@ def _conclude(
     noise_nm: float,
     low_pass: LowPass,
     channels: _Channels,
+    hints: Mapping[str, str],
 ) -> Diagnosis:
     verdict, place = verdict_of(features)
     names = features.names
@@ -285,11 +290,18 @@ def _conclude(
         )
         del rival_gain, rival
     causes.sort(key=lambda c: -(c.gap_closed_percent or 0.0) * (0.25 + c.confidence))
-    reasons: dict[str, str] = {}
+    reasons: dict[str, str] = dict(hints)
     upcoming = None
-    if verdict == "explained" and causes and causes[0].confidence < 0.6 and causes[0].confusable_with:
+    if "motion" in hints:
+        causes = [replace(c, confidence=min(c.confidence, 0.45)) for c in causes]
+    if (
+        verdict == "explained"
+        and causes
+        and causes[0].confidence < 0.6
+        and (causes[0].confusable_with or "motion" in hints)
+    ):
         verdict = "ambiguous"
-        rival = causes[0].confusable_with[0]
+        rival = causes[0].confusable_with[0] if causes[0].confusable_with else "torque_bias"
         upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
         if len(causes) == 1:
             causes.append(Cause(rival, round(min(0.5, 1.0 - causes[0].confidence), 3), {}, (causes[0].effect,), None))
@@ -319,10 +331,7 @@ def _conclude(
     )
 
 
-def _ratio(evidence: Evidence, model: object) -> float:
-    from frictid_hil.gap.which import Model
-
-    assert isinstance(model, Model)
+def _ratio(evidence: Evidence, model: Model) -> float:
     return evidence.misfit_ratio(model.groups) / evidence.misfit_ratio(())
 
 
@@ -361,12 +370,10 @@ def _per_log(bare: Mapping[str, Replayed], after: Mapping[str, Replayed]) -> dic
 
 
 def _summary(
-    name: str, verdict: str, causes: Sequence[Cause], places: Sequence[object], closed: float, place: str
+    name: str, verdict: str, causes: Sequence[Cause], places: Sequence[Where], closed: float, place: str
 ) -> str:
-    from frictid_hil.gap.diagnosis import Where
-
     first = places[0] if places else None
-    lives = f"{100 * first.share_of_gap:.0f} % of the gap sits {first.description}" if isinstance(first, Where) else ""
+    lives = f"{100 * first.share_of_gap:.0f} % of the gap sits {first.description}" if first is not None else ""
     if verdict == "none":
         return f"{name}: no gap beyond noise and the nominal model's tolerances."
     if verdict == "unknown":

@@ -94,7 +94,13 @@ class Evidence:
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], encoder_step_rad: float, library: Sequence[str], noise_nm: float | None
+        self,
+        recordings: Sequence[Recording],
+        encoder_step_rad: float,
+        library: Sequence[str],
+        noise_nm: float | None,
+        *,
+        tolerance_factor: float = 1.0,
     ) -> None:
         self.recordings = [r for r in recordings if r.view is not None and r.plant_nm is not None]
         views = [r.view for r in self.recordings if r.view is not None]
@@ -116,8 +122,8 @@ class Evidence:
             count = columns[0].shape[1]
             self.groups[FAMILY + name, 0] = tuple(range(width, width + count))
             width += count
-        self._prior = np.array([1.0 / n.deviation**2 for n in NUISANCES])
-        self._bound = np.array([n.bound for n in NUISANCES])
+        self._prior = np.array([1.0 / (tolerance_factor * n.deviation) ** 2 for n in NUISANCES])
+        self._bound = tolerance_factor * np.array([n.bound for n in NUISANCES])
         self._views = views
         self._refined: dict[Group, dict[str, float]] = {}
         self._weigh(parts, encoder_step_rad, noise_nm)
@@ -139,6 +145,11 @@ class Evidence:
             self.deviation_nm.append(deviation[: table.shape[0]][keep])
             table = table[keep] / self.deviation_nm[-1][:, None]
             self.thin.append((table[:, :-1], table[:, -1]))
+
+    @property
+    def noise_nm(self) -> list[Array]:
+        """Standard deviation that noise and any model's limits leave, per log, thinned, N m."""
+        return self.deviation_nm
 
     def _reduce(self) -> None:
         stride = self.low_pass.stride

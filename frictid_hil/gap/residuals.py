@@ -195,7 +195,9 @@ def _view(nominal: Nominal, experiment: Experiment, step_s: float, start_s: floa
     cos, sin = np.cos(q), np.sin(q)
     gravity = nominal.gravity_cos_nm * cos + nominal.gravity_sin_nm * sin
     coulomb, stiffness = friction_scales(nominal)
-    load = gravity + payload_cos * cos + (inertia - motor + payload_inertia) * acceleration
+    # The load's magnitude enters: the encoder's noise in the acceleration would count as load.
+    smooth = LowPass.at(1.0 / step_s)(acceleration)
+    load = gravity + payload_cos * cos + (inertia - motor + payload_inertia) * smooth
     if experiment.rigid_body_torque_nm is not None:
         load = experiment.rigid_body_torque_nm
     return View(

@@ -105,6 +105,6 @@ EFFECT = Effect(
             **shape,
             "gap_rad": shape["gap_rad"] * max(0.05, float(coefficients[0])),
         },
-        first_coefficient=(0.4, 2.5),
+        first_coefficient=(0.2, 4.0),
     ),
 )

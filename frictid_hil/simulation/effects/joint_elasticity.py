@@ -95,6 +95,6 @@ EFFECT = Effect(
             "compliance_rad_per_nm": shape["compliance_rad_per_nm"] * max(0.05, float(coefficients[0])),
             "relaxation_s": shape["relaxation_s"],
         },
-        first_coefficient=(0.4, 2.5),
+        first_coefficient=(0.2, 4.0),
     ),
 )
