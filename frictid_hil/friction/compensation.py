@@ -1,0 +1,196 @@
+"""Friction compensation, algorithm (24) and its rivals (26), (27): one tiny stateful object per joint.
+
+A spring of stiffness K that slips at the Coulomb level F_0 stands for presliding and the sign of motion; the identified
+curve adds what depends on speed; R < 1 keeps the joint from running away. The spring is driven by encoder increments
+rather than by v * dt: a coarse or late velocity costs nothing there (20).
+
+==========  ===================================================
+``mo``      R K e                                           (26)
+``mol``     R (K e + B_c v)                                 (27)
+``mop``     R (K e + phi_0(v))                              (24)
+==========  ===================================================
+
+Two limits keep it stable. R < 1: a free joint that is given all of its friction back runs away on the first touch.
+R K < presliding stiffness: below break-away the joint is held by its own presliding spring alone; a compensation
+stiffer than that is a negative spring, and the joint hunts.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from frictid_hil.errors import UsageError
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+
+FORMS = ("mo", "mol", "mop")
+
+PAPER_RATIO = 0.9
+PAPER_STIFFNESS_NM_PER_RAD = 10_000.0
+OUR_RATIO = 0.95
+OUR_SHARE_OF_PRESLIDING = 0.9
+"""K of the setting ``ours``, as a share of the identified presliding stiffness."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompensationSettings:
+    """What one joint is given back, as plain values.
+
+    Attributes:
+        form: ``mo``, ``mol`` or ``mop``.
+        coulomb_nm: F_0.
+        stiffness_nm_per_rad: K.
+        ratio: R.
+        speed_rad_s: knots of phi_0, first 0, increasing, shape (k,); extended with the last slope.
+        forward_nm: phi_0 at the knots for positive motion, first 0, shape (k,).
+        backward_nm: its magnitude for negative motion, shape (k,).
+    """
+
+    form: str
+    coulomb_nm: float
+    stiffness_nm_per_rad: float
+    ratio: float
+    speed_rad_s: tuple[float, ...] = (0.0, 1.0)
+    forward_nm: tuple[float, ...] = (0.0, 0.0)
+    backward_nm: tuple[float, ...] = (0.0, 0.0)
+
+    @staticmethod
+    def of(
+        curve: FrictionCurve,
+        form: str,
+        *,
+        stiffness_nm_per_rad: float,
+        ratio: float,
+        asymmetry_nm: tuple[float, ...] | None = None,
+        viscous_nm_s_per_rad: float | None = None,
+    ) -> CompensationSettings:
+        """From an identified curve.
+
+        Args:
+            curve: phi.
+            form: one of FORMS.
+            stiffness_nm_per_rad: K.
+            ratio: R.
+            asymmetry_nm: half the difference of forward and backward friction at the curve's pairs, 0 at rest.
+            viscous_nm_s_per_rad: B_c for ``mol``; least squares on phi - F_0 unless given.
+
+        Raises:
+            UsageError: no such form.
+        """
+        if form not in FORMS:
+            raise UsageError(f"no compensation {form!r}; there are {', '.join(FORMS)}")
+        base = CompensationSettings(form, curve.coulomb_nm, stiffness_nm_per_rad, ratio)
+        if form == "mol":
+            slope = least_squares_viscosity(curve) if viscous_nm_s_per_rad is None else viscous_nm_s_per_rad
+            return replace(base, forward_nm=(0.0, slope), backward_nm=(0.0, slope))
+        if form == "mo":
+            return base
+        rate = np.asarray(curve.torque_nm) - curve.coulomb_nm
+        even = np.zeros_like(rate) if asymmetry_nm is None else np.asarray(asymmetry_nm)
+        return replace(
+            base,
+            speed_rad_s=(0.0, *curve.velocity_rad_s),
+            forward_nm=(0.0, *(rate + even).tolist()),
+            backward_nm=(0.0, *(rate - even).tolist()),
+        )
+
+    def refuse_unstable(self, presliding_nm_per_rad: float | None, *, where: str = "") -> None:
+        """Refuse what would hunt or run away.
+
+        Args:
+            presliding_nm_per_rad: as identified; None where it is not known (only R is then checked).
+            where: what to name in the error.
+
+        Raises:
+            UsageError: with the reason.
+        """
+        if not 0.0 < self.ratio < 1.0:
+            raise UsageError(
+                f"the compensation ratio R = {self.ratio:g} must lie between 0 and 1",
+                where=where,
+                cause="at R = 1 nothing is left to slow a free joint down, and it runs away on the first touch",
+                next_step="use --compensation-ratio 0.9",
+            )
+        if not self.stiffness_nm_per_rad > 0.0:
+            raise UsageError(f"the stiffness K = {self.stiffness_nm_per_rad:g} N m/rad must be positive", where=where)
+        if presliding_nm_per_rad is None:
+            return
+        if self.ratio * self.stiffness_nm_per_rad >= presliding_nm_per_rad:
+            raise UsageError(
+                f"R K = {self.ratio * self.stiffness_nm_per_rad:.4g} N m/rad is not below the identified "
+                f"presliding stiffness {presliding_nm_per_rad:.4g} N m/rad",
+                where=where,
+                cause="a standing joint is held by its presliding spring; a compensation stiffer than it makes it hunt",
+                next_step=f"use --stiffness below {presliding_nm_per_rad / self.ratio:.4g} N m/rad",
+            )
+
+
+class Compensation:
+    """One joint's compensation; nothing is allocated per step but floats.
+
+    Args:
+        settings: checked by ``refuse_unstable``.
+        period_s: between two steps; used only where a reference velocity drives the spring.
+    """
+
+    __slots__ = ("_backward", "_forward", "_knots", "_last", "_limit", "_period", "_ratio", "_spring", "_stiffness")
+
+    def __init__(self, settings: CompensationSettings, period_s: float) -> None:
+        self._knots = settings.speed_rad_s
+        self._last = len(settings.speed_rad_s) - 2
+        self._forward = _sections(settings.speed_rad_s, settings.forward_nm)
+        self._backward = _sections(settings.speed_rad_s, settings.backward_nm)
+        self._limit = settings.coulomb_nm
+        self._stiffness = settings.stiffness_nm_per_rad
+        self._ratio = settings.ratio
+        self._period = period_s
+        self._spring = 0.0
+
+    def step(
+        self, position_increment_rad: float, velocity_rad_s: float, reference_velocity_rad_s: float | None = None
+    ) -> float:
+        """f_c of (24c), N m, for the cycle to come.
+
+        Args:
+            position_increment_rad: since the last step, from the encoder.
+            velocity_rad_s: measured.
+            reference_velocity_rad_s: where it is known what the joint will do, friction is that of this velocity: it
+                is neither late nor noisy, and its sign changes when the motion does.
+        """
+        if reference_velocity_rad_s is not None:
+            velocity_rad_s = reference_velocity_rad_s
+            position_increment_rad = reference_velocity_rad_s * self._period
+        limit = self._limit
+        spring = self._spring + self._stiffness * position_increment_rad
+        if spring > limit:
+            spring = limit
+        elif spring < -limit:
+            spring = -limit
+        self._spring = spring
+        last = self._last
+        if velocity_rad_s >= 0.0:
+            at = bisect_right(self._knots, velocity_rad_s) - 1
+            level, slope = self._forward[at if at < last else last]
+            return self._ratio * (spring + level + slope * velocity_rad_s)
+        at = bisect_right(self._knots, -velocity_rad_s) - 1
+        level, slope = self._backward[at if at < last else last]
+        return self._ratio * (spring - level + slope * velocity_rad_s)
+
+
+def least_squares_viscosity(curve: FrictionCurve) -> float:
+    """B_c of (27): the line through rest nearest to phi - F_0 over [0, V_N], N m s/rad."""
+    speeds: Array = np.linspace(0.0, curve.velocity_rad_s[-1], 512)
+    rate = curve.magnitude(speeds) - curve.coulomb_nm
+    return float(speeds @ rate / (speeds @ speeds))
+
+
+def _sections(speeds: tuple[float, ...], levels: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
+    """(level at speed 0, slope) of each line section."""
+    sections = []
+    for low, high, f_low, f_high in zip(speeds, speeds[1:], levels, levels[1:], strict=False):
+        slope = (f_high - f_low) / (high - low)
+        sections.append((f_low - slope * low, slope))
+    return tuple(sections)

@@ -1,0 +1,144 @@
+"""A control law in force: once per cycle from what the joint reports to the torque it is given.
+
+``Controller`` holds the state of one law (friction spring, last torque); ``LawSource`` feeds it with a path and writes
+the set-point of the drive's mode; ``FadeOut`` ends it: friction compensation fades, gravity and the reference stay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import repeat
+
+import numpy as np
+
+from frictid_hil.control import Compensated, ControlLaw
+from frictid_hil.driver import Feedback, Mode, SetPoint
+from frictid_hil.friction.compensation import Compensation
+
+_VELOCITY_LOOP_PER_S = 5.0
+"""Share of a position error that a drive in velocity mode is asked to make good per second."""
+
+_AHEAD_CYCLES = 1.5
+"""From the instant of a report to the middle of the cycle in which the torque answering it is applied."""
+
+Reference = tuple[float, float]
+"""Position, rad, and velocity, rad/s."""
+
+
+class Controller:
+    """One law of one joint.
+
+    Args:
+        law: what to give.
+        period_s: of the cycle.
+        torque_nm: what the joint is being given now; the law takes over from there without a jump.
+    """
+
+    def __init__(self, law: ControlLaw, period_s: float, torque_nm: float) -> None:
+        self.law = law
+        self.torque_nm = torque_nm
+        self.friction_share = 1.0
+        self._friction = Compensation(law.friction, period_s) if law.friction is not None else None
+        self._period_s = period_s
+        self._step_nm = law.slew_nm_per_s * period_s
+        self._position_rad = math.nan
+
+    def update(self, report: Feedback, reference: Reference) -> float:
+        """Torque for the coming cycle, N m: clamped, and near the last one."""
+        law = self.law
+        position = report.position_rad
+        increment = position - self._position_rad
+        if increment != increment:  # the first report
+            increment = 0.0
+        self._position_rad = position
+        velocity = report.velocity_rad_s
+        if velocity != velocity:  # a drive that reports none
+            velocity = increment / self._period_s
+        torque = law.gravity.torque_nm(position)
+        if law.gains is not None:
+            torque += law.gains.stiffness_nm_per_rad * (reference[0] - position)
+            torque += law.gains.damping_nm_s_per_rad * (reference[1] - velocity)
+        if self._friction is not None:
+            expected = reference[1] if law.follows_reference else None
+            friction = self._friction.step(increment, velocity, expected)
+            if law.ripple is not None:
+                friction += law.ripple.torque_at_nm(position + _AHEAD_CYCLES * self._period_s * velocity)
+            torque += self.friction_share * friction
+        limit = law.torque_limit_nm
+        torque = limit if torque > limit else -limit if torque < -limit else torque
+        change, step = torque - self.torque_nm, self._step_nm
+        self.torque_nm = self.torque_nm + step if change > step else self.torque_nm - step if change < -step else torque
+        return self.torque_nm
+
+
+class LawSource:
+    """A controller along a path, as a source of set-points.
+
+    Args:
+        controller: of the law.
+        motion: path and drive mode.
+        period_s: of the cycle.
+    """
+
+    def __init__(self, controller: Controller, motion: Compensated, period_s: float) -> None:
+        self.controller = controller
+        self.drive_mode = motion.drive_mode
+        self.reference: Reference = (float(motion.position_rad(np.zeros(1))[0]), 0.0)
+        self._path = _references(motion, period_s)
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """The coming cycle of the path."""
+        reference = next(self._path, None)
+        if reference is None:
+            return False
+        self.reference = reference
+        self.write(feedback, set_point)
+        return True
+
+    def write(self, feedback: Feedback, set_point: SetPoint) -> None:
+        """The law's torque at the present reference, in the way the drive's mode takes it."""
+        torque_nm = self.controller.update(feedback, self.reference)
+        position_rad, velocity_rad_s = self.reference
+        if self.drive_mode is Mode.TORQUE:
+            set_point.torque_nm = torque_nm
+            # Recorded beside the measured position; a joint that a person guides has no reference.
+            set_point.position_rad = feedback.position_rad if self.controller.law.gains is None else position_rad
+            return
+        set_point.torque_offset_nm = torque_nm
+        set_point.position_rad = position_rad
+        if self.drive_mode is Mode.VELOCITY:
+            set_point.velocity_rad_s = velocity_rad_s + _VELOCITY_LOOP_PER_S * (position_rad - feedback.position_rad)
+
+
+class FadeOut:
+    """Ends a law: friction compensation fades to nothing while gravity stays and the reference stands still.
+
+    Args:
+        source: in force until now.
+        cycles: to fade in.
+    """
+
+    def __init__(self, source: LawSource, cycles: int) -> None:
+        self._source = source
+        self._cycles = cycles
+        self._done = 0
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """One step less."""
+        if self._done >= self._cycles:
+            return False
+        self._done += 1
+        self._source.controller.friction_share = 1.0 - self._done / self._cycles
+        self._source.reference = (self._source.reference[0], 0.0)
+        self._source.write(feedback, set_point)
+        return True
+
+
+def _references(motion: Compensated, period_s: float) -> Iterator[Reference]:
+    if not math.isfinite(motion.duration_s):
+        return repeat((float(motion.position_rad(np.zeros(1))[0]), 0.0))
+    steps = max(1, math.ceil(motion.duration_s / period_s - 1e-9))
+    positions = motion.position_rad(np.arange(steps + 1) * period_s)
+    velocities = np.diff(positions) / period_s
+    return iter(list(zip(positions[:-1].tolist(), velocities.tolist(), strict=True)))

@@ -1,0 +1,160 @@
+"""One joint between position control and control laws, without a jump either way.
+
+::
+
+    position control --enter--> law (torque mode, or an offset on top) --leave--> position control, where it stands
+
+A joint goes over standing still, with the torque that holds it; it comes back to the position loop with compensation
+faded out. Consecutive stretches under the same law keep its state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from frictid_hil.control import Compensated
+from frictid_hil.driver import Driver, Feedback, JointSetup, Mode
+from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
+from frictid_hil.runner.cycle import CyclicLoop
+from frictid_hil.runner.runaway import RunawayWatch
+from frictid_hil.runner.supervisor import JointLimits, Supervisor
+
+_FADE_S = 0.2
+_LISTEN_S = 0.1
+"""How long the holding torque is averaged."""
+_LET_GO_S = 0.3
+_MODE_TIMEOUT_S = 0.5
+_NOISE_SHARE = 0.05
+"""Reported torque may exceed the commanded one by this share of the rated torque."""
+
+
+class LawRunner:
+    """Runs the ``Compensated`` motions of one joint.
+
+    Args:
+        driver: cycling.
+        loop: of the session.
+        supervisor: watching the joint in position mode.
+        joint: that moves.
+        index: of it.
+        limits: of the joint in position control.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        loop: CyclicLoop,
+        supervisor: Supervisor,
+        joint: JointSetup,
+        index: int,
+        limits: JointLimits,
+    ) -> None:
+        self._driver = driver
+        self._loop = loop
+        self._supervisor = supervisor
+        self._joint = joint
+        self._index = index
+        self._limits = limits
+        self._drive_mode = Mode.POSITION
+        self._source: LawSource | None = None
+
+    def run(self, motion: Compensated) -> Mark:
+        """One stretch; the joint goes over first where it is not under this law yet.
+
+        Raises:
+            SafetyAbort: by the supervisor, or the drive did not take the mode.
+            Interrupted: asked to stop; compensation was faded out first.
+        """
+        loop = self._loop
+        source = self._source
+        if source is None or source.controller.law != motion.law or self._drive_mode is not motion.drive_mode:
+            self.leave()
+            controller = self._enter(motion)
+            free = motion.law.gains is None and motion.drive_mode is Mode.TORQUE
+            self._supervisor.watch_runaway(RunawayWatch(loop.period_s, motion.bounds.growth_s) if free else None)
+        else:
+            controller = source.controller
+        self._source = source = LawSource(controller, motion, loop.period_s)
+        self._supervisor.set_limits(self._index, self._bounds(motion))
+        start_ns = loop.now_ns()
+        loop.run(source, self._index, ending=FadeOut(source, round(_FADE_S / loop.period_s)))
+        return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+
+    def leave(self) -> bool:
+        """Back to position control, standing where the joint is; False where it was there already."""
+        source = self._source
+        if source is None:
+            return False
+        loop, index = self._loop, self._index
+        self._source = None
+        loop.run(FadeOut(source, round(_FADE_S / loop.period_s)), index)
+        self._supervisor.watch_runaway(None)
+        if self._drive_mode is not Mode.POSITION:
+            self._take_mode(Mode.POSITION)
+        self._supervisor.set_limits(index, self._limits)
+        set_point = loop.set_points[index]
+        set_point.torque_nm = set_point.velocity_rad_s = 0.0
+        # What is left of an offset is gravity; the drive's own loop takes it over.
+        steps = round(_FADE_S / loop.period_s)
+        offset_nm = set_point.torque_offset_nm
+        for k in range(steps):
+            set_point.torque_offset_nm = offset_nm * (1.0 - (k + 1) / steps)
+            loop.cycle()
+        return True
+
+    def _enter(self, motion: Compensated) -> Controller:
+        loop, index = self._loop, self._index
+        set_point = loop.set_points[index]
+        if motion.drive_mode is not Mode.TORQUE:
+            if motion.drive_mode is not Mode.POSITION:
+                self._take_mode(motion.drive_mode)
+            return Controller(motion.law, loop.period_s, 0.0)
+        cycles = max(1, round(_LISTEN_S / loop.period_s))
+        holding_nm = 0.0
+        for _ in range(cycles):
+            torque_nm = loop.cycle()[index].torque_nm
+            holding_nm += (torque_nm if math.isfinite(torque_nm) else 0.0) / cycles
+        limit_nm = motion.law.torque_limit_nm
+        set_point.torque_nm = holding_nm = min(limit_nm, max(-limit_nm, holding_nm))
+        self._supervisor.set_limits(index, self._bounds(motion))
+        self._take_mode(Mode.TORQUE)
+        # What friction holds of it is let go slowly, or the gear's presliding spring would ring.
+        steps = round(_LET_GO_S / loop.period_s)
+        for k in range(steps):
+            share = (k + 1) / steps
+            gravity_nm = motion.law.gravity.torque_nm(loop.feedback[index].position_rad)
+            set_point.torque_nm = (1.0 - share) * holding_nm + share * min(limit_nm, max(-limit_nm, gravity_nm))
+            loop.cycle()
+        return Controller(motion.law, loop.period_s, set_point.torque_nm)
+
+    def _take_mode(self, mode: Mode) -> None:
+        """Ask for a mode and cycle until the drive shows it; the set-point stays where the joint is."""
+        loop, index = self._loop, self._index
+        self._driver.enable(self._joint.name, mode)
+
+        def shown(feedback: Sequence[Feedback]) -> bool:
+            report = feedback[index]
+            if self._drive_mode is not Mode.POSITION:
+                loop.set_points[index].position_rad = report.position_rad
+            return report.mode is mode
+
+        loop.wait_for(shown, _MODE_TIMEOUT_S, f"mode {mode.name} of joint {self._joint.name}")
+        self._drive_mode = mode
+        self._supervisor.expect_mode(mode)
+
+    def _bounds(self, motion: Compensated) -> JointLimits:
+        bounds, limits = motion.bounds, self._limits
+        torque_nm = limits.torque_nm
+        if motion.drive_mode is Mode.TORQUE:
+            torque_nm = min(torque_nm, motion.law.torque_limit_nm + _NOISE_SHARE * self._joint.rated_torque_nm)
+        return replace(
+            limits,
+            position_min_rad=bounds.position_min_rad,
+            position_max_rad=bounds.position_max_rad,
+            velocity_rad_s=min(bounds.velocity_rad_s, self._joint.max_velocity_rad_s),
+            torque_nm=torque_nm,
+            power_w=bounds.power_w,
+        )
