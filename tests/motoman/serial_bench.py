@@ -13,7 +13,7 @@ from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator, Settings
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
-from frictid_hil.driver import JointSetup, Mode, RobotSetup, SetPoint
+from frictid_hil.driver import Feedback, JointSetup, Mode, RobotSetup, SetPoint
 
 PULSES_PER_DEGREE = 1000.0
 GEAR = 100.0
@@ -153,25 +153,27 @@ def stream_motion(
     driver.start_cycling()
     streamed.first_tick = -driver.clock.tick_ns(0) // 4_000_000
     deadline_ns = driver.clock.now_ns()
+    reports: Sequence[Feedback] = ()
 
     def cycle() -> None:
-        nonlocal deadline_ns
+        nonlocal deadline_ns, reports
         deadline_ns = max(deadline_ns + 4_000_000, driver.clock.now_ns())
         driver.clock.wait_until(deadline_ns)
-        for index, report in enumerate(driver.exchange(set_points)):
-            if index == 0 and report.age_cycles == 0:
-                row = (report.t_ns, report.position_rad, report.velocity_rad_s, report.torque_nm)
-                streamed.rows.append(row)
+        reports = driver.exchange(set_points)
+        first = reports[0]
+        if first.age_cycles == 0:
+            streamed.rows.append((first.t_ns, first.position_rad, first.velocity_rad_s, first.torque_nm))
 
     cycle()
-    for set_point in set_points:
-        set_point.position_rad = START_RAD
+    for set_point, report in zip(set_points, reports, strict=True):
+        set_point.position_rad = report.position_rad
+    start_rad = set_points[0].position_rad
     for name in joints:
         driver.enable(name, Mode.POSITION)
     for _ in range(6):
         cycle()
     for k in range(1, ticks + 1):
-        set_points[0].position_rad = START_RAD + travel_rad / 2 * (1 - math.cos(2 * math.pi * k / ticks))
+        set_points[0].position_rad = start_rad + travel_rad / 2 * (1 - math.cos(2 * math.pi * k / ticks))
         cycle()
     for _ in range(10):
         cycle()
