@@ -63,23 +63,23 @@ class TerminalWatcher:
         self._phase_began = time.monotonic()
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
-        """Print it, remember the durations."""
+        """Print it, remember the durations; refuse at once where nobody could be asked."""
+        if not self._yes and not sys.stdin.isatty():
+            raise UsageError(
+                "motion needs a yes, and there is no terminal to ask on",
+                next_step="add --yes once the plan is right (see --dry-run)",
+            )
         self._planned = {joint.joint: joint.duration_s for joint in plan.joints}
         if not self._silent:
             print_plan(self._console, plan, setup)
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
-        """Ask on a TTY; without one ``--yes`` is needed."""
+        """Ask, unless the person said yes beforehand."""
         for finding in preflight.findings:
             if finding.severity is not Severity.OK:
                 self.note(f"{finding.severity.value}: {finding.subject}: {finding.message}")
         if self._yes:
             return True
-        if not sys.stdin.isatty():
-            raise UsageError(
-                "motion needs a yes, and there is no terminal to ask on",
-                next_step="add --yes once the plan is right (see --dry-run)",
-            )
         joints = ", ".join(joint.joint for joint in plan.joints)
         return typer.confirm(
             f"{plan.robot}: joints {joints} will move, one at a time, all others locked. Is the cell clear?", err=True

@@ -77,7 +77,7 @@ def test_a_dry_run_in_json_carries_the_plan() -> None:
 def test_a_users_mistake_is_exit_2_with_a_reason(arguments: list[str], said: str, tmp_path: Path) -> None:
     result = run(*arguments, cwd=tmp_path)
     assert result.returncode == 2, result.stderr
-    assert said in " ".join(result.stderr.split())
+    assert said in " ".join(result.stderr.replace("│", " ").split())
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
     assert not list(tmp_path.rglob("samples*")), "nothing may have been started"
