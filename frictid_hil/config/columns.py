@@ -17,20 +17,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from frictid_hil.columns import TIME_UNITS_NS, ColumnMap, JointColumns, Source, si_factor
-from frictid_hil.config.schema import Strict, schema_version, validated
+from frictid_hil.config.schema import Names, Strict, schema_version, validated
 from frictid_hil.config.search import find
 from frictid_hil.config.yaml import read
 from frictid_hil.errors import FieldProblem, UsageError
 
 KIND = "frictid.columns"
 NEWEST = 1
-
-_Names = Annotated[tuple[str, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v)]
 
 
 class TimeFile(Strict):
@@ -54,7 +52,7 @@ class SourceFile(Strict):
     """
 
     column: str | None = None
-    product: _Names | None = Field(default=None, min_length=2)
+    product: Names | None = Field(default=None, min_length=2)
     unit: str
     scale: float = 1.0
     offset: float = 0.0

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from frictid_hil.config.schema import Numbers, Strict, validated
+from frictid_hil.config.schema import Numbers, Strict, as_tuple, validated
 from frictid_hil.config.yaml import Document, KeyPath, read
 from frictid_hil.errors import ConfigError, FieldProblem
 
@@ -127,9 +127,7 @@ class NominalFile(Open):
     controller: Controller | None = None
     drive: Drive | None = None
     encoder: Encoder | None = None
-    experiments: Annotated[
-        tuple[Experiment, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v), Field(min_length=1)
-    ]
+    experiments: Annotated[tuple[Experiment, ...], BeforeValidator(as_tuple), Field(min_length=1)]
 
 
 @dataclass(frozen=True, slots=True)

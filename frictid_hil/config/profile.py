@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from frictid_hil.config.provenance import Provenance
-from frictid_hil.config.schema import Numbers, Pair, Pairs, Strict, schema_version, validated
+from frictid_hil.config.schema import Numbers, Pair, Pairs, Strict, as_tuple, schema_version, validated
 from frictid_hil.config.write import dump, plain, write_whole
 from frictid_hil.config.yaml import Document, KeyPath, Node, read
 from frictid_hil.errors import ConfigError, ProfileMismatch
@@ -183,7 +183,7 @@ class JointProfile(Strict):
     procedure: ProcedureUsed | None = None
     drive: DriveIdentity = DriveIdentity()
     quality: dict[str, Any] = Field(default_factory=dict)
-    gates: Annotated[tuple[Gate, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v)] = ()
+    gates: Annotated[tuple[Gate, ...], BeforeValidator(as_tuple)] = ()
 
     @field_validator("velocity_rad_s")
     @classmethod
