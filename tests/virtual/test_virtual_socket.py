@@ -118,15 +118,21 @@ def test_slow_reader_loses_frames_and_holds_up_nobody(hub):
 class TestSyncGrid:
     def test_jitter_does_not_reach_run_time(self):
         grid = SyncGrid(MS)
-        jitter = [0, 300_000, -200_000, 450_000, -450_000, 100_000] * 20
+        jitter = [0, 300_000, -100_000, 600_000, -100_000, 100_000] * 200
         times = [grid.sync_ns(n * MS + late) for n, late in enumerate(jitter)]
         assert times == [n * MS for n in range(len(jitter))]
+
+    def test_a_late_first_sync_is_forgotten_soon(self):
+        grid = SyncGrid(MS)
+        times = [grid.sync_ns(n * MS + (500_000 if n == 0 else 0)) for n in range(60)]
+        assert all(after - before == MS for before, after in zip(times[20:], times[21:], strict=False))
+        assert grid.sync_ns(60 * MS + 700_000) == times[-1] + MS, "late ones are tolerated as from a good start"
 
     def test_time_stands_on_the_grid_between_syncs(self):
         grid = SyncGrid(MS)
         grid.sync_ns(0)
-        assert [grid.time_ns(t) for t in (100, MS - 1, MS, 2 * MS + 5)] == [0, 0, MS, 2 * MS]
-        assert grid.sync_ns(2 * MS + 300_000) == 2 * MS, "late, but in time for its own point"
+        assert [grid.time_ns(t) for t in (100, MS, MS + 790_000, MS + 810_000, 3 * MS)] == [0, 0, 0, MS, 2 * MS]
+        assert grid.sync_ns(3 * MS + 750_000) == 3 * MS, "late, but in time for its own point"
 
     def test_missed_syncs_are_skipped_not_squeezed(self):
         grid = SyncGrid(MS)
@@ -134,7 +140,7 @@ class TestSyncGrid:
 
     def test_two_syncs_in_one_period_are_one_moment(self):
         grid = SyncGrid(MS)
-        assert [grid.sync_ns(t) for t in (0, MS + 700_000, 2 * MS)] == [0, 2 * MS, 2 * MS]
+        assert [grid.sync_ns(t) for t in (0, MS + 900_000, 2 * MS)] == [0, 2 * MS, 2 * MS]
 
     def test_pause_starts_a_new_grid(self):
         grid = SyncGrid(MS)

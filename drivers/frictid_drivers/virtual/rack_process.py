@@ -41,15 +41,16 @@ _FAREWELL_NS = 10_000_000_000
 _STANDSTILL_NS = 1_000_000_000
 _FIFO_PRIORITY = 50
 _GRID_GAP = 10
-_GRID_SHARE = 0.01
+_EARLY_SHARE, _LATE_SHARE = 0.2, 0.002
 
 
 class SyncGrid:
     """Run time of the drives on the wall clock, locked to SYNC.
 
-    A SYNC counts as sent exactly on the nearest point of the grid, and the grid follows the mean deviation by a
-    hundredth; after ten periods without SYNC the next one starts a new grid. Between SYNCs run time stands on the last
-    grid point that has passed, so that a SYNC is never too late for its own point.
+    A SYNC belongs to a point of the grid when it was sent from a fifth of a period before it to four fifths after, and
+    counts as sent exactly there. Processes are late now and then but never early, so the grid follows early SYNCs fast
+    and late ones slowly. Between SYNCs run time stands on the last point whose SYNC cannot come any more. After ten
+    periods without SYNC the next one starts a new grid.
 
     Attributes:
         period_ns: of SYNC; 0 without one, and run time is the wall clock's.
@@ -65,23 +66,26 @@ class SyncGrid:
         raw_ns = wall_ns + round(self._offset_ns)
         if not self.period_ns or self._last_ns is None:
             return raw_ns
-        periods = (raw_ns - self._last_ns) // self.period_ns
-        if periods > _GRID_GAP:
-            return raw_ns
-        return self._last_ns + max(0, periods) * self.period_ns
+        periods = self._periods(raw_ns, self._last_ns) - 1
+        return raw_ns if periods > _GRID_GAP else self._last_ns + max(0, periods) * self.period_ns
 
     def sync_ns(self, wall_ns: int) -> int:
         """Run time of a SYNC that was sent at a moment of the wall clock."""
         raw_ns = wall_ns + round(self._offset_ns)
         if self.period_ns and self._last_ns is not None:
-            periods = round((raw_ns - self._last_ns) / self.period_ns)
+            periods = self._periods(raw_ns, self._last_ns)
             if periods <= _GRID_GAP:
                 grid_ns = self._last_ns + max(0, periods) * self.period_ns
-                self._offset_ns += _GRID_SHARE * (grid_ns - raw_ns)
+                early_ns = grid_ns - raw_ns
+                self._offset_ns += early_ns * (_EARLY_SHARE if early_ns > 0 else _LATE_SHARE)
                 self._last_ns = grid_ns
                 return grid_ns
         self._last_ns = raw_ns
         return raw_ns
+
+    def _periods(self, raw_ns: int, last_ns: int) -> int:
+        """Points of the grid since the last SYNC, the one that a SYNC sent now would belong to included."""
+        return (raw_ns - last_ns + self.period_ns // 5) // self.period_ns
 
 
 class Wire(Protocol):
