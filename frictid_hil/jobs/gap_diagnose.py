@@ -11,7 +11,10 @@ from frictid_hil.files import write_whole
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.jobs.improved_robot import improved_robot
+from frictid_hil.report.gap import SideBySide, gap_page
+from frictid_hil.report.pages import write_page
 
 
 def diagnose(
@@ -36,15 +39,47 @@ def diagnose(
     if write_model is not None:
         result["model"] = str(_write_model(write_model, experiments, found, apply).resolve())
     if out is not None:
-        result["report"] = None
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"cannot be created: {error.strerror}", where=str(out)) from error
+        page = gap_page(found, _side_by_side(experiments, found))
+        result["report"] = str(write_page(page, out / "gap.html").resolve())
     return result
+
+
+def _side_by_side(experiments: ExperimentSet, found: Diagnosis) -> tuple[SideBySide, ...]:
+    """Each validation log, measured, nominal and improved; nothing where the closed loop cannot be simulated."""
+    if why_not(experiments) is not None:
+        return ()
+    replay = Replay(experiments)
+    nominal = replay({}, validation=True)
+    model = found.improved_model()
+    improved = replay(model.effects, validation=True) if model is not None and found.causes else {}
+    logs = []
+    for log in experiments.experiments:
+        if not log.validation or log.torque_nm is None:
+            continue
+        before, after = nominal[log.name], improved.get(log.name)
+        logs.append(
+            SideBySide(
+                log=log.name,
+                time_s=log.time_s,
+                torque_nm=log.torque_nm,
+                nominal_torque_nm=log.torque_nm - before.torque_nm,
+                improved_torque_nm=None if after is None else log.torque_nm - after.torque_nm,
+                nominal_position_error_rad=-before.position_rad,
+                improved_position_error_rad=None if after is None else -after.position_rad,
+            )
+        )
+    return tuple(logs)
 
 
 def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply: bool) -> Path:
     if found.verdict in ("unknown", "ambiguous") and not apply:
         raise UsageError(
             f"the verdict is {found.verdict}: no cause is sure enough to change the simulator",
-            where=str(experiments.folder),
+            where=experiments.name,
             cause=found.summary,
             next_step="record the next experiment, or add --apply to write the best candidate all the same",
         )
@@ -52,7 +87,7 @@ def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply
     if model is None:
         raise UsageError(
             "the closed loop of this joint cannot be simulated, so there is no joint to write",
-            where=str(experiments.folder),
+            where=experiments.name,
             cause="; ".join(f"{name}: {why}" for name, why in found.reasons.items()),
             next_step="add controller, drive and encoder to nominal.yaml",
         )

@@ -1,0 +1,162 @@
+"""The page of a diagnosis: one sentence first, then where, which, how far, and measured beside nominal and improved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures
+from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, bars, line
+from frictid_hil.report.pages import Page, Section, Table
+from frictid_hil.units import degrees
+
+
+@dataclass(frozen=True, slots=True)
+class SideBySide:
+    """One validation log, measured and simulated; every column has shape (n,).
+
+    Attributes:
+        log: its name.
+        time_s: of the log.
+        torque_nm: measured.
+        nominal_torque_nm: of the nominal joint in closed loop.
+        improved_torque_nm: of the improved joint; None where nothing was applied.
+        nominal_position_error_rad: simulated minus measured.
+        improved_position_error_rad: None where nothing was applied.
+    """
+
+    log: str
+    time_s: Array
+    torque_nm: Array
+    nominal_torque_nm: Array
+    improved_torque_nm: Array | None
+    nominal_position_error_rad: Array
+    improved_position_error_rad: Array | None
+
+
+def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = ()) -> Page:
+    """The page of one diagnosis."""
+    sections = [
+        Section("Where the gap lies", tables=(_where_table(found),), figures=(_where_figure(found),)),
+        Section(
+            "Which effect causes it",
+            words=() if found.causes else ("No effect of the library is named.",),
+            tables=(_causes(found.causes),) if found.causes else (),
+        ),
+        Section("How far it closes", tables=(_how_far(found),), figures=_per_log(found.per_log)),
+    ]
+    if found.next_experiment is not None:
+        asked = found.next_experiment
+        sections.append(
+            Section(
+                "What to record next",
+                words=(f"{asked.description} ({asked.duration_s:.0f} s); it parts {' from '.join(asked.separates)}.",),
+            )
+        )
+    if found.reasons:
+        words = tuple(f"{subject}: {why}" for subject, why in found.reasons.items())
+        sections.append(Section("What could not be concluded", words=words))
+    for log in side_by_side:
+        sections.append(Section(f"Measured, nominal, improved: {log.log}", figures=_side_by_side(log)))
+    return Page(f"Sim-to-real gap of {found.name}", found.summary, sections)
+
+
+def _where_table(found: Diagnosis) -> Table:
+    return Table(
+        ("region", "share of the squared gap", ""),
+        tuple((w.region, f"{100 * w.share_of_gap:.0f} %", w.description) for w in found.where),
+        caption="Shares of the squared residual; they add up to 100 %.",
+    )
+
+
+def _where_figure(found: Diagnosis) -> Figure:
+    regions = [w.region for w in found.where]
+    return Figure(
+        "Where the gap lies",
+        (bars("share", regions, [100 * w.share_of_gap for w in found.where], IDENTIFIED),),
+        "region of the motion",
+        "share of the squared gap [%]",
+    )
+
+
+def _causes(causes: tuple[Cause, ...]) -> Table:
+    rows = []
+    for cause in causes:
+        parameters = [
+            f"{name} = {value.value:.4g}"
+            + ("" if value.low is None or value.high is None else f" ({value.low:.4g} .. {value.high:.4g})")
+            for name, value in cause.parameters.items()
+        ]
+        closed = "" if cause.gap_closed_percent is None else f"{cause.gap_closed_percent:.0f} %"
+        rows.append(
+            (
+                cause.effect,
+                f"{cause.confidence:.2f}",
+                closed,
+                "; ".join(parameters),
+                ", ".join(cause.confusable_with),
+            )
+        )
+    return Table(
+        ("effect", "confidence", "closes of the gap", "parameters (95 % interval)", "confusable with"), tuple(rows)
+    )
+
+
+def _how_far(found: Diagnosis) -> Table:
+    rows = [
+        (
+            name,
+            _text(getattr(found.before, key)),
+            _text(getattr(found.after, key)),
+            _text(getattr(found.noise_floor, key)),
+        )
+        for name, key in (
+            ("inverse dynamics [N m]", "inverse_nm"),
+            ("torque in closed loop [N m]", "forward_torque_nm"),
+            ("position in closed loop [rad]", "forward_position_rad"),
+        )
+    ]
+    return Table(
+        ("RMS on validation logs", "nominal", "with the causes added", "noise floor"),
+        tuple(rows),
+        caption="Recordings that nothing was fitted to.",
+    )
+
+
+def _per_log(per_log: Mapping[str, Mapping[str, Figures]]) -> tuple[Figure, ...]:
+    names = [name for name, figures in per_log.items() if figures["before"].forward_torque_nm is not None]
+    if not names:
+        return ()
+    before = [per_log[name]["before"].forward_torque_nm for name in names]
+    after = [per_log[name]["after"].forward_torque_nm for name in names]
+    return (
+        Figure(
+            "Torque difference in closed loop, log by log",
+            (bars("nominal", names, before, PUBLISHED), bars("with the causes added", names, after, IDENTIFIED)),
+            "validation log",
+            "RMS torque difference [N m]",
+        ),
+    )
+
+
+def _side_by_side(log: SideBySide) -> tuple[Figure, ...]:
+    torque = [
+        line("measured", log.time_s, log.torque_nm, MEASURED, width=1),
+        line("nominal", log.time_s, log.nominal_torque_nm, PUBLISHED, width=1),
+    ]
+    error = [line("nominal", log.time_s, degrees(1.0) * log.nominal_position_error_rad, PUBLISHED, width=1)]
+    if log.improved_torque_nm is not None and log.improved_position_error_rad is not None:
+        torque.append(line("improved", log.time_s, log.improved_torque_nm, IDENTIFIED, width=1))
+        improved = degrees(1.0) * np.asarray(log.improved_position_error_rad)
+        error.append(line("improved", log.time_s, improved, IDENTIFIED, width=1))
+    return (
+        Figure(f"{log.log}: torque", tuple(torque), "time [s]", "torque [N m]"),
+        Figure(f"{log.log}: position difference", tuple(error), "time [s]", "simulated - measured position [deg]"),
+    )
+
+
+def _text(value: float | None) -> str:
+    return "cannot be formed" if value is None else f"{value:.4g}"
