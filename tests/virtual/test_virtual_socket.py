@@ -1,6 +1,7 @@
 """The bus between processes: members hear each other, the interface is registered, slow readers do no harm."""
 
 import contextlib
+import itertools
 import select
 import threading
 import time
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from frictid_drivers.virtual.rack_launcher import decode_setup, encode_setup
-from frictid_drivers.virtual.rack_process import SyncGrid
+from frictid_drivers.virtual.rack_process import SyncTime
 from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub, SocketBus, message_of, pack
 
 MS = 1_000_000
@@ -115,53 +116,37 @@ def test_slow_reader_loses_frames_and_holds_up_nobody(hub):
     quick.shutdown()
 
 
-class TestSyncGrid:
-    def test_jitter_does_not_reach_run_time(self):
-        grid = SyncGrid(MS)
-        jitter = [0, 300_000, -100_000, 600_000, -100_000, 100_000] * 200
-        times = [grid.sync_ns(n * MS + late) for n, late in enumerate(jitter)]
-        assert times == [n * MS for n in range(len(jitter))]
+class TestSyncTime:
+    def test_every_sync_is_one_period_whenever_it_comes(self):
+        clock = SyncTime(MS)
+        jitter = [0, 300_000, -200_000, 900_000, -450_000, 12 * MS, 11 * MS + 900_000, 12 * MS] * 20
+        times = [clock.sync_ns(n * MS + late) for n, late in enumerate(jitter)]
+        assert [after - before for before, after in itertools.pairwise(times)] == [MS] * (len(times) - 1)
 
-    def test_a_late_first_sync_is_forgotten_soon(self):
-        grid = SyncGrid(MS)
-        times = [grid.sync_ns(n * MS + (500_000 if n == 0 else 0)) for n in range(60)]
-        assert all(after - before == MS for before, after in zip(times[20:], times[21:], strict=False))
-        assert grid.sync_ns(60 * MS + 700_000) == times[-1] + MS, "late ones are tolerated as from a good start"
+    def test_time_waits_for_a_late_sync_but_not_for_ever(self):
+        clock = SyncTime(MS)
+        assert clock.sync_ns(10 * MS) == 10 * MS
+        assert [clock.time_ns(t * MS) for t in (10, 30, 60, 61, 200)] == [t * MS for t in (10, 10, 10, 11, 150)]
+        assert clock.sync_ns(200 * MS) == 150 * MS
+        assert clock.sync_ns(201 * MS) == 151 * MS
 
-    def test_time_stands_on_the_grid_between_syncs(self):
-        grid = SyncGrid(MS)
-        grid.sync_ns(0)
-        assert [grid.time_ns(t) for t in (100, MS, MS + 790_000, MS + 810_000, 3 * MS)] == [0, 0, 0, MS, 2 * MS]
-        assert grid.sync_ns(3 * MS + 750_000) == 3 * MS, "late, but in time for its own point"
+    def test_a_burst_does_not_run_ahead_of_the_wall_clock(self):
+        clock = SyncTime(MS)
+        assert [clock.sync_ns(5 * MS) // MS for _ in range(6)] == [5, 6, 7, 7, 7, 7]
+        assert clock.sync_ns(8 * MS) == 8 * MS
 
-    def test_missed_syncs_are_skipped_not_squeezed(self):
-        grid = SyncGrid(MS)
-        assert [grid.sync_ns(t * MS) for t in (0, 1, 4, 5)] == [0, MS, 4 * MS, 5 * MS]
+    def test_without_a_period_the_wall_clock_rules(self):
+        clock = SyncTime()
+        assert [clock.sync_ns(t) for t in (7, 9, 1000)] == [7, 9, 1000]
 
-    def test_two_syncs_in_one_period_are_one_moment(self):
-        grid = SyncGrid(MS)
-        assert [grid.sync_ns(t) for t in (0, MS + 900_000, 2 * MS)] == [0, 2 * MS, 2 * MS]
-
-    def test_pause_starts_a_new_grid(self):
-        grid = SyncGrid(MS)
-        grid.sync_ns(0)
-        assert grid.sync_ns(500 * MS + 400_000) == 500 * MS + 400_000
-        assert grid.sync_ns(501 * MS + 300_000) == 501 * MS + 400_000
-
-    def test_slow_drift_is_followed(self):
-        grid = SyncGrid(MS)
-        for n in range(20_000):
-            time_ns = grid.sync_ns(round(n * MS * 1.0002))
-        assert time_ns == 19_999 * MS
-
-    @given(st.lists(st.integers(0, 40 * MS), max_size=60), st.booleans())
-    def test_never_backwards_by_more_than_half_a_period(self, gaps, mixed):
-        grid, wall, highest = SyncGrid(MS), 0, 0
+    @given(st.lists(st.integers(0, 120 * MS), max_size=60), st.booleans())
+    def test_never_backwards(self, gaps, mixed):
+        clock, wall, highest = SyncTime(MS), 0, 0
         for n, gap in enumerate(gaps):
             wall += gap
-            now = grid.time_ns(wall) if mixed and n % 2 else grid.sync_ns(wall)
-            assert now >= highest - MS
-            highest = max(highest, now)
+            now = clock.time_ns(wall) if mixed and n % 2 else clock.sync_ns(wall)
+            assert now >= highest and now <= wall + 2 * MS
+            highest = now
 
 
 def test_robot_crosses_the_process_border_unchanged(make_robot):

@@ -4,8 +4,6 @@ import math
 import random
 import struct
 
-import pytest
-
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_process import RackProcess
 
@@ -100,22 +98,17 @@ def wall_clock(setup, cycles, late):
 def test_jitter_of_both_processes_gives_the_same_bits(make_robot):
     setup = make_robot(joints=1)
     chance = random.Random(1)
-    jitter = [0, *(chance.randrange(-100_000, 600_000) for _ in range(500))]
+    jitter = [0, *(chance.choice((0, 0, 0, 50_000, -100_000, 700_000, 1_900_000, 12_000_000)) for _ in range(500))]
     reference = lock_step(setup, 500)
     assert len(reference) == 500 and len(set(reference)) > 400
     assert wall_clock(setup, 500, lambda n: 0) == reference
     assert wall_clock(setup, 500, lambda n: jitter[n - 1]) == reference
 
 
-def test_a_cycle_that_is_missed_costs_its_own_set_point_only(make_robot):
-    """SYNC 200 comes a whole period late and shares its moment with SYNC 201; after that all is as before."""
+def test_run_time_waits_for_a_host_that_pauses_but_not_long(make_robot):
+    """Missed cycles: the set-points go on one by one, later; past the patience the joint is held meanwhile."""
     setup = make_robot(joints=1)
     reference = lock_step(setup, 400)
-    disturbed = wall_clock(setup, 400, lambda n: MS - 100_000 if n == 200 else 0)
-    positions = (
-        [struct.unpack("<ih", data)[0] for data in reference],
-        [struct.unpack("<ih", data)[0] for data in disturbed],
-    )
-    worst = max(abs(a - b) for a, b in zip(*positions, strict=True)) / UNITS_PER_RAD
-    late = max(abs(a - b) for a, b in zip(positions[0][260:], positions[1][260:], strict=True)) / UNITS_PER_RAD
-    assert worst < 0.004 and late == pytest.approx(0.0, abs=2e-4)
+    for pause_ms in (3, 40, 140):
+        delayed = wall_clock(setup, 400, lambda n, pause_ms=pause_ms: pause_ms * MS if n >= 200 else 0)
+        assert (delayed == reference) == (pause_ms < 50)

@@ -6,8 +6,7 @@ process ends when the owner says ``end``. When the owner disappears instead - SI
 on until their own watchdogs have brought every joint to rest, so that what drives do without their host happens here as
 it does in a robot.
 
-The drives' time follows SYNC where there is one, as in drives that lock their control loops to it: a SYNC is taken to
-be exactly on its grid, so that the jitter of two processes' scheduling does not become motion.
+Run time here is paced by SYNC, see ``SyncTime``: the scheduling jitter of two processes does not become motion.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ from frictid_drivers.virtual.socket_bus import ERROR, EXTENDED, REMOTE, Hub
 from frictid_hil.errors import FrictidError
 
 SYNC_ID = 0x80
+PATIENCE_NS = 50_000_000
+"""How long run time waits for a SYNC before the wall clock goes on without it."""
+
 SYNC_GAP_TENTHS = 500
-"""2010h:01 on the wall clock: 50 periods. An ordinary operating system loses the processor for tens of milliseconds now
-and then; the host's heartbeat, not SYNC, is what stops the drives here."""
+"""2010h:01 on the wall clock: 50 periods. The host's heartbeat, not SYNC, is what stops the drives here."""
 
 _LONGEST_WAIT_S = 0.005
 _SHORTEST_WAIT_S = 0.0002
 _FAREWELL_NS = 10_000_000_000
 _STANDSTILL_NS = 1_000_000_000
 _FIFO_PRIORITY = 50
-_GRID_GAP = 10
-_EARLY_SHARE, _LATE_SHARE = 0.2, 0.002
 
 
-class SyncGrid:
-    """Run time of the drives on the wall clock, locked to SYNC.
+class SyncTime:
+    """Run time of the drives on the wall clock, paced by SYNC.
 
-    A SYNC belongs to a point of the grid when it was sent from a fifth of a period before it to four fifths after, and
-    counts as sent exactly there. Processes are late now and then but never early, so the grid follows early SYNCs fast
-    and late ones slowly. Between SYNCs run time stands on the last point whose SYNC cannot come any more. After ten
-    periods without SYNC the next one starts a new grid.
+    Every SYNC is one period of run time, whenever exactly it comes; without SYNC run time waits for ``PATIENCE_NS``,
+    then follows the wall clock again. So a machine that keeps a process from running for some milliseconds, as every
+    ordinary one does, gives the simulated joint the motion of lock-step instead of a jerk; the host counts its late and
+    missed cycles all the same. Run time never runs ahead of the wall clock by more than two periods.
 
     Attributes:
         period_ns: of SYNC; 0 without one, and run time is the wall clock's.
@@ -58,34 +57,26 @@ class SyncGrid:
 
     def __init__(self, period_ns: int = 0) -> None:
         self.period_ns = period_ns
-        self._offset_ns = 0.0  # grid time minus wall time
-        self._last_ns: int | None = None
+        self._ceiling_ns = 0  # run time minus wall time at the last start of a series of SYNCs
+        self._last: tuple[int, int] | None = None  # wall time and run time of the last SYNC
 
     def time_ns(self, wall_ns: int) -> int:
         """Run time at a moment of the wall clock."""
-        raw_ns = wall_ns + round(self._offset_ns)
-        if not self.period_ns or self._last_ns is None:
-            return raw_ns
-        periods = self._periods(raw_ns, self._last_ns) - 1
-        return raw_ns if periods > _GRID_GAP else self._last_ns + max(0, periods) * self.period_ns
+        if self._last is None:
+            return wall_ns
+        last_wall_ns, last_ns = self._last
+        return last_ns + max(0, wall_ns - last_wall_ns - PATIENCE_NS)
 
     def sync_ns(self, wall_ns: int) -> int:
         """Run time of a SYNC that was sent at a moment of the wall clock."""
-        raw_ns = wall_ns + round(self._offset_ns)
-        if self.period_ns and self._last_ns is not None:
-            periods = self._periods(raw_ns, self._last_ns)
-            if periods <= _GRID_GAP:
-                grid_ns = self._last_ns + max(0, periods) * self.period_ns
-                early_ns = grid_ns - raw_ns
-                self._offset_ns += early_ns * (_EARLY_SHARE if early_ns > 0 else _LATE_SHARE)
-                self._last_ns = grid_ns
-                return grid_ns
-        self._last_ns = raw_ns
-        return raw_ns
-
-    def _periods(self, raw_ns: int, last_ns: int) -> int:
-        """Points of the grid since the last SYNC, the one that a SYNC sent now would belong to included."""
-        return (raw_ns - last_ns + self.period_ns // 5) // self.period_ns
+        now_ns = self.time_ns(wall_ns)
+        if self._last is None or not self.period_ns or wall_ns - self._last[0] > PATIENCE_NS:
+            self._ceiling_ns = now_ns - wall_ns + 2 * self.period_ns
+        else:
+            now_ns = max(now_ns, min(now_ns + self.period_ns, wall_ns + self._ceiling_ns))
+        if self.period_ns:
+            self._last = (wall_ns, now_ns)
+        return now_ns
 
 
 class Wire(Protocol):
@@ -119,7 +110,7 @@ class RackProcess:
         self._drives = FaultyRack(rack, faults) if faults else rack
         self._hub = hub
         self._origin_ns = (time.monotonic_ns() if now_ns is None else now_ns) - rack.now_ns
-        self._grid = SyncGrid()
+        self._time = SyncTime()
         self._drives.transmit = hub.send
         hub.heard = self._heard
 
@@ -128,17 +119,17 @@ class RackProcess:
             return
         wall_ns = stamp_ns - self._origin_ns
         if can_id == SYNC_ID:
-            self._grid.period_ns = next((servo.sync_period_ns for servo in self._rack.servos.values()), 0)
-            self._drives.advance(self._grid.sync_ns(wall_ns))
+            self._time.period_ns = next((servo.sync_period_ns for servo in self._rack.servos.values()), 0)
+            self._drives.advance(self._time.sync_ns(wall_ns))
         else:
-            self._drives.advance(self._grid.time_ns(wall_ns))
+            self._drives.advance(self._time.time_ns(wall_ns))
         self._drives.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
 
     def serve_until(self, now_ns: int) -> int:
         """Deal with what was sent until a moment of the monotonic clock, then let run time reach it; returns it."""
         wall_ns = now_ns - self._origin_ns
         self._hub.serve()
-        self._drives.advance(self._grid.time_ns(wall_ns))
+        self._drives.advance(self._time.time_ns(wall_ns))
         return wall_ns
 
     def run(self, owner: Owner) -> None:
