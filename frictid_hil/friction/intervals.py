@@ -1,9 +1,9 @@
 """Honest 95 % intervals: how far an identified torque may be from the truth, by terms that can be named.
 
-* **scatter**: the accelerating and decelerating halves of a window, forwards and backwards, are four independent looks
-  at one F_n once inertia and gravity have cancelled; torque noise, ripple and hysteresis show as their disagreement.
-* **skew**: one standard deviation of undeclared delay between torque and position, through the very same windows.
-* **model**: the distance between windows and global least squares, two estimators that fail differently.
+* **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise, ripple
+  and friction that depends on the place show as their disagreement;
+* **skew**: one standard deviation of undeclared delay between torque and position, through the very same windows;
+* **model**: the distance between windows and global least squares, two estimators that fail differently;
 * **drift**: friction changed between the first and the second run of the repeated cycle.
 
 For least squares, scatter comes from leaving out one quarter cycle after the other (a jackknife over passes, so that
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import Fit, hat_functions
@@ -26,6 +27,8 @@ from frictid_hil.friction.trajectory import Array
 
 FINER = 8
 """Points per sample at which windows begin and end: one sample too many on one side is an error of its own."""
+STEADY = 0.28
+"""Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,16 +55,20 @@ class Terms:
 
 
 def aligned_pairs(recording: CycleRecording, motion: Motion, column: Array | None = None) -> IdentifiedPairs:
-    """(7) on synchronised columns, windows begun and ended between samples.
+    """(7) on synchronised columns, both smoothed alike, windows begun and ended between samples.
 
     Args:
         recording: for its procedure.
         motion: synchronised columns.
         column: averaged in place of the torque, shape (n,).
     """
+    velocity, torque = motion.velocity_rad_s, motion.torque_nm if column is None else column
+    width_s = STEADY / float(recording.procedure.angular_frequencies_rad_s[-1])
+    if width_s > motion.smoother.step_s:
+        steady = Gaussian(motion.smoother.step_s, width_s)
+        velocity, torque = steady.smooth(velocity), steady.smooth(torque)
     fine = np.linspace(motion.time_s[0], motion.time_s[-1], (motion.time_s.size - 1) * FINER + 1)
-    velocity = np.interp(fine, motion.time_s, motion.velocity_rad_s)
-    torque = np.interp(fine, motion.time_s, motion.torque_nm if column is None else column)
+    velocity, torque = np.interp(fine, motion.time_s, velocity), np.interp(fine, motion.time_s, torque)
     pairs = function_a(fine, velocity, torque, recording.procedure, where=recording.where)
     return IdentifiedPairs(
         pairs.velocity_rad_s,
@@ -191,31 +198,25 @@ def _drift_share(recording: CycleRecording, scatter_nm: Array, drift: Drift | No
 
 
 def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> Array:
-    """Standard deviation of each F_n from the disagreement of the four half windows, shape (N,).
+    """Standard deviation of each F_n from the disagreement of its four half windows, shape (N,).
 
-    d+ = accelerating minus decelerating half forwards, d- the same backwards with the sign turned. Gravity and what is
-    left of inertia enter both alike, so d+ - d- holds scatter alone: that of four half windows, while F_n is their
-    mean, hence the quarter.
+    Forwards the early half covers the lower half of the travel, backwards the late one does. Lower minus upper halves,
+    both ways with the sign of the motion, is free of gravity, of asymmetry and of what is left of inertia: it holds
+    the scatter of all four halves, and friction that depends on the place. F_n is their mean, hence the quarter.
     """
+    procedure = recording.procedure
     inertia = 0.0 if solved is None else solved.values[solved.blocks.inertia]
     torque = motion.torque_nm - inertia * motion.acceleration_rad_s2
-    procedure = recording.procedure
-    middle = (procedure.cycle_starts_s[:-1] + procedure.cycle_starts_s[1:]) / 2
-    single = np.empty(procedure.cycles)
+    bounds = np.searchsorted(motion.time_s, procedure.cycle_starts_s)
+    single = np.zeros(procedure.cycles)
     for n in range(procedure.cycles):
-        period = float(procedure.cycle_starts_s[n + 1] - procedure.cycle_starts_s[n])
-        here = np.abs(motion.time_s - middle[n]) <= period / 2
+        here = slice(bounds[n], bounds[n + 1])
         v, f = motion.velocity_rad_s[here], torque[here]
-        time = motion.time_s[here]
-        threshold = procedure.ratio * procedure.peak_velocities_rad_s[n]
-        halves = []
         for sign in (1, -1):
-            window = sign * v >= threshold
-            centre = float(np.mean(time[window]))
-            early, late = window & (time < centre), window & (time >= centre)
-            halves.append(sign * (f[early].mean() - f[late].mean()) if early.any() and late.any() else 0.0)
-        single[n] = (halves[0] - halves[1]) / 4
+            rows = np.flatnonzero(sign * v >= procedure.ratio * procedure.peak_velocities_rad_s[n])
+            early, late = np.array_split(f[rows], 2)
+            single[n] += (early.mean() - late.mean()) / 4 if late.size else 0.0
     # One degree of freedom each: pooled over five neighbours, and widened for those five.
-    pool = np.convolve(np.pad(single**2, 2, mode="reflect" if single.size > 2 else "edge"), np.full(5, 0.2), "valid")
-    spread: Array = np.sqrt(pool) * student.ppf(0.975, 5) / COVERAGE
+    pooled = np.convolve(np.pad(single**2, 2, mode="edge"), np.full(5, 0.2), "valid")
+    spread: Array = np.sqrt(pooled) * student.ppf(0.975, 5) / COVERAGE
     return spread

@@ -29,6 +29,8 @@ EVEN_KNOTS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 """Speeds of the even part as shares of the highest: the asymmetry of directions changes slowly with speed."""
 BIAS_PRIOR = 0.15
 """Over a short travel a constant and gravity look alike; a bias is expected within this share of the friction."""
+BEND_PRIOR = 0.005
+"""Above the slow knots a curve is expected to leave its neighbours' line by this share of the friction."""
 FINE, COARSE = 0.2, 0.5
 """Widths of the kernel in radians of the fastest cycle: one that keeps the curve, one that keeps vibration out."""
 
@@ -127,8 +129,9 @@ def fit(
     guard = min(np.inf if recording.prismatic else GUARD_RAD, recording.procedure.amplitude_rad / 12)
     spoiled = (quarter < 0) | (travel < guard)
     kept = ~binary_dilation(spoiled, iterations=int(np.ceil(3 * width)))
+    every = max(1, int(width / 2))  # what the kernel leaves is oversampled
     thin = np.zeros_like(kept)
-    thin[:: max(1, int(width / 2))] = True  # what the kernel leaves is oversampled
+    thin[::every] = True
     rows = np.flatnonzero(kept & thin)
     if rows.size < 100:
         raise IdentificationError(
@@ -142,16 +145,15 @@ def fit(
     late = np.gradient(motion.torque_nm, step_s)
     both = np.column_stack([columns, motion.torque_nm, late])
     both = gaussian_filter1d(both, width, axis=0, truncate=6.0, mode="nearest")[rows]
-    return _solve(
+    rows_alike = 2 * np.sqrt(np.pi) * width / every
+    values, covariance, drawn, residual_rms = _solve(
         both[:, :-2],
         both[:, -2:],
         quarter[rows],
-        blocks,
-        knots[observed],
-        knots[~observed],
-        BIAS_PRIOR * level_nm,
+        _priors(blocks, knots[observed], level_nm, rows_alike),
         recording.where,
     )
+    return Fit(blocks, knots[observed], values, covariance, -drawn, knots[~observed], residual_rms)
 
 
 def hat_functions(speed: Array, knots: Array) -> Array:
@@ -229,16 +231,42 @@ def _quarters(recording: CycleRecording, motion: Motion) -> tuple[NDArray[np.int
     return quarter, travel
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prior:
+    """``weights @ coefficients`` is expected within ``deviation`` of zero.
+
+    Attributes:
+        weights: shape (size,).
+        deviation: N m.
+        rows_alike: rows of data that count as one independent piece of evidence against it (0: a quarter cycle).
+    """
+
+    weights: Array
+    deviation: float
+    rows_alike: float
+
+
+def _priors(blocks: Blocks, knots: Array, level_nm: float, rows_alike: float) -> list[_Prior]:
+    bias = np.zeros(blocks.size)
+    bias[blocks.bias] = 1.0
+    # Misfit that lasts a pass looks like a bias, however many samples the pass has.
+    priors = [_Prior(bias, BIAS_PRIOR * level_nm, 0.0)]
+    fast = np.flatnonzero(knots >= 0.09 * knots[-1])
+    for k in fast[1:-1]:
+        before, after = knots[k] - knots[k - 1], knots[k + 1] - knots[k]
+        nearest = min(before, after)
+        bend = np.zeros(blocks.size)
+        bend[blocks.odd.start + k - 1] = nearest / before
+        bend[blocks.odd.start + k] = -nearest / before - nearest / after
+        bend[blocks.odd.start + k + 1] = nearest / after
+        priors.append(_Prior(bend, BEND_PRIOR * level_nm, rows_alike))
+    return priors
+
+
 def _solve(
-    x: Array,
-    targets: Array,
-    quarter: NDArray[np.int64],
-    blocks: Blocks,
-    knots: Array,
-    unobserved: Array,
-    bias_prior_nm: float,
-    where: str,
-) -> Fit:
+    x: Array, targets: Array, quarter: NDArray[np.int64], priors: list[_Prior], where: str
+) -> tuple[Array, Array, Array, float]:
+    """Coefficients, their covariance, those of the second target, and the rms of what remains of the first."""
     scale = np.linalg.norm(x, axis=0)
     scale[scale < 1e-9 * scale.max()] = np.inf  # a column of nothing (ripple filtered away) gets coefficient 0
     x = x / scale
@@ -249,39 +277,29 @@ def _solve(
     moment = np.array([x[a:b].T @ targets[a:b] for a, b in pairwise(bounds)])
     whole, right = gram.sum(axis=0), moment.sum(axis=0)
 
-    tiny = 1e-11 * np.eye(blocks.size)
+    left = whole + 1e-11 * np.eye(scale.size)
+    noise = float(np.mean((targets[:, 0] - x @ np.linalg.solve(left, right[:, 0])) ** 2))
+    added = np.zeros_like(left)
+    pulls = []
+    for prior in priors:
+        weight = noise * (prior.rows_alike or x.shape[0] / len(gram)) / prior.deviation**2
+        row = prior.weights / scale
+        added += weight * np.outer(row, row)
+        pulls.append(weight * prior.deviation * row)
+    left = left + added
     alive = np.isfinite(scale)
-    spectrum = np.linalg.eigvalsh(whole[np.ix_(alive, alive)])
-    if blocks.gravity is None and spectrum[0] < 1e-10 * spectrum[-1]:
-        raise _undetermined(where)
-    first = np.linalg.solve(whole + tiny, right[:, 0])
-    rest = targets[:, 0] - x @ first
-    # One independent piece of evidence per quarter cycle, not per sample.
-    weight = float(np.mean(rest**2)) * x.shape[0] / len(gram)
-    prior = tiny.copy()
-    prior[blocks.bias, blocks.bias] += weight / (bias_prior_nm * scale[blocks.bias]) ** 2
-    spectrum = np.linalg.eigvalsh((whole + prior)[np.ix_(alive, alive)])
+    spectrum = np.linalg.eigvalsh(left[np.ix_(alive, alive)])
     if spectrum[0] < 1e-10 * spectrum[-1]:
         raise _undetermined(where)
 
-    solution = np.linalg.solve(whole + prior, right)
-    without = np.linalg.solve(whole - gram + prior, (right - moment)[:, :, :1])[:, :, 0]
+    solution = np.linalg.solve(left, right)
+    without = np.linalg.solve(left - gram, (right - moment)[:, :, :1])[:, :, 0]
     spread = (without - without.mean(axis=0)) / scale
-    covariance = spread.T @ spread * (len(gram) - 1) / len(gram)
-    # What the prior pulled towards zero may have been as large as the prior allows.
-    unit = np.zeros(blocks.size)
-    unit[blocks.bias] = prior[blocks.bias, blocks.bias] * bias_prior_nm * scale[blocks.bias]
-    pulled = np.linalg.solve(whole + prior, unit) / scale
+    # What a prior pulled towards zero may have been as large as the prior allows.
+    pulled = np.linalg.solve(left, np.array(pulls).T) / scale[:, None]
+    covariance = spread.T @ spread * (len(gram) - 1) / len(gram) + pulled @ pulled.T
     rest = targets[:, 0] - x @ solution[:, 0]
-    return Fit(
-        blocks=blocks,
-        knots=knots,
-        values=solution[:, 0] / scale,
-        covariance=covariance + np.outer(pulled, pulled),
-        per_second_of_skew=-solution[:, 1] / scale,
-        unobserved=unobserved,
-        residual_rms_nm=float(np.sqrt(np.mean(rest**2))),
-    )
+    return solution[:, 0] / scale, covariance, solution[:, 1] / scale, float(np.sqrt(np.mean(rest**2)))
 
 
 def _undetermined(where: str) -> IdentificationError:
