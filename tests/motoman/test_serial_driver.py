@@ -203,6 +203,24 @@ def test_run_time_is_that_of_the_controllers_ticks() -> None:
     driver.close()
 
 
+def test_the_command_in_force_belongs_to_the_tick_of_the_report() -> None:
+    bench = make_bench()
+    driver, set_points = cycling(bench)
+    commanded: dict[int, float] = {}
+    seen = 0
+    for k in range(60):
+        driver.clock.wait_until(driver.clock.now_ns() + 4_000_000)
+        set_points[0].position_rad = START_RAD + 0.0005 * k
+        commanded[driver.clock.now_ns()] = set_points[0].position_rad
+        (report,) = driver.exchange(set_points)
+        if report.t_ns in commanded:
+            seen += 1
+            assert report.position_command_rad == pytest.approx(commanded[report.t_ns], abs=1e-5)
+            assert report.position_rad == pytest.approx(report.position_command_rad, abs=2e-5)
+    assert seen > 50
+    driver.close()
+
+
 def test_velocity_and_torque_come_in_joint_units_whatever_the_direction() -> None:
     for direction in (1, -1):
         driver = make_bench(direction=direction).driver()

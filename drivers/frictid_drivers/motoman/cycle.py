@@ -7,6 +7,7 @@ time t moves the arm at run time t, and the marks of a recording agree with its 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 
 from frictid_drivers.motoman.joint_units import AxisUnits
@@ -101,6 +102,8 @@ class StreamCycle:
         self._wanted: set[int] = set()
         self._locked: set[int] = set()
         self._last_tick = -1
+        self._under_way: deque[tuple[int, tuple[int, ...]]] = deque()
+        self._in_force: tuple[int, ...] | None = None
         order = [axis for axis in range(8) if welcome.axis_mask >> axis & 1]
         self._place = {k: order.index(units.axis) for k, units in enumerate(self._units) if units.axis in order}
         tick_s = welcome.tick_us * 1e-6
@@ -149,7 +152,8 @@ class StreamCycle:
         if self._wanted and not session.halted:
             self._aim(set_points, ticks=max(1, report.tick - self._last_tick) if self._last_tick >= 0 else 1)
             feed_forward = self._may_feed_forward and any(self._torques)
-            session.send(self._targets, self._torques if feed_forward else ())
+            due_tick = session.send(self._targets, self._torques if feed_forward else ())
+            self._under_way.append((due_tick, tuple(self._targets)))
         self._read(report)
         self._last_tick = report.tick
         return self._feedback
@@ -176,6 +180,8 @@ class StreamCycle:
     def _read(self, report: TickReport) -> None:
         fresh = report.tick != self._last_tick
         t_ns = self._clock.tick_ns(report.tick)
+        while self._under_way and self._under_way[0][0] <= report.tick:
+            self._in_force = self._under_way.popleft()[1]
         for k, feedback in enumerate(self._feedback):
             place = self._place.get(k)
             feedback.state = self._state(k, report)
@@ -191,6 +197,8 @@ class StreamCycle:
             feedback.position_rad = unit.position_rad(axis.pulses)
             feedback.velocity_rad_s = unit.velocity_rad_s(axis.speed_tenths)
             feedback.torque_nm = unit.torque_nm(axis.torque, self._torque_unit)
+            if self._in_force is not None:
+                feedback.position_command_rad = unit.position_rad(self._in_force[place])
             feedback.mode = Mode.POSITION
             feedback.age_cycles = 0
             feedback.valid = True

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_hil.errors import PlanRefused
-from frictid_hil.plan import Corners, Cycles, Hold, Motion, Move, Sine
+from frictid_hil.plan import Corners, Cycles, Hold, Motion, Move, Sine, WarmUp
 
 GUIDED = "guided"
 """Name of a ``Hold`` during which a person guides the joint by hand, the friction table in force."""
@@ -74,8 +74,11 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
         case Move():
             return [f"M:{ticks}:{units.pulses(motion.to_rad)}"]
         case Sine():
-            each = max(4, round(motion.duration_s / motion.repeats / tick_s))
-            return [":".join(["C", str(_travel(motion.amplitude_rad, units)), *[str(each)] * motion.repeats])]
+            return [_alike(motion.amplitude_rad, motion.duration_s / motion.repeats, motion.repeats, units, tick_s)]
+        case WarmUp():
+            # A job cannot end early: friction that has settled before is warmed on to the end.
+            repeats = round(motion.duration_s / motion.cycle_s)
+            return [_alike(motion.amplitude_rad, motion.cycle_s, repeats, units, tick_s)]
         case Cycles():
             boundaries = motion.procedure.cycle_starts_s / tick_s
             whole = np.round(boundaries).astype(np.int64)
@@ -94,6 +97,11 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
                 if count > 0
             ]
     raise PlanRefused(f"a serial controller in batch has no segment for the motion {motion.name!r}")
+
+
+def _alike(amplitude_rad: float, cycle_s: float, repeats: int, units: AxisUnits, tick_s: float) -> str:
+    each = max(4, round(cycle_s / tick_s))
+    return ":".join(["C", str(_travel(amplitude_rad, units)), *[str(each)] * repeats])
 
 
 def _travel(amplitude_rad: float, units: AxisUnits) -> int:

@@ -149,12 +149,13 @@ class StreamSession:
                 )
             self._collect(quiet_until_s - self._port.now_s())
 
-    def send(self, pulses: Sequence[int], torque: Sequence[int] = ()) -> None:
-        """Targets of all axes of the session, due ``lead_ticks`` after the report that they answer."""
+    def send(self, pulses: Sequence[int], torque: Sequence[int] = ()) -> int:
+        """Targets of all axes of the session, due ``lead_ticks`` after the report that they answer; the due tick."""
         assert self.report is not None and self.welcome is not None
         self._seq = (self._seq + 1) & 0xFFFF
         self._last_due = max(self._last_due + 1, self.report.tick + self._lead_ticks)
         self._write(encode_set_point(self._seq, self._session, self.welcome.axis_mask, self._last_due, pulses, torque))
+        return self._last_due
 
     def raise_if_stopped(self) -> None:
         """Raise what the controller has against going on; nothing where we asked it to stop ourselves.
