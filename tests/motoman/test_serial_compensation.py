@@ -1,0 +1,114 @@
+"""Friction compensated by a downloaded table on the controller's tick, against the same law from the host at 250 Hz.
+
+A simulated person swings the joint at 0.5 Hz, 20 deg to either side, in both cases; what counts is the torque that the
+person needs. Both laws see the joint once per 4 ms and hold their torque until the next tick.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from frictid_drivers.motoman import MotomanDriver
+from frictid_drivers.motoman.emulator.build import build
+from frictid_drivers.motoman.emulator.loopback import LoopbackPort
+from frictid_hil.config.robot import load_robot
+from frictid_hil.friction.compensation import Compensation, CompensationSettings
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.plan import Hold, JointPlan
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.servo_loop import ServoLoop
+
+pytestmark = pytest.mark.slow
+
+SETUP = load_robot("hp3j-serial").to_setup()
+SECONDS, SKIPPED_S, TICK_S = 8.0, 2.0, 0.004
+RATIO, SHARE_OF_PRESLIDING = 0.9, 0.9
+
+
+def model_of(joint: str) -> JointModel:
+    entry = SETUP.joint(joint)
+    return JointModel.from_mapping(
+        entry.simulated,
+        gear_ratio=entry.gear_ratio,
+        rated_torque_nm=entry.rated_torque_nm,
+        max_torque_nm=entry.max_torque_nm,
+    )
+
+
+def curve_of(model: JointModel) -> FrictionCurve:
+    speed = 0.932 * np.arange(1, 11) * math.radians(11.5)
+    return FrictionCurve.through(speed, model.true_curve_nm(speed))
+
+
+def effort(external_nm: list[float]) -> float:
+    """F_s of (25) once the swing has settled."""
+    return math.sqrt(float(np.mean(np.square(external_nm[round(SKIPPED_S / TICK_S) :]))))
+
+
+def by_table(joint: str, ratio: float) -> float:
+    emulator = build(SETUP)
+    driver = MotomanDriver(SETUP, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
+    model, entry = model_of(joint), SETUP.joint(joint)
+    axis = emulator.axes[entry.address]
+    felt: list[float] = []
+    run = axis.run
+
+    def feel(duration_s: float) -> None:
+        run(duration_s)
+        if axis.floating:
+            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]
+
+    axis.run = feel  # type: ignore[method-assign]
+    driver.open()
+    driver.download_table(
+        joint,
+        curve_of(model),
+        ratio=ratio,
+        stiffness_nm_per_rad=SHARE_OF_PRESLIDING * model.presliding_stiffness_nm_per_rad,
+        gravity_cos_nm=model.gravity_cos_nm,
+        gravity_sin_nm=model.gravity_sin_nm,
+    )
+    driver.compensate_by_table([joint])
+    at = entry.locked_position_rad
+    driver.run_batch(JointPlan(joint, (Hold(at, 0.1), Hold(at, SECONDS, name="guided"), Hold(at, 0.1)), {}))
+    driver.close()
+    assert len(felt) == pytest.approx(SECONDS / TICK_S, abs=2)
+    return effort(felt)
+
+
+def by_host(joint: str, ratio: float) -> float:
+    """The law of the host on torque mode, one exchange per tick, applied from the same tick on."""
+    model, entry = model_of(joint), SETUP.joint(joint)
+    at = entry.locked_position_rad
+    loop = ServoLoop(model, period_s=0.001, seed=3, position_rad=at)
+    loop.power(True)
+    loop.brake(False)
+    loop.advance(0.1, position_rad=at)
+    loop.set_mode(10)
+    loop.hold_hand(model.hand, centre_rad=at, amplitude_rad=0.349, frequency_hz=0.5)
+    stiffness = SHARE_OF_PRESLIDING * model.presliding_stiffness_nm_per_rad
+    settings = CompensationSettings.of(curve_of(model), "mop", stiffness_nm_per_rad=stiffness, ratio=ratio)
+    friction = Compensation(settings, TICK_S)
+    felt: list[float] = []
+    before = loop.measured_position_rad
+    for _ in range(round(SECONDS / TICK_S)):
+        here = loop.measured_position_rad
+        gravity = model.gravity_cos_nm * math.cos(here) + model.gravity_sin_nm * math.sin(here)
+        torque = gravity + friction.step(here - before, loop.velocity_rad_s)
+        before = here
+        loop.advance(TICK_S, torque_nm=torque)
+        felt.append(loop.external_torque_nm)
+    return effort(felt)
+
+
+@pytest.mark.parametrize("joint", ["0", "1", "4"])
+def test_the_table_does_what_the_host_does_within_three_points(joint: str) -> None:
+    reductions = {}
+    for name, swing in (("table", by_table), ("host", by_host)):
+        reductions[name] = 100 * (1 - swing(joint, RATIO) / swing(joint, 0.0))
+    print(f"joint {joint}: " + ", ".join(f"{name} {points:.1f} %" for name, points in reductions.items()))
+    assert reductions["host"] > 30
+    assert reductions["table"] == pytest.approx(reductions["host"], abs=3.0)
