@@ -21,6 +21,7 @@ from frictid_hil.gap.blind.figures import Log, believed_motion, figures, record,
 from frictid_hil.gap.blind.joints import Joint, changed, draw_joint, nominal_mapping
 from frictid_hil.gap.blind.outsiders import OUTSIDERS
 from frictid_hil.gap.blind.plant import TICK_S, Physics
+from frictid_hil.gap.experiments import FULL
 
 ALIASES = (
     ("torque_bias", "direction_asymmetry"),
@@ -85,7 +86,7 @@ def assignments(cases: int, seed: int) -> tuple[Assignment, ...]:
     return tuple(result)
 
 
-def draw_case(index: int, seed: int, assignment: Assignment) -> Case:
+def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[str, ...] = FULL) -> Case:
     """The case at an index; the same from the same arguments, whatever else is drawn.
 
     A joint that its controller cannot hold with the effects on is drawn anew.
@@ -93,7 +94,7 @@ def draw_case(index: int, seed: int, assignment: Assignment) -> Case:
     for attempt in range(50):
         rng = np.random.default_rng([seed, 202, index, attempt])
         noise_seed = [seed, 303, index, attempt]
-        joint = draw_joint(rng)
+        joint = draw_joint(rng, experiments)
         ideal = record(joint, joint.physics, noise_seed)
         if not _held(ideal):
             continue
@@ -158,10 +159,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--experiments", nargs="+", default=FULL, help="names of the catalogue")
     arguments = parser.parse_args()
     (arguments.out / "truth").mkdir(parents=True, exist_ok=True)
     for index, assignment in enumerate(assignments(arguments.cases, arguments.seed)):
-        case = draw_case(index, arguments.seed, assignment)
+        case = draw_case(index, arguments.seed, assignment, tuple(arguments.experiments))
         write_case(case, arguments.out / "cases" / case.name)
         (arguments.out / "truth" / f"{case.name}.yaml").write_text(truth_text(case.truth))
         print(case.name, flush=True)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.blind.plant import TICK_S, Controller, Physics
-from frictid_hil.gap.experiments import Envelope, Experiment, full_set
+from frictid_hil.gap.experiments import FULL, Envelope, Experiment, chosen
 
 TOLERANCE = 0.008
 PAIRS = 8
@@ -92,8 +92,8 @@ def base_friction(physics: Physics, speed: float) -> float:
     return physics.coulomb + physics.viscous_low * low + physics.viscous_high * (speed - low)
 
 
-def draw_joint(rng: np.random.Generator) -> Joint:
-    """A joint of random size."""
+def draw_joint(rng: np.random.Generator, experiments: tuple[str, ...] = FULL) -> Joint:
+    """A joint of random size, and the experiments that it is put through."""
     inertia = log_uniform(rng, 0.02, 5.0)
     share = rng.uniform(0.2, 0.55)
     gear_ratio = float(rng.choice([50, 51, 60, 80, 81, 100, 101, 120, 121, 160, 161, 200]))
@@ -131,6 +131,9 @@ def draw_joint(rng: np.random.Generator) -> Joint:
         velocity_rad_s=speed,
         triangle_velocity_rad_s=rng.uniform(0.09, 0.115),
     )
+    # The second posture a quarter of a turn away, towards the side with more room.
+    centre = envelope.centre_rad
+    envelope = replace(envelope, second_centre_rad=centre - math.copysign(math.pi / 2, centre))
     return Joint(
         physics=_with_traces(rng, physics, NOISE_LEFT * noise),
         payload=payload,
@@ -141,7 +144,7 @@ def draw_joint(rng: np.random.Generator) -> Joint:
         rated_torque_nm=rated,
         torque_noise_nm=noise,
         torque_quantum_nm=0.001 * rated,
-        experiments=full_set(envelope, seed=int(rng.integers(2**31))),
+        experiments=chosen(experiments, envelope, seed=int(rng.integers(2**31))),
     )
 
 
