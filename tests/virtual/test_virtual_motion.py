@@ -77,6 +77,10 @@ class TestPosition:
         desk.wait(50)
         assert desk.read(0x6064) == 0
 
+    def test_demand_is_where_the_joint_is_while_off(self, desk):
+        desk.plant.measured_position_rad = 0.5
+        assert desk.read(0x6062) == desk.read(0x6064) == 79_577 and desk.read(0x60F4) == 0
+
     def test_following_error_after_its_timeout(self, desk):
         desk.write(0x6065, 0, 1000, 4)
         desk.write(0x6066, 0, 20, 2)

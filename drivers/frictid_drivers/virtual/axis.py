@@ -101,6 +101,8 @@ class Axis:
 
     Attributes:
         now_ns: run time that the plant has reached.
+        powered: current may flow.
+        mode: 8, 9, 10, or 0 for none.
         alarm: EMCY code of what supervision found, 0 for nothing; the node clears it.
         ramping: decelerating to standstill.
         internal_limit: a set-point was cut by a limit (statusword bit 11).
@@ -169,11 +171,6 @@ class Axis:
         self._own_inertia_kg_m2 = number[key(0x2021, 2)] * 1e-6 * self._gear_ratio**2
         self._own_anything = bool(self._own_coulomb_nm or self._own_viscous or self._own_inertia_kg_m2)
         self._plant.limits(self._torque_limit_nm)
-
-    @property
-    def interpolation_ns(self) -> int:
-        """60C2h as time."""
-        return self._interpolation_ns
 
     # -- power ---------------------------------------------------------------------------------------------------------
 
@@ -419,7 +416,7 @@ class Axis:
         step = self._torque_step
         values[_K6077] = _clipped(torque_nm / (self._nm_per_mille * step), _I16 // step) * step
         values[_K6074] = _clipped((self._torque_nm + self._offset_nm) / self._nm_per_mille, _I16)
-        demand = _clipped(self._position_rad / self._rad_per_unit, _I32)
+        demand = _clipped(self._position_rad / self._rad_per_unit, _I32) if self.powered else values[_K6064]
         values[_K6062] = demand
         values[_K60F4] = _clipped(demand - values[_K6064], _I32)
         values[_K2030] = _clipped(plant.external_torque_nm * 1000.0, _I32)
