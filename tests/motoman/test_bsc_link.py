@@ -63,8 +63,11 @@ def test_golden_exchange_as_controller() -> None:
         def say(self, kind: str, data: bytes) -> None:
             said.append(data.hex(" "))
 
-        def hears_enq(self) -> bool:
-            return False
+        def hears_enq(self) -> str:
+            return ""
+
+        def delivered(self, arrived: bool) -> None:
+            assert arrived
 
         def doubts_block(self) -> bool:
             return False
@@ -234,8 +237,11 @@ class Pair:
     def say(self, kind: str, data: bytes) -> None:
         self.to_host += data
 
-    def hears_enq(self) -> bool:
-        return False
+    def hears_enq(self) -> str:
+        return ""
+
+    def delivered(self, arrived: bool) -> None:
+        pass
 
     def doubts_block(self) -> bool:
         return False

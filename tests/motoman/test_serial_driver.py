@@ -248,6 +248,26 @@ def test_states_follow_enable_disable_and_quick_stop() -> None:
     assert not bench.still_moving()
 
 
+def test_servo_power_goes_off_only_once_the_arm_stands() -> None:
+    bench = make_bench()
+    driver, set_points = cycling(bench)
+    for k in range(30):
+        set_points[0].position_rad = START_RAD + 0.004 * k
+        turn(driver, set_points, 1)
+    moving_when_cut: list[bool] = []
+    power = bench.emulator.panel.power
+
+    def cut(on: bool) -> None:
+        assert bench.emulator.stream is not None
+        moving_when_cut.append(bench.emulator.stream.moving)
+        power(on)
+
+    bench.emulator.panel.power = cut  # type: ignore[method-assign]
+    driver.close()
+    assert moving_when_cut == [False]
+    assert not bench.emulator.panel.servo_on
+
+
 def test_a_locked_joint_ignores_its_set_point() -> None:
     bench = make_bench(axes=2)
     driver, set_points = cycling(bench)

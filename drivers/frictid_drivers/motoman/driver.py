@@ -18,6 +18,7 @@ from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_drivers.motoman.joint_units import axis_units
 from frictid_drivers.motoman.layers import Layer, Line, Reach, find_layer, streamed_mask
 from frictid_drivers.motoman.port import BytePort, SerialPort
+from frictid_drivers.motoman.power import ServoPower
 from frictid_drivers.motoman.settings import serial_options
 from frictid_drivers.motoman.table import friction_table
 from frictid_hil.driver import (
@@ -41,7 +42,6 @@ _SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
 """Marks portions of serial bytes in a bus log; no CAN drive uses this identifier."""
 _LOGGED_BYTES = 64
 
-_POWER_S = 5.0
 _SERVO_LAG_S = 0.02
 _URGENT_S = 0.5
 
@@ -98,6 +98,7 @@ class MotomanDriver:
             )
             self._line = Line(port, host, options, parity, self._tick_us, self._log)
             self._batch = BatchClient(host, port.now_s)
+            self._power = ServoPower(host, port.now_s)
             host.status()
             self._reach = find_layer(self._line, self._batch, options, self._mask(self._units))
         except BaseException:
@@ -193,7 +194,7 @@ class MotomanDriver:
             raise HardwareError("this controller does not stream", next_step="use run_batch")
         active = self._mask(self._active or self._units)
         mask = streamed_mask(self._mask(self._units), active, self._options.stream_baud, welcome.tick_us)
-        self._servo_on()
+        self._power.on()
         pulses = line.host.pulses()
         session = line.begin_stream(mask)
         self._cycle = StreamCycle(
@@ -239,7 +240,7 @@ class MotomanDriver:
         line = self._open_line()
         self.clock.release()
         line.end_stream(cycle.session)
-        line.host.servo(False)
+        self._power.off()
 
     def quick_stop(self) -> None:
         """Stop. A stream is told without waiting; a job by host control, whose handshake may take half a second.
@@ -265,8 +266,8 @@ class MotomanDriver:
                 line.end_stream(cycle.session)
             if job is not None and job.running and self._batch is not None:
                 self._batch.stop(job.number, within_s=_URGENT_S)
-            if cycle is not None or job is not None:
-                line.host.order("SVON 0", within_s=2 * _URGENT_S)
+            if self._power.ours:
+                self._power.off(urgent=True)
         except FrictidError:
             # The line itself failed; the controller's watchdog stops the arm.
             return
@@ -302,6 +303,8 @@ class MotomanDriver:
         line, batch, reach = self._open_line(), self._batch, self._reach
         if batch is None or reach.batch is None:
             raise HardwareError("this controller has no batch application", next_step="see `frictid-hil check`")
+        if reach.batch.tick_us != self._tick_us:
+            raise PlanRefused(f"the controller ticks every {reach.batch.tick_us} us, the plan every {self._tick_us} us")
         low_rad, high_rad, torque_nm = self._limits[plan.joint]
         self._job_number = self._job_number % 65535 + 1
         self._job = BatchRun(
@@ -314,10 +317,10 @@ class MotomanDriver:
             self._job_number,
         )
         try:
-            self._job.run(plan, self._servo_on, stop, progress)
+            self._job.run(plan, self._power.on, stop, progress)
         finally:
             self.batch_columns = self._job.columns
-        line.host.servo(False)
+        self._power.off()
         return self.batch_columns
 
     def download_table(
@@ -357,26 +360,6 @@ class MotomanDriver:
         self._batch.compensate(self._mask(joints))
 
     # -- inside ------------------------------------------------------------------------------------------------
-
-    def _servo_on(self) -> None:
-        """Release a command hold that was left behind, then servo power, and see that it is on."""
-        host = self._open_line().host
-        status = host.status()
-        if "command hold" in status.conditions:
-            host.hold(False)
-        if not status.servo_on:
-            host.servo(True)
-            self._await_power(host)
-
-    def _await_power(self, host: HostControl) -> None:
-        until_s = self._open_line().port.now_s() + _POWER_S
-        while not host.status().servo_on:
-            if self._open_line().port.now_s() > until_s:
-                raise HardwareError(
-                    f"servo power is not on {_POWER_S:g} s after it was ordered",
-                    where="controller",
-                    next_step="look at the pendant: safety circuit, e-stops, alarms",
-                )
 
     def _command_delay_s(self) -> float:
         """Queue, averaging and servo; where the controller does not know its averaging, what the robot file allows."""

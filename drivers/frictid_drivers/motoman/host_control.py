@@ -132,9 +132,9 @@ class HostControl:
         figures = self._figures("RSTATS", 2)
         return decode_status(self._profile, *figures)
 
-    def pulses(self) -> list[int]:
+    def pulses(self, *, within_s: float | None = None) -> list[int]:
         """RPOSJ: the joints' positions in pulses; axes that the robot lacks read 0."""
-        return self._figures("RPOSJ", 12)
+        return self._figures("RPOSJ", 12, within_s)
 
     def servo(self, on: bool) -> None:
         """SVON."""
@@ -165,24 +165,27 @@ class HostControl:
         if reply.header != _RESULT:
             raise self.bad_reply(f"{reply.header} {reply.text!r} instead of a result", text)
 
-    def ask(self, text: str, on_text: Callable[[str, int], None] | None = None) -> str:
+    def ask(
+        self, text: str, on_text: Callable[[str, int], None] | None = None, *, within_s: float | None = None
+    ) -> str:
         """A command that is answered by data.
 
         Args:
             text: the command.
             on_text: told of every block of the reply as it comes (text, index), also when the rest never comes.
+            within_s: give up after this time instead of the link's own.
 
         Raises:
             ControllerError: the controller refused it.
             LinkError: no answer, or a broken one.
         """
-        reply = self._exchange(text, on_text)
+        reply = self._exchange(text, on_text, within_s=within_s)
         if reply.header != _DATA:
             raise self.bad_reply(f"{reply.header} {reply.text!r} instead of data", text)
         return reply.text
 
-    def _figures(self, command: str, count: int) -> list[int]:
-        reply = self.ask(command)
+    def _figures(self, command: str, count: int, within_s: float | None = None) -> list[int]:
+        reply = self.ask(command, within_s=within_s)
         try:
             figures = [int(part.strip()) for part in reply.split(",")]
         except ValueError:

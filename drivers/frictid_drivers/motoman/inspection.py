@@ -23,22 +23,22 @@ def identity(joint: JointSetup, units: AxisUnits, options: SerialOptions, reach:
         "layer": reach.layer.value,
         "pulses_per_degree": abs(units.pulses_per_rad) / degrees(1.0),
     }
-    measured, averaging, firmware, unit = False, None, "", 0
-    if reach.welcome is not None:
-        measured, averaging, unit = reach.welcome.torque_measured, reach.welcome.averaging_ms, reach.welcome.torque_unit
-        settings["tick_us"] = reach.welcome.tick_us
+    averaging, unit = None, 0
     if reach.batch is not None:
-        measured, averaging = reach.batch.torque_measured, reach.batch.averaging_ms
-        firmware = reach.batch.name
+        averaging = reach.batch.averaging_ms
         settings["tick_us"] = reach.batch.tick_us
+    if reach.welcome is not None:
+        averaging, unit = reach.welcome.averaging_ms, reach.welcome.torque_unit
+        settings["tick_us"] = reach.welcome.tick_us
     if averaging is not None:
         settings["command_averaging_ms"] = averaging
     source = ""
     if reach.layer is not Layer.HOST:
-        source = "controller application, " + ("measured" if measured else "commanded") + " at the motor shaft"
+        what = "measured" if _measures_torque(reach) else "commanded"
+        source = f"controller application, {what} at the motor shaft"
     return JointIdentity(
         joint=joint.name,
-        firmware=firmware,
+        firmware=reach.batch.name if reach.batch is not None else "",
         product=f"MOTOMAN-class controller, {options.controller.upper()} generation, axis {units.axis}",
         rated_torque_nm=joint.rated_torque_nm,
         gear_ratio=joint.gear_ratio,
@@ -127,6 +127,9 @@ def _of_layers(setup: RobotSetup, options: SerialOptions, reach: Reach) -> list[
     if ticks - {wanted}:
         message = f"the controller ticks every {max(ticks)} us, the robot file says every {wanted} us"
         found.append(Finding(Severity.ERROR, "rate", message, f"set `cycle_hz` to {1e6 / max(ticks):g}"))
+    if reach.layer is not Layer.HOST and not _measures_torque(reach):
+        message = "the controller application reports commanded torque, which the controller's own delays shift"
+        found.append(Finding(Severity.WARNING, "torque", message, "measure it, or declare its delay"))
     averaging = reach.welcome.averaging_ms if reach.welcome else reach.batch.averaging_ms if reach.batch else 0
     if averaging is None:
         found.append(
@@ -142,6 +145,12 @@ def _of_layers(setup: RobotSetup, options: SerialOptions, reach: Reach) -> list[
     if options.layer == "auto" and reach.layer is Layer.BATCH:
         found.append(Finding(Severity.OK, "transfer", "a joint's recording takes about half a minute at 19200 baud"))
     return found
+
+
+def _measures_torque(reach: Reach) -> bool:
+    if reach.layer is Layer.STREAM:
+        return reach.welcome is not None and reach.welcome.torque_measured
+    return reach.batch is not None and reach.batch.torque_measured
 
 
 def _of_positions(setup: RobotSetup, units: Mapping[str, AxisUnits], reach: Reach, host: HostControl) -> list[Finding]:

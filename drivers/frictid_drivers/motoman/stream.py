@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-from frictid_drivers.motoman.controller_errors import LinkError
+from frictid_drivers.motoman.controller_errors import BadReply, LinkError
 from frictid_drivers.motoman.host_control import ControllerProfile, decode_status
 from frictid_drivers.motoman.port import BytePort
 from frictid_drivers.motoman.stream_frames import (
@@ -108,6 +108,7 @@ class StreamSession:
 
         Raises:
             LinkError: it does not.
+            HardwareError: it answers something that we cannot work with.
         """
         self._session = session
         until_s = self._port.now_s() + _HELLO_FOR_S
@@ -120,6 +121,7 @@ class StreamSession:
                 self._raise_error()
                 welcome = self.welcome
                 if welcome is not None and welcome.session == session:
+                    self._check_welcome(welcome, axis_mask)
                     return welcome
         raise LinkError(
             f"no HELLO within {_HELLO_FOR_S:g} s after streaming was granted",
@@ -127,6 +129,16 @@ class StreamSession:
             cause="the port does not follow to the stream's speed",
             next_step="check `options.stream_baud` against what adapter and gateway can do",
         )
+
+    def _check_welcome(self, welcome: Welcome, axis_mask: int) -> None:
+        if welcome.axis_mask != axis_mask:
+            raise BadReply(f"asked for axes {axis_mask:#x}, granted {welcome.axis_mask:#x}", where="HELLO")
+        if welcome.queue_limit < self._lead_ticks:
+            raise HardwareError(
+                f"the controller queues {welcome.queue_limit} ticks, the robot file wants {self._lead_ticks}",
+                where="HELLO",
+                next_step="lower `options.lead_ticks`",
+            )
 
     def wait_for_tick(self, tick: int) -> TickReport:
         """The first report of this tick or a later one; of a later one also where too many wait to be answered.

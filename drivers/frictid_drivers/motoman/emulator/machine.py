@@ -287,7 +287,7 @@ class Emulator:
     def _switch_to_host_control(self) -> None:
         self.line = (self.settings.baud, self.settings.parity)
         self._on_stream_line = False
-        self.panel.operating = False
+        self.panel.operating = self.stream is not None and self.stream.moving
         self.station.reset(self.now_s)
 
     # -- the voice of the station and of the stream ------------------------------------------------------------
