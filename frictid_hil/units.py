@@ -93,7 +93,9 @@ def format_torque(torque_nm: float) -> str:
 
 
 def format_duration(duration_s: float) -> str:
-    """A duration as a person reads it: ``96.0 s``, ``2 min 05 s``."""
+    """A duration as a person reads it: ``96.0 s``, ``2 min 05 s``, ``until interrupted``."""
+    if math.isinf(duration_s):
+        return "until interrupted"
     if duration_s < 120:
         return f"{duration_s:.1f} s"
     minutes, seconds = divmod(round(duration_s), 60)

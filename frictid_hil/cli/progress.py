@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 
@@ -138,7 +139,9 @@ class TerminalWatcher:
             )
             self._progress.start()
             for joint, planned_s in self._planned.items():
-                self._tasks[joint] = self._progress.add_task(joint, total=planned_s, phase="waiting")
+                self._tasks[joint] = self._progress.add_task(
+                    joint, total=planned_s if math.isfinite(planned_s) else None, phase="waiting"
+                )
         task = self._tasks.get(event.joint)
         if task is not None:
             self._progress.update(task, completed=self._done_s[event.joint], phase=event.phase)

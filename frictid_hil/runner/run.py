@@ -79,7 +79,8 @@ def run_plan(
         notify: told what happens.
         proceed: asked once, after the preflight and before anything moves.
         care: bounds.
-        prepare: called with a lock-step driver before it is opened (simulated hands, payloads).
+        prepare: called with the driver before it is opened, for what only a simulated robot can do (hands, payloads);
+            on the wall clock with a twin of the driver, since the one that runs is in another process.
 
     Returns:
         Rows that were lost because files were written too slowly (0 in a healthy run).
@@ -105,10 +106,11 @@ def run_plan(
         drain()
         notify(event)
 
+    if prepare is not None:
+        prepare(driver)
     with Interrupts() as interrupts:
         try:
             if own_process:
-                del driver
                 run_in_own_process(
                     driver_name,
                     setup,
@@ -121,8 +123,6 @@ def run_plan(
                     care=care,
                 )
             else:
-                if prepare is not None:
-                    prepare(driver)
                 Scheduler(
                     driver,
                     setup,

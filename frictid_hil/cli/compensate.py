@@ -1,0 +1,140 @@
+"""``compensate``: friction compensation live on the bus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from frictid_hil.cli.output import BusOption, JsonOption, Output, QuietOption, Result, RobotOption, YesOption, quantity
+from frictid_hil.driver import Mode
+from frictid_hil.errors import UsageError
+from frictid_hil.units import degrees
+
+_DRIVE_MODES = {"torque": Mode.TORQUE, "position": Mode.POSITION, "velocity": Mode.VELOCITY}
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's verbs."""
+    app.command("compensate")(compensate)
+
+
+def _duration(text: str) -> float:
+    return 0.0 if text.strip() == "0" else quantity("duration")(text)
+
+
+_duration.__name__ = "DURATION"
+
+
+def compensate(
+    robot: RobotOption,
+    profile: Annotated[Path, typer.Option("--profile", "-p", help="Profile, or a run folder that holds one.")],
+    joint: Annotated[str, typer.Option("--joint", "-j", help="The joint.")],
+    task: Annotated[
+        str, typer.Option("--task", help="hand (a person guides the joint), track (a triangle under a weak PD).")
+    ],
+    mode: Annotated[
+        str | None,
+        typer.Option("--mode", help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task."),
+    ] = None,
+    setting: Annotated[str, typer.Option("--setting", help="ours, or paper (R = 0.9, K = 10000 N m/rad).")] = "ours",
+    ratio: Annotated[float | None, typer.Option("--compensation-ratio", help="R, below 1.")] = None,
+    stiffness: Annotated[
+        float | None, typer.Option("--stiffness", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
+    ] = None,
+    viscosity: Annotated[
+        float | None,
+        typer.Option("--viscosity", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0),
+    ] = None,
+    speed: Annotated[
+        float | None, typer.Option("--speed", parser=quantity("angular velocity"), help="Peak speed of the task.")
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", parser=_duration, help="Of each mode, 10s unless told; 0 runs until interrupted."),
+    ] = None,
+    centre: Annotated[
+        float | None, typer.Option("--centre", parser=quantity("angle"), help="Middle of the travel.")
+    ] = None,
+    drive_mode: Annotated[
+        str, typer.Option("--drive-mode", help="torque; position or velocity with the torque as offset (60B2).")
+    ] = "torque",
+    force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
+    bus: BusOption = None,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write to.")] = None,
+    yes: YesOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
+    from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.jobs.compensate import CompensateOptions
+    from frictid_hil.jobs.compensate import compensate as job
+
+    output = Output(as_json, quiet)
+    watcher = TerminalWatcher(output, yes=yes)
+
+    def run() -> Result:
+        if drive_mode not in _DRIVE_MODES:
+            raise UsageError(f"no drive mode {drive_mode!r}; there are {', '.join(_DRIVE_MODES)}")
+        options = CompensateOptions(
+            robot=robot,
+            profile=profile,
+            joint=joint,
+            task=task,
+            modes=tuple(part.strip() for part in mode.split(",")) if mode else (),
+            setting=setting,
+            ratio=ratio,
+            stiffness_nm_per_rad=stiffness,
+            viscous_nm_s_per_rad=viscosity,
+            speed_rad_s=speed,
+            duration_s=10.0 if duration is None else duration,
+            centre_rad=centre,
+            drive_mode=_DRIVE_MODES[drive_mode],
+            force=force,
+            bus=bus,
+            realtime=realtime,
+            seed=seed,
+            out=out,
+        )
+        try:
+            return job(options, watcher, live=watcher.note)
+        finally:
+            watcher.close()
+
+    output.run("compensate", run, lambda result: _show(output, result))
+
+
+def _show(output: Output, result: Result) -> None:
+    table = Table(title=f"Joint {result['joint']} of {result['robot']}: {result['task']}, setting {result['setting']}")
+    for heading in ("mode", "V_s", "F_s", "less", "inertia removed", "less", "ceiling", "E_s"):
+        table.add_column(heading)
+    for name, figures in result["modes"].items():
+        table.add_row(name, *_row(figures, track=result["task"] == "track"))
+    output.out.print(table)
+    for warning in result["warnings"]:
+        output.out.print(f"note: {warning}", soft_wrap=True, markup=False)
+    for key in ("run", "report"):
+        if result.get(key):
+            output.out.print(f"{key}: {result[key]}", soft_wrap=True, markup=False)
+
+
+def _row(figures: dict[str, Any], *, track: bool) -> tuple[str, ...]:
+    def number(key: str, unit: str, scale: float = 1.0) -> str:
+        value = figures.get(key)
+        return "" if value is None else f"{value * scale:.4g} {unit}"
+
+    less = number("reduction_percent", "%")
+    return (
+        number("velocity_rms_rad_s", "deg/s", degrees(1.0)),
+        number("torque_rms_nm", "N m"),
+        less,
+        number("torque_rms_inertia_removed_nm", "N m"),
+        number("reduction_inertia_removed_percent", "%"),
+        number("ceiling_percent", "%"),
+        number("tracking_rms_rad", "deg", degrees(1.0)) if track else "",
+    )

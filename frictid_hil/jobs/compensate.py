@@ -1,0 +1,444 @@
+"""``frictid-hil compensate``: a profile put to work on the bus, mode by mode, and what each mode reached.
+
+The order is that of every run: profile and plan checked, drives read and compared with the profile, a person asked, the
+joint probed in position control, and only then given its compensation (section 5 of the paper).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.control import Compensated
+from frictid_hil.driver import Driver, Mode, RobotSetup
+from frictid_hil.errors import FrictidError, UsageError
+from frictid_hil.jobs.compensation_figures import ModeRun, figures, mode_run
+from frictid_hil.jobs.compensation_plan import MODES, CompensationPlan, Wanted, compensation_plan
+from frictid_hil.jobs.plans import expected_of
+from frictid_hil.jobs.profile_fit import doubts_of_drive, doubts_of_file, refuse
+from frictid_hil.jobs.watch import Watcher
+from frictid_hil.plan import refuse_beyond_limits
+from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.report.compensation import compensation_page
+from frictid_hil.report.pages import write_page
+from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
+from frictid_hil.runner.ring import Rows
+from frictid_hil.runner.run import run_plan
+from frictid_hil.runner.run_folder import RowKeeper, RunFolder
+from frictid_hil.units import degrees
+
+VERB = "compensate"
+_LIVE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class CompensateOptions:
+    """What a person asked for.
+
+    Attributes:
+        robot: robot file, by path or name.
+        profile: file, or a run folder that holds one.
+        joint: name.
+        task: ``hand`` or ``track``.
+        modes: () for all that the task has.
+        setting: ``ours`` or ``paper``.
+        ratio: R instead of the setting's.
+        stiffness_nm_per_rad: K instead of the setting's.
+        viscous_nm_s_per_rad: B_c of ``mol`` instead of the least-squares one.
+        speed_rad_s: peak speed of the task.
+        duration_s: of each mode; 0 for one mode until interrupted.
+        centre_rad: middle of the travel.
+        drive_mode: how the torque reaches the drive.
+        force: use a doubtful profile all the same.
+        bus: ``interface:channel``.
+        realtime: wall clock for the virtual robot.
+        seed: of simulated noise.
+        out: run folder to write.
+    """
+
+    robot: str
+    profile: Path
+    joint: str
+    task: str
+    modes: tuple[str, ...] = ()
+    setting: str = "ours"
+    ratio: float | None = None
+    stiffness_nm_per_rad: float | None = None
+    viscous_nm_s_per_rad: float | None = None
+    speed_rad_s: float | None = None
+    duration_s: float = 10.0
+    centre_rad: float | None = None
+    drive_mode: Mode = Mode.TORQUE
+    force: bool = False
+    bus: str | None = None
+    realtime: bool = False
+    seed: int = 0
+    out: Path | None = None
+
+
+@runtime_checkable
+class GuidedBySimulation(Protocol):
+    """A driver whose robot has a simulated person."""
+
+    def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
+        """Guide the joint along centre + amplitude sin(2 pi f t) from now; frequency 0 lets go."""
+        ...
+
+
+Live = Callable[[str], None]
+"""Told a line of figures twice a second while a service runs."""
+
+
+@dataclass(slots=True)
+class _Progress:
+    """What a run has come to, so that an error halfway loses nothing."""
+
+    marks: list[Mark] = field(default_factory=list)
+    runs: dict[str, ModeRun] = field(default_factory=dict)
+    run: JointRun | None = None
+    ended: FrictidError | None = None
+
+
+def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> dict[str, Any]:
+    """Check, plan, ask, probe, compensate, compare.
+
+    Raises:
+        UsageError: refused before anything moved (arguments, files, limits, another drive's profile, the person said
+            no), or by the probe.
+        HardwareError: hardware unreachable.
+
+    Returns:
+        The JSON of the verb. A safety abort or an interruption after motion began is an outcome, not an exception.
+    """
+    robot = load_robot(options.robot)
+    robot.check_joints([options.joint])
+    driver_name = robot.driver(options.bus)
+    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    profile = load_profile(_profile_path(options.profile))
+    wanted = _wanted(options, simulated=driver_name == "virtual")
+    doubts = doubts_of_file(profile, setup.joint(options.joint), robot.name, robot.policy)
+    if not options.force:
+        refuse(doubts, options.joint)
+    entry = profile.joint(options.joint)
+    planned = compensation_plan(robot.name, setup, options.joint, entry, robot.policy, wanted)
+    if options.force:
+        forced = tuple(f"forced in spite of: {doubt}" for doubt in doubts)
+        planned = replace(planned, plan=replace(planned.plan, notes=(*planned.plan.notes, *forced)))
+    refuse_beyond_limits(planned.plan, setup, expected_of(robot))
+    _refuse_without_hand(setup, driver_name, options)
+    watcher.plan(planned.plan, setup)
+    folder = RunFolder.create(robot, VERB, options.out)
+    progress = _run(robot, setup, planned, profile, folder, options, wanted, watcher, live)
+    return _finish(robot, setup, folder, options, wanted, planned, entry, progress)
+
+
+def _wanted(options: CompensateOptions, *, simulated: bool) -> Wanted:
+    endless = options.duration_s == 0.0
+    if options.duration_s < 0.0:
+        raise UsageError("the duration must not be negative")
+    modes = options.modes
+    if not modes and options.task == "hand":
+        modes = ("mop",) if endless else MODES[:4]
+    return Wanted(
+        task=options.task,
+        modes=modes or MODES,
+        setting=options.setting,
+        ratio=options.ratio,
+        stiffness_nm_per_rad=options.stiffness_nm_per_rad,
+        viscous_nm_s_per_rad=options.viscous_nm_s_per_rad,
+        speed_rad_s=options.speed_rad_s,
+        duration_s=math.inf if endless else options.duration_s,
+        centre_rad=options.centre_rad,
+        drive_mode=options.drive_mode,
+        force=options.force,
+        simulated=simulated,
+    )
+
+
+def _run(
+    robot: Robot,
+    setup: RobotSetup,
+    planned: CompensationPlan,
+    profile: FrictionProfile,
+    folder: RunFolder,
+    options: CompensateOptions,
+    wanted: Wanted,
+    watcher: Watcher,
+    live: Live | None,
+) -> _Progress:
+    progress = _Progress()
+    joint = options.joint
+    entry = profile.joint(joint)
+    hand = _Hand(joint, planned.centre_rad, wanted, watcher)
+    begun = False
+
+    def proceed(preflight: Preflight) -> bool:
+        doubts = doubts_of_drive(entry, preflight.identities[joint])
+        if not options.force:
+            refuse(doubts, joint)
+        for doubt in doubts:
+            watcher.note(f"forced in spite of: {doubt}")
+        if options.drive_mode is not Mode.TORQUE and not preflight.capabilities.torque_offset:
+            raise UsageError("these drives take no torque offset (60B2)", next_step="use --drive-mode torque")
+        if options.drive_mode not in preflight.capabilities.modes:
+            raise UsageError(f"these drives have no {options.drive_mode.name.lower()} mode (6502)")
+        return watcher.confirm(planned.plan, preflight)
+
+    def notify(event: Event) -> None:
+        nonlocal begun
+        watcher.event(event)
+        folder.note(event)
+        hand.follow(event)
+        if isinstance(event, PhaseStarted) and event.phase.partition(" ")[2] in MODES:
+            begun = True
+            figures_live.counting = True
+        elif isinstance(event, Marked):
+            progress.marks.append(event.mark)
+        elif isinstance(event, JointRun):
+            progress.run = event
+            _measure(folder.samples(event), planned, wanted, progress)
+
+    with folder.keeping(setup, watcher.at) as keeper:
+        figures_live = _LiveFigures(keeper, setup, joint, wanted, live)
+        try:
+            run_plan(
+                robot.driver(options.bus),
+                setup,
+                planned.plan,
+                figures_live if wanted.endless else keeper,
+                notify=notify,
+                proceed=proceed,
+                prepare=hand.take_driver,
+            )
+        except FrictidError as error:
+            if not begun and (isinstance(error, UsageError) or not keeper.rows):
+                folder.discard()
+                raise
+            progress.ended = error
+            if wanted.endless:
+                figures_live.add_to(progress)
+            else:
+                _measure_what_was_finished(keeper, folder, setup, joint, planned, wanted, progress)
+    return progress
+
+
+class _Hand:
+    """The simulated person, following the phases; on a real robot the person reads what to do."""
+
+    def __init__(self, joint: str, centre_rad: float, wanted: Wanted, watcher: Watcher) -> None:
+        self._joint = joint
+        self._centre_rad = centre_rad
+        self._wanted = wanted
+        self._watcher = watcher
+        self._driver: GuidedBySimulation | None = None
+
+    def take_driver(self, driver: Driver) -> None:
+        if isinstance(driver, GuidedBySimulation):
+            self._driver = driver
+
+    def follow(self, event: Event) -> None:
+        if self._wanted.task != "hand":
+            return
+        if isinstance(event, PhaseStarted):
+            phase = event.phase.partition(" ")[0]
+            if phase == "hand":
+                self._guide(self._wanted.amplitude_rad)
+            elif phase == "rest":
+                self._guide(0.0)
+        elif isinstance(event, Marked) and event.mark.name.startswith("rest ") and self._driver is not None:
+            self._driver.simulate_hand(self._joint, self._centre_rad, 0.0, 0.0)
+
+    def _guide(self, amplitude_rad: float) -> None:
+        if self._driver is not None:
+            self._driver.simulate_hand(self._joint, self._centre_rad, amplitude_rad, 1.0 / self._wanted.period_s)
+        elif amplitude_rad:
+            self._watcher.note(
+                f"move joint {self._joint} by hand, {degrees(amplitude_rad):.0f} deg to either side, "
+                f"back and forth in {self._wanted.period_s:g} s"
+            )
+        else:
+            self._watcher.note(f"bring joint {self._joint} back to {degrees(self._centre_rad):.0f} deg and hold it")
+
+
+class _LiveFigures:
+    """Keeps rows as the keeper does, forgets them, and tells what they say."""
+
+    def __init__(self, keeper: RowKeeper, setup: RobotSetup, joint: str, wanted: Wanted, live: Live | None) -> None:
+        self._keeper = keeper
+        self._index = [one.name for one in setup.joints].index(joint)
+        self._wanted = wanted
+        self._live = live
+        self._sums = np.zeros(3)
+        self._window: list[Rows] = []
+        self._told_ns = 0
+        self._seen_ns = 0
+        self.counting = False
+
+    def samples(self, rows: Rows) -> None:
+        self._keeper.samples(rows)
+        now_ns = int(rows["t_ns"][-1]) + 1
+        mine = self._keeper.taken(self._index, self._seen_ns, now_ns)
+        self._seen_ns = now_ns
+        if mine.size and self.counting:
+            self._window.append(mine)
+            torque = np.nan_to_num(mine["external_torque_nm"])
+            self._sums += (mine.size, float(np.sum(mine["velocity_rad_s"] ** 2)), float(np.sum(torque**2)))
+        if now_ns - self._told_ns >= _LIVE_S * 1e9 and self._window:
+            self._told_ns = now_ns
+            window, self._window = np.concatenate(self._window), []
+            if self._live is not None:
+                self._live(_live_line(window))
+
+    def frames(self, rows: Rows) -> None:
+        self._keeper.frames(rows)
+
+    def add_to(self, progress: _Progress) -> None:
+        """The sums of a service as a mark of its own."""
+        progress.marks.append(Mark("service", 0, self._seen_ns, {"count_v2_t2": self._sums.tolist()}))
+
+
+def _live_line(rows: Rows) -> str:
+    last = rows[-1]
+    external = rows["external_torque_nm"]
+    hand = f"hand {np.sqrt(np.mean(external**2)):6.3f} N m rms" if np.isfinite(external).all() else "hand not measured"
+    return (
+        f"{last['t_ns'] * 1e-9:8.1f} s  {degrees(float(last['position_rad'])):8.2f} deg  "
+        f"{degrees(float(last['velocity_rad_s'])):7.1f} deg/s  drive {float(last['torque_nm']):7.2f} N m  {hand}"
+    )
+
+
+def _measure(samples: Samples, planned: CompensationPlan, wanted: Wanted, progress: _Progress) -> None:
+    """Cut each mode's task out of the samples."""
+    motions = {m.name: m for m in planned.plan.joints[0].motions if isinstance(m, Compensated)}
+    for mark in samples.marks:
+        task, _, mode = mark.name.partition(" ")
+        if task == wanted.task and mark.name in motions:
+            progress.runs[mode] = mode_run(samples, mark, motions[mark.name], mode, wanted.period_s)
+
+
+def _measure_what_was_finished(
+    keeper: RowKeeper,
+    folder: RunFolder,
+    setup: RobotSetup,
+    joint: str,
+    planned: CompensationPlan,
+    wanted: Wanted,
+    progress: _Progress,
+) -> None:
+    if progress.run is not None or not progress.marks:
+        return
+    marks = tuple(progress.marks)
+    half = JointRun(joint, 0, marks, 0.0, 0, 0, 0, 0.0, 0.0)
+    _measure(folder.samples(half), planned, wanted, progress)
+
+
+def _finish(
+    robot: Robot,
+    setup: RobotSetup,
+    folder: RunFolder,
+    options: CompensateOptions,
+    wanted: Wanted,
+    planned: CompensationPlan,
+    entry: JointProfile,
+    progress: _Progress,
+) -> dict[str, Any]:
+    inertia, source = _inertia(setup, options.joint, entry, simulated=wanted.simulated)
+    found = figures(progress.runs, wanted.task, inertia)
+    modes: dict[str, Any] = {mode: figure.values() for mode, figure in found.items()}
+    modes |= _service_figures(wanted, progress)
+    friction = next((law.friction for law in planned.laws.values() if law.friction is not None), None)
+    ended = progress.ended
+    result: dict[str, Any] = {
+        "outcome": ended.outcome if ended else "ok",
+        "exit_code": ended.exit_code if ended else 0,
+        "robot": robot.name,
+        "joint": options.joint,
+        "task": wanted.task,
+        "setting": wanted.setting,
+        "compensation_ratio": friction.ratio if friction else None,
+        "stiffness_nm_per_rad": friction.stiffness_nm_per_rad if friction else None,
+        "inertia_kg_m2": inertia,
+        "inertia_source": source,
+        "seed": setup.seed if wanted.simulated else None,
+        "rate_hz": progress.run.rate_hz if progress.run else None,
+        "late_cycles": progress.run.late_cycles if progress.run else None,
+        "missed_cycles": progress.run.missed_cycles if progress.run else None,
+        "warnings": list(planned.plan.notes[1:]),
+        "profile": str(_profile_path(options.profile).resolve()),
+        "run": str(folder.path.resolve()),
+        "modes": modes,
+    }
+    if ended is not None:
+        result["error"] = {
+            "what": ended.what,
+            "where": ended.where,
+            "cause": ended.cause,
+            "next_step": ended.next_step,
+        }
+    folder.finish(result)
+    if progress.runs:
+        page = compensation_page(
+            robot.name,
+            options.joint,
+            wanted.task,
+            progress.runs,
+            modes,
+            facts=_facts(result),
+            outcome=str(result["outcome"]),
+            error=ended.what if ended else "",
+        )
+        result["report"] = str(write_page(page, folder.path / "report.html").resolve())
+    return result
+
+
+def _service_figures(wanted: Wanted, progress: _Progress) -> dict[str, Any]:
+    sums = [mark.details["count_v2_t2"] for mark in progress.marks if mark.name == "service"]
+    if not sums or not sums[0][0]:
+        return {}
+    count, velocity, torque = sums[0]
+    return {
+        wanted.modes[0]: {
+            "velocity_rms_rad_s": math.sqrt(velocity / count),
+            "torque_rms_nm": math.sqrt(torque / count) if torque else None,
+            "torque_rms_inertia_removed_nm": None,
+            "reduction_percent": None,
+            "reduction_inertia_removed_percent": None,
+            "tracking_rms_rad": None,
+            "reasons": {"reduction_percent": "a service has nothing to compare with"},
+        }
+    }
+
+
+def _inertia(setup: RobotSetup, joint: str, entry: JointProfile, *, simulated: bool) -> tuple[float | None, str]:
+    """What is removed from the hand torque: on a simulated robot its own inertia, which no law ever sees."""
+    if simulated:
+        value = setup.joint(joint).simulated.get("inertia_kg_m2")
+        if isinstance(value, int | float):
+            return float(value), "simulated joint"
+    return entry.inertia_kg_m2.value, "profile"
+
+
+def _facts(result: dict[str, Any]) -> dict[str, str]:
+    names = ("setting", "compensation_ratio", "stiffness_nm_per_rad", "inertia_kg_m2", "inertia_source", "seed")
+    facts = {name: str(result[name]) for name in (*names, "rate_hz", "profile", "run")}
+    return {**facts, "warnings": "; ".join(result["warnings"])}
+
+
+def _profile_path(given: Path) -> Path:
+    return given / "profile.yaml" if given.is_dir() else given
+
+
+def _refuse_without_hand(setup: RobotSetup, driver: str, options: CompensateOptions) -> None:
+    if options.task == "hand" and driver == "virtual" and "hand" not in setup.joint(options.joint).simulated:
+        raise UsageError(
+            "this simulated joint has nobody to guide it",
+            where=f"joint {options.joint}",
+            next_step="give it stiffness and damping under `simulated: hand:` in the robot file",
+        )

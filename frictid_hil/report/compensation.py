@@ -1,0 +1,218 @@
+"""The page that compares modes of compensation: the paper's Figs. 11 to 14, and the figures behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, REFERENCE, Figure, bars, line
+from frictid_hil.report.pages import Page, Section, Table
+from frictid_hil.units import degrees
+
+_COLORS = {"nc": MEASURED, "mo": PUBLISHED, "mol": "#8a5fb0", "mop": IDENTIFIED, "mop-reference": REFERENCE}
+_SHOWN_CYCLES = 2.0
+_NAMES = {
+    "nc": "NC: no friction compensation",
+    "mo": "MO: Coulomb spring",
+    "mol": "MOL: with linear viscosity",
+    "mop": "MOP: with the identified curve",
+    "mop-reference": "MOP with the reference velocity",
+}
+
+
+class Run(Protocol):
+    """One mode's samples, as a page needs them; every array of shape (n,)."""
+
+    @property
+    def time_s(self) -> Array:
+        """Since the beginning of the task."""
+        ...
+
+    @property
+    def position_rad(self) -> Array:
+        """Measured."""
+        ...
+
+    @property
+    def velocity_rad_s(self) -> Array:
+        """Measured."""
+        ...
+
+    @property
+    def reference_rad(self) -> Array:
+        """The path."""
+        ...
+
+    @property
+    def external_torque_nm(self) -> Array | None:
+        """A person's."""
+        ...
+
+
+def compensation_page(
+    robot: str,
+    joint: str,
+    task: str,
+    runs: Mapping[str, Run],
+    modes: Mapping[str, Mapping[str, Any]],
+    *,
+    facts: Mapping[str, str],
+    outcome: str,
+    error: str = "",
+) -> Page:
+    """The page of one joint and task.
+
+    Args:
+        robot: name.
+        joint: name.
+        task: ``hand`` or ``track``.
+        runs: samples by mode.
+        modes: figures by mode, as in the JSON of the verb.
+        facts: provenance.
+        outcome: word of the run's JSON.
+        error: why it ended early.
+    """
+    headline = _headline(joint, task, modes)
+    if outcome != "ok":
+        headline += f" The run ended as {outcome}{': ' + error if error else ''}."
+    names = list(runs)
+    hand = task == "hand"
+    figures = (_moving(runs), *_hand_bars(names, modes)) if hand else (*_following(runs), _tracking_bars(names, modes))
+    section = Section(
+        "Moved by hand" if hand else "Tracking a triangle", tables=(_table(names, modes, hand=hand),), figures=figures
+    )
+    return Page(f"Friction compensation of {robot}, joint {joint}", headline, [section], dict(facts))
+
+
+def _headline(joint: str, task: str, modes: Mapping[str, Mapping[str, Any]]) -> str:
+    best = [
+        (float(figure["reduction_percent"]), mode)
+        for mode, figure in modes.items()
+        if mode != "nc" and figure.get("reduction_percent") is not None
+    ]
+    measure = "the torque a person needs" if task == "hand" else "the tracking error"
+    if not best:
+        return f"Joint {joint}: nothing to compare with; run nc beside the others."
+    reduction, mode = max(best)
+    return f"Joint {joint}: {mode} reduces {measure} by {reduction:.1f} %."
+
+
+def _table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]], *, hand: bool) -> Table:
+    return _hand_table(names, modes) if hand else _tracking_table(names, modes)
+
+
+def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Table:
+    headings = ("mode", "V_s [deg/s]", "F_s [N m]", "less", "inertia removed [N m]", "less", "ceiling of F_s")
+    rows = tuple(
+        (
+            _NAMES.get(name, name),
+            _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
+            _number(modes[name]["torque_rms_nm"]),
+            _percent(modes[name]["reduction_percent"]),
+            _number(modes[name]["torque_rms_inertia_removed_nm"]),
+            _percent(modes[name]["reduction_inertia_removed_percent"]),
+            _percent(modes[name].get("ceiling_percent")),
+        )
+        for name in names
+    )
+    caption = "The ceiling is what a joint without any friction would reach: inertia still has to be moved."
+    return Table(headings, rows, caption)
+
+
+def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Table:
+    rows = tuple(
+        (
+            _NAMES.get(name, name),
+            _number(modes[name]["tracking_rms_rad"], degrees(1.0)),
+            _percent(modes[name]["reduction_percent"]),
+            _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
+        )
+        for name in names
+    )
+    return Table(("mode", "E_s [deg]", "less", "V_s [deg/s]"), rows, "The same gains in all modes.")
+
+
+def _moving(runs: Mapping[str, Run]) -> Figure:
+    traces = []
+    for mode, run in runs.items():
+        if run.external_torque_nm is not None:
+            traces.append(line(mode, degrees(1.0) * run.velocity_rad_s, run.external_torque_nm, _color(mode), width=1))
+    return Figure(
+        "Torque of the hand over velocity (Fig. 11)",
+        tuple(traces),
+        "velocity [deg/s]",
+        "hand torque [N m]",
+        caption="Friction opens the loop along the vertical axis at zero speed; inertia alone makes a flat ellipse."
+        if traces
+        else "No force sensor: the torque of the hand is not known.",
+    )
+
+
+def _hand_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, Figure]:
+    velocity = [degrees(float(modes[name]["velocity_rms_rad_s"])) for name in names]
+    torque = [modes[name]["torque_rms_nm"] for name in names]
+    removed = [modes[name]["torque_rms_inertia_removed_nm"] for name in names]
+    return (
+        Figure("Magnitude of velocity V_s (Fig. 12)", (bars("V_s", names, velocity, MEASURED),), "mode", "V_s [deg/s]"),
+        Figure(
+            "Magnitude of hand torque F_s (Fig. 12)",
+            (bars("as measured", names, torque, IDENTIFIED), bars("inertia removed", names, removed, REFERENCE)),
+            "mode",
+            "F_s [N m]",
+        ),
+    )
+
+
+def _following(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
+    first = next(iter(runs.values()))
+    shown = {mode: _first_cycles(run) for mode, run in runs.items()}
+    reference = line(
+        "reference",
+        first.time_s[_first_cycles(first)],
+        degrees(1.0) * first.reference_rad[_first_cycles(first)],
+        "#222222",
+        dash="dot",
+        width=1,
+    )
+    positions = [
+        line(mode, run.time_s[shown[mode]], degrees(1.0) * run.position_rad[shown[mode]], _color(mode), width=1.5)
+        for mode, run in runs.items()
+    ]
+    errors = [
+        line(
+            mode,
+            run.time_s[shown[mode]],
+            degrees(1.0) * (run.reference_rad - run.position_rad)[shown[mode]],
+            _color(mode),
+            width=1.5,
+        )
+        for mode, run in runs.items()
+    ]
+    return (
+        Figure("Position (Fig. 13)", (reference, *positions), "time [s]", "position [deg]"),
+        Figure("Tracking error", tuple(errors), "time [s]", "reference - position [deg]"),
+    )
+
+
+def _tracking_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Figure:
+    values = [degrees(float(modes[name]["tracking_rms_rad"])) for name in names]
+    return Figure("Tracking error E_s (Fig. 14)", (bars("E_s", names, values, IDENTIFIED),), "mode", "E_s [deg]")
+
+
+def _first_cycles(run: Run) -> slice:
+    """As much of a run as shows its shape: two seconds or so."""
+    count = int((run.time_s < run.time_s[0] + _SHOWN_CYCLES * 1.5).sum())
+    return slice(0, max(2, count))
+
+
+def _color(mode: str) -> str:
+    return _COLORS.get(mode, MEASURED)
+
+
+def _number(value: float | None, scale: float = 1.0) -> str:
+    return "" if value is None else f"{value * scale:.4g}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f} %"
