@@ -13,7 +13,7 @@ from frictid_hil.gap.confidence import confidence
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.forward import Replay, Replayed, pooled, why_not
+from frictid_hil.gap.forward import Replay, Replayed, pooled, settled_nm, why_not
 from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, needed, shares
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
@@ -28,6 +28,7 @@ FAMILY_SHARE = 0.25
 """Share of what is left that a family without a cause may explain before the answer is unknown."""
 FAMILY_AHEAD = 0.03
 """How far such a family alone may be ahead of the library's effects."""
+VELOCITY_EFFECTS = frozenset({"stribeck", "viscous_nonlinearity", "direction_asymmetry"})
 HELD_SHARE = 0.002
 """Share of repeated positions in motion from which the position itself is in doubt."""
 
@@ -86,7 +87,6 @@ def _full(
     judge = Judge(replay, evidence, drive, has_validation)
     hypothesis = needed(judge, choose(judge, ranking, floor), floor)
     after = judge.judged(hypothesis.effects)
-    after_nm = pooled(after, "torque_nm")
     effects = sorted({g[0] for g in evidence.groups if not g[0].startswith("family ")})
     bare_score = evidence.score(())
     model = Model(hypothesis.groups, evidence.score(hypothesis.groups) - bare_score)
@@ -95,8 +95,8 @@ def _full(
     family_share = family[0] / max(1.0, 0.5 * evidence.misfit_ratio(hypothesis.groups) * ranking.rows)
     names = (*drive, *hypothesis.names)
     features = Features(
-        before=before_nm / floor,
-        after=after_nm / floor,
+        before=settled_nm(bare) / floor,
+        after=settled_nm(after) / floor,
         misfit=evidence.misfit_ratio(hypothesis.groups),
         misfit_before=ranking.misfit,
         family_share=family_share,
@@ -161,9 +161,12 @@ def verdict_of(f: Features) -> tuple[str, str]:
         return "unknown", "kinematics: positions repeat while the joint moves"
     if not f.names:
         return ("unknown", f.family_name) if f.before > 1.6 and f.misfit_before > 1.5 else ("none", "")
-    if f.rivals and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1:
+    # A velocity curve that fits better than a velocity effect's formula is still that effect.
+    same_kind = f.family_name == "velocity" and bool(VELOCITY_EFFECTS & set(f.names))
+    plant_alone = bool(f.rivals) and set(f.rivals) == set(f.names)
+    if plant_alone and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1 and not same_kind:
         return "unknown", f.family_name
-    if f.family_share > FAMILY_SHARE and f.misfit > 1.3 and f.after > 1.2:
+    if f.family_share > FAMILY_SHARE and f.misfit > 1.3 and f.after > 1.2 and not same_kind:
         return "unknown", f.family_name
     if f.after > 2.0 and f.misfit > 3.0 and f.coarse <= 1.5 and f.after > 0.25 * f.before:
         return "unknown", f.family_name

@@ -18,7 +18,7 @@ from scipy import signal
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.actuation import noise_rms
 from frictid_hil.gap.generic import families
-from frictid_hil.gap.residuals import LowPass, Recording, slip_state
+from frictid_hil.gap.residuals import LowPass, Recording, first_slide, rms, slip_state
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 
@@ -113,7 +113,11 @@ class Evidence:
             if form is None:
                 continue
             for index, shape in enumerate(form.shapes):
-                parts.append(self._thin(form.regressors(views, shape)))
+                columns = self._thin(form.regressors(views, shape))
+                # A column of nothing: the nominal joint lacks what this effect acts on.
+                if not any(np.any(np.abs(part) > 1e-12) for part in columns):
+                    continue
+                parts.append(columns)
                 count = parts[-1][0].shape[1]
                 self.groups[name, index] = tuple(range(width, width + count))
                 width += count
@@ -259,6 +263,12 @@ class Evidence:
         weights = self.coefficients(model)[self._prior.size :]
         return (y - x[:, columns] @ weights) * scale, y * scale
 
+    def judged_nm(self, model: Sequence[Group]) -> float:
+        """RMS that effects leave on the validation logs (on all where there are none), N m."""
+        chosen = [k for k, r in enumerate(self.recordings) if r.experiment.validation]
+        chosen = chosen or list(range(len(self.recordings)))
+        return rms(np.concatenate([self.explained_nm(k, model)[0] for k in chosen]))
+
     def shapes(self, effect: str) -> list[Group]:
         """All groups of one effect."""
         return [group for group in self.groups if group[0] == effect]
@@ -324,6 +334,8 @@ def deviation_nm(
     timing = TIMING_S * low_pass(np.gradient(view.torque_nm, view.step_s))
     variance = (white * low_pass.white_gain) ** 2 + encoder**2 + (MODEL_FLOOR * view.coulomb_nm) ** 2
     deviation: Array = np.sqrt(np.maximum(variance + timing**2 + stuck * winding, 1e-18))
+    held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
+    deviation[:held] = np.hypot(deviation[:held], 0.3 * view.coulomb_nm)
     return deviation
 
 
@@ -343,7 +355,7 @@ def _nuisance(views: Sequence[View]) -> list[Array]:
             np.stack(
                 [
                     (v.motor_inertia_kg_m2 + v.link_inertia_kg_m2) * v.acceleration_rad_s2,
-                    v.gravity_nm,
+                    v.gravity_nm if v.motor_inertia_kg_m2 + v.link_inertia_kg_m2 > 0.0 else v.load_nm,
                     v.coulomb_nm * v.slip,
                     v.rate_nm,
                     v.payload_inertia_kg_m2 * v.acceleration_rad_s2,

@@ -14,7 +14,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.residuals import LowPass, friction_scales, rms
+from frictid_hil.gap.residuals import LowPass, first_slide, friction_scales, rms
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
 from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, closed_loop
@@ -23,14 +23,23 @@ Effects = Mapping[str, Mapping[str, float]]
 
 SEARCH_SUBSTEP_S = 5e-4
 """Sub-step of replays that only compare neighbours; what is reported uses the simulator's own."""
+SETTLING_S = 0.3
+"""Time the controller takes after the first slide to forget the start."""
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """Recorded minus simulated, low-passed once; arrays of shape (n,)."""
+    """Recorded minus simulated, low-passed once; arrays of shape (n,).
+
+    Attributes:
+        torque_nm: difference of torque.
+        position_rad: difference of position.
+        settled: first row that what friction held before the recording no longer touches.
+    """
 
     torque_nm: Array
     position_rad: Array
+    settled: int = 0
 
 
 def why_not(experiments: ExperimentSet) -> str | None:
@@ -95,6 +104,8 @@ class Replay:
         self._lagging = controller_lags
         self._experiments = experiments.experiments
         self._nominal = nominal_model(experiments.nominal)
+        coulomb, stiffness = friction_scales(experiments.nominal)
+        self._slide_rad = 3.0 * coulomb / stiffness
         controller = experiments.nominal.controller
         assert controller is not None
         self._controller = Controller(
@@ -163,12 +174,22 @@ class Replay:
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
         torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
-        return Replayed(low_pass(torque), low_pass(experiment.position_rad - rows.position_rad)), rows.state
+        held = first_slide(experiment.position_rad, self._slide_rad) + round(SETTLING_S * low_pass.rate_hz)
+        return Replayed(
+            low_pass(torque),
+            low_pass(experiment.position_rad - rows.position_rad),
+            min(held, experiment.time_s.size // 3),
+        ), rows.state
 
 
 def pooled(differences: Mapping[str, Replayed], part: str) -> float:
     """RMS over all rows of the given logs of ``torque_nm`` or ``position_rad``."""
     return rms(np.concatenate([getattr(d, part) for d in differences.values()]))
+
+
+def settled_nm(differences: Mapping[str, Replayed]) -> float:
+    """RMS torque difference from where each recording has settled: what hypotheses are compared by."""
+    return rms(np.concatenate([d.torque_nm[d.settled :] for d in differences.values()]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +246,7 @@ def refine(replay: Replay, effects: Effects, rounds: int = 3) -> Refined:
 
     def difference(values: Effects) -> Array:
         logs = replay(values, validation=False, substep_s=SEARCH_SUBSTEP_S)
-        return np.concatenate([d.torque_nm[::8] for d in logs.values()])
+        return np.concatenate([d.torque_nm[d.settled :: 8] for d in logs.values()])
 
     base = difference(current)
     before = least = float(np.mean(base**2))

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 from frictid_hil.gap.evidence import Evidence, Group
-from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled, refine
+from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled, refine, settled_nm
 from frictid_hil.gap.which import Model, Ranking
 from frictid_hil.simulation.effects import all_effects
 
@@ -40,6 +40,7 @@ class Hypothesis:
         fitted_nm: torque difference left on the identification logs, RMS.
         judged_nm: on the validation logs.
         misfit: of the plant channel, held-out squares per row.
+        inverse_nm: left of the plant channel on the validation logs, RMS.
     """
 
     groups: tuple[Group, ...]
@@ -48,6 +49,7 @@ class Hypothesis:
     fitted_nm: float
     judged_nm: float
     misfit: float
+    inverse_nm: float
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,9 +87,10 @@ class Judge:
     def _refined(self, groups: tuple[Group, ...]) -> Hypothesis:
         start = {**self.drive, **self.evidence.parameters(groups)}
         if not groups:
-            fitted = pooled(self.replay(start, validation=False), "torque_nm")
+            fitted = settled_nm(self.replay(start, validation=False))
+            judged = settled_nm(self.judged(start))
             return Hypothesis(
-                (), start, {}, fitted, pooled(self.judged(start), "torque_nm"), self.evidence.misfit_ratio(())
+                (), start, {}, fitted, judged, self.evidence.misfit_ratio(()), self.evidence.judged_nm(())
             )
         refined = refine(self.replay, start)
         best = list(groups)
@@ -100,7 +103,7 @@ class Judge:
             trial = [*best[:k], added, *best[k + 1 :]]
             if self.evidence.score(trial) > self.evidence.score(best):
                 best = trial
-        judged = pooled(self.judged(refined.effects), "torque_nm")
+        judged = settled_nm(self.judged(refined.effects))
         return Hypothesis(
             groups=tuple(best),
             effects=refined.effects,
@@ -108,6 +111,7 @@ class Judge:
             fitted_nm=math.sqrt(refined.squares),
             judged_nm=judged,
             misfit=self.evidence.misfit_ratio(best),
+            inverse_nm=self.evidence.judged_nm(best),
         )
 
 
@@ -136,8 +140,18 @@ def choose(judge: Judge, ranking: Ranking, floor_nm: float) -> Hypothesis:
 
 
 def _stands_out(before: Hypothesis, after: Hypothesis, floor_nm: float, share: float) -> bool:
-    taken = before.judged_nm**2 - after.judged_nm**2
-    return taken > (share * floor_nm) ** 2 and after.cost < before.cost
+    return _taken(before, after, floor_nm) > share**2 and after.cost < before.cost
+
+
+def _taken(before: Hypothesis, after: Hypothesis, floor_nm: float) -> float:
+    """Squared torque that ``after`` takes off over the squared floor: by replay or, where it is quick, in the plant.
+
+    A controller hides from its replay what is quicker than itself (play, ripple); inverse dynamics still shows it, less
+    clearly, so that it must leave little there, too.
+    """
+    replayed = (before.judged_nm**2 - after.judged_nm**2) / floor_nm**2
+    plant = (before.inverse_nm**2 - after.inverse_nm**2) / max(floor_nm, after.inverse_nm) ** 2
+    return max(replayed, plant)
 
 
 def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[str, float]:
@@ -147,7 +161,7 @@ def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[s
     def left(kept: frozenset[str]) -> float:
         if kept not in cached:
             effects = {n: v for n, v in hypothesis.effects.items() if n in kept or n not in names}
-            cached[kept] = pooled(judge.judged(effects), "torque_nm") ** 2
+            cached[kept] = settled_nm(judge.judged(effects)) ** 2
         return cached[kept]
 
     total = left(frozenset()) - left(frozenset(names))
@@ -165,21 +179,26 @@ def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[s
 
 
 def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
-    """The hypothesis without effects that the validation replays do not need; the rest is fitted again."""
+    """The hypothesis without effects that the validation logs do not need; the rest is fitted again."""
     while hypothesis.groups:
         taken: dict[str, float] = {}
         for group in hypothesis.groups:
             others = tuple(g for g in hypothesis.groups if g != group)
-            without = {**judge.drive, **judge.evidence.parameters(others)}
-            judged = pooled(judge.judged(without), "torque_nm")
-            taken[group[0]] = (judged**2 - hypothesis.judged_nm**2) / floor_nm**2
+            quick = {**judge.drive, **judge.evidence.parameters(others)}
+            without = replace(
+                hypothesis,
+                groups=others,
+                judged_nm=settled_nm(judge.judged(quick)),
+                inverse_nm=judge.evidence.judged_nm(others),
+            )
+            taken[group[0]] = _taken(without, hypothesis, floor_nm)
         alone = len(hypothesis.groups) == 1 and not judge.drive
-        least = STANDS_ALONE if alone else STANDS_BESIDE
+        least = (STANDS_ALONE if alone else STANDS_BESIDE) ** 2
         weakest = min(taken, key=lambda n: taken[n])
-        if taken[weakest] >= least**2:
+        if taken[weakest] >= least:
             return hypothesis
         rest = judge(tuple(g for g in hypothesis.groups if g[0] != weakest))
-        if (rest.judged_nm**2 - hypothesis.judged_nm**2) / floor_nm**2 >= least**2:
+        if _taken(rest, hypothesis, floor_nm) >= least:
             return hypothesis
         hypothesis = rest
     return hypothesis

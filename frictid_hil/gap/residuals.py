@@ -224,6 +224,16 @@ def _view(nominal: Nominal, experiment: Experiment, step_s: float, start_s: floa
     )
 
 
+def first_slide(position_rad: Array, travel_rad: float) -> int:
+    """First row at which the joint has left its start by ``travel_rad``; at most a third of the rows.
+
+    Until then friction may hold any torque: what it held before the recording began is not in the recording.
+    """
+    moved = np.abs(position_rad - position_rad[0]) > travel_rad
+    first = int(np.argmax(moved)) if moved.any() else position_rad.size
+    return min(first, position_rad.size // 3)
+
+
 def friction_scales(nominal: Nominal) -> tuple[float, float]:
     """(F_0 in N m, presliding stiffness in N m/rad), with a stiff default where the file does not say."""
     coulomb = nominal.curve.coulomb_nm if nominal.curve is not None else 1.0

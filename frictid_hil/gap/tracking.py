@@ -143,17 +143,16 @@ def _fit(chain: Chain, logs: Sequence[Recording], names: tuple[str, ...]) -> Cha
         values = {n: float(np.clip(v * scale[n], low[n], top[n])) for n, v in zip(names, x, strict=True)}
         return replace(chain, **values)
 
+    def cost_of(x: Array) -> float:
+        return _left(built(x), logs)
+
     best, least = chain, _left(chain, logs)
     for start in (0.3, 1.0, 3.0):
         x0 = np.array([(1.0 if n == "gain" else max(getattr(chain, n), start * scale[n])) / scale[n] for n in names])
-        found = optimize.minimize(
-            lambda x: _left(built(x), logs),
-            x0,
-            method="Nelder-Mead",
-            options={"maxiter": 80 * len(names), "fatol": 1e-9},
-        )
-        if found.fun < least:
-            best, least = built(found.x), float(found.fun)
+        found = optimize.fmin(cost_of, x0, maxiter=80 * len(names), ftol=1e-9, disp=False)
+        cost = cost_of(found)
+        if cost < least:
+            best, least = built(found), cost
     return best
 
 

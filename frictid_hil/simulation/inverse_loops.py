@@ -62,9 +62,14 @@ def transmitted(
     stiffness_nm_per_rad: float,
     damping_nm_s_per_rad: float,
 ) -> Array:
-    """Torque from motor to link through play and spring, the link moved by the measured motor, N m, shape (n,)."""
+    """Torque from motor to link through play and spring, the link moved by the measured motor, N m, shape (n,).
+
+    Nothing is transmitted to a link without inertia.
+    """
     rows = position_rad.shape[0]
     torque = np.zeros(rows)
+    if link_kg_m2 <= 0.0:
+        return torque
     parts = max(1, math.ceil(step_s * math.sqrt(stiffness_nm_per_rad / link_kg_m2) / 0.35))
     part_s = step_s / parts
     half = 0.5 * gap_rad
