@@ -17,7 +17,10 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.bus_logs import is_log, logs_of
+from frictid_hil.jobs.decoded_log import Account, samples_in
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.plans import given_procedure
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.run_folder import load_manifest
@@ -134,21 +137,7 @@ def _in_folder(folder: Path) -> list[Path]:
 def _task(log: Path, options: IdentifyOptions) -> _Task:
     robot = load_robot(options.robot) if options.robot else None
     setup = robot.to_setup() if robot else None
-    given = (options.amplitude_rad, options.velocity_rad_s)
-    procedure: Procedure | None = None
-    if all(value is not None for value in given):
-        assert options.amplitude_rad is not None and options.velocity_rad_s is not None
-        try:
-            procedure = Procedure(
-                options.amplitude_rad, options.velocity_rad_s, options.cycles or 10, options.ratio or 0.8
-            )
-        except ValueError as error:
-            raise UsageError(str(error)) from None
-    elif any(value is not None for value in (*given, options.cycles, options.ratio)):
-        raise UsageError(
-            "--amplitude and --velocity belong together, and --cycles and --ratio to them",
-            next_step="give the procedure as it was commanded, or leave all four out",
-        )
+    procedure = given_procedure(options.amplitude_rad, options.velocity_rad_s, options.cycles, options.ratio)
     columns = load_columns(options.columns) if options.columns else None
     return _Task(log, options.joints, setup, procedure, options.method, columns)
 
@@ -156,7 +145,7 @@ def _task(log: Path, options: IdentifyOptions) -> _Task:
 def _identified(task: _Task) -> _Identified:
     """Read and identify one recording; what goes wrong is part of the answer, so that others go on."""
     try:
-        every = read(task.log, task.columns)
+        every = _decoded(task) if task.log.is_file() and is_log(task.log) else read(task.log, task.columns)
     except FrictidError as error:
         return _Identified({}, {}, error)
     wanted = [samples for samples in every if not task.joints or samples.joint in task.joints]
@@ -175,6 +164,12 @@ def _identified(task: _Task) -> _Identified:
             failed[samples.joint] = str(error)
             last = error
     return _Identified(joints, failed, None if joints else last)
+
+
+def _decoded(task: _Task) -> list[Samples]:
+    """The samples in a bus log; where nothing tells which frame is what, `replay` can be told."""
+    account = Account()
+    return list(samples_in(logs_of(task.log, None), task.setup.name if task.setup else "", account).values())
 
 
 def _joint(samples: Samples, task: _Task) -> JointProfile:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from frictid_hil.config.robot import Robot
 from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.plan import Corners, Cycles, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
 
@@ -72,3 +73,24 @@ def expected_of(robot: Robot) -> dict[str, Expected]:
             values = joint.expected
             expected[name] = Expected(values.inertia_kg_m2, values.gravity_nm, values.friction_nm)
     return expected
+
+
+def given_procedure(
+    amplitude_rad: float | None, velocity_rad_s: float | None, cycles: int | None, ratio: float | None
+) -> Procedure | None:
+    """The procedure that a recording without marks was made with, as typed; None where nothing was.
+
+    Raises:
+        UsageError: some, but not amplitude and velocity, or values that make no procedure.
+    """
+    if amplitude_rad is not None and velocity_rad_s is not None:
+        try:
+            return Procedure(amplitude_rad, velocity_rad_s, cycles or 10, ratio or 0.8)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    if any(value is not None for value in (amplitude_rad, velocity_rad_s, cycles, ratio)):
+        raise UsageError(
+            "--amplitude and --velocity belong together, and --cycles and --ratio to them",
+            next_step="give the procedure as it was commanded, or leave all four out",
+        )
+    return None

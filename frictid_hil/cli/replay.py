@@ -1,0 +1,108 @@
+"""``replay``: a recording played back into the decoders, or into the simulated joint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from frictid_hil.cli.calibrate import AmplitudeOption, CyclesOption, JointOption, OutOption, RatioOption, VelocityOption
+from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result, RobotOption
+from frictid_hil.units import degrees
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's verbs."""
+    app.command("replay")(replay)
+
+
+def replay(
+    source: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_LOG", help="Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")
+    ],
+    robot: RobotOption,
+    joint: JointOption = None,
+    frames: Annotated[
+        Path | None, typer.Option("--frames", help="Mapping file of a foreign log: which frame is what.")
+    ] = None,
+    eds: Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the drives of a foreign log.")] = None,
+    profile: Annotated[
+        Path | None, typer.Option("--profile", help="Profile to compare with; default: the run's own.")
+    ] = None,
+    amplitude: AmplitudeOption = None,
+    velocity: VelocityOption = None,
+    cycles: CyclesOption = None,
+    ratio: RatioOption = None,
+    method: Annotated[str | None, typer.Option("--method", help="Estimator; default: that of the profile.")] = None,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
+    echo: Annotated[
+        str | None, typer.Option("--echo", help="interface:channel of a bus on which every frame is sent again.")
+    ] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
+    ] = True,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Play a recording back: the same profile to the last bit, and measured beside simulated motion."""
+    from frictid_hil.jobs.plans import given_procedure
+    from frictid_hil.jobs.replay import ReplayOptions
+    from frictid_hil.jobs.replay import replay as job
+
+    output = Output(as_json, quiet)
+
+    def run() -> Result:
+        options = ReplayOptions(
+            source=source,
+            robot=robot,
+            joints=tuple(joint or ()),
+            frames=frames,
+            eds=eds,
+            profile=profile,
+            procedure=given_procedure(amplitude, velocity, cycles, ratio),
+            method=method,
+            paced=realtime,
+            echo=echo,
+            simulation=simulate,
+            out=out,
+        )
+        return job(options, output.err.print)
+
+    output.run("replay", run, lambda result: _print(output, result))
+
+
+def _print(output: Output, result: Result) -> None:
+    table = Table(title=f"Replay of {result['source']}")
+    for heading in ("joint", "outcome", "profile", "rows missing", "position rms", "torque rms", "remarks"):
+        table.add_column(heading)
+    for name, joint in result["joints"].items():
+        position, torque = joint.get("position_rms_rad"), joint.get("torque_rms_nm")
+        table.add_row(
+            name,
+            joint["outcome"],
+            _verdict(joint),
+            str(joint.get("lost_rows") or 0),
+            "" if position is None else f"{degrees(position):.3g} deg",
+            "" if torque is None else f"{torque:.3g} N m",
+            "; ".join(joint["remarks"]),
+        )
+    output.out.print(table)
+    log = result.get("log")
+    if log:
+        output.out.print(f"{log['frames']} frames, {log['rows']} cycles")
+        for name, count in log["unknown"].items():
+            output.out.print(f"unknown: {count} x {name}")
+        for key in ("repeated", "backwards", "skipped"):
+            if log[key]:
+                output.out.print(f"{key}: {log[key]} frames")
+        if log["damage"]:
+            output.out.print(f"damaged: {log['damage']}")
+
+
+def _verdict(joint: Result) -> str:
+    if joint["identical"] is None:
+        return "nothing to compare with"
+    return "identical" if joint["identical"] else f"differs by {joint['difference_percent']:.3g} %"

@@ -1,0 +1,305 @@
+"""``frictid-hil replay``: a bus log through the decoders and the identification of a live run, or set-points simulated.
+
+What a live run identifies from are its decoded frames and their run time, and the log carries both: the same log gives
+the same profile to the last bit. The run's manifest says which frame is what; for logs of other origin a frame map or
+an EDS file does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+
+from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile
+from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
+from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.driver import RobotSetup
+from frictid_hil.errors import (
+    HardwareError,
+    IdentificationError,
+    InputFileError,
+)
+from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.bus_logs import given_map, is_log, logs_of
+from frictid_hil.jobs.decoded_log import (
+    MOST_LOST_PERCENT,
+    Account,
+)
+from frictid_hil.jobs.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.simulated_replay import simulate
+from frictid_hil.recording.read import read
+from frictid_hil.recording.samples import Samples
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOptions:
+    """What a person asked for.
+
+    Attributes:
+        source: run folder, bus log, or a recording of samples.
+        robot: robot file.
+        joints: only these; all when empty.
+        frames: mapping file that tells which frame is what (``schema: frictid.frames/1``).
+        eds: EDS or DCF file that does.
+        profile: to compare with; None for the run's own.
+        procedure: of a log that carries no marks.
+        method: estimator; None for the one of the profile compared with, else ``aligned``.
+        paced: at recorded speed.
+        echo: bus on which the frames are sent again.
+        simulation: stream the set-points to the simulated joints as well.
+        out: folder for profile and CSV files.
+    """
+
+    source: Path
+    robot: str
+    joints: tuple[str, ...] = ()
+    frames: Path | None = None
+    eds: Path | None = None
+    profile: Path | None = None
+    procedure: Procedure | None = None
+    method: str | None = None
+    paced: bool = False
+    echo: str | None = None
+    simulation: bool = True
+    out: Path | None = None
+
+
+def replay(options: ReplayOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Play a recording back.
+
+    Raises:
+        UsageError: nothing says which frame is what, or options contradict each other.
+        InputFileError: the recording is unreadable or unusable.
+    """
+    robot = load_robot(options.robot)
+    robot.check_joints(options.joints)
+    account = Account()
+    late: dict[str, int] = {}
+    if is_log(options.source):
+        recordings, late = _decoded(options, robot, account, note)
+    else:
+        recordings = [one for one in read(options.source) if not options.joints or one.joint in options.joints]
+    unknown_joints = [one.joint for one in recordings if one.joint not in robot.file.joints]
+    if unknown_joints or not recordings:
+        raise InputFileError(
+            f"joints {', '.join(unknown_joints)} are not in {robot.path.name}" if unknown_joints else "no joint moved",
+            where=str(options.source),
+        )
+    reference = _reference(options)
+    profiles, failed = _identify(recordings, robot.to_setup(), options, reference, account, late)
+    result = _result(options, robot, recordings, profiles, failed, reference, account)
+    if options.simulation:
+        result |= _simulated(options, robot, recordings, result["joints"], note)
+    return result
+
+
+# -- decoding -------------------------------------------------------------------------------------------------------
+
+
+def _decoded(
+    options: ReplayOptions, robot: Robot, account: Account, note: Callable[[str], None]
+) -> tuple[list[Samples], dict[str, int]]:
+    """Samples of every joint that moved, and the late cycles that the live run counted."""
+    logs = logs_of(options.source, given_map(options.frames, options.eds, robot))
+    told_s = -math.inf
+
+    def at(time_s: float) -> None:
+        nonlocal told_s
+        if options.paced and time_s >= told_s + 1.0:
+            told_s = time_s
+            note(f"{time_s:.0f} s")
+
+    with _echo(options.echo) as echo:
+        samples = samples_in(logs, robot.name, account, joints=options.joints, paced=options.paced, echo=echo, at=at)
+    late = {motion.joint: motion.late_cycles for log in logs for motion in log.motions}
+    return [samples[name] for name in sorted(samples, key=_order_in(robot))], late
+
+
+def _order_in(robot: Robot) -> Callable[[str], int]:
+    names = list(robot.joint_names)
+    return lambda name: names.index(name) if name in names else len(names)
+
+
+class _echo:  # noqa: N801 - a context manager that reads as a function
+    """The bus to send the frames to again, or None."""
+
+    def __init__(self, named: str | None) -> None:
+        self._named = named
+        self._bus: can.BusABC | None = None
+
+    def __enter__(self) -> can.BusABC | None:
+        if self._named is None:
+            return None
+        interface, _, channel = self._named.partition(":")
+        try:
+            self._bus = can.Bus(interface=interface, channel=channel)
+        except (can.CanError, OSError, ValueError) as error:
+            raise HardwareError(
+                f"cannot be opened: {error}", where=self._named, next_step="name it as interface:channel"
+            ) from None
+        return self._bus
+
+    def __exit__(self, *_: object) -> None:
+        if self._bus is not None:
+            self._bus.shutdown()
+
+
+# -- identifying and comparing --------------------------------------------------------------------------------------
+
+
+def _reference(options: ReplayOptions) -> FrictionProfile | None:
+    if options.profile is not None:
+        path = options.profile / "profile.yaml" if options.profile.is_dir() else options.profile
+        return load_profile(path)
+    folder = options.source if options.source.is_dir() else options.source.parent
+    own = folder / "profile.yaml"
+    return load_profile(own) if (folder / "manifest.json").exists() and own.exists() else None
+
+
+def _identify(
+    recordings: list[Samples],
+    setup: RobotSetup,
+    options: ReplayOptions,
+    reference: FrictionProfile | None,
+    account: Account,
+    late: Mapping[str, int],
+) -> tuple[dict[str, JointProfile], dict[str, str]]:
+    profiles: dict[str, JointProfile] = {}
+    failed: dict[str, str] = {}
+    for samples in recordings:
+        known = reference.joints.get(samples.joint) if reference else None
+        method = options.method or (known.method if known else "aligned")
+        procedure = None if samples.marks else options.procedure
+        try:
+            profile = identify_joint(
+                samples,
+                setup.joint(samples.joint),
+                method=method,
+                procedure=procedure,
+                late_cycles=late.get(samples.joint, 0),
+            )
+        except IdentificationError as error:
+            failed[samples.joint] = str(error)
+            continue
+        gate = account.gate(samples.joint)
+        gates: tuple[Gate, ...] = profile.gates if gate is None else (*profile.gates, gate)
+        drive = profile.drive if known is None else known.drive
+        profiles[samples.joint] = profile.model_copy(update={"gates": gates, "drive": drive})
+    return profiles, failed
+
+
+def _result(
+    options: ReplayOptions,
+    robot: Robot,
+    recordings: list[Samples],
+    profiles: Mapping[str, JointProfile],
+    failed: Mapping[str, str],
+    reference: FrictionProfile | None,
+    account: Account,
+) -> dict[str, Any]:
+    joints: dict[str, dict[str, Any]] = {}
+    for samples in recordings:
+        name = samples.joint
+        if name in failed:
+            joints[name] = {"outcome": "gate_failed", "remarks": [failed[name]], "velocity_rad_s": [], "torque_nm": []}
+        else:
+            joints[name] = joint_result(profiles[name])
+        joints[name] |= {"identical": None, "difference_percent": None}
+        joints[name]["lost_rows"] = account.lost_rows.get(name)
+        if reference is not None and name in reference.joints and name in profiles:
+            mine, other = profiles[name], reference.joints[name]
+            joints[name]["identical"] = mine.values() == other.values()
+            distance = curve_distance(mine.curve(), other.curve(), other.velocity_rad_s[-1])
+            joints[name]["difference_percent"] = distance.e_percent
+    wanted = set(options.joints or (reference.joints if reference else ()))
+    compared = None
+    if reference is not None:
+        compared = all(joints.get(name, {}).get("identical") is True for name in wanted & set(reference.joints))
+    bad = {name: joint["remarks"] for name, joint in joints.items() if joint["outcome"] != "ok"}
+    result: dict[str, Any] = {
+        "outcome": "gate_failed" if bad else "ok",
+        "robot": robot.name,
+        "source": str(options.source.resolve()),
+        "identical": compared,
+        "position_rms_rad": None,
+        "torque_rms_nm": None,
+        "log": asdict(account) if account.frames else None,
+        "profile": _write(options, robot, profiles),
+        "joints": joints,
+    }
+    if bad:
+        result["error"] = {
+            "what": "; ".join(f"joint {name}: {'; '.join(remarks)}" for name, remarks in bad.items()),
+            "where": str(options.source),
+            "cause": f"a joint that lacks more than {MOST_LOST_PERCENT:g} % of its rows fails"
+            if account.frames
+            else "",
+            "next_step": "results of the other joints stand",
+        }
+    return result
+
+
+def _write(options: ReplayOptions, robot: Robot, profiles: Mapping[str, JointProfile]) -> str | None:
+    if options.out is None or not profiles:
+        return None
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "profile.yaml"
+    logs = sorted(options.source.glob("bus*.blf")) if options.source.is_dir() else [options.source]
+    FrictionProfile(
+        robot=robot.name,
+        joints=dict(profiles),
+        provenance=Provenance(
+            created_utc=utc_now(),
+            git_revision=git_revision(),
+            robot_file=robot.path.name,
+            config_sha256=robot.digest,
+            run=str(options.source.resolve()),
+            log_sha256={log.name: file_sha256(log) for log in logs},
+            notes=["identified from a replay"],
+        ),
+    ).save(path)
+    return str(path.resolve())
+
+
+# -- simulating -----------------------------------------------------------------------------------------------------
+
+
+def _simulated(
+    options: ReplayOptions,
+    robot: Robot,
+    recordings: list[Samples],
+    joints: dict[str, dict[str, Any]],
+    note: Callable[[str], None],
+) -> dict[str, Any]:
+    """Root mean squares over all joints that the robot file can simulate; per joint beside them."""
+    squares: dict[str, list[tuple[float, int]]] = {"position_rms_rad": [], "torque_rms_nm": []}
+    files = []
+    for samples in recordings:
+        if not robot.file.joints[samples.joint].simulated:
+            joints[samples.joint]["simulation"] = "the robot file has no `simulated` for this joint"
+            continue
+        simulated = simulate(robot, samples)
+        if simulated.note:
+            note(f"joint {samples.joint}: {simulated.note}")
+        for key in squares:
+            value = getattr(simulated, key)
+            joints[samples.joint][key] = value
+            if value is not None:
+                squares[key].append((value**2, len(samples)))
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+            files.append(str(simulated.write_csv(options.out / f"simulated-{samples.joint}.csv").resolve()))
+    together: dict[str, Any] = {key: _pooled(values) for key, values in squares.items()}
+    return {**together, "simulated": files}
+
+
+def _pooled(values: list[tuple[float, int]]) -> float | None:
+    rows = sum(count for _, count in values)
+    return math.sqrt(float(np.sum([square * count for square, count in values])) / rows) if rows else None
