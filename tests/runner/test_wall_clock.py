@@ -1,0 +1,168 @@
+"""On the wall clock: three processes, any of which may be killed at any moment."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import numpy as np
+import psutil
+import pytest
+
+from frictid_hil.errors import InputFileError
+from frictid_hil.recording.bus_log import read_frames
+from frictid_hil.recording.mcap_reader import read_mcap
+
+pytestmark = pytest.mark.slow
+
+JOINT = "5"
+NODE = 6
+COUNTS_PER_RAD = 131072 * 81.5 / (2 * math.pi)
+
+
+class Running:
+    """A calibration in the background, and an ear on its bus."""
+
+    def __init__(self, out: Path, channel: str) -> None:
+        self.out = out
+        program = Path(sys.executable).parent / "frictid-hil"
+        self.parent = subprocess.Popen(
+            [
+                str(program),
+                *("calibrate", "--robot", "hp3j", "--joint", JOINT, "--realtime", "--yes"),
+                *("--bus", f"virtual:{channel}", "--out", str(out)),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.bus = self._listen(channel)
+
+    def wait_for_cycles(self) -> None:
+        """Until the joint moves faster than the slow moves around the cycles do."""
+        until = time.monotonic() + 60
+        before: tuple[float, float] | None = None
+        while time.monotonic() < until:
+            try:
+                at = self.position_rad()
+            except can.CanError:
+                raise AssertionError(f"the run ended early: {self.parent.communicate()[0]}") from None
+            if before is not None and at is not None and at[0] - before[0] > 0.02:
+                if abs(at[1] - before[1]) / (at[0] - before[0]) > math.radians(40):
+                    return
+                before = at
+            before = before or at
+        raise AssertionError("the cycles never began")
+
+    def position_rad(self) -> tuple[float, float] | None:
+        """(time, position) of the next report of the joint."""
+        message = self.bus.recv(0.5)
+        if message is None or message.arbitration_id != 0x180 + NODE or len(message.data) < 6:
+            return None
+        return time.monotonic(), struct.unpack_from("<i", message.data, 2)[0] / COUNTS_PER_RAD
+
+    def child(self) -> psutil.Process:
+        """The process of the cyclic loop."""
+        (loop,) = [c for c in psutil.Process(self.parent.pid).children() if "spawn_main" in " ".join(c.cmdline())]
+        return loop
+
+    def last_run_time_s(self) -> float:
+        """Run time of the newest readable sample."""
+        with contextlib.suppress(InputFileError):
+            return max(float(samples.time_ns[-1]) * 1e-9 for samples in read_mcap(self.out / "samples.mcap"))
+        return 0.0
+
+    @staticmethod
+    def _listen(channel: str) -> can.BusABC:
+        for _ in range(200):
+            with contextlib.suppress(can.CanError, OSError):
+                return can.Bus(interface="frictid", channel=channel)
+            time.sleep(0.1)
+        raise AssertionError("the simulated bus never came up")
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Running]:
+    run = Running(tmp_path / "run", f"kill-{os.getpid()}-{tmp_path.name}")
+    try:
+        run.wait_for_cycles()
+        yield run
+    finally:
+        run.parent.kill()
+        run.parent.wait()
+        run.bus.shutdown()
+
+
+def positions_until_quiet(run: Running, seconds: float) -> list[float]:
+    """Every position reported from now until the bus is gone or the time is over."""
+    seen: list[float] = []
+    until = time.monotonic() + seconds
+    with contextlib.suppress(can.CanError):  # the simulated bus ends with its owner
+        while time.monotonic() < until:
+            at = run.position_rad()
+            if at is not None:
+                seen.append(at[1])
+    return seen
+
+
+def asked(run: Running, index: int, layout: str) -> int:
+    """An object of the drive, read by SDO from the second seat on the bus."""
+    run.bus.send(
+        can.Message(arbitration_id=0x600 + NODE, data=struct.pack("<BHB4x", 0x40, index, 0), is_extended_id=False)
+    )
+    until = time.monotonic() + 2
+    while time.monotonic() < until:
+        message = run.bus.recv(0.5)
+        if message is not None and message.arbitration_id == 0x580 + NODE:
+            value: int = struct.unpack_from(layout, message.data, 4)[0]
+            return value
+    raise AssertionError(f"the drive did not answer for {index:04X}")
+
+
+def test_a_killed_parent_loses_at_most_half_a_second_and_the_loop_stops_the_joint(running: Running) -> None:
+    known_s, known_at = running.last_run_time_s(), time.monotonic()
+    time.sleep(1.5)
+    loop = running.child()
+    running.parent.kill()
+    killed_at = time.monotonic()
+    last = positions_until_quiet(running, 5.0)[-50:]
+    assert np.ptp(last) < math.radians(0.05), "the joint stood before the loop ended"
+    loop.wait(timeout=5)
+    running.parent.wait()
+    assert running.last_run_time_s() >= known_s + (killed_at - known_at) - 0.5
+    assert len(read_frames(running.out / "bus.blf")) > 1000
+
+
+def test_a_killed_loop_leaves_the_joint_to_the_drives_watchdog(running: Running) -> None:
+    running.child().send_signal(signal.SIGKILL)
+    # The drive's heartbeat consumer is set to 100-200 ms; its quick stop ramps after that.
+    positions_until_quiet(running, 1.0)
+    before = asked(running, 0x6064, "<i")
+    time.sleep(0.2)
+    moved_rad = abs(asked(running, 0x6064, "<i") - before) / COUNTS_PER_RAD
+    status = asked(running, 0x6041, "<H")
+    assert moved_rad < math.radians(0.01)
+    assert status & 0x6F != 0x27, "no longer in operation enabled"
+    said, _ = running.parent.communicate(timeout=30)
+    assert running.parent.returncode == 4, said
+    assert "ended without a word" in said
+    assert "Traceback" not in said
+    assert running.last_run_time_s() > 3.0
+
+
+def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> None:
+    running.parent.send_signal(signal.SIGINT)
+    said, _ = running.parent.communicate(timeout=30)
+    assert running.parent.returncode == 130, said
+    assert "brought to rest" in said
+    assert "Traceback" not in said
+    assert running.last_run_time_s() > 3.0
