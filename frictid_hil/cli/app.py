@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from frictid_hil import __version__
-from frictid_hil.cli import calibrate, compensate, gap, profiles, reports
+from frictid_hil.cli import calibrate, compensate, gap, profiles, replay, reports
 
 app = typer.Typer(
     name="frictid-hil",
@@ -17,6 +17,7 @@ app = typer.Typer(
 calibrate.register(app)
 compensate.register(app)
 reports.register(app)
+replay.register(app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 
