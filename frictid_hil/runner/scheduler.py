@@ -69,6 +69,7 @@ class Care:
         velocity_margin: measured speed may exceed the planned peak by this factor ...
         velocity_slack_rad_s: ... plus this.
         travel_slack_rad: measured position may leave the planned travel by this.
+        silence_s: how long the moving joint may go without a report; never less than three cycles.
         interlock: must be closed before and during motion; None where a person watches.
     """
 
@@ -80,6 +81,7 @@ class Care:
     velocity_margin: float = 1.25
     velocity_slack_rad_s: float = math.radians(10.0)
     travel_slack_rad: float = math.radians(2.0)
+    silence_s: float = 0.02
     interlock: Interlock | None = None
 
 
@@ -242,6 +244,7 @@ class Scheduler:
             torque_nm=joint.max_torque_nm * 1.05,
             following_error_rad=care.following_error_rad,
             still_rad=care.still_rad,
+            max_age_cycles=max(3, math.ceil(care.silence_s * self._plan.cycle_hz)),
         )
 
     def _motions(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan) -> list[Mark]:

@@ -109,8 +109,8 @@ class Supervisor:
         self._torque_high[joint] = 0
 
     def set_report_interval(self, joint: int, cycles: int) -> None:
-        """A joint that reports every ``cycles`` cycles may be that much older."""
-        self._max_age[joint] = self._limits[joint].max_age_cycles * max(1, cycles)
+        """A joint that reports every ``cycles`` cycles may be three times as old."""
+        self._max_age[joint] = max(self._limits[joint].max_age_cycles, 3 * cycles)
 
     def check(self, set_points: Sequence[SetPoint], feedback: Sequence[Feedback]) -> None:
         """Pass one cycle's feedback.
