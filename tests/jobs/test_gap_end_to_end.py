@@ -50,7 +50,7 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "torque_constant_error": {"error_share": (0.03, 0.1)},
     "torque_delay": {"delay_s": (2e-3, 4e-3)},
     "torque_ripple": {"amplitude_nm": (0.2, 0.6), "phase_rad": (-3.0, 3.0)},
-    "torque_saturation": {"limit_share": (0.34, 0.38)},
+    "torque_saturation": {"limit_share": (0.335, 0.355)},
     "velocity_lag": {"time_constant_s": (3e-3, 8e-3)},
     "viscous_nonlinearity": {"share": (0.3, 0.8), "knee_rad_s": (0.2, 0.6)},
 }
