@@ -176,7 +176,7 @@ def _run(
     progress = _Progress()
     joint = options.joint
     entry = profile.joint(joint)
-    hand = _Hand(joint, planned.centre_rad, wanted, watcher)
+    hand = _Hand(joint, planned, wanted, watcher)
     begun = False
 
     def proceed(preflight: Preflight) -> bool:
@@ -232,9 +232,16 @@ def _run(
 class _Hand:
     """The simulated person, following the phases; on a real robot the person reads what to do."""
 
-    def __init__(self, joint: str, centre_rad: float, wanted: Wanted, watcher: Watcher) -> None:
+    def __init__(self, joint: str, planned: CompensationPlan, wanted: Wanted, watcher: Watcher) -> None:
         self._joint = joint
-        self._centre_rad = centre_rad
+        self._centre_rad = planned.centre_rad
+        names = {motion.name for motion in planned.plan.joints[0].motions}
+        # A person who does not rest lets go at the end of the swing.
+        self._last = {
+            name if (rest := name.replace("hand ", "rest ")) not in names else rest
+            for name in names
+            if name[:5] == "hand "
+        }
         self._wanted = wanted
         self._watcher = watcher
         self._driver: GuidedBySimulation | None = None
@@ -252,7 +259,7 @@ class _Hand:
                 self._guide(self._wanted.amplitude_rad)
             elif phase == "rest":
                 self._guide(0.0)
-        elif isinstance(event, Marked) and event.mark.name.startswith("rest ") and self._driver is not None:
+        elif isinstance(event, Marked) and event.mark.name in self._last and self._driver is not None:
             self._driver.simulate_hand(self._joint, self._centre_rad, 0.0, 0.0)
 
     def _guide(self, amplitude_rad: float) -> None:

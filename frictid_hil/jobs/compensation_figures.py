@@ -54,7 +54,8 @@ class ModeFigures:
         reduction_percent: of the task's own measure against nc: F_s for ``hand``, E_s for ``track``.
         reduction_inertia_removed_percent: of the one with inertia removed.
         tracking_rms_rad: E_s of (28).
-        ceiling_percent: raw reduction that a joint without any friction would reach.
+        ceiling_percent: raw reduction against nc of a joint without any friction that moves as this one did.
+        inertial_rms_nm: of inertia times acceleration.
         reasons: by figure.
     """
 
@@ -65,6 +66,7 @@ class ModeFigures:
     reduction_inertia_removed_percent: float | None = None
     tracking_rms_rad: float | None = None
     ceiling_percent: float | None = None
+    inertial_rms_nm: float | None = None
     reasons: Mapping[str, str] | None = None
 
     def values(self) -> dict[str, object]:
@@ -144,7 +146,7 @@ def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
     return replace(
         figure,
         torque_rms_inertia_removed_nm=_rms(torque_nm - inertial_nm),
-        ceiling_percent=_reduction(_rms(inertial_nm), _rms(torque_nm)),
+        inertial_rms_nm=_rms(inertial_nm),
     )
 
 
@@ -152,7 +154,7 @@ def _against(figure: ModeFigures, base: ModeFigures | None, task: str) -> ModeFi
     reasons = dict(figure.reasons or {})
     if base is None:
         reasons["reduction_percent"] = "nc did not run"
-        return replace(figure, ceiling_percent=None, reasons=reasons)
+        return replace(figure, reasons=reasons)
     if task == "track":
         return replace(figure, reduction_percent=_reduction(figure.tracking_rms_rad, base.tracking_rms_rad))
     return replace(
@@ -161,7 +163,7 @@ def _against(figure: ModeFigures, base: ModeFigures | None, task: str) -> ModeFi
         reduction_inertia_removed_percent=_reduction(
             figure.torque_rms_inertia_removed_nm, base.torque_rms_inertia_removed_nm
         ),
-        ceiling_percent=base.ceiling_percent,
+        ceiling_percent=_reduction(figure.inertial_rms_nm, base.torque_rms_nm),
     )
 
 

@@ -151,7 +151,7 @@ def compensation_plan(
         centre_rad = joint.start_position_rad + travel_rad / 2
     warnings: list[str] = []
     laws = {mode: law_of(entry, joint, mode, wanted, warnings) for mode in wanted.modes}
-    motions = _motions(joint, entry, policy, wanted, centre_rad, laws)
+    motions = _motions(joint, entry, policy, wanted, centre_rad, laws, hunts=bool(warnings))
     others = {other.name: other.locked_position_rad for other in setup.joints if other.name != name}
     moved: JointPlan = joint_plan(joint, motions, others, None)
     gravity = next(iter(laws.values())).gravity
@@ -248,6 +248,8 @@ def _motions(
     wanted: Wanted,
     centre_rad: float,
     laws: dict[str, ControlLaw],
+    *,
+    hunts: bool,
 ) -> list[Motion]:
     reach = wanted.amplitude_rad
     low_rad, home_rad = centre_rad - reach, joint.locked_position_rad
@@ -269,12 +271,14 @@ def _motions(
         Hold(centre_rad, _PAUSE_S),
     ]
     for mode, law in laws.items():
-        motions += _task(joint, wanted, centre_rad, mode, law)
+        motions += _task(joint, wanted, centre_rad, mode, law, hunts)
         motions.append(Hold(centre_rad, _PAUSE_S))
     return [*motions, Move.within(centre_rad, home_rad, APPROACH_RAD_S, name="return"), Hold(home_rad, 0.2)]
 
 
-def _task(joint: JointSetup, wanted: Wanted, centre_rad: float, mode: str, law: ControlLaw) -> list[Motion]:
+def _task(
+    joint: JointSetup, wanted: Wanted, centre_rad: float, mode: str, law: ControlLaw, hunts: bool
+) -> list[Motion]:
     bounds = _bounds(joint, wanted, centre_rad, law)
     drive_mode = wanted.drive_mode
     duration_s = wanted.cycles * wanted.period_s
@@ -288,11 +292,11 @@ def _task(joint: JointSetup, wanted: Wanted, centre_rad: float, mode: str, law: 
         velocity_rad_s=_STAND_RAD_S,
     )
     swing = Swing(centre_rad, wanted.amplitude_rad, 1.0 / wanted.period_s, math.inf if wanted.endless else duration_s)
-    return [
-        Compensated(f"stand {mode}", Hold(centre_rad, _STAND_S), law, standing, drive_mode),
-        Compensated(f"hand {mode}", swing, law, bounds, drive_mode),
-        Compensated(f"rest {mode}", Hold(centre_rad, _REST_S), law, bounds, drive_mode),
-    ]
+    stand = Compensated(f"stand {mode}", Hold(centre_rad, _STAND_S), law, standing, drive_mode)
+    hand = Compensated(f"hand {mode}", swing, law, bounds, drive_mode)
+    rest = Compensated(f"rest {mode}", Hold(centre_rad, _REST_S), law, bounds, drive_mode)
+    # A setting that hunts at standstill is only in force while the person moves the joint.
+    return [hand] if hunts and law.friction is not None else [stand, hand, rest]
 
 
 def triangle(centre_rad: float, amplitude_rad: float, speed_rad_s: float, cycles: int) -> Corners:
