@@ -189,7 +189,8 @@ class Capabilities:
         external_torque: feedback carries a force sensor's torque.
         temperature: feedback carries a motor or gear temperature.
         table_download: a friction table can be compensated on the controller's own tick.
-        command_delay_s: delay from set-point to motion that is normal here; following errors are judged with it.
+        command_delay_s: delay from the set-point in force (``Feedback.position_command_rad``) to motion that is normal
+            here; following errors are judged with it.
         digital_inputs: a joint with the option ``digital_inputs: true`` reports its inputs in the feedback, so that an
             interlock can be watched.
     """

@@ -40,7 +40,8 @@ PortFactory = Callable[[str, int, str], BytePort]
 
 _SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
 """Marks portions of serial bytes in a bus log; no CAN drive uses this identifier."""
-_LOGGED_BYTES = 64
+_LOGGED_LENGTHS = (64, 48, 32, 24, 20, 16, 12, *range(8, 0, -1))
+"""Lengths that a bus log can hold (those of CAN FD); bytes on the wire are cut into the longest of them."""
 
 _SERVO_LAG_S = 0.02
 _URGENT_S = 0.5
@@ -362,10 +363,10 @@ class MotomanDriver:
     # -- inside ------------------------------------------------------------------------------------------------
 
     def _command_delay_s(self) -> float:
-        """Queue, averaging and servo; where the controller does not know its averaging, what the robot file allows."""
+        """Averaging and servo; where the controller does not know its averaging, what the robot file allows."""
         known_ms = self._reach.welcome.averaging_ms if self._reach.welcome is not None else None
         averaging_ms = self._options.command_delay_ms if known_ms is None else known_ms
-        return self._options.lead_ticks * self._tick_us * 1e-6 + averaging_ms * 1e-3 + _SERVO_LAG_S
+        return averaging_ms * 1e-3 + _SERVO_LAG_S
 
     def _mask(self, joints: Iterable[str]) -> int:
         return sum(1 << self._units[name].axis for name in joints)
@@ -384,5 +385,7 @@ class MotomanDriver:
         sink = self._sink
         if sink is not None:
             now_ns = self.clock.now_ns()
-            for start in range(0, len(data), _LOGGED_BYTES):
-                sink(now_ns, _SERIAL_BYTES_ID, data[start : start + _LOGGED_BYTES], sent)
+            while data:
+                size = next(length for length in _LOGGED_LENGTHS if length <= len(data))
+                sink(now_ns, _SERIAL_BYTES_ID, data[:size], sent)
+                data = data[size:]

@@ -27,7 +27,7 @@ class SerialOptions:
         baud: of host control (RS032).
         parity: E, O or N (RS033); "" is E on hardware and N on a pseudo terminal, which can do nothing else.
         stream_baud: asked of FSTREAM; 0 where the port is no gateway port.
-        lead_ticks: how far ahead of the newest report targets are due.
+        lead_ticks: how far ahead of the report that they answer targets are due; what the host may be late by.
         silence_ms: without feedback for so long, the controller counts as lost.
         command_delay_ms: what the controller may delay the motion by where it does not say how much it averages.
         watchdog_s: a batch job stops when it hears nothing from us for so long.
@@ -48,8 +48,8 @@ class SerialOptions:
     baud: int = 19200
     parity: str = ""
     stream_baud: int = 0
-    lead_ticks: int = 5
-    silence_ms: float = 100.0
+    lead_ticks: int = 25
+    silence_ms: float = 300.0
     command_delay_ms: float = 300.0
     watchdog_s: float = 5.0
     reply_s: float = 10.0

@@ -84,6 +84,7 @@ class StreamSession:
         self._session = 0
         self._last_due = 0
         self._error: FrictidError | None = None
+        self._refused_at_tick = -1
         self._goodbye = False
         self.welcome: Welcome | None = None
         self.report: TickReport | None = None
@@ -175,11 +176,8 @@ class StreamSession:
         Raises:
             SafetyAbort: it stopped the arm, or refused a target.
         """
-        if self.halted:
-            return
-        self._raise_error()
         report = self._newest
-        if report is None:
+        if self.halted or report is None:
             return
         if report.alarm:
             raise SafetyAbort(
@@ -195,6 +193,9 @@ class StreamSession:
             )
         if Flag.LATCHED in report.flags:
             raise self._latched(report)
+        # A refusal may overtake the report that explains it better.
+        if self._error is not None and report.tick > self._refused_at_tick + 1:
+            raise self._error
 
     def _latched(self, report: TickReport) -> SafetyAbort:
         holds = set(decode_status(self._profile, report.data_1, report.data_2).holds) - {"command hold"}
@@ -253,6 +254,7 @@ class StreamSession:
                 self.nacks[frame.reason] += 1
                 if frame.code not in _RECOVERABLE and self._error is None:
                     self._error = _refused(frame)
+                    self._refused_at_tick = self._newest.tick if self._newest is not None else -1
             case Welcome():
                 self.welcome = frame
                 self.arrived_s = self._port.now_s()
