@@ -105,7 +105,7 @@ class Cycles:
         return self.start_rad + trajectory.position(self.procedure, time_s)
 
     def details(self) -> Mapping[str, Any]:
-        """V, A, N, c."""
+        """V, A, N, c, and the shares of V where the speeds are not the paper's."""
         p = self.procedure
         return {
             "start_rad": self.start_rad,
@@ -113,6 +113,7 @@ class Cycles:
             "velocity_rad_s": p.velocity_rad_s,
             "cycles": p.cycles,
             "ratio": p.ratio,
+            **({"shares": list(p.shares)} if p.shares else {}),
         }
 
 

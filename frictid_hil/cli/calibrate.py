@@ -78,7 +78,14 @@ def calibrate(
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
-    method: MethodOption = "aligned",
+    method: Annotated[
+        str | None,
+        typer.Option("--method", help="function-a (as published), aligned, least-squares. Default: the programme's."),
+    ] = None,
+    program: Annotated[
+        str,
+        typer.Option("--program", help="thorough (N speeds, aligned), standard (3 speeds), quick (2): least squares."),
+    ] = "thorough",
     bus: BusOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
@@ -107,6 +114,7 @@ def calibrate(
         cycles=cycles,
         ratio=ratio,
         method=method,
+        program=program,
         realtime=realtime,
         seed=seed,
         resume=resume,

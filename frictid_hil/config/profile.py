@@ -96,12 +96,16 @@ class Ripple(Strict):
 
 
 class ProcedureUsed(Strict):
-    """V, A, N, c that the curve was measured with; None for recordings that followed no procedure."""
+    """V, A, N, c that the curve was measured with, and the shares of V of a short programme.
+
+    None for recordings that followed no procedure.
+    """
 
     amplitude_rad: float = Field(gt=0)
     velocity_rad_s: float = Field(gt=0)
     cycles: int = Field(ge=1)
     ratio: float = Field(ge=0, lt=1)
+    shares: Numbers | None = None
 
 
 class DriveIdentity(Strict):
@@ -220,6 +224,8 @@ class JointProfile(Strict):
         for name in ("torque_interval_nm", "forward", "backward", "published", "ripple", "procedure", "temperature_c"):
             if values[name] is None:
                 del values[name]
+        if self.procedure is not None and self.procedure.shares is None:
+            del values["procedure"]["shares"]
         for value in values.values():
             if isinstance(value, dict) and "value" in value:
                 _drop_nothings(value)

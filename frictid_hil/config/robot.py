@@ -192,8 +192,17 @@ class Robot:
         velocity_rad_s: float | None = None,
         cycles: int | None = None,
         ratio: float | None = None,
+        shares: tuple[float, ...] = (),
     ) -> Procedure:
         """The procedure of one joint: what is given here, else the joint's own, else the robot's.
+
+        Args:
+            joint: name.
+            amplitude_rad: A.
+            velocity_rad_s: V.
+            cycles: N.
+            ratio: c.
+            shares: peak speeds of a short programme as shares of V; their number is then N.
 
         Raises:
             UsageError: no such joint, or values that make no procedure.
@@ -203,7 +212,7 @@ class Robot:
         given = {
             "amplitude_rad": amplitude_rad,
             "velocity_rad_s": velocity_rad_s,
-            "cycles": cycles,
+            "cycles": len(shares) or cycles,
             "ratio": ratio,
         }
         for name, value in given.items():
@@ -211,7 +220,7 @@ class Robot:
                 override = getattr(own, name)
                 given[name] = getattr(common, name) if override is None else override
         try:
-            return Procedure(**given)  # type: ignore[arg-type]  # cycles is an int in the model and in the argument
+            return Procedure(**given, shares=shares)  # type: ignore[arg-type]  # cycles is an int in the model and in the argument
         except ValueError as error:
             raise UsageError(str(error), where=f"joint {joint}") from None
 

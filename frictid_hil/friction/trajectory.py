@@ -1,13 +1,15 @@
 """The identification trajectory: N sinusoidal cycles of one travel and rising speed, equations (2)-(5).
 
 ``A`` is the **peak-to-peak** travel (2); the paper's analysis (11) uses the same letter zero-to-peak. The position runs
-one-sided from 0 to A and back in every cycle, with peak speed nV/N in cycle n.
+one-sided from 0 to A and back in every cycle, with peak speed nV/N in cycle n; a shorter programme may name the peak
+speeds of fewer cycles instead.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,13 +26,15 @@ class Procedure:
         amplitude_rad: A, peak-to-peak travel.
         velocity_rad_s: V, peak speed of the last cycle.
         cycles: N, number of cycles and of identified pairs; at least 2.
-        ratio: c, samples with abs(v) >= c n V / N count; 0 <= c < 1.
+        ratio: c, samples with abs(v) >= c times the cycle's peak speed count; 0 <= c < 1.
+        shares: peak speed of every cycle as a share of V, rising to 1; empty for the paper's n / N.
     """
 
     amplitude_rad: float
     velocity_rad_s: float
     cycles: int = 10
     ratio: float = 0.8
+    shares: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.amplitude_rad) and self.amplitude_rad > 0):
@@ -41,15 +45,22 @@ class Procedure:
             raise ValueError(f"a curve needs at least 2 cycles, got {self.cycles}")
         if not 0.0 <= self.ratio < 1.0:
             raise ValueError(f"the window ratio must lie in [0, 1), got {self.ratio}")
+        if self.shares:
+            if len(self.shares) != self.cycles:
+                raise ValueError(f"{self.cycles} cycles need as many speeds, got {len(self.shares)}")
+            if not (self.shares[0] > 0 and self.shares[-1] == 1 and all(a < b for a, b in pairwise(self.shares))):
+                raise ValueError(f"shares of the peak velocity must rise to 1, got {self.shares}")
 
     @property
     def peak_velocities_rad_s(self) -> Array:
-        """n V / N for n = 1..N, shape (N,)."""
+        """n V / N for n = 1..N, or V times each share, shape (N,)."""
+        if self.shares:
+            return np.array(self.shares) * self.velocity_rad_s
         return np.arange(1, self.cycles + 1) * (self.velocity_rad_s / self.cycles)
 
     @property
     def angular_frequencies_rad_s(self) -> Array:
-        """w_n = 2 n V / (A N), shape (N,)."""
+        """w_n = 2 n V / (A N): twice the peak speed over A, shape (N,)."""
         return 2.0 * self.peak_velocities_rad_s / self.amplitude_rad
 
     @property

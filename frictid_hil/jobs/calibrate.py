@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from frictid_hil.config.policy import WarmUp
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
@@ -15,12 +17,15 @@ from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import calibration_plan, expected_of
+from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, refuse_beyond_limits
-from frictid_hil.runner.events import Event, JointRun
+from frictid_hil.runner.events import Event, JointRun, Preflight
+from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
+from frictid_hil.runner.scheduler import Care
 
 VERB = "calibrate"
 
@@ -37,11 +42,15 @@ class CalibrateOptions:
         velocity_rad_s: V.
         cycles: N.
         ratio: c.
-        method: estimator.
+        method: estimator; None for the programme's.
+        program: ``thorough``, ``standard`` or ``quick``.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise.
         resume: run folder to continue.
         out: run folder to write.
+        verb: that the run is part of.
+        warm_up: every joint is warmed up before it is measured.
+        interlock: must be closed before and during motion.
     """
 
     robot: str
@@ -51,11 +60,15 @@ class CalibrateOptions:
     velocity_rad_s: float | None = None
     cycles: int | None = None
     ratio: float | None = None
-    method: str = "aligned"
+    method: str | None = None
+    program: str = "thorough"
     realtime: bool = False
     seed: int = 0
     resume: Path | None = None
     out: Path | None = None
+    verb: str = VERB
+    warm_up: WarmUp | None = None
+    interlock: Interlock | None = None
 
 
 @dataclass(slots=True)
@@ -75,12 +88,14 @@ class Planned:
         robot: its file.
         setup: as the driver knows it.
         plan: within every limit.
+        method: estimator.
         resumed: the run folder to go on with.
     """
 
     robot: Robot
     setup: RobotSetup
     plan: Plan
+    method: str
     resumed: RunFolder | None
 
 
@@ -91,20 +106,27 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         UsageError: refused (arguments, files, limits).
     """
     robot = load_robot(options.robot)
-    if options.method not in METHODS:
-        raise UsageError(f"no estimator {options.method!r}; there are {', '.join(METHODS)}")
+    chosen = programme(options.program)
+    method = options.method or chosen.method
+    if method not in METHODS:
+        raise UsageError(f"no estimator {method!r}; there are {', '.join(METHODS)}")
+    if chosen.shares and options.cycles is not None:
+        raise UsageError(f"programme {chosen.name} has {len(chosen.shares)} cycles; leave --cycles out")
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    if options.interlock is not None:
+        setup = _reporting_inputs(setup, options.interlock.joint)
     wanted = options.joints or robot.joint_names
     robot.check_joints(wanted)
     resumed = RunFolder.resume(options.resume, robot) if options.resume else None
     kept = resumed.kept_joints() if resumed else {}
-    procedures = {name: _procedure(robot, name, options) for name in dict.fromkeys(wanted) if name not in kept}
+    procedures = {name: _procedure(robot, name, options, chosen) for name in dict.fromkeys(wanted) if name not in kept}
     expected = expected_of(robot)
     rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
-    notes = _notes(procedures, expected, rehearse)
-    plan = calibration_plan(robot, setup, procedures, expected, rehearse=rehearse, notes=notes)
+    notes = [chosen.note(procedure) for procedure in list(procedures.values())[:1]]
+    notes += _notes(procedures, expected, rehearse)
+    plan = calibration_plan(robot, setup, procedures, expected, rehearse=rehearse, notes=notes, warm_up=options.warm_up)
     refuse_beyond_limits(plan, setup, expected)
-    return Planned(robot, setup, plan, resumed)
+    return Planned(robot, setup, plan, method, resumed)
 
 
 def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
@@ -121,42 +143,40 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
     planned = plan_calibration(options)
     robot, setup, plan = planned.robot, planned.setup, planned.plan
     watcher.plan(plan, setup)
-    folder = planned.resumed or RunFolder.create(robot, VERB, options.out)
+    folder = planned.resumed or RunFolder.create(robot, options.verb, options.out)
     kept = folder.kept_joints()
     progress = _Progress(
         joints={name: profile for name, (profile, _) in kept.items()},
         results={name: result for name, (_, result) in kept.items()},
     )
-    lost = _run(robot, setup, plan, folder, options, watcher, progress)
+    lost = _run(planned, folder, options, watcher, progress)
     return _finish(robot, setup, folder, options, progress, lost)
 
 
-def _run(
-    robot: Robot,
-    setup: RobotSetup,
-    plan: Plan,
-    folder: RunFolder,
-    options: CalibrateOptions,
-    watcher: Watcher,
-    progress: _Progress,
-) -> int:
+def _run(planned: Planned, folder: RunFolder, options: CalibrateOptions, watcher: Watcher, progress: _Progress) -> int:
     """Move the joints; every finished joint is identified and kept before the next one begins."""
+    setup, plan = planned.setup, planned.plan
+
+    before = dict(folder.manifest["identities"])
 
     def notify(event: Event) -> None:
         watcher.event(event)
+        if isinstance(event, Preflight):
+            _refuse_other_drives(before, event, folder)
         folder.note(event)
         if isinstance(event, JointRun):
-            _identify(event, folder, setup, options, watcher, progress)
+            _identify(event, folder, planned, watcher, progress)
 
     with folder.keeping(setup, watcher.at) as keeper:
         try:
             return run_plan(
-                robot.driver(options.bus),
+                planned.robot.driver(options.bus),
                 setup,
                 plan,
                 keeper,
                 notify=notify,
                 proceed=lambda preflight: watcher.confirm(plan, preflight),
+                care=Care(interlock=options.interlock),
             )
         except FrictidError as error:
             if isinstance(error, UsageError) or not keeper.rows:
@@ -167,14 +187,33 @@ def _run(
             return 0
 
 
-def _identify(
-    run: JointRun,
-    folder: RunFolder,
-    setup: RobotSetup,
-    options: CalibrateOptions,
-    watcher: Watcher,
-    progress: _Progress,
-) -> None:
+def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:
+    """The robot with one drive that reports its digital inputs."""
+    joints = tuple(
+        replace(one, options={**one.options, "digital_inputs": True}) if one.name == joint else one
+        for one in setup.joints
+    )
+    return replace(setup, joints=joints)
+
+
+def _refuse_other_drives(before: Mapping[str, Any], preflight: Preflight, folder: RunFolder) -> None:
+    """A run is continued with the drives it began with.
+
+    Raises:
+        UsageError: a serial number differs.
+    """
+    for name, identity in preflight.identities.items():
+        was = before.get(name, {}).get("serial", identity.serial)
+        if was != identity.serial:
+            raise UsageError(
+                f"the drive has serial number {identity.serial or 'none'}, this run began with {was or 'none'}",
+                where=f"joint {name}",
+                cause="a drive was exchanged, or this is another robot",
+                next_step=f"start a new run; what was measured before is in {folder.path}",
+            )
+
+
+def _identify(run: JointRun, folder: RunFolder, planned: Planned, watcher: Watcher, progress: _Progress) -> None:
     samples = folder.samples(run)
     result: dict[str, Any] = {
         "duration_s": run.duration_s,
@@ -184,7 +223,10 @@ def _identify(
     }
     try:
         profile = identify_joint(
-            samples, setup.joint(run.joint), method=options.method, late_cycles=run.late_cycles + run.missed_cycles
+            samples,
+            planned.setup.joint(run.joint),
+            method=planned.method,
+            late_cycles=run.late_cycles + run.missed_cycles,
         )
     except IdentificationError as error:
         progress.results[run.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
@@ -274,13 +316,14 @@ def _provenance(
     )
 
 
-def _procedure(robot: Robot, name: str, options: CalibrateOptions) -> Procedure:
+def _procedure(robot: Robot, name: str, options: CalibrateOptions, chosen: Programme) -> Procedure:
     return robot.procedure(
         name,
         amplitude_rad=options.amplitude_rad,
         velocity_rad_s=options.velocity_rad_s,
         cycles=options.cycles,
         ratio=options.ratio,
+        shares=chosen.shares,
     )
 
 

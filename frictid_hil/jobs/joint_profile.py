@@ -70,9 +70,10 @@ def identify_joint(
 
 
 def procedure_of(mark: Mark) -> Procedure:
-    """V, A, N, c that a recording carries."""
+    """V, A, N, c and the shares of V that a recording carries."""
     amplitude, velocity, cycles, ratio = (mark.details[key] for key in _PROCEDURE_KEYS)
-    return Procedure(float(amplitude), float(velocity), int(cycles), float(ratio))
+    shares = tuple(map(float, mark.details.get("shares", ())))
+    return Procedure(float(amplitude), float(velocity), int(cycles), float(ratio), shares)
 
 
 def joint_result(profile: JointProfile) -> dict[str, Any]:
@@ -131,6 +132,7 @@ def _from_cycles(
             velocity_rad_s=procedure.velocity_rad_s,
             cycles=procedure.cycles,
             ratio=procedure.ratio,
+            shares=procedure.shares or None,
         ),
         drive=_drive(samples.meta),
         quality={

@@ -95,3 +95,18 @@ def test_sample_times_cover_the_run_although_their_number_is_no_integer():
 def test_a_procedure_that_cannot_work_is_refused(wrong):
     with pytest.raises(ValueError):
         Procedure(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("shares", "cycles"), [((0.5, 1.0), 3), ((0.5, 0.4, 1.0), 3), ((0.5, 0.9), 2), ((0.0, 1.0), 2)]
+)
+def test_shares_that_make_no_programme_are_rejected(shares: tuple[float, ...], cycles: int) -> None:
+    with pytest.raises(ValueError, match=r"speeds|rise to 1"):
+        Procedure(20 * DEG, 115 * DEG, cycles, shares=shares)
+
+
+def test_equal_shares_are_the_papers_procedure() -> None:
+    paper, named = Procedure(0.3, 2.0, 4), Procedure(0.3, 2.0, 4, shares=(0.25, 0.5, 0.75, 1.0))
+    time_s = np.linspace(-0.1, paper.duration_s + 0.1, 500)
+    assert named.duration_s == pytest.approx(paper.duration_s)
+    np.testing.assert_allclose(trajectory.position(named, time_s), trajectory.position(paper, time_s))
