@@ -25,7 +25,8 @@ def confidence(name: str, features: Features) -> tuple[float, tuple[str, ...]]:
     else:
         rivals = sorted(features.rival_drive.items(), key=lambda item: -item[1])
         share, rival = (rivals[0][1], rivals[0][0]) if rivals else (0.0, "")
-        margin = 1000.0 * (1.0 - share)
+        # Samples of the torque are not quite independent: a tenth of their likelihood is taken.
+        margin = 0.1 * features.drive_gain.get(name, 1e5) * (1.0 - share)
     chance = 1.0 - 0.65 * math.exp(-max(0.0, margin) / 60.0)
     # What is left to explain could be the true cause.
     chance *= 1.0 - min(0.6, 1.5 * max(0.0, features.family_share - 0.06))

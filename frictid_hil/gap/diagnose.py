@@ -29,6 +29,8 @@ FAMILY_SHARE = 0.25
 FAMILY_AHEAD = 0.03
 """How far such a family alone may be ahead of the library's effects."""
 VELOCITY_EFFECTS = frozenset({"stribeck", "viscous_nonlinearity", "direction_asymmetry"})
+COLOURED = 3.0
+"""Low-passed actuation residual over what its white part leaves; slow noise of a healthy drive reaches 2."""
 HELD_SHARE = 0.002
 """Share of repeated positions in motion from which the position itself is in doubt."""
 
@@ -109,6 +111,8 @@ def _full(
         gain=model.gain,
         rivals=rivals,
         rival_drive=dict(channels.actuation.rivals) if channels.actuation is not None else {},
+        drive_gain=dict(channels.actuation.found) if channels.actuation is not None else {},
+        actuation_ratio=float(np.median(list(channels.actuation.ratio.values()))) if channels.actuation else 1.0,
         coarse=channels.kinematic.step_factor,
         floor_nm=floor,
     )
@@ -149,13 +153,15 @@ class Features:
     gain: float
     rivals: Mapping[str, tuple[float, str]]
     rival_drive: Mapping[str, float]
+    drive_gain: Mapping[str, float]
+    actuation_ratio: float
     coarse: float
     floor_nm: float
 
 
 def verdict_of(f: Features) -> tuple[str, str]:
     """(verdict, where it lives if unknown)."""
-    if f.actuation_left > 0.3:
+    if f.actuation_left > 0.3 or f.actuation_ratio > COLOURED:
         return "unknown", "actuation"
     if f.held_share > HELD_SHARE:
         return "unknown", "kinematics: positions repeat while the joint moves"

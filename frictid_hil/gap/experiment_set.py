@@ -8,6 +8,7 @@ diagnosis says what it cannot conclude without it.
 from __future__ import annotations
 
 import gzip
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -326,7 +327,10 @@ def read_log(path: Path) -> dict[str, Array]:
     try:
         with opener(path, "rt", encoding="utf-8", newline="") as file:
             header = [name.strip() for name in file.readline().lstrip("\ufeff").split(",")]
-            table = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MAX_ROWS + 1)
+            with warnings.catch_warnings():
+                # An empty table is reported below, in our own words.
+                warnings.simplefilter("ignore", UserWarning)
+                table = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MAX_ROWS + 1)
     except FileNotFoundError as error:
         raise InputFileError("no such log", where=where, next_step="correct `file` in nominal.yaml") from error
     except (OSError, EOFError, UnicodeDecodeError, ValueError) as error:

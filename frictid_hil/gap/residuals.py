@@ -149,6 +149,8 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
     if experiment.torque_nm is not None:
         view = _view(nominal, experiment, step_s, start_s, velocity)
         plant = view.torque_nm - nominal_torque(nominal, experiment, view)
+        # The ends have no second difference.
+        plant[0], plant[-1] = plant[1], plant[-2]
         if demand is not None:
             actuation = settled(experiment.torque_nm - held(demand), step_s)
     if experiment.velocity_rad_s is not None:

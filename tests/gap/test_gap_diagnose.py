@@ -1,0 +1,163 @@
+"""The diagnosis on joints made with the product's own simulator: verdicts, figures, traps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import gap_sets
+import numpy as np
+import pytest
+
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.forward import Replay, pooled
+from frictid_hil.gap.residuals import LowPass, recordings, rms
+
+SINGLES = {
+    "stribeck": {"share": 0.12, "stribeck_velocity_rad_s": 0.06, "exponent": 1.4},
+    "viscous_nonlinearity": {"share": 0.08, "knee_rad_s": 0.3, "bend": 2.0},
+    "direction_asymmetry": {"coulomb_share": 0.07, "viscous_share": 0.15},
+    "load_dependent_friction": {"linear_share": 0.1},
+    "torque_ripple": {"amplitude_nm": 0.3, "cycles_per_motor_revolution": 2.0, "phase_rad": 0.7},
+    "presliding_hysteresis": {"share": 0.2, "distance_rad": 0.008},
+    "stiction_breakaway": {"share": 0.3, "dwell_time_s": 0.5, "travel_rad": 2e-3},
+    "joint_elasticity": {"compliance_rad_per_nm": 6e-4, "relaxation_s": 1e-3},
+    "torque_delay": {"delay_s": 0.003},
+    "torque_constant_error": {"error_share": 0.05},
+    "torque_saturation": {"limit_share": 0.22},
+    "velocity_lag": {"time_constant_s": 0.006},
+    "encoder_offset": {"offset_rad": 0.06},
+    "gravity_error": {"error_share": 0.08},
+    "inertia_error": {"error_share": 0.2},
+    "torque_bias": {"bias_nm": 0.25},
+    "electrical_lag": {"time_constant_s": 0.004},
+    "temperature_drift": {"coulomb_share": 0.3, "viscous_share": 0.3, "power_w": 1.0, "time_constant_s": 30.0},
+    "encoder_quantisation": {"step_rad": 1e-4},
+}
+
+
+@pytest.fixture(scope="module")
+def healthy() -> ExperimentSet:
+    return gap_sets.make()
+
+
+def test_healthy_joint_has_no_gap(healthy: ExperimentSet) -> None:
+    d = diagnose(healthy)
+    assert d.verdict == "none" and not d.causes
+    assert d.before.forward_torque_nm == pytest.approx(d.noise_floor.forward_torque_nm, rel=0.1)
+
+
+def test_traces_below_the_floor_are_not_reported() -> None:
+    traces = {
+        "torque_bias": {"bias_nm": 0.012},
+        "torque_ripple": {"amplitude_nm": 0.008, "cycles_per_motor_revolution": 2.0},
+        "presliding_hysteresis": {"share": 0.006, "distance_rad": 0.01},
+    }
+    d = diagnose(gap_sets.make(traces))
+    assert d.verdict == "none" and not d.causes
+
+
+@pytest.mark.parametrize("name", ["gravity_error", "torque_delay"])
+def test_single_effect_is_named_and_closed(name: str) -> None:
+    d = diagnose(gap_sets.make({name: SINGLES[name]}))
+    assert d.verdict == "explained"
+    assert d.causes[0].effect == name and d.causes[0].confidence >= 0.8
+    before, after = d.before.forward_torque_nm, d.after.forward_torque_nm
+    floor = d.noise_floor.forward_torque_nm
+    assert before is not None and after is not None and floor is not None
+    assert before > 1.5 * floor and (before - after) / (before - floor) > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(SINGLES))
+def test_every_effect_is_named(name: str) -> None:
+    d = diagnose(gap_sets.make({name: SINGLES[name]}, seed=3))
+    assert d.causes and d.causes[0].effect == name
+
+
+@pytest.mark.slow
+def test_parameters_come_back_with_intervals_that_hold_them() -> None:
+    d = diagnose(gap_sets.make({"gravity_error": SINGLES["gravity_error"]}))
+    value = d.causes[0].parameters["error_share"]
+    assert value.value == pytest.approx(0.08, abs=0.004)
+    assert value.low is not None and value.high is not None and value.low < value.value < value.high
+
+
+@pytest.mark.slow
+def test_two_effects_are_both_named() -> None:
+    d = diagnose(gap_sets.make({n: SINGLES[n] for n in ("torque_ripple", "torque_bias")}))
+    assert {c.effect for c in d.causes[:2]} == {"torque_ripple", "torque_bias"}
+    assert sum(c.gap_closed_percent or 0.0 for c in d.causes) <= 100.5
+
+
+@pytest.mark.slow
+def test_without_the_right_effect_in_the_library_no_wrong_one_is_sure() -> None:
+    from frictid_hil.simulation.effects import all_effects
+
+    library = set(all_effects()) - {"torque_ripple"}
+    d = diagnose(gap_sets.make({"torque_ripple": SINGLES["torque_ripple"]}), library=library)
+    assert d.verdict == "unknown" or all(c.confidence < 0.9 for c in d.causes)
+    assert "torque_ripple" not in {c.effect for c in d.causes}
+
+
+def test_json_is_plain_and_shares_add_up(healthy: ExperimentSet) -> None:
+    d = diagnose(gap_sets.make({"direction_asymmetry": SINGLES["direction_asymmetry"]}))
+    document = json.loads(json.dumps(d.to_json()))
+    assert set(document["gap"]) >= {"before", "after", "noise_floor"}
+    assert set(document["gap"]["before"]) == {"inverse_nm", "forward_torque_nm", "forward_position_rad"}
+    assert sum(w["share_of_gap"] for w in document["where"]) == pytest.approx(1.0)
+    assert document["causes"][0]["parameters"]["coulomb_share"]["interval_95"] is not None
+
+
+@pytest.mark.slow
+def test_same_answer_twice(healthy: ExperimentSet) -> None:
+    experiments = gap_sets.make({"torque_bias": SINGLES["torque_bias"]})
+    assert diagnose(experiments).to_json() == diagnose(experiments).to_json()
+
+
+def test_improved_model_closes_the_gap_in_the_simulator() -> None:
+    effect = {"direction_asymmetry": SINGLES["direction_asymmetry"]}
+    experiments = gap_sets.make(effect)
+    d = diagnose(experiments)
+    model = d.improved_model()
+    assert model is not None
+    assert set(model.effects) == {"direction_asymmetry"}
+    left = pooled(Replay(experiments)(model.effects, validation=True), "torque_nm")
+    assert left == pytest.approx(d.after.forward_torque_nm, rel=1e-6)
+
+
+def test_unknown_applies_nothing_and_never_enlarges_the_gap() -> None:
+    experiments = gap_sets.make()
+    # A torque over position that no effect has: the recording alone knows it.
+    odd = [
+        replace(e, torque_nm=e.torque_nm + 0.6 * np.sin(9.0 * e.position_rad) * np.sign(np.gradient(e.position_rad)))
+        for e in experiments.experiments
+        if e.torque_nm is not None
+    ]
+    d = diagnose(replace(experiments, experiments=tuple(odd)))
+    assert d.verdict == "unknown"
+    assert d.after == d.before
+    assert d.model is not None and not d.model.effects
+    assert "cause" in d.reasons
+
+
+def test_low_pass_once_a_healthy_joint_has_no_backlash(healthy: ExperimentSet) -> None:
+    logs = recordings(healthy)
+    low_pass = LowPass.at(500.0)
+    for recording in logs:
+        assert recording.plant_nm is not None and recording.actuation_nm is not None
+        noise = rms(low_pass(recording.actuation_nm))
+        assert rms(low_pass(recording.plant_nm)) < 3.0 * noise
+
+
+@pytest.mark.slow
+def test_concave_curve_below_its_first_pair_is_not_called_stribeck() -> None:
+    from frictid_hil.friction.curve import FrictionCurve
+
+    # The true curve bends down towards standstill; the nominal one was drawn straight through its first two pairs.
+    speeds = np.array([0.01, 0.03, 0.08, 0.2, 0.8, 1.8])
+    true = replace(gap_sets.NOMINAL, curve=FrictionCurve.through(speeds, np.array([2.7, 2.85, 3.02, 3.2, 3.7, 4.5])))
+    made = gap_sets.make(nominal=true)
+    d = diagnose(replace(made, nominal=gap_sets.NOMINAL))
+    assert not any(c.effect == "stribeck" and c.confidence >= 0.6 for c in d.causes)
