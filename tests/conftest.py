@@ -1,0 +1,12 @@
+"""Every test process lives in folders of its own: locks, sockets, state and data of other runs are out of reach."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+_home = tempfile.mkdtemp(prefix="frictid-tests-")
+for _name in ("FRICTID_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_DATA_HOME"):
+    os.environ[_name] = f"{_home}/{_name.lower()}"
+    Path(os.environ[_name]).mkdir()
