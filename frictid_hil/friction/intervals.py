@@ -21,7 +21,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.recording import CycleRecording, Motion
-from frictid_hil.friction.regression import Fit, hat_functions
+from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
@@ -160,6 +160,10 @@ class Drift:
     change: float
     apart_s: float
 
+    def over(self, duration_s: float) -> float:
+        """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most."""
+        return self.change * min(duration_s / self.apart_s, 3.0)
+
 
 def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) -> Drift | None:
     """The repeated cycle against its first run in ``pairs``; None where none was repeated completely."""
@@ -193,8 +197,9 @@ def _drift_share(recording: CycleRecording, scatter_nm: Array, drift: Drift | No
     if drift is None:
         return 0.0
     noise = scatter_nm[drift.cycle - 1] / drift.first_nm
-    change = np.sqrt(max(drift.change**2 - 2 * noise**2, 0.0))
-    return float(change * min(recording.procedure.duration_s / drift.apart_s, 3.0) / np.sqrt(3.0))
+    seen = drift.over(recording.procedure.duration_s)
+    beyond_noise = np.sqrt(max(1 - 2 * (noise / drift.change) ** 2, 0.0)) if drift.change else 0.0
+    return float(abs(seen) * beyond_noise / np.sqrt(3.0))
 
 
 def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> Array:
@@ -205,8 +210,12 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
     the scatter of all four halves, and friction that depends on the place. F_n is their mean, hence the quarter.
     """
     procedure = recording.procedure
-    inertia = 0.0 if solved is None else solved.values[solved.blocks.inertia]
-    torque = motion.torque_nm - inertia * motion.acceleration_rad_s2
+    torque = motion.torque_nm
+    if solved is not None:
+        blocks, v = solved.blocks, motion.velocity_rad_s[:, None]
+        waves = ripple_waves(recording, motion.position_rad)
+        ripple = np.column_stack([waves, np.sign(v) * waves, v * waves]) @ solved.values[blocks.ripple]
+        torque = torque - solved.values[blocks.inertia] * motion.acceleration_rad_s2 - ripple
     bounds = np.searchsorted(motion.time_s, procedure.cycle_starts_s)
     single = np.zeros(procedure.cycles)
     for n in range(procedure.cycles):

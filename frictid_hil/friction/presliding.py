@@ -4,9 +4,11 @@ After a turning point friction goes from one sliding level to the other over a s
 yields. Two shapes of that passage are fitted, x being the travel since the turning point, D the whole change of torque,
 
     yields at once       f(x) = f_r -/+ min(sigma x, D)
-    yields gradually     f(x) = f_r -/+ D (1 - exp(-sigma x / D))          (Dahl)
+    yields gradually     f(x) = f_r -/+ D (1 - exp(-2 sigma x / D))        (Dahl, LuGre)
 
-and the one that leaves less decides. sigma is the stiffness at the turning point in both.
+and the one that leaves less decides. sigma is the slope midway, where friction passes zero: the stiffness of a joint
+at rest. Right after the turning point a gradual joint is twice as stiff, but only until it has moved; a compensation
+spring as stiff as that would give back more than the joint takes.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ _SMOOTHING_S = 0.02
 _TURN_SHARE = 0.3
 """A turning point is followed by at least this share of the whole travel in the other direction."""
 _LEAST_ROWS = 20
+_LEAST_CLARITY = 4.0
+"""The passage is larger than what the fitted shape leaves by at least this factor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +106,7 @@ def _at_once(travel: Array, start: float, stiffness: float, change: float) -> Ar
 
 
 def _gradually(travel: Array, start: float, stiffness: float, change: float) -> Array:
-    falling: Array = start - change * (1.0 - np.exp(-stiffness * travel / change))
+    falling: Array = start - change * (1.0 - np.exp(-2.0 * stiffness * travel / change))
     return falling
 
 
@@ -124,9 +128,10 @@ def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Arr
             )
         except (RuntimeError, ValueError):
             continue
-        if np.sqrt(spread[1, 1]) < 0.5 * values[1]:
+        rest = float(np.mean((shape(travel, *values) - drop) ** 2))
+        if np.sqrt(spread[1, 1]) < 0.5 * values[1] and values[2] > _LEAST_CLARITY * np.sqrt(rest):
             found.append(float(values[1]))
-            left += float(np.mean((shape(travel, *values) - drop) ** 2))
+            left += rest
     if len(found) < 2:
         return None
     return np.array(found), left / len(found)

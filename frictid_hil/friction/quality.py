@@ -62,7 +62,7 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
     if math.isfinite(recording.torque_limit_nm):
         asked.append(_saturation(recording))
     if result.drift is not None:
-        asked.append(_drift(result.drift))
+        asked.append(_drift(recording, result.drift))
     if result.link_resonance_hz is not None:
         asked.append(_resonance(recording, result.link_resonance_hz.value))
     return tuple(asked)
@@ -159,12 +159,12 @@ def _saturation(recording: CycleRecording) -> Gate:
     )
 
 
-def _drift(drift: Drift) -> Gate:
-    change = abs(drift.change)
+def _drift(recording: CycleRecording, drift: Drift) -> Gate:
+    change = abs(drift.over(recording.procedure.duration_s))
     passed = change <= MOST_DRIFT
     said = (
-        f"friction changed by {100 * drift.change:+.1f} % (allowed {100 * MOST_DRIFT:.0f} %) "
-        f"when cycle {drift.cycle} ran again {drift.apart_s:.0f} s later"
+        f"friction had changed by {100 * drift.change:+.1f} % when cycle {drift.cycle} ran again "
+        f"{drift.apart_s:.1f} s later: {100 * change:.1f} % over the run (allowed {100 * MOST_DRIFT:.0f} %)"
     )
     return Gate("drift", passed, change, MOST_DRIFT, said if passed else f"{said}: warm the joint up first")
 

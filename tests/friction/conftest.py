@@ -7,7 +7,6 @@ import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -59,31 +58,12 @@ class Joint:
         return s + self.viscous * v + self.saturating * np.tanh(v / self.saturating_velocity)
 
 
-class Numbers(NamedTuple):
-    """A joint as the compiled loop takes it."""
-
-    inertia: float
-    link_share: float
-    link_stiffness: float
-    gravity_cos: float
-    gravity_sin: float
-    gravity_level: float
-    bias: float
-    coulomb: float
-    stribeck: float
-    stribeck_velocity: float
-    viscous: float
-    saturating: float
-    saturating_velocity: float
-    asymmetry: float
-    stiffness: float
-    gear_ratio: float
-    ripple: float
-    load: float
-    drift: float
-    max_torque: float
-    quantum_nm: float
-    count_rad: float
+NUMBERS = (
+    "inertia", "link_share", "link_stiffness", "gravity_cos", "gravity_sin", "gravity_level", "bias", "coulomb",
+    "stribeck", "stribeck_velocity", "viscous", "saturating", "saturating_velocity", "asymmetry", "stiffness",
+    "gear_ratio", "ripple", "load", "drift", "max_torque", "quantum_nm", "count_rad",
+)  # fmt: skip
+"""A joint as the compiled loop takes it: a record of floats (a class of ours would be named in numba's cache)."""
 
 
 @njit(cache=True)
@@ -192,13 +172,14 @@ def drive(joint: Joint, command, velocity, *, step_s: float = 0.001, delay: int 
     link, motor = joint.inertia * joint.link_share, joint.inertia * (1 - joint.link_share)
     # The resonance of the two masses free of everything else.
     stiffness = (2 * math.pi * joint.link_frequency_hz) ** 2 * link * motor / joint.inertia
-    numbers = Numbers(
-        **{name: float(getattr(joint, name)) for name in Numbers._fields if hasattr(joint, name)},
-        gravity_level=abs(gravity) if gravity else 1e9,
-        link_stiffness=stiffness,
-        quantum_nm=joint.quantum * joint.rated_torque,
-        count_rad=2 * math.pi / joint.counts / joint.gear_ratio,
-    )
+    derived = {
+        "gravity_level": abs(gravity) if gravity else 1e9,
+        "link_stiffness": stiffness,
+        "quantum_nm": joint.quantum * joint.rated_torque,
+        "count_rad": 2 * math.pi / joint.counts / joint.gear_ratio,
+    }
+    values = tuple(derived[name] if name in derived else float(getattr(joint, name)) for name in NUMBERS)
+    numbers = np.array([values], dtype=[(name, "f8") for name in NUMBERS])[0]
     blend = 1.0 - math.exp(-step_s / joint.velocity_filter_s) if joint.velocity_filter_s > 0 else 1.0
     white = joint.noise * joint.rated_torque * np.random.default_rng(seed).normal(size=command.size)
     substeps = max(1, round(step_s / 5e-5))

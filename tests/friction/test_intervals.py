@@ -1,0 +1,79 @@
+"""The intervals are judged where they are hard: on plants with effects that no estimator here contains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.intervals import coulomb_half_width_nm, curve_half_width_nm
+from frictid_hil.friction.recording import Skew
+
+UNKNOWN = {
+    "ripple": {"ripple": 0.1},
+    "soft": {"link_share": 0.5, "link_frequency_hz": 28.0},
+    "load": {"load": 0.05},
+    "plain": {},
+}
+
+
+def outcome(plants, joint, seed, method, amplitude=20):
+    """(error, half width) at every knot, as shares of the friction; true skew drawn as it was declared."""
+    procedure = plants.procedure(amplitude)
+    recording = plants.record(joint, procedure, seed=seed)
+    uncertainty = 1e-4
+    wrong = np.random.default_rng(seed + 77).normal() * uncertainty
+    recording = replace(recording, skew=Skew(torque_delay_s=5e-4 + wrong, uncertainty_s=uncertainty))
+    result = estimate(recording, method)
+    knots = np.array(result.curve.velocity_rad_s)
+    level = np.mean(result.curve.torque_nm)
+    error = np.array(result.curve.torque_nm) - joint.steady(knots)
+    return error / level, result.half_width_nm / level
+
+
+@pytest.mark.parametrize("method", ["function-a", "aligned", "least-squares"])
+@pytest.mark.parametrize("indices", [(1, 3), pytest.param((0, 2, 4, 5), marks=pytest.mark.slow)])
+def test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless(plants, method, indices):
+    errors, widths = [], []
+    for kind, effects in UNKNOWN.items():
+        for index in indices:
+            error, width = outcome(plants, replace(plants.arm[index], **effects), 3 * index + len(kind), method)
+            errors.append(error)
+            widths.append(width)
+    errors, widths = np.concatenate(errors), np.concatenate(widths)
+    assert np.mean(np.abs(errors) <= widths) >= 0.90
+    assert np.sqrt(np.mean(widths**2)) <= 5 * np.sqrt(np.mean(errors**2))
+
+
+def test_a_drifting_joint_gets_wide_intervals(plants):
+    error, width = outcome(plants, replace(plants.arm[1], drift=-0.05), 1, "aligned")
+    assert np.mean(np.abs(error) <= width) >= 0.9
+    assert np.mean(width) > 0.03
+
+
+def test_declared_skew_uncertainty_widens_the_fast_knots_only(plants):
+    recording = plants.record(plants.arm[1], plants.procedure(20))
+    narrow = estimate(replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=0.0)))
+    wide = estimate(replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=1e-3)))
+    added = wide.half_width_nm - narrow.half_width_nm
+    assert added[0] < 0.01 * added[-1]
+    predicted = 1.96 * 0.93 * 1.9 * recording.procedure.velocity_rad_s * 1e-3
+    predicted *= recording.procedure.angular_frequencies_rad_s[-1] ** 2
+    assert wide.terms.skew[-1] * 1.96 == pytest.approx(predicted, rel=0.15)
+
+
+def test_coulomb_interval_is_that_of_a_line_through_two_uncertain_pairs():
+    curve = FrictionCurve.through(np.array([0.2, 0.4, 0.6]), np.array([5.0, 5.2, 5.4]))
+    draws = np.random.default_rng(0).normal(size=(100_000, 2)) * [0.1, 0.05]
+    level = (5.0 + draws[:, 0]) * 2 - (5.2 + draws[:, 1])
+    assert coulomb_half_width_nm(curve, np.array([0.1, 0.05, 0.05])) == pytest.approx(np.std(level), rel=0.02)
+
+
+def test_intervals_grow_where_the_curve_is_extrapolated():
+    curve = FrictionCurve.through(np.array([0.2, 0.4, 0.6]), np.array([5.0, 5.2, 5.4]))
+    half = np.array([0.1, 0.2, 0.1])
+    at = curve_half_width_nm(curve, half, np.array([0.0, 0.1, 0.2, 0.3, 0.6, 1.2, -0.3]))
+    assert at[0] > at[1] > at[2] == pytest.approx(0.1)
+    assert at[3] == at[6] == pytest.approx(0.15)
+    assert at[5] > at[4] == pytest.approx(0.1)
