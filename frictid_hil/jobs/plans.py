@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from frictid_hil.config import policy
 from frictid_hil.config.robot import Robot
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.plan import Corners, Cycles, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
+from frictid_hil.plan import Corners, Cycles, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, WarmUp, joint_plan
 
 APPROACH_RAD_S = math.radians(20.0)
 """Speed of moves between the locked position and the start, and of the rehearsal."""
@@ -18,7 +19,9 @@ _REVERSAL_TRAVEL_RAD = 6e-3
 _REVERSAL_SPEED_RAD_S = 4e-3
 
 
-def calibration_motions(joint: JointSetup, procedure: Procedure, *, rehearse: bool) -> list[Motion]:
+def calibration_motions(
+    joint: JointSetup, procedure: Procedure, *, rehearse: bool, warm_up: policy.WarmUp | None = None
+) -> list[Motion]:
     """What one joint does in a calibration, from its locked position and back to it."""
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
@@ -26,6 +29,10 @@ def calibration_motions(joint: JointSetup, procedure: Procedure, *, rehearse: bo
     motions: list[Motion] = [Move.within(home, start, APPROACH_RAD_S)] if home != start else []
     if rehearse:
         motions.append(Sine(start, amplitude, min(APPROACH_RAD_S, procedure.velocity_rad_s), name="rehearsal"))
+    longest_s = 0.0 if warm_up is None else warm_up.max_s if warm_up.fixed_s is None else warm_up.fixed_s
+    if warm_up is not None and longest_s > 0.0:
+        limit = warm_up.settled_percent_per_min if warm_up.fixed_s is None else None
+        motions.append(WarmUp(start, amplitude, drift_speed, longest_s, limit))
     motions += [
         Hold(start, 0.5),
         Cycles(start, procedure),
@@ -53,13 +60,14 @@ def calibration_plan(
     *,
     rehearse: Sequence[str] = (),
     notes: Sequence[str] = (),
+    warm_up: policy.WarmUp | None = None,
 ) -> Plan:
     """The plan of a calibration, joint by joint in the order of ``procedures``."""
     locked = {joint.name: joint.locked_position_rad for joint in setup.joints}
     joints: list[JointPlan] = []
     for name, procedure in procedures.items():
         joint = setup.joint(name)
-        motions = calibration_motions(joint, procedure, rehearse=name in rehearse)
+        motions = calibration_motions(joint, procedure, rehearse=name in rehearse, warm_up=warm_up)
         others = {other: at for other, at in locked.items() if other != name}
         joints.append(joint_plan(joint, motions, others, expected.get(name)))
     return Plan(robot.name, setup.cycle_hz, tuple(joints), tuple(notes))

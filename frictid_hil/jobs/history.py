@@ -1,0 +1,84 @@
+"""A robot's history: its profiles, promotions and recalibrations, as values and as its index page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.config.attempts import attempts
+from frictid_hil.config.store import ProfileStore
+from frictid_hil.errors import UsageError
+from frictid_hil.report.index import index_page
+from frictid_hil.report.pages import write_page
+
+
+def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict[str, Any]:
+    """Profiles, promotions and recalibrations of a robot, oldest first.
+
+    Args:
+        store: where they are.
+        robot: name.
+        last: only so many of each; None for all.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    profiles, promotions, nights = _known(store, robot)
+    active, baseline = store.active(robot), store.baseline(robot)
+    kept = slice(-last if last else None, None)
+    return {
+        "outcome": "ok",
+        "robot": robot,
+        "active": active.id if active else None,
+        "baseline": baseline,
+        "profiles": [
+            {
+                "id": stored.id,
+                "created_utc": stored.created_utc,
+                "active": active is not None and stored.id == active.id,
+                "joints": {
+                    name: {
+                        "coulomb_nm": joint.coulomb_nm,
+                        "temperature_c": joint.temperature_c,
+                        "distance_percent": joint.distance_percent,
+                        "gates_failed": list(joint.gates_failed),
+                    }
+                    for name, joint in stored.joints.items()
+                },
+            }
+            for stored in profiles[kept]
+        ],
+        "promotions": [
+            {"action": p.action, "id": p.id, "utc": p.utc, "by": p.by, "reason": p.reason} for p in promotions[kept]
+        ],
+        "recalibrations": [
+            {"utc": one.utc, "outcome": one.outcome, "promoted": one.promoted, "drifted": list(one.drifted)}
+            | {"reason": one.reason, "next_step": one.next_step, "run": one.run}
+            for one in nights[kept]
+        ],
+    }
+
+
+def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) -> Path:
+    """The index page of a robot, in its folder of the store unless told.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    _, promotions, nights = _known(store, robot)
+    active = store.active(robot)
+    page = index_page(robot, store.trends(robot), promotions, nights, active, store.baseline(robot))
+    return write_page(page, path or store.root / robot / "index.html")
+
+
+def _known(store: ProfileStore, robot: str) -> tuple[Any, Any, Any]:
+    profiles, promotions = store.history(robot), store.promotions(robot)
+    nights = attempts(store.root, robot)
+    if not profiles and not nights:
+        robots = ", ".join(store.robots()) or "none"
+        raise UsageError(
+            f"the store knows no robot named {robot!r}; it has {robots}",
+            where=str(store.root),
+            next_step="promote a profile with `frictid-hil profile promote RUN`",
+        )
+    return profiles, promotions, nights

@@ -1,0 +1,286 @@
+"""``frictid-hil recalibrate``: the unattended job. It asks nobody, and whoever reads its line knows what to do next.
+
+::
+
+    permission and interlock (on a real bus) -> alone on this robot -> preflight -> warm-up -> calibrate -> gates
+    -> compare with the active profile and the baseline -> promote or refuse -> history, page, one line
+
+Every ending is in the journal of recalibrations beside the profile store: done, refused, aborted, robot switched off.
+A process killed in the middle leaves the active profile as it was, or the new one, whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+import filelock
+
+from frictid_hil.config.attempts import Attempt, note_attempt
+from frictid_hil.config.policy import Policy, WarmUp
+from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.provenance import utc_now
+from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.config.store import ProfileStore
+from frictid_hil.errors import FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.history import write_index_page
+from frictid_hil.jobs.judgement import Verdict, judge
+from frictid_hil.jobs.watch import Watcher
+from frictid_hil.report.pages import write_page
+from frictid_hil.report.recalibration import recalibration_page
+from frictid_hil.runner.interlock import Interlock
+
+VERB = "recalibrate"
+
+
+@dataclass(frozen=True, slots=True)
+class RecalibrateOptions:
+    """What the schedule asks for.
+
+    Attributes:
+        robot: robot file, by path or name; its ``policy`` decides.
+        bus: ``interface:channel``.
+        store: folder of the profile store; None for the user's own.
+        realtime: wall clock for the virtual robot.
+        seed: of simulated noise.
+        out: run folder to write.
+        by: who started it, for the history.
+    """
+
+    robot: str
+    bus: str | None = None
+    store: Path | None = None
+    realtime: bool = False
+    seed: int = 0
+    out: Path | None = None
+    by: str = "recalibrate"
+
+
+def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]:
+    """The whole night.
+
+    Raises:
+        UsageError: the robot file is wrong, or gives no permission to move a real robot unattended.
+        HardwareBusy: another recalibration of this robot, or somebody else on its bus.
+        HardwareError: the robot is off or not reachable.
+
+    Returns:
+        The JSON of the verb; a refusal by gates or policy, and an abort after motion began, are outcomes.
+    """
+    robot = load_robot(options.robot)
+    store = ProfileStore(options.store)
+    began_utc = utc_now()
+    try:
+        with _terminable(), _alone(store, robot):
+            result = _night(options, robot, store, watcher)
+    except FrictidError as error:
+        _note_failure(store, robot, began_utc, error)
+        raise
+    note_attempt(store.root, robot.name, _attempt(began_utc, result))
+    # The history is on the disk; a page that cannot be written must not turn a good night into a bad one.
+    with contextlib.suppress(FrictidError):
+        result["history"] = str(write_index_page(store, robot.name).resolve())
+    return result
+
+
+def _night(options: RecalibrateOptions, robot: Robot, store: ProfileStore, watcher: Watcher) -> dict[str, Any]:
+    policy = robot.policy
+    interlock = _permission(robot, options.bus)
+    measured = calibrate(
+        CalibrateOptions(
+            robot=options.robot,
+            bus=options.bus,
+            realtime=options.realtime,
+            seed=options.seed,
+            out=options.out,
+            verb=VERB,
+            warm_up=_warm_up(policy),
+            interlock=interlock,
+        ),
+        watcher,
+    )
+    return _concluded(options, robot, store, measured)
+
+
+def _permission(robot: Robot, bus: str | None) -> Interlock | None:
+    """The interlock to watch; None for a simulated robot without one.
+
+    Raises:
+        UsageError: a real robot may not be moved with nobody asked.
+    """
+    unattended = robot.policy.unattended
+    if unattended is None:
+        if robot.driver(bus) == "virtual":
+            return None
+        raise UsageError(
+            "this robot may not be moved unattended",
+            where=str(robot.path),
+            cause="its `policy` has no `unattended`, where a person takes responsibility and names the interlock",
+            next_step="add policy.unattended to the robot file, or run `frictid-hil calibrate` with a person present",
+        )
+    named = unattended.interlock_input
+    return Interlock(named.joint, named.bit, named.closed_when)
+
+
+def _warm_up(policy: Policy) -> WarmUp | None:
+    return None if policy.warm_up.fixed_s == 0.0 else policy.warm_up
+
+
+def _concluded(
+    options: RecalibrateOptions, robot: Robot, store: ProfileStore, measured: dict[str, Any]
+) -> dict[str, Any]:
+    """Compare, decide, promote or refuse; the active profile changes here or not at all."""
+    active, baseline = _active_and_baseline(store, robot.name)
+    result: dict[str, Any] = {
+        "outcome": measured["outcome"],
+        "exit_code": measured["exit_code"],
+        "robot": robot.name,
+        "run": measured["run"],
+        "profile": measured["profile"],
+        "stored": None,
+        "drift": {},
+        "drifted": [],
+        "promoted": False,
+        "active": None,
+        "reason": "",
+        "next_step": "",
+        "joints": {name: _short(joint) for name, joint in measured["joints"].items()},
+        "report": measured.get("report"),
+    }
+    if "error" in measured:
+        result["error"] = measured["error"]
+        result["reason"] = measured["error"]["what"]
+        result["next_step"] = measured["error"]["next_step"] or "see the run folder"
+    if measured["profile"] is not None:
+        newer = load_profile(measured["profile"])
+        identity = store.add(newer)
+        result["stored"] = identity
+        failed = {
+            name: "; ".join(joint.get("remarks") or [joint["outcome"]])
+            for name, joint in measured["joints"].items()
+            if joint["outcome"] != "ok"
+        }
+        verdict = judge(robot.policy, newer, active, baseline, failed=failed)
+        result |= {"drift": dict(verdict.joints), "drifted": list(verdict.drifted)}
+        if measured["outcome"] in ("ok", "gate_failed"):
+            _apply(verdict, result, store, robot.name, identity, options.by)
+        _write_page(result, robot, store, newer, active, baseline)
+    current = store.active(robot.name)
+    result["active"] = str(store.path(robot.name, current.id).resolve()) if current else None
+    return result
+
+
+def _active_and_baseline(store: ProfileStore, robot: str) -> tuple[FrictionProfile | None, FrictionProfile | None]:
+    baseline = store.baseline(robot)
+    return store.active_profile(robot), None if baseline is None else store.load(robot, baseline)
+
+
+def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot: str, identity: str, by: str) -> None:
+    result |= {"reason": verdict.reason, "next_step": verdict.next_step}
+    if verdict.promote:
+        store.promote(robot, identity, by=by, reason=verdict.reason)
+        result["promoted"] = True
+    elif verdict.refused:
+        result |= {"outcome": GateFailed.outcome, "exit_code": GateFailed.exit_code}
+        where = f"{robot}, profile {identity}"
+        result["error"] = {"what": verdict.reason, "where": where, "cause": "", "next_step": verdict.next_step}
+
+
+def _short(joint: dict[str, Any]) -> dict[str, Any]:
+    """What fits on a line of a journal."""
+    kept = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
+    return {key: joint[key] for key in kept if key in joint}
+
+
+def _write_page(
+    result: dict[str, Any],
+    robot: Robot,
+    store: ProfileStore,
+    newer: FrictionProfile,
+    active: FrictionProfile | None,
+    baseline: FrictionProfile | None,
+) -> None:
+    # The verdict stands whether or not its page can be written.
+    with contextlib.suppress(FrictidError):
+        page = recalibration_page(result, robot.policy, newer, active, baseline, store.trends(robot.name))
+        result["recalibration_report"] = str(write_page(page, Path(result["run"]) / "recalibration.html").resolve())
+
+
+# -- alone, and ending in order -------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
+    """One recalibration of a robot at a time; the lock dies with its process.
+
+    Raises:
+        HardwareBusy: another one is at work.
+    """
+    folder = store.root / robot.name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot be created: {error.strerror}", where=str(folder)) from None
+    lock = filelock.FileLock(folder / ".recalibrate.lock")
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise HardwareBusy(
+            f"another recalibration of {robot.name} is at work",
+            where=str(folder),
+            next_step="wait for it to end; nothing was moved by this one",
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM outside motion ends the job like Ctrl-C, with its line and exit code; inside, the runner handles it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(_signal: int, _frame: FrameType | None) -> NoReturn:
+        raise Interrupted("stopped by a signal; nothing was moving", next_step="start it again when it suits")
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+# -- history --------------------------------------------------------------------------------------------------------
+
+
+def _attempt(began_utc: str, result: dict[str, Any]) -> Attempt:
+    return Attempt(
+        utc=began_utc,
+        outcome=result["outcome"],
+        exit_code=result["exit_code"],
+        promoted=result["promoted"],
+        profile=result["stored"] or "",
+        drift_percent={name: figures["distance_percent"] for name, figures in result["drift"].items()},
+        drifted=tuple(result["drifted"]),
+        reason=result["reason"],
+        next_step=result["next_step"],
+        run=result["run"],
+    )
+
+
+def _note_failure(store: ProfileStore, robot: Robot, began_utc: str, error: FrictidError) -> None:
+    attempt = Attempt(began_utc, error.outcome, error.exit_code, reason=str(error), next_step=error.next_step)
+    # The error itself is what must be told; a disk that is full cannot hold the line as well.
+    with contextlib.suppress(FrictidError):
+        note_attempt(store.root, robot.name, attempt)

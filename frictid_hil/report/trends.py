@@ -1,0 +1,96 @@
+"""How joints change over months: figures over the date, one line per joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.store import TrendPoint
+from frictid_hil.report.figures import Figure, rounded
+
+_COLORS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#b2477f", "#7a6cc0", "#6b7785", "#b5a11f", "#2aa3a3")
+_MOST_POINTS = 1500
+
+
+def trend_figures(trends: Mapping[str, Sequence[TrendPoint]]) -> tuple[Figure, ...]:
+    """F_0, distance from the baseline, temperature; a figure without a single value is left out."""
+    figures = (
+        _figure(
+            trends,
+            _coulomb_percent,
+            "Coulomb friction F_0 over time",
+            "F_0 [percent of the first]",
+            "Extrapolated Coulomb level of every joint, in percent of its first; bars are 95 % intervals.",
+            half_width=_coulomb_half_percent,
+        ),
+        _figure(
+            trends,
+            lambda point, _: point.joint.distance_percent,
+            "Distance of the curve from the baseline over time",
+            "distance (15) [percent of the baseline's mean]",
+            "Equation (15) over the measured speeds. Drift shows here as a slope, damage as a step.",
+        ),
+        _figure(
+            trends,
+            lambda point, _: point.joint.temperature_c,
+            "Temperature during the measurement",
+            "temperature [degC]",
+            "A cold gear has more friction: look here before calling a change wear.",
+        ),
+    )
+    return tuple(figure for figure in figures if figure.traces)
+
+
+_Value = Callable[[TrendPoint, TrendPoint], float | None]
+
+
+def _figure(
+    trends: Mapping[str, Sequence[TrendPoint]],
+    value: _Value,
+    title: str,
+    y_title: str,
+    caption: str,
+    *,
+    half_width: _Value | None = None,
+) -> Figure:
+    traces = []
+    for number, (name, points) in enumerate(trends.items()):
+        every = max(1, -(-len(points) // _MOST_POINTS))
+        shown = [point for at, point in enumerate(points) if at % every == 0 or at == len(points) - 1]
+        first = next((point for point in points if point.joint.coulomb_nm), points[0])
+        known = [(point, y) for point in shown if (y := value(point, first)) is not None]
+        if known:
+            trace = _trace(name, [point for point, _ in known], [y for _, y in known], _COLORS[number % len(_COLORS)])
+            if half_width is not None:
+                widths = [half_width(point, first) for point, _ in known]
+                array = [0.0 if width is None else width for width in widths]
+                trace["error_y"] = {"type": "data", "array": rounded(np.array(array)), "visible": True, "thickness": 1}
+            traces.append(trace)
+    return Figure(title, tuple(traces), "date [UTC]", y_title, caption=caption)
+
+
+def _trace(name: str, points: Sequence[TrendPoint], values: Sequence[float], color: str) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": "lines+markers",
+        "name": f"joint {name}",
+        "x": [point.created_utc for point in points],
+        "y": rounded(np.array(values)),
+        "line": {"color": color, "width": 1.5},
+        "marker": {"color": color, "size": 5},
+    }
+
+
+def _coulomb_percent(point: TrendPoint, first: TrendPoint) -> float | None:
+    value, begun = point.joint.coulomb_nm, first.joint.coulomb_nm
+    return None if value is None or not begun else 100.0 * value / begun
+
+
+def _coulomb_half_percent(point: TrendPoint, first: TrendPoint) -> float | None:
+    low, high, begun = point.joint.coulomb_low_nm, point.joint.coulomb_high_nm, first.joint.coulomb_nm
+    if low is None or high is None or not begun or not math.isfinite(high - low):
+        return None
+    return 50.0 * (high - low) / abs(begun)
