@@ -268,6 +268,26 @@ def test_servo_power_goes_off_only_once_the_arm_stands() -> None:
     assert not bench.emulator.panel.servo_on
 
 
+def test_a_stream_on_which_nothing_is_enabled_stays_alive() -> None:
+    bench = make_bench()
+    driver = bench.driver()
+    driver.open()
+    driver.configure(250.0, ["0"])
+    driver.start_cycling()
+    set_points = [SetPoint(position_rad=START_RAD)]
+    turn(driver, set_points, 1200)
+    assert driver.exchange(set_points)[0].valid
+    driver.close()
+
+
+def test_a_controller_whose_host_died_comes_back_to_host_control() -> None:
+    bench = make_bench()
+    cycling(bench)
+    bench.emulator.advance(bench.emulator.now_s + 3.0)
+    driver, _ = cycling(bench)  # another host: it finds host control, and releases the command hold
+    driver.close()
+
+
 def test_a_locked_joint_ignores_its_set_point() -> None:
     bench = make_bench(axes=2)
     driver, set_points = cycling(bench)

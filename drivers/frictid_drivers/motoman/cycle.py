@@ -19,6 +19,7 @@ from frictid_hil.units import degrees
 
 _SERVO_ON = 1 << 6
 _STEP_MARGIN = 1.05
+_KEEP_ALIVE_TICKS = 100
 
 
 class TickClock:
@@ -91,6 +92,7 @@ class StreamCycle:
     ) -> None:
         welcome = session.welcome
         assert welcome is not None
+        first = session.wait_for_tick(0)
         self.session = session
         self._clock = clock
         self._torque_unit = welcome.torque_unit
@@ -102,6 +104,7 @@ class StreamCycle:
         self._wanted: set[int] = set()
         self._locked: set[int] = set()
         self._last_tick = -1
+        self._alive_until_tick = first.tick + _KEEP_ALIVE_TICKS
         self._under_way: deque[tuple[int, tuple[int, ...]]] = deque()
         self._in_force: tuple[int, ...] | None = None
         order = [axis for axis in range(8) if welcome.axis_mask >> axis & 1]
@@ -113,7 +116,6 @@ class StreamCycle:
             lowest, highest = sorted((unit.pulses(low), unit.pulses(high)))
             step = abs(joint.max_velocity_rad_s * tick_s * unit.pulses_per_rad) * _STEP_MARGIN
             self._bounds.append((lowest, highest, int(step) + 1))
-        first = session.wait_for_tick(0)
         clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
         # Targets in the order of the axes; axes without a joint stay where they are.
         self._targets = [axis.pulses for axis in first.axes]
@@ -154,6 +156,9 @@ class StreamCycle:
             feed_forward = self._may_feed_forward and any(self._torques)
             due_tick = session.send(self._targets, self._torques if feed_forward else ())
             self._under_way.append((due_tick, tuple(self._targets)))
+        elif report.tick >= self._alive_until_tick:
+            self._alive_until_tick = report.tick + _KEEP_ALIVE_TICKS
+            session.keep_alive()
         self._read(report)
         self._last_tick = report.tick
         return self._feedback

@@ -170,6 +170,11 @@ class StreamSession:
         self._write(encode_set_point(self._seq, self._session, self.welcome.axis_mask, self._last_due, pulses, torque))
         return self._last_due
 
+    def keep_alive(self) -> None:
+        """Say HELLO again: while no targets go out, this is how the controller knows that we are here."""
+        assert self.welcome is not None
+        self._write(encode_hello(self._seq, self._session, self.welcome.axis_mask))
+
     def raise_if_stopped(self) -> None:
         """Raise what the controller has against going on; nothing where we asked it to stop ourselves.
 

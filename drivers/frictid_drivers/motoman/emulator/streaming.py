@@ -22,7 +22,7 @@ QUEUE = 64
 WATCHDOG_TICKS = 3
 _STRAY_RAD = 0.004
 _SILENT_TICKS = 500
-"""A line on which nobody opens a session goes back to host control."""
+"""A line on which nobody speaks and nothing moves goes back to host control."""
 
 
 class StreamApplication:
@@ -254,11 +254,10 @@ class StreamApplication:
         self.tick_number += 1
         if self._session:
             self._report()
-        else:
-            self._idle_ticks += 1
-            if self._idle_ticks > _SILENT_TICKS:
-                self._on_leave()
-                return
+        self._idle_ticks += 1
+        if self._idle_ticks > _SILENT_TICKS and not self.moving:
+            self._on_leave()
+            return
         self._dropped = self._extrapolated = False
         if not self._armed:
             return
