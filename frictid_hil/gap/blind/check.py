@@ -25,7 +25,7 @@ from typing import Any
 from frictid_hil.gap.blind.generator import Assignment, assignments, draw_case, truth_text, write_case
 from frictid_hil.gap.blind.score import Answer, score, score_left_out
 
-SCHEMA = "frictid.gap-check/1"
+SCHEMA = "frictid.gap_check/1"
 
 Progress = Callable[[str, int, int], None]
 """Called with the phase (``draw``, ``diagnose``, ``leave one out``), how many are done, and of how many."""
