@@ -1,0 +1,168 @@
+"""Accuracy of the main job against withheld truth: the shipped robot, changed copies, and plants written differently.
+
+    python benchmarks/accuracy.py [--quick]
+
+Each robot is calibrated whole, through bus, driver and scheduler; the truth is the simulated joints' own steady sliding
+curve. The copies have every friction parameter changed by up to 30 % (seeded), or a flexible link. The MuJoCo joint is
+another simulator altogether: its own contact solver and integrator, a position loop written here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.profile import load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.friction import trajectory
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.friction.recording import CycleRecording, Skew
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.compare import true_curve
+from frictid_hil.jobs.watch import Silent
+
+DEG = math.pi / 180
+
+
+def shipped() -> dict[str, Any]:
+    return dict(load_robot("hp3j.yaml").document.data)
+
+
+def scaled(values: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """Every friction parameter of every joint, changed by up to 30 % either way."""
+    rng = np.random.default_rng(seed)
+
+    def changed(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: changed(item) for key, item in value.items()}
+        return value * rng.uniform(0.7, 1.3) if isinstance(value, float) else value
+
+    robot = {**values, "name": f"hp3j-seed-{seed}", "joints": {}}
+    for name, joint in values["joints"].items():
+        simulated = dict(joint["simulated"])
+        simulated["friction"] = changed(simulated["friction"])
+        effects = dict(simulated["effects"])
+        for effect in ("stribeck", "viscous_nonlinearity", "direction_asymmetry"):
+            effects[effect] = changed(effects[effect])
+        simulated["effects"] = effects
+        stiffness = float(simulated["presliding_stiffness_nm_per_rad"])
+        simulated["presliding_stiffness_nm_per_rad"] = stiffness * rng.uniform(0.7, 1.3)
+        robot["joints"][name] = {**joint, "simulated": simulated}
+    return robot
+
+
+def flexible(values: Mapping[str, Any], resonance_hz: float) -> dict[str, Any]:
+    """Every link on a spring: a two-mass joint."""
+    robot = {**values, "name": f"hp3j-flexible-{resonance_hz:g}", "joints": {}}
+    for name, joint in values["joints"].items():
+        simulated = dict(joint["simulated"])
+        link = simulated["inertia_kg_m2"] * (1.0 - simulated["motor_inertia_share"])
+        stiffness = link * (2 * math.pi * resonance_hz) ** 2
+        damping = 0.04 * math.sqrt(stiffness * link)
+        elastic = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
+        simulated["effects"] = {**simulated["effects"], "joint_elasticity": elastic}
+        robot["joints"][name] = {**joint, "simulated": simulated}
+    return robot
+
+
+def errors_of(robot: Mapping[str, Any], amplitude_deg: float, folder: Path) -> dict[str, tuple[float, float, float]]:
+    """Per joint: Function A over [0, V], aligned over [0, V], aligned over the measured range; percent of the mean."""
+    path = folder / f"{robot['name']}.yaml"
+    path.write_text(dump(robot))
+    out = folder / f"{robot['name']}-{amplitude_deg:g}"
+    bus = f"virtual:{robot['name']}-{amplitude_deg:g}"
+    options = CalibrateOptions(str(path), bus=bus, amplitude_rad=amplitude_deg * DEG, out=out)
+    result = calibrate(options, Silent())
+    loaded, profile = load_robot(path), load_profile(result["profile"])
+    found = {}
+    for name, joint in profile.joints.items():
+        assert joint.procedure is not None and joint.published is not None
+        velocity = joint.procedure.velocity_rad_s
+        truth = true_curve(loaded, name, velocity)
+        published = FrictionCurve.through(np.array(joint.published.velocity_rad_s), np.array(joint.published.torque_nm))
+        function_a = curve_distance(published, truth, velocity)
+        aligned = curve_distance(joint.curve(), truth, velocity)
+        found[name] = (function_a.e_percent, aligned.e_percent, aligned.e_percent_measured_range)
+    return found
+
+
+def mujoco_errors(amplitude_deg: float) -> tuple[float, float, float]:
+    """The same three figures for a joint simulated by MuJoCo: dry friction, damping, gravity; 10 kHz, logged at 1 kHz."""
+    import mujoco
+
+    inertia, dry, viscous, weight = 0.8, 6.0, 3.0, 12.0
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.0001" integrator="implicitfast" gravity="0 0 -9.81"/>
+        <worldbody><body><joint name="j" axis="0 -1 0" armature="{inertia * 0.5}" solreffriction="0.0005 1"
+        damping="{viscous}" frictionloss="{dry}"/>
+        <inertial pos="0.4 0 0" mass="{weight / 9.81 / 0.4}" diaginertia="0.05 0.05 0.05"/>
+        </body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    procedure = Procedure(amplitude_deg * DEG, 115 * DEG)
+    times = np.arange(-0.5, procedure.duration_s + 0.5, 1e-3)
+    command = trajectory.position(procedure, times)
+    rate = np.gradient(command, 1e-3)
+    rng = np.random.default_rng(1)
+    quantum = 2 * math.pi / 131072 / 100
+    rows = np.empty((times.size, 2))
+    torque = integral = weight
+    for k in range(times.size):
+        measured = round(float(data.qpos[0]) / quantum) * quantum
+        rows[k] = measured, torque + rng.normal(0.0, 0.2)
+        error = command[k] - measured
+        integral += 160e3 * 1e-3 * error
+        torque = 8000.0 * error + 130.0 * (rate[k] - float(data.qvel[0])) + integral
+        data.qfrc_applied[0] = torque
+        for _ in range(10):
+            mujoco.mj_step(model, data)
+    # The torque of row k acted during the step before it; half a step of zero-order hold.
+    recording = CycleRecording(
+        time_s=times,
+        position_rad=rows[:, 0],
+        torque_nm=rows[:, 1],
+        procedure=procedure,
+        velocity_rad_s=np.gradient(rows[:, 0], 1e-3),
+        command_rad=command,
+        skew=Skew(torque_delay_s=0.0005),
+    )
+    speeds = np.linspace(0.0, procedure.velocity_rad_s, 2001)[1:]
+    truth = FrictionCurve.through(speeds, dry + viscous * speeds)
+    published = curve_distance(estimate(recording, "function-a").curve, truth, procedure.velocity_rad_s)
+    aligned = curve_distance(estimate(recording, "aligned").curve, truth, procedure.velocity_rad_s)
+    return published.e_percent, aligned.e_percent, aligned.e_percent_measured_range
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="one changed copy instead of three")
+    quick = arguments.parse_args().quick
+    base = shipped()
+    robots = [(base, 20.0), (base, 50.0)]
+    for seed in (1,) if quick else (1, 2, 3):
+        robots += [(scaled(base, seed), 20.0), (scaled(base, seed), 50.0)]
+    robots.append((flexible(base, 30.0), 20.0))
+    print("error to truth, percent of the curve's mean: Function A [0, V] / aligned [0, V] / aligned [V_1, V_N]\n")
+    print(f"| {'robot':<22} | A | " + " | ".join(f"joint {j}" for j in base["joints"]) + " |")
+    print("|---|---|" + "---|" * len(base["joints"]))
+    with tempfile.TemporaryDirectory() as temporary:
+        for robot, amplitude in robots:
+            found = errors_of(robot, amplitude, Path(temporary))
+            cells = " | ".join("{:.2f} / {:.2f} / {:.2f}".format(*found[j]) for j in base["joints"] if j in found)
+            print(f"| {robot['name']:<22} | {amplitude:g} | {cells} |", flush=True)
+    for amplitude in (20.0, 50.0):
+        print(f"\nMuJoCo joint, A = {amplitude:g} deg: " + " / ".join(f"{e:.2f}" for e in mujoco_errors(amplitude)))
+
+
+if __name__ == "__main__":
+    main()
