@@ -125,17 +125,17 @@ def _means(
         splits[1:-1] |= inside[1:] != inside[:-1]
     edges = splits.nonzero()[0]
     first = edges[:-1]
-    sums = np.add.reduceat(velocity, first), np.add.reduceat(torque, first), edges[1:] - first
-    for name, column in zip(("velocity", "torque"), sums, strict=False):
-        if not np.isfinite(column).all():  # a NaN would fail every comparison above and vanish without a word
-            raise IdentificationError(f"the {name} holds a value that is not finite", where=where)
-    cycle = bounds.searchsorted(first, side="right") - 1
-    cycles = bounds.size - 1
+    sums = np.empty((3, first.size))
+    np.add.reduceat(velocity, first, out=sums[0])
+    np.add.reduceat(torque, first, out=sums[1])
+    np.subtract(edges[1:], first, out=sums[2])
+    if not np.isfinite(sums).all():  # a NaN would fail every comparison above and vanish without a word
+        name = "torque" if np.isfinite(sums[0]).all() else "velocity"
+        raise IdentificationError(f"the {name} holds a value that is not finite", where=where)
+    cycle_begins = first.searchsorted(bounds[:-1])
     means: list[tuple[Array, Array, NDArray[np.int64]]] = []
     for inside in windows:
-        kept = inside[first]
-        of = cycle[kept]
-        v, f, count = (np.bincount(of, column[kept], cycles) for column in sums)
+        v, f, count = np.add.reduceat(np.where(inside[first], sums, 0.0), cycle_begins, axis=1)
         some = np.maximum(count, 1)  # an empty window is the caller's to report
         means.append((v / some, f / some, count.astype(np.int64)))
     return means

@@ -26,6 +26,8 @@ MOST_DRIFT = 0.05
 RESONANCE_SHARE = 0.2
 LEAST_SAMPLES = 8
 MOST_LATE = 0.02
+MOST_ASYMMETRY = 0.3
+MOST_KINK = 0.1
 
 _ROUGH_S = 0.008
 _AT_LIMIT = 0.98
@@ -58,6 +60,8 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
         _roughness(recording, result),
         _samples(result),
         _lateness(recording),
+        _asymmetry(result),
+        _kinks(recording, result),
     ]
     if math.isfinite(recording.torque_limit_nm):
         asked.append(_saturation(recording))
@@ -142,6 +146,49 @@ def _lateness(recording: CycleRecording) -> Gate:
         share,
         MOST_LATE,
         said if passed else f"{said}: give the process real-time priority, or lower the rate",
+    )
+
+
+def _asymmetry(result: Estimate) -> Gate:
+    shares = np.abs(result.asymmetry_nm) / np.asarray(result.curve.torque_nm)
+    worst = int(np.argmax(shares))
+    share = float(shares[worst])
+    passed = share <= MOST_ASYMMETRY
+    said = (
+        f"at {result.curve.velocity_rad_s[worst]:.3g} rad/s the directions differ by {100 * share:.1f} % "
+        f"to either side (allowed {100 * MOST_ASYMMETRY:.0f} %)"
+    )
+    return Gate(
+        "direction_asymmetry",
+        passed,
+        share,
+        MOST_ASYMMETRY,
+        said if passed else f"{said}: a load that works one way, torque saturating one way, or a damaged gear",
+    )
+
+
+def _kinks(recording: CycleRecording, result: Estimate) -> Gate:
+    """How far a pair leaves the line through its neighbours; below the standard V_1 a Stribeck dip may."""
+    v, f = np.array(result.curve.velocity_rad_s), np.array(result.curve.torque_nm)
+    fast = v >= 0.09 * recording.procedure.velocity_rad_s
+    v, f = v[fast], f[fast]
+    if v.size < 3:
+        return Gate("straightness", True, 0.0, MOST_KINK, "too few pairs to see one leave its neighbours' line")
+    line = f[:-2] + (f[2:] - f[:-2]) * (v[1:-1] - v[:-2]) / (v[2:] - v[:-2])
+    leaves = np.abs(f[1:-1] - line) / f.mean()
+    worst = int(np.argmax(leaves))
+    share = float(leaves[worst])
+    passed = share <= MOST_KINK
+    said = (
+        f"the pair at {v[1 + worst]:.3g} rad/s leaves its neighbours' line by {100 * share:.1f} % of the friction "
+        f"(allowed {100 * MOST_KINK:.0f} %)"
+    )
+    return Gate(
+        "straightness",
+        passed,
+        share,
+        MOST_KINK,
+        said if passed else f"{said}: that cycle was disturbed; run it again",
     )
 
 

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from frictid_hil.errors import IdentificationError
@@ -20,6 +21,7 @@ def test_a_sound_recording_passes_every_gate_and_says_why(sound):
     found = asked(sound)
     assert set(found) == {
         "tracking", "high_frequency_torque", "samples_per_window", "late_cycles", "saturation", "drift",
+        "direction_asymmetry", "straightness",
     }  # fmt: skip
     assert all(gate.passed for gate in found.values())
     assert all(len(gate.reason) > 20 for gate in found.values())
@@ -69,3 +71,14 @@ def test_late_cycles_and_thin_windows_are_counted(sound):
         velocity_rad_s=sound.velocity_rad_s[thin],
     )
     assert not asked(sparse)["samples_per_window"].passed
+
+
+def test_a_disturbed_cycle_and_a_one_sided_load_are_caught(sound):
+    starts = sound.procedure.cycle_starts_s
+    v = sound.velocity_rad_s
+    sixth = (sound.time_s >= starts[5]) & (sound.time_s < starts[6])
+    disturbed = replace(sound, torque_nm=sound.torque_nm + np.where(sixth, 8.0 * np.sign(v), 0.0))
+    assert not asked(disturbed)["straightness"].passed
+    one_sided = replace(sound, torque_nm=sound.torque_nm + 12.0 * np.maximum(v, 0.0))
+    found = asked(one_sided)["direction_asymmetry"]
+    assert not found.passed and "to either side" in found.reason

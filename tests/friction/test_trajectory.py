@@ -110,3 +110,11 @@ def test_equal_shares_are_the_papers_procedure() -> None:
     time_s = np.linspace(-0.1, paper.duration_s + 0.1, 500)
     assert named.duration_s == pytest.approx(paper.duration_s)
     np.testing.assert_allclose(trajectory.position(named, time_s), trajectory.position(paper, time_s))
+
+
+def test_peak_acceleration_is_what_saturation_is_predicted_from():
+    """2 V^2 / A at the reversals of the last cycle: halving the travel doubles the torque of inertia."""
+    p = procedure()
+    time = np.linspace(0, p.duration_s, 400_001)[:-1]
+    assert np.abs(trajectory.acceleration(p, time)).max() == pytest.approx(trajectory.peak_acceleration(p), rel=1e-6)
+    assert trajectory.peak_acceleration(procedure(10)) == pytest.approx(2 * trajectory.peak_acceleration(p))
