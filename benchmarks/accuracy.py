@@ -97,7 +97,7 @@ def errors_of(robot: Mapping[str, Any], amplitude_deg: float, folder: Path) -> d
 
 
 def mujoco_errors(amplitude_deg: float) -> tuple[float, float, float]:
-    """The same three figures for a joint simulated by MuJoCo: dry friction, damping, gravity; 10 kHz, logged at 1 kHz."""
+    """The same figures for a joint simulated by MuJoCo: dry friction, damping, gravity; 10 kHz, logged at 1 kHz."""
     import mujoco
 
     inertia, dry, viscous, weight = 0.8, 6.0, 3.0, 12.0

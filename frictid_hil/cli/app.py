@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import typer
 
 from frictid_hil import __version__
@@ -37,6 +39,8 @@ def _root(
 
 def main() -> None:
     """Entry point of the console script."""
+    # Libraries log what we tell better as errors with cause and next step.
+    logging.getLogger().addHandler(logging.NullHandler())
     app()
 
 
