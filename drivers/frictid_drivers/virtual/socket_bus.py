@@ -180,7 +180,7 @@ class Hub:
         for number, _ in self._poll.poll(0):
             if number == self._listener.fileno():
                 self._accept()
-            else:
+            elif number in self._members:  # not dropped meanwhile, when a frame could not be passed on to it
                 self._read(number)
 
     def close(self) -> None:
