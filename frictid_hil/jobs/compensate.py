@@ -18,7 +18,7 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profi
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.control import Compensated
 from frictid_hil.driver import Driver, Mode, RobotSetup
-from frictid_hil.errors import FrictidError, UsageError
+from frictid_hil.errors import FrictidError, Interrupted, UsageError
 from frictid_hil.jobs.compensation_figures import ModeRun, figures, mode_run
 from frictid_hil.jobs.compensation_plan import MODES, CompensationPlan, Wanted, compensation_plan
 from frictid_hil.jobs.plans import expected_of
@@ -35,7 +35,9 @@ from frictid_hil.runner.run_folder import RowKeeper, RunFolder
 from frictid_hil.units import degrees
 
 VERB = "compensate"
-_LIVE_S = 0.5
+_LIVE_NS = 500_000_000
+_HELD_BACK_NS = 1_000_000_000
+"""Of a service's figures: how it was ended is not counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +285,7 @@ class _LiveFigures:
         self._wanted = wanted
         self._live = live
         self._sums = np.zeros(3)
-        self._window: list[Rows] = []
+        self._recent: list[Rows] = []
         self._told_ns = 0
         self._seen_ns = 0
         self.counting = False
@@ -293,15 +295,16 @@ class _LiveFigures:
         now_ns = int(rows["t_ns"][-1]) + 1
         mine = self._keeper.taken(self._index, self._seen_ns, now_ns)
         self._seen_ns = now_ns
-        if mine.size and self.counting:
-            self._window.append(mine)
-            torque = np.nan_to_num(mine["external_torque_nm"])
-            self._sums += (mine.size, float(np.sum(mine["velocity_rad_s"] ** 2)), float(np.sum(torque**2)))
-        if now_ns - self._told_ns >= _LIVE_S * 1e9 and self._window:
+        if not (mine.size and self.counting):
+            return
+        recent = np.concatenate([*self._recent, mine])
+        old = recent["t_ns"] < now_ns - _HELD_BACK_NS
+        counted, self._recent = recent[old], [recent[~old]]
+        torque = np.nan_to_num(counted["external_torque_nm"])
+        self._sums += (counted.size, float(np.sum(counted["velocity_rad_s"] ** 2)), float(np.sum(torque**2)))
+        if self._live is not None and now_ns - self._told_ns >= _LIVE_NS:
             self._told_ns = now_ns
-            window, self._window = np.concatenate(self._window), []
-            if self._live is not None:
-                self._live(_live_line(window))
+            self._live(_live_line(recent))
 
     def frames(self, rows: Rows) -> None:
         self._keeper.frames(rows)
@@ -387,7 +390,8 @@ def _finish(
             "what": ended.what,
             "where": ended.where,
             "cause": ended.cause,
-            "next_step": ended.next_step,
+            # A run of modes has nothing to resume.
+            "next_step": "" if isinstance(ended, Interrupted) else ended.next_step,
         }
     folder.finish(result)
     if progress.runs:

@@ -159,6 +159,8 @@ def compensation_plan(
     peak_nm = gravity.largest_nm + float(entry.curve().magnitude(np.array(moved.peak_velocity_rad_s)))
     peak_nm += inertia * wanted.peak_rad_s * 2 * math.pi / wanted.period_s
     limit_nm = max(1.3 * peak_nm, *(law.torque_limit_nm for law in laws.values()))
+    if wanted.drive_mode is not Mode.TORQUE:
+        limit_nm = joint.max_torque_nm
     moved = replace(moved, predicted_torque_nm=peak_nm, torque_limit_nm=min(joint.max_torque_nm, limit_nm))
     notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}", *warnings]
     return CompensationPlan(Plan(robot, setup.cycle_hz, (moved,), tuple(notes)), centre_rad, laws, tuple(warnings))
@@ -281,7 +283,6 @@ def _task(
 ) -> list[Motion]:
     bounds = _bounds(joint, wanted, centre_rad, law)
     drive_mode = wanted.drive_mode
-    duration_s = wanted.cycles * wanted.period_s
     if wanted.task == "track":
         path = triangle(centre_rad, wanted.amplitude_rad, wanted.peak_rad_s, wanted.cycles)
         return [Compensated(f"track {mode}", path, law, bounds, drive_mode)]
@@ -291,7 +292,8 @@ def _task(
         position_max_rad=centre_rad + _STAND_SLACK_RAD,
         velocity_rad_s=_STAND_RAD_S,
     )
-    swing = Swing(centre_rad, wanted.amplitude_rad, 1.0 / wanted.period_s, math.inf if wanted.endless else duration_s)
+    duration_s = math.inf if wanted.endless else wanted.cycles * wanted.period_s
+    swing = Swing(centre_rad, wanted.amplitude_rad, 1.0 / wanted.period_s, duration_s)
     stand = Compensated(f"stand {mode}", Hold(centre_rad, _STAND_S), law, standing, drive_mode)
     hand = Compensated(f"hand {mode}", swing, law, bounds, drive_mode)
     rest = Compensated(f"rest {mode}", Hold(centre_rad, _REST_S), law, bounds, drive_mode)
@@ -316,11 +318,13 @@ def _bounds(joint: JointSetup, wanted: Wanted, centre_rad: float, law: ControlLa
     if wanted.endless:
         low, high = -math.inf, math.inf
     speed = _speed_bound(wanted, joint)
+    # With the torque as an offset, the drive's own loop adds what it needs.
+    torque_nm = law.torque_limit_nm if wanted.drive_mode is Mode.TORQUE else joint.max_torque_nm
     return Bounds(
         position_min_rad=max(low, joint.position_min_rad + _STAND_SLACK_RAD),
         position_max_rad=min(high, joint.position_max_rad - _STAND_SLACK_RAD),
         velocity_rad_s=speed,
-        power_w=_POWER_SHARE * speed * law.torque_limit_nm,
+        power_w=_POWER_SHARE * speed * torque_nm,
         growth_s=math.inf if wanted.task == "track" else max(0.75, 0.375 * wanted.period_s),
     )
 

@@ -1,0 +1,288 @@
+"""Compensation whole: a one-joint robot on its simulated bus, calibrated by this product, in lock-step."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.driver import Mode
+from frictid_hil.errors import FrictidError, ProfileMismatch, UsageError
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.recording.read import read
+
+JOINT = "3"
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    values = load_robot("hp3j.yaml").values()
+    values["joints"] = {JOINT: values["joints"][JOINT]}
+    values["bus"] = f"virtual:compensate{os.getpid()}"
+    path = tmp_path_factory.mktemp("robot") / "one.yaml"
+    path.write_text(dump(values))
+    return path
+
+
+@pytest.fixture(scope="module")
+def profile(robot: Path) -> Path:
+    result = calibrate(CalibrateOptions(str(robot), out=robot.parent / "calibration"), Silent())
+    assert result["outcome"] == "ok", result
+    return Path(result["profile"])
+
+
+@pytest.fixture
+def go(robot: Path, profile: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
+    def run(task: str = "hand", modes: tuple[str, ...] = ("nc", "mop"), **changes: Any) -> dict[str, Any]:
+        options = CompensateOptions(str(robot), profile, JOINT, task, modes, duration_s=6.0, out=tmp_path / "run")
+        return compensate(replace(options, **changes), Silent())
+
+    return run
+
+
+def edited(profile: Path, to: Path, **changes: Any) -> Path:
+    """A profile with one joint changed, consistently, as another tool might have written it."""
+    whole = load_profile(profile)
+    entry = whole.joints[JOINT]
+    provenance = whole.provenance.model_copy(update=changes.pop("provenance", {}))
+    drive = entry.drive.model_copy(update=changes.pop("drive", {}))
+    fresh = {"measured_range_rad_s": None, "slopes_nm_s_per_rad": None}
+    joint: JointProfile = entry.model_copy(update={**fresh, "drive": drive, **changes})
+    FrictionProfile(robot=whole.robot, joints={JOINT: joint}, provenance=provenance).save(to)
+    return to
+
+
+def scaled(profile: Path, to: Path, factor: float) -> Path:
+    entry = load_profile(profile).joints[JOINT]
+    stiffness = entry.presliding_stiffness_nm_per_rad
+    assert stiffness.value is not None
+    return edited(
+        profile,
+        to,
+        torque_nm=tuple(factor * f for f in entry.torque_nm),
+        torque_interval_nm=None,
+        coulomb_nm=type(entry.coulomb_nm)(value=factor * (entry.coulomb_nm.value or 0.0)),
+        presliding_stiffness_nm_per_rad=type(stiffness)(value=abs(factor) * stiffness.value),
+        quality={**entry.quality, "asymmetry_nm": [factor * a for a in entry.quality["asymmetry_nm"]]},
+    )
+
+
+# -- what it reaches --------------------------------------------------------------------------------------------------
+
+
+def test_a_hand_needs_a_tenth_of_the_torque(go: Callable[..., dict[str, Any]]) -> None:
+    result = go()
+    assert result["outcome"] == "ok", result
+    nc, mop = result["modes"]["nc"], result["modes"]["mop"]
+    assert mop["reduction_inertia_removed_percent"] >= 90.0
+    assert 80.0 <= mop["reduction_percent"] <= mop["ceiling_percent"] + 1.0
+    assert mop["velocity_rms_rad_s"] == pytest.approx(nc["velocity_rms_rad_s"], rel=0.03)
+    assert nc["reduction_percent"] == 0.0 and nc["tracking_rms_rad"] is None
+    assert Path(result["report"]).stat().st_size > 100_000
+    assert result["late_cycles"] == 0
+
+
+def test_tracking_errors_fall_in_the_papers_order(go: Callable[..., dict[str, Any]]) -> None:
+    result = go("track", ())
+    error = {mode: figures["tracking_rms_rad"] for mode, figures in result["modes"].items()}
+    assert list(error) == ["nc", "mo", "mol", "mop", "mop-reference"]
+    assert error["nc"] > error["mo"] > error["mol"]
+    assert error["mop"] <= 1.02 * error["mol"]
+    assert result["modes"]["mop-reference"]["reduction_percent"] >= 85.0
+    assert result["modes"]["mop"]["torque_rms_nm"] is None
+
+
+@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY])
+def test_as_an_offset_it_helps_the_drives_own_loop(go: Callable[..., dict[str, Any]], mode: Mode) -> None:
+    result = go("track", ("nc", "mop"), drive_mode=mode)
+    assert result["outcome"] == "ok", result
+    assert result["modes"]["mop"]["tracking_rms_rad"] < result["modes"]["nc"]["tracking_rms_rad"]
+
+
+def test_lock_step_is_bit_identical(robot: Path, profile: Path, tmp_path: Path) -> None:
+    options = CompensateOptions(str(robot), profile, JOINT, "track", ("mop",), duration_s=3.0)
+    first, second = (compensate(replace(options, out=tmp_path / name), Silent()) for name in ("a", "b"))
+    assert first["modes"] == second["modes"]
+
+
+# -- profiles that do not fit -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"drive": {"serial": "4711"}}, "4711"),
+        ({"drive": {"rated_torque_nm": 38.0}}, "38 N m"),
+        ({"drive": {"gear_ratio": 100.0}}, "gear ratio is 120, the profile was identified with 100"),
+        ({"provenance": {"created_utc": "2020-01-01T00:00:00Z"}}, "max_age_days is 180"),
+        ({"temperature_c": 80.0}, "80.0 degC"),
+    ],
+)
+def test_a_profile_of_something_else_is_refused_with_both_values(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    wrong = edited(profile, tmp_path / "wrong.yaml", **changes)
+    with pytest.raises(ProfileMismatch) as refusal:
+        go(profile=wrong)
+    assert words in str(refusal.value)
+    assert "--force" in refusal.value.next_step
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_drives_own_compensation_is_never_added_to(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
+) -> None:
+    settings = load_profile(profile).joints[JOINT].drive.settings
+    wrong = edited(profile, tmp_path / "wrong.yaml", drive={"settings": {**settings, "velocity low-pass, us": 4000}})
+    with pytest.raises(ProfileMismatch, match="velocity low-pass, us is 1000, the profile was identified with 4000"):
+        go(profile=wrong)
+
+
+def test_a_stale_profile_may_be_forced(go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path) -> None:
+    stale = edited(profile, tmp_path / "stale.yaml", provenance={"created_utc": "2020-01-01T00:00:00Z"})
+    result = go("track", ("mop",), profile=stale, force=True)
+    assert result["outcome"] == "ok"
+    assert any("days old" in warning for warning in result["warnings"])
+
+
+def test_a_doubled_profile_is_refused_by_the_probe(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ProfileMismatch, match="friction at slow motion"):
+        go(profile=scaled(profile, tmp_path / "doubled.yaml", 2.0))
+
+
+@pytest.mark.parametrize("task", ["hand", "track"])
+def test_a_doubled_profile_that_is_forced_is_stopped_before_the_speed_limit(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path, robot: Path, task: str
+) -> None:
+    doubled = scaled(profile, tmp_path / "doubled.yaml", 2.0)
+    result = go(task, ("nc", "mop"), profile=doubled, force=True)
+    limit = load_robot(robot).to_setup().joint(JOINT).max_velocity_rad_s
+    samples = next(one for one in read(tmp_path / "run") if one.joint == JOINT)
+    assert samples.velocity_rad_s is not None
+    assert float(np.abs(samples.velocity_rad_s).max()) < 0.5 * limit
+    if task == "hand":
+        assert result["outcome"] == "aborted" and result["exit_code"] == 4
+        assert "mop" not in result["modes"] and "nc" in result["modes"]
+
+
+def test_a_profile_with_the_wrong_sign_is_refused_even_when_forced(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
+) -> None:
+    negative = scaled(profile, tmp_path / "negative.yaml", -1.0)
+    for force in (False, True):
+        with pytest.raises(ProfileMismatch, match="not positive"):
+            go(profile=negative, force=force)
+
+
+def test_gravity_with_the_wrong_sign_is_found_by_the_probe(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
+) -> None:
+    entry = load_profile(profile).joints[JOINT]
+    wrong = type(entry.bias_nm)(value=-2.0)
+    with pytest.raises(ProfileMismatch, match="holding torque"):
+        go(profile=edited(profile, tmp_path / "wrong.yaml", bias_nm=wrong))
+
+
+def test_wrong_gravity_that_is_forced_trips_at_once(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path, robot: Path
+) -> None:
+    entry = load_profile(profile).joints[JOINT]
+    wrong = edited(profile, tmp_path / "wrong.yaml", bias_nm=type(entry.bias_nm)(value=-6.0))
+    result = go(profile=wrong, force=True)
+    assert result["outcome"] == "aborted" and result["exit_code"] == 4
+    limit = load_robot(robot).to_setup().joint(JOINT).max_velocity_rad_s
+    samples = next(one for one in read(tmp_path / "run") if one.joint == JOINT)
+    assert samples.velocity_rad_s is not None
+    assert float(np.abs(samples.velocity_rad_s).max()) < 0.5 * limit
+    assert abs(float(samples.velocity_rad_s[-1])) < math.radians(0.5)
+
+
+# -- requests that cannot work ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"ratio": 1.0}, "R = 1"),
+        ({"ratio": 0.95, "stiffness_nm_per_rad": 6000.0}, "presliding"),
+        ({"modes": ("nc", "mop-reference")}, "person's hand"),
+        ({"drive_mode": Mode.POSITION}, "guided by hand"),
+        ({"modes": ("dahl",)}, "no mode 'dahl'"),
+        ({"task": "push"}, "no task 'push'"),
+        ({"setting": "theirs"}, "no setting 'theirs'"),
+        ({"duration_s": 0.0, "modes": ("nc", "mop")}, "one mode"),
+        ({"task": "track", "duration_s": 0.0}, "until interrupted"),
+        ({"centre_rad": 3.3}, "leaves its limits"),
+        ({"speed_rad_s": 6.0}, "above its limit"),
+    ],
+)
+def test_requests_that_cannot_work_are_refused_before_the_bus_is_opened(
+    go: Callable[..., dict[str, Any]], changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError) as refusal:
+        go(changes.pop("task", "hand"), changes.pop("modes", ("nc", "mop")), **changes)
+    assert words in str(refusal.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_a_yes_nothing_moves(robot: Path, profile: Path, tmp_path: Path) -> None:
+    class No(Silent):
+        def confirm(self, plan: object, preflight: object) -> bool:
+            return False
+
+    options = CompensateOptions(str(robot), profile, JOINT, "hand", ("mop",), out=tmp_path / "run")
+    with pytest.raises(FrictidError, match="nothing has moved"):
+        compensate(options, No())
+
+
+# -- the service ------------------------------------------------------------------------------------------------------
+
+
+def test_a_service_runs_until_interrupted_and_leaves_its_figures(robot: Path, profile: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "frictid_hil.cli.app", "compensate", "--robot", str(robot), "--profile"]
+    command += [str(profile), "--joint", JOINT, "--task", "hand", "--duration", "0", "--yes"]
+    command += ["--bus", f"virtual:service{os.getpid()}", "--out", str(tmp_path / "service")]
+    service = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert service.stderr is not None
+    seen = []
+    deadline = time.monotonic() + 60
+    for line in service.stderr:
+        seen.append(line)
+        if sum("N m rms" in shown for shown in seen) >= 20 or time.monotonic() > deadline:
+            break
+    service.send_signal(signal.SIGINT)
+    out, err = service.communicate(timeout=60)
+    assert service.returncode == 130, (seen, out, err)
+    assert "until interrupted" in "".join(seen)
+    manifest = json.loads((tmp_path / "service" / "manifest.json").read_text())
+    assert manifest["outcome"] == "interrupted"
+    samples = next(one for one in read(tmp_path / "service") if one.joint == JOINT)
+    assert len(samples) > 10_000
+    assert "mop" in out and "0.3" in out
+
+
+@pytest.mark.slow
+def test_on_the_wall_clock_it_reaches_the_same(go: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+    lock_step = go("hand", ("nc", "mop"), out=tmp_path / "lock_step")
+    wall = go("hand", ("nc", "mop"), out=tmp_path / "wall", realtime=True)
+    assert wall["outcome"] == "ok", wall
+    found, expected = (r["modes"]["mop"]["reduction_inertia_removed_percent"] for r in (wall, lock_step))
+    assert found == pytest.approx(expected, abs=3.0)
