@@ -7,7 +7,7 @@ import logging
 import typer
 
 from frictid_hil import __version__
-from frictid_hil.cli import calibrate, compensate, gap, profiles, replay, reports
+from frictid_hil.cli import calibrate, compensate, gap, jobs, profiles, replay, reports
 
 app = typer.Typer(
     name="frictid-hil",
@@ -20,6 +20,7 @@ calibrate.register(app)
 compensate.register(app)
 reports.register(app)
 replay.register(app)
+jobs.register(app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 

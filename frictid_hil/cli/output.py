@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
+import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +19,9 @@ from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.units import parse_quantity
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
+
+NOTIFY_TIMEOUT_S = 60.0
+"""A command of ``--notify`` may take this long."""
 
 Result = Mapping[str, Any]
 
@@ -51,10 +56,12 @@ class Output:
     Attributes:
         as_json: one object on stdout.
         quiet: no progress.
+        notify: command that is given the same JSON on its standard input, whatever the ending.
     """
 
     as_json: bool = False
     quiet: bool = False
+    notify: str | None = None
 
     @property
     def err(self) -> Console:
@@ -89,6 +96,7 @@ class Output:
             self._fail(verb, Interrupted("interrupted before anything moved"))
         result.setdefault("outcome", "ok")
         code = int(result.pop("exit_code", EXIT_OF_OUTCOME[str(result["outcome"])]))
+        self._tell({"schema": f"frictid.{verb}/1", **result})
         if self.as_json:
             _print_json({"schema": f"frictid.{verb}/1", **result})
         elif show is not None:
@@ -100,10 +108,32 @@ class Output:
 
     def _fail(self, verb: str, error: FrictidError) -> NoReturn:
         described = describe(error)
+        failure = {"schema": f"frictid.{verb}/1", "outcome": error.outcome, "error": described}
+        self._tell(failure)
         if self.as_json:
-            _print_json({"schema": f"frictid.{verb}/1", "outcome": error.outcome, "error": described})
+            _print_json(failure)
         self._explain(described)
         raise typer.Exit(error.exit_code)
+
+    def _tell(self, result: Mapping[str, Any]) -> None:
+        """Give the result to the command of ``notify``; what becomes of that changes no result."""
+        if self.notify is None:
+            return
+        text = json.dumps(_finite(result), default=_jsonable) + "\n"
+        try:
+            told = subprocess.run(
+                shlex.split(self.notify),
+                input=text,
+                text=True,
+                stdout=sys.stderr,
+                timeout=NOTIFY_TIMEOUT_S,
+                check=False,
+            )
+            wrong = f"ended with {told.returncode}" if told.returncode else ""
+        except (OSError, ValueError, subprocess.SubprocessError) as error:
+            wrong = str(error)
+        if wrong:
+            print(f"warning: --notify {self.notify}: {wrong}", file=sys.stderr)
 
     def _explain(self, error: Mapping[str, Any]) -> None:
         # Errors are never quiet, and never wrapped in the middle of a path.

@@ -11,6 +11,11 @@ from rich.table import Table
 from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result
 from frictid_hil.units import degrees
 
+StoreOption = Annotated[
+    Path | None, typer.Option("--store", help="Folder of the profile store; default: the user's data folder.")
+]
+RobotName = Annotated[str | None, typer.Option("--robot", "-r", help="Name of the robot whose store is meant by ids.")]
+
 app = typer.Typer(help="Show, compare and manage friction profiles.", no_args_is_help=True)
 
 
@@ -45,3 +50,122 @@ def show(
         output.out.print(f"{result['robot']}, {provenance['created_utc']}, frictid-hil {provenance['tool_version']}")
 
     output.run("profile_show", lambda: job(profile), print_profile)
+
+
+@app.command("diff")
+def diff(
+    older: Annotated[str, typer.Argument(help="Profile, run folder; or with --robot an id, `active`, `baseline`.")],
+    newer: Annotated[str, typer.Argument(help="The same.")],
+    robot: RobotName = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """How two profiles differ: distance (15), F_0, overlap of intervals, temperature, and what else changed."""
+    from frictid_hil.jobs.profiles import diff as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        table = Table(
+            "joint", "distance [%]", "F_0 [%]", "intervals that overlap [%]", "temperature [K]", "also changed"
+        )
+        for name, figures in result["joints"].items():
+            share = figures["overlap_share"]
+            table.add_row(
+                name,
+                f"{figures['distance_percent']:.2f}",
+                _signed(figures["coulomb_change_percent"]),
+                "" if share is None else f"{100 * share:.0f}",
+                _signed(figures["temperature_change_c"]),
+                "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
+            )
+        output.out.print(table)
+
+    output.run("profile_diff", lambda: job(older, newer, robot=robot, store=store), show)
+
+
+@app.command("promote")
+def promote(
+    profile: Annotated[str, typer.Argument(help="Profile, run folder; or with --robot an id of the store.")],
+    robot: RobotName = None,
+    reason: Annotated[str, typer.Option("--reason", help="For the history.")] = "",
+    baseline: Annotated[bool, typer.Option("--baseline", help="Measure drift from it from now on.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Although a quality gate failed.")] = False,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Make a profile the active one of its robot; nothing is overwritten, and one command goes back."""
+    from frictid_hil.jobs.profiles import promote as job
+
+    output = Output(as_json, quiet)
+    output.run(
+        "profile_promote",
+        lambda: job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force),
+        lambda result: output.out.print(f"active: {result['active']}", soft_wrap=True),
+    )
+
+
+@app.command("rollback")
+def rollback(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
+    reason: Annotated[str, typer.Option("--reason", help="For the history.")] = "",
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Make the profile active again that was so before the present one."""
+    from frictid_hil.jobs.profiles import rollback as job
+
+    output = Output(as_json, quiet)
+    output.run(
+        "profile_rollback",
+        lambda: job(robot, store=store, reason=reason),
+        lambda result: output.out.print(f"active: {result['active']}", soft_wrap=True),
+    )
+
+
+@app.command("history")
+def history(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
+    last: Annotated[int | None, typer.Option("--last", min=1, help="Only so many.")] = None,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
+    from frictid_hil.config.store import ProfileStore
+    from frictid_hil.jobs.history import history as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        joints = list(dict.fromkeys(name for profile in result["profiles"] for name in profile["joints"]))
+        table = Table(
+            "profile", "", *(f"joint {name}" for name in joints), title=f"F_0, distance, temperature: {robot}"
+        )
+        for profile in result["profiles"]:
+            cells = [_cell(profile["joints"].get(name)) for name in joints]
+            table.add_row(profile["id"], "active" if profile["active"] else "", *cells)
+        output.out.print(table)
+        for one in result["promotions"]:
+            output.out.print(
+                f"{one['utc']} {one['action']} {one['id']} by {one['by']}: {one['reason']}", soft_wrap=True
+            )
+
+    output.run("profile_history", lambda: job(ProfileStore(store), robot, last=last), show)
+
+
+def _cell(joint: Result | None) -> str:
+    if joint is None or joint["coulomb_nm"] is None:
+        return ""
+    distance, temperature = joint["distance_percent"], joint["temperature_c"]
+    parts = [f"{joint['coulomb_nm']:.3g}"]
+    parts += [f"{distance:.1f} %"] if distance is not None else []
+    parts += [f"{temperature:.0f} C"] if temperature is not None else []
+    return ", ".join(parts)
+
+
+def _signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.1f}"
