@@ -41,14 +41,14 @@ def driver_of(setup: RobotSetup) -> MotomanDriver:
 
 
 def recording_of(setup: RobotSetup, joint: str, time_ns: Any, columns: dict[str, Any], start_ns: int) -> CycleRecording:
-    options = setup.options
+    timing = setup.options["timing"]
     return CycleRecording(
         time_s=(time_ns - start_ns) * 1e-9,
         position_rad=columns["position_rad"],
         velocity_rad_s=columns["velocity_rad_s"],
         torque_nm=columns["torque_nm"],
         procedure=PROCEDURE,
-        skew=Skew(0.0, options["velocity_delay_s"], options["torque_delay_s"]),
+        skew=Skew(0.0, timing["velocity_delay_s"], timing["torque_delay_s"]),
         gear_ratio=setup.joint(joint).gear_ratio,
     )
 

@@ -58,6 +58,29 @@ def test_pulses_per_degree_have_no_default(value: object) -> None:
     assert caught.value.problems[0].path == ("joints", "0", "options", "pulses_per_degree")
 
 
+@pytest.mark.parametrize(
+    ("timing", "field"),
+    [
+        ({"torque_delay_s": 2.0}, "torque_delay_s"),
+        ({"lag": 0.1}, "lag"),
+        (3, None),
+        ({"uncertainty_s": 0}, "uncertainty_s"),
+    ],
+)
+def test_impossible_timing_is_named(timing: object, field: str | None) -> None:
+    with pytest.raises(InvalidFields) as caught:
+        MotomanDriver(replace(make_bench().setup, options={"timing": timing}))
+    assert caught.value.problems[0].path == ("options", "timing", *([field] if field else []))
+
+
+def test_declared_timing_travels_with_the_identity() -> None:
+    driver = make_bench(timing={"torque_delay_s": 0.004}).driver()
+    driver.open()
+    timing = driver.identify()["0"].timing
+    assert (timing.torque_delay_s, timing.uncertainty_s, timing.source) == (0.004, 0.0005, "robot file")
+    driver.close()
+
+
 def test_two_joints_on_one_axis_are_refused() -> None:
     bench = make_bench()
     with pytest.raises(InvalidFields, match="taken already"):

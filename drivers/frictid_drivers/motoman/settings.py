@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from frictid_drivers.motoman.bsc import BscTiming
@@ -14,6 +14,7 @@ from frictid_hil.driver import Timing
 from frictid_hil.errors import FieldProblem, InvalidFields
 
 _PSEUDO_TERMINALS = "/dev/pts/"
+_ASSUMED = Timing(uncertainty_s=0.0005)
 LAYERS = ("auto", "stream", "batch", "host")
 
 
@@ -36,11 +37,7 @@ class SerialOptions:
         timer_b_s: RS035.
         retry_1: RS036.
         retry_2: RS037.
-        position_delay_s: of reported positions.
-        velocity_delay_s: of reported velocities.
-        torque_delay_s: of reported torques.
-        delay_uncertainty_s: one standard deviation of torque against velocity.
-        timing_known: the delays were given, not assumed.
+        timing: when reported figures were true.
     """
 
     controller: str = "nx"
@@ -57,11 +54,7 @@ class SerialOptions:
     timer_b_s: float = 20.0
     retry_1: int = 10
     retry_2: int = 3
-    position_delay_s: float = 0.0
-    velocity_delay_s: float = 0.0
-    torque_delay_s: float = 0.0
-    delay_uncertainty_s: float = 0.0005
-    timing_known: bool = False
+    timing: Timing = _ASSUMED
 
     def parity_on(self, path: str) -> str:
         """The parity of host control on this port: decided by the port's kind, never by trying."""
@@ -71,13 +64,6 @@ class SerialOptions:
     def link(self) -> BscTiming:
         """Timers and retries of the link."""
         return BscTiming(self.timer_a_s, self.timer_b_s, self.retry_1, self.retry_2)
-
-    @property
-    def timing(self) -> Timing:
-        """When reported figures were true."""
-        source = "robot file" if self.timing_known else "assumed"
-        delays = (self.position_delay_s, self.velocity_delay_s, self.torque_delay_s)
-        return Timing(*delays, self.delay_uncertainty_s, source)
 
 
 _CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -97,10 +83,12 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "timer_b_s": (0.1, 25.5),
     "retry_1": (0, 30),
     "retry_2": (0, 10),
+}
+_DELAYS: Mapping[str, tuple[float, float]] = {
     "position_delay_s": (-1, 1),
     "velocity_delay_s": (-1, 1),
     "torque_delay_s": (-1, 1),
-    "delay_uncertainty_s": (1e-6, 0.1),
+    "uncertainty_s": (1e-6, 0.1),
 }
 _OTHERS = frozenset({"emulator"})
 """Read by the emulator only."""
@@ -113,29 +101,47 @@ def serial_options(mapping: Mapping[str, Any]) -> SerialOptions:
         InvalidFields: an unknown option, or a value that is not possible.
     """
     problems: list[FieldProblem] = []
-    known = {entry.name: entry for entry in fields(SerialOptions) if entry.name != "timing_known"}
+    types = {entry.name: entry.type for entry in fields(SerialOptions)}
     values: dict[str, Any] = {}
     for name, value in mapping.items():
         if name in _OTHERS:
             continue
-        problem = _problem(name, value, known)
+        if name == "timing":
+            values[name] = _timing(value, problems)
+            continue
+        problem = _problem(name, value, types)
         if problem:
             problems.append(FieldProblem(("options", name), problem))
         else:
             values[name] = value
     if problems:
         raise InvalidFields(problems)
-    delays = {"position_delay_s", "velocity_delay_s", "torque_delay_s"}
-    return SerialOptions(**values, timing_known=bool(delays & values.keys()))
+    return SerialOptions(**values)
 
 
-def _problem(name: str, value: Any, known: Mapping[str, Any]) -> str:
-    if name not in known:
-        return f"is no option of the serial driver; there are {', '.join(sorted(known))}"
+def _timing(value: Any, problems: list[FieldProblem]) -> Timing:
+    path = ("options", "timing")
+    if not isinstance(value, Mapping):
+        problems.append(FieldProblem(path, "must be a mapping"))
+        return Timing()
+    for name in value.keys() - _DELAYS.keys():
+        problems.append(FieldProblem((*path, str(name)), f"is no delay; there are {', '.join(_DELAYS)}"))
+    wrong = [(name, _out_of_bounds(value[name], *bounds)) for name, bounds in _DELAYS.items() if name in value]
+    problems += [FieldProblem((*path, name), problem) for name, problem in wrong if problem]
+    if any(problem for _, problem in wrong) or value.keys() - _DELAYS.keys():
+        return Timing()
+    return replace(_ASSUMED, **value, source="robot file")
+
+
+def _problem(name: str, value: Any, types: Mapping[str, Any]) -> str:
+    if name not in types:
+        return f"is no option of the serial driver; there are {', '.join(sorted(types))}"
     if name in _CHOICES:
         return "" if value in _CHOICES[name] else f"must be one of {', '.join(_CHOICES[name])}, found {value!r}"
-    low, high = _BOUNDS[name]
-    whole = known[name].type == "int"
+    return _out_of_bounds(value, *_BOUNDS[name], whole=types[name] == "int")
+
+
+def _out_of_bounds(value: Any, low: float, high: float, *, whole: bool = False) -> str:
     if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not math.isfinite(value):
         return f"must be a {'whole ' if whole else ''}number, found {value!r}"
     return "" if low <= value <= high else f"must lie in {low:g}..{high:g}, found {value:g}"
