@@ -1,0 +1,49 @@
+"""``emulate``: simulated controllers for those who have none at hand."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result
+from frictid_hil.errors import UsageError
+
+app = typer.Typer(help="Put a simulated controller on a port of this computer.", no_args_is_help=True)
+
+
+@app.callback()
+def _group() -> None:
+    """Put a simulated controller on a port of this computer."""
+
+
+@app.command("motoman")
+def motoman(
+    pty: Annotated[bool, typer.Option("--pty", help="On a pseudo terminal, whose name is printed first.")] = False,
+    robot: Annotated[
+        str | None, typer.Option("--robot", "-r", help="Robot file whose joints stand behind it (hp3j-serial.yaml).")
+    ] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option("--fault", help="What shall go wrong, in the emulator's words; repeat.")
+    ] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """A serial MOTOMAN-style controller with six simulated joints; runs until Ctrl-C."""
+    from frictid_hil.jobs.emulate import emulate
+
+    output = Output(as_json, quiet)
+
+    def announce(port: str) -> None:
+        if as_json:
+            typer.echo(f'{{"schema": "frictid.emulate/1", "outcome": "ok", "port": "{port}"}}')
+        else:
+            typer.echo(f"port: {port}")
+
+    def run() -> Result:
+        if not pty:
+            raise UsageError("where shall it listen?", next_step="frictid-hil emulate motoman --pty")
+        emulate("motoman", announce=announce, robot_name=robot, faults=tuple(fault or ()))
+        raise typer.Exit(0)
+
+    output.run("emulate", run)
