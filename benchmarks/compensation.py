@@ -3,6 +3,7 @@
     python benchmarks/compensation.py calibrate --out runs/benchmark          # the profile that the rest uses
     python benchmarks/compensation.py hand  --profile runs/benchmark/profile.yaml [--setting paper]
     python benchmarks/compensation.py track --profile runs/benchmark/profile.yaml
+    python benchmarks/compensation.py stability --profile runs/benchmark/profile.yaml
     python benchmarks/compensation.py cost
 
 All through the product's own command line, on the simulated bus, with the drives' torque steps, encoder counts and two
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 JOINTS = ("0", "1", "2", "3", "4", "5")
@@ -124,9 +126,105 @@ def cost(_options: argparse.Namespace) -> None:
     print(f"memory growth over 10^7 steps: {tracemalloc.get_traced_memory()[0] - before} bytes")
 
 
+def stability(options: argparse.Namespace) -> None:
+    """Largest R and K at which a joint that was pushed comes to rest, free and under the PD of the track task."""
+    from frictid_hil.config.profile import load_profile
+    from frictid_hil.friction.compensation import OUR_RATIO, OUR_SHARE_OF_PRESLIDING
+
+    profile = load_profile(options.profile)
+    print(f"# pushed to 20 deg/s and let go; still: under 0.01 deg/s rms after 4 s; robot {options.robot}")
+    print(
+        "| joint | delay [cycles] | R + 0.02, K + 10 %: free | PD hold | largest R | largest K/presliding: free | PD |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for joint in options.joint or JOINTS:
+        if joint not in profile.joints:
+            continue
+        for delay in (2, 5):
+            case = _Stability(options.robot, profile.joints[joint], joint, delay)
+            bar = [case.rms_deg_s(OUR_RATIO + 0.02, 1.1 * OUR_SHARE_OF_PRESLIDING, hold) for hold in (False, True)]
+            ratio = _largest(lambda r, c=case: c.rms_deg_s(r, OUR_SHARE_OF_PRESLIDING, False) < 0.01, 0.9, 1.3)
+            stiffness = [
+                _largest(lambda k, c=case, h=hold: c.rms_deg_s(OUR_RATIO, k, h) < 0.01, 0.5, 4.0)
+                for hold in (False, True)
+            ]
+            print(
+                f"| {joint} | {delay} | {bar[0]:.4f} deg/s | {bar[1]:.4f} deg/s | {ratio:.2f} "
+                f"| {stiffness[0]:.2f} | {stiffness[1]:.2f} |",
+                flush=True,
+            )
+
+
+def _largest(good, low: float, high: float) -> float:
+    """By bisection; ``high`` where nothing goes wrong below it."""
+    if good(high):
+        return high
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+class _Stability:
+    """One simulated joint under the product's own controller, without the bus: delay counted in whole cycles."""
+
+    def __init__(self, robot: str, entry, joint: str, delay: int) -> None:
+        from frictid_hil.config.robot import load_robot
+        from frictid_hil.simulation.joint import JointModel
+
+        self.setup = load_robot(robot).to_setup().joint(joint)
+        self.entry = entry
+        self.model = JointModel.from_mapping(
+            self.setup.simulated,
+            gear_ratio=self.setup.gear_ratio,
+            rated_torque_nm=self.setup.rated_torque_nm,
+            max_torque_nm=self.setup.max_torque_nm,
+        )
+        # One cycle of the delay is the simulated joint's own.
+        self.waiting = delay - 1
+
+    def rms_deg_s(self, ratio: float, stiffness_share: float, hold: bool) -> float:
+        import math
+
+        import numpy as np
+
+        from frictid_hil.driver import Feedback
+        from frictid_hil.jobs.compensation_plan import Wanted, law_of
+        from frictid_hil.runner.compensation import Controller
+        from frictid_hil.simulation.servo_loop import ServoLoop
+
+        wanted = Wanted("track" if hold else "hand", ("mop",))
+        law = law_of(self.entry, self.setup, "mop", wanted, [])
+        friction = replace(
+            law.friction,
+            ratio=ratio,
+            stiffness_nm_per_rad=stiffness_share * self.entry.presliding_stiffness_nm_per_rad.value,
+        )
+        centre = self.setup.start_position_rad + math.radians(10)
+        loop = ServoLoop(self.model, period_s=0.001, position_rad=centre)
+        loop.brake(False)
+        loop.power(True)
+        loop.set_mode(10)
+        controller = Controller(replace(law, friction=friction), 0.001, law.gravity.torque_nm(centre))
+        step_nm = self.setup.rated_torque_nm / 1000.0
+        queue = [controller.torque_nm] * self.waiting
+        push_nm = 2.0 * friction.coulomb_nm
+        report, velocities, pushing = Feedback(valid=True), [], True
+        for k in range(5000):
+            report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
+            torque = controller.update(report, (centre, 0.0))
+            pushing = pushing and k < 1000 and abs(loop.true_velocity_rad_s) < math.radians(20)
+            queue.append(torque + (push_nm if pushing else 0.0))
+            loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)
+            velocities.append(loop.true_velocity_rad_s)
+            if abs(loop.true_velocity_rad_s) > 20.0:
+                return math.inf
+        return math.degrees(float(np.sqrt(np.mean(np.square(velocities[4000:])))))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["calibrate", "hand", "track", "cost"])
+    parser.add_argument("what", choices=["calibrate", "hand", "track", "stability", "cost"])
     parser.add_argument("--robot", default="hp3j.yaml")
     parser.add_argument("--bus", default="virtual:benchmark")
     parser.add_argument("--profile", default="runs/benchmark/profile.yaml")
@@ -136,7 +234,8 @@ def main() -> None:
     parser.add_argument("--speed", default="30deg/s")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    {"calibrate": calibrate, "hand": hand, "track": track, "cost": cost}[options.what](options)
+    verbs = {"calibrate": calibrate, "hand": hand, "track": track, "stability": stability, "cost": cost}
+    verbs[options.what](options)
 
 
 if __name__ == "__main__":

@@ -31,8 +31,11 @@ FORMS = ("mo", "mol", "mop")
 PAPER_RATIO = 0.9
 PAPER_STIFFNESS_NM_PER_RAD = 10_000.0
 OUR_RATIO = 0.95
-OUR_SHARE_OF_PRESLIDING = 0.9
-"""K of the setting ``ours``, as a share of the identified presliding stiffness."""
+OUR_SHARE_OF_PRESLIDING = 0.8
+"""K of the setting ``ours``, as a share of the identified presliding stiffness.
+
+That is identified at rest, where static friction stands above its sliding level and stiffens the presliding spring by
+as much; a joint that begins to hunt slides, and has the lower stiffness."""
 
 
 @dataclass(frozen=True, slots=True)
