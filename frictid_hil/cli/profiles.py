@@ -142,9 +142,10 @@ def history(
 
     def show(result: Result) -> None:
         joints = list(dict.fromkeys(name for profile in result["profiles"] for name in profile["joints"]))
-        table = Table(
-            "profile", "", *(f"joint {name}" for name in joints), title=f"F_0, distance, temperature: {robot}"
-        )
+        table = Table(title=f"F_0, distance from the baseline, temperature: {robot}")
+        table.add_column("profile", no_wrap=True)
+        for heading in ("", *(f"joint {name}" for name in joints)):
+            table.add_column(heading)
         for profile in result["profiles"]:
             cells = [_cell(profile["joints"].get(name)) for name in joints]
             table.add_row(profile["id"], "active" if profile["active"] else "", *cells)
