@@ -191,10 +191,16 @@ def _recording(
         prismatic=samples.prismatic,
         torque_limit_nm=joint.max_torque_nm if joint else math.inf,
         torque_quantum_nm=float(quantum) if quantum else 0.0,
-        repeat=Repeat(procedure.cycles // 2 + 1, drift[0].start_ns * 1e-9 - start_s) if drift else None,
+        repeat=_repeat(drift[0], procedure, start_s) if drift else None,
         late_cycles=late_cycles,
         where=f"joint {samples.joint}",
     )
+
+
+def _repeat(drift: Mark, procedure: Procedure, start_s: float) -> Repeat:
+    """Which cycle was run again: the one whose peak speed the mark carries."""
+    off = np.abs(procedure.peak_velocities_rad_s - float(drift.details["peak_velocity_rad_s"]))
+    return Repeat(int(np.argmin(off)) + 1, drift.start_ns * 1e-9 - start_s)
 
 
 def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np.ndarray[Any, np.dtype[np.bool_]]:

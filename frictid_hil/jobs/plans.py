@@ -25,14 +25,16 @@ def calibration_motions(
     """What one joint does in a calibration, from its locked position and back to it."""
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
-    drift_speed = float(procedure.peak_velocities_rad_s[procedure.cycles // 2])
+    # An early cycle: the later it is run again, the better drift is seen.
+    drift_speed = float(procedure.peak_velocities_rad_s[procedure.cycles // 4])
     motions: list[Motion] = [Move.within(home, start, APPROACH_RAD_S)] if home != start else []
     if rehearse:
         motions.append(Sine(start, amplitude, min(APPROACH_RAD_S, procedure.velocity_rad_s), name="rehearsal"))
     longest_s = 0.0 if warm_up is None else warm_up.max_s if warm_up.fixed_s is None else warm_up.fixed_s
     if warm_up is not None and longest_s > 0.0:
         limit = warm_up.settled_percent_per_min if warm_up.fixed_s is None else None
-        motions.append(WarmUp(start, amplitude, drift_speed, longest_s, limit))
+        warming_speed = float(procedure.peak_velocities_rad_s[procedure.cycles // 2])
+        motions.append(WarmUp(start, amplitude, warming_speed, longest_s, limit))
     motions += [
         Hold(start, 0.5),
         Cycles(start, procedure),
