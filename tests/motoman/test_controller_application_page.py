@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ from serial_bench import make_bench
 from frictid_drivers.motoman import stream_frames as frames
 from frictid_drivers.motoman.batch import BatchClient, JobOrder
 from frictid_drivers.motoman.controller_errors import ControllerError
+from frictid_drivers.motoman.emulator.build import _DEFAULTS as EMULATOR_OPTIONS
+from frictid_drivers.motoman.emulator.faults import OCCASIONS
 from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_drivers.motoman.emulator.streaming import StreamApplication
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_drivers.motoman.joint_units import axis_units
+from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.table import friction_table
 from frictid_hil.friction.curve import FrictionCurve
 
@@ -157,6 +161,12 @@ def test_every_command_and_frame_of_the_code_is_on_the_page() -> None:
         assert re.search(rf"\| {refusal.value} \|", text)
     for flag in frames.Flag:
         assert re.search(rf"\| {flag.value} \|", text)
+
+
+def test_every_option_and_fault_is_on_the_users_page() -> None:
+    text = (PAGE.parent / "driver-motoman.md").read_text()
+    for name in [*OCCASIONS, *EMULATOR_OPTIONS, *(entry.name for entry in fields(SerialOptions))]:
+        assert f"`{name}`" in text, name
 
 
 def test_the_page_says_what_was_never_tested() -> None:

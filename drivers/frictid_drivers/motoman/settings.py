@@ -45,7 +45,7 @@ class SerialOptions:
     baud: int = 19200
     parity: str = ""
     stream_baud: int = 0
-    lead_ticks: int = 25
+    lead_ticks: int = 8
     silence_ms: float = 300.0
     command_delay_ms: float = 300.0
     watchdog_s: float = 5.0

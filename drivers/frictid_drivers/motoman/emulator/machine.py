@@ -136,6 +136,12 @@ class Emulator:
             times.append(self._next_tick_s)
         return max(self.now_s, min(times))
 
+    @property
+    def starving(self) -> bool:
+        """Nothing is under way on the wire, and the coming tick finds hardly a target in the queue."""
+        dry = self.stream is not None and self.stream.running_dry
+        return dry and self.next_event_s() >= self._next_tick_s
+
     def advance(self, to_s: float) -> None:
         """Let everything happen that happens until then."""
         while True:

@@ -21,6 +21,7 @@ VERSION = 1
 QUEUE = 64
 WATCHDOG_TICKS = 3
 _STRAY_RAD = 0.004
+_NEARLY_DRY = 2
 _SILENT_TICKS = 500
 """A line on which nobody speaks and nothing moves goes back to host control."""
 
@@ -85,6 +86,11 @@ class StreamApplication:
     def moving(self) -> bool:
         """Targets are being followed, or the arm is still being decelerated."""
         return self._armed and (not self._latched or self._stopping > 0)
+
+    @property
+    def running_dry(self) -> bool:
+        """Targets are being followed, and hardly any are left."""
+        return self._armed and not self._latched and len(self._queue) <= _NEARLY_DRY
 
     # -- the wire ----------------------------------------------------------------------------------------------
 
