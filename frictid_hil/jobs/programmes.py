@@ -24,8 +24,8 @@ class Programme:
         name: as typed.
         shares: peak speeds as shares of V; empty for the N equally spaced ones of the robot file.
         method: estimator unless one is asked for.
-        error_percent: error over the curve's measured range, worst joint of the simulated hp3j (A = 20 deg,
-            V = 115 deg/s, 1 kHz, seeds 0 to 2, rigid), as ``benchmarks/programmes.py`` prints it.
+        error_percent: error over the curve's measured range, worst joint and seed of the simulated hp3j, rigid or
+            flexible (A = 20 deg, V = 115 deg/s, 1 kHz), as ``benchmarks/programmes.py`` prints it.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Programme:
 PROGRAMMES = {
     programme.name: programme
     for programme in (
-        Programme("thorough", (), "aligned", 0.5),
-        Programme("standard", (12 / _TOP, 60 / _TOP, 1.0), "least-squares", 0.3),
-        Programme("quick", (30 / _TOP, 1.0), "least-squares", 0.5),
+        Programme("thorough", (), "aligned", 0.25),
+        Programme("standard", (12 / _TOP, 60 / _TOP, 1.0), "least-squares", 0.5),
+        Programme("quick", (30 / _TOP, 1.0), "least-squares", 1.3),
     )
 }
 DEFAULT = PROGRAMMES["thorough"]
