@@ -1,0 +1,196 @@
+"""A recorded run replays to the identical profile; damage is told; foreign logs are decoded by a frame map."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from frictid_hil.config.profile import load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.errors import ConfigError, InputFileError, UsageError
+from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.decoded_log import lost_rows
+from frictid_hil.jobs.replay import ReplayOptions, replay
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.recording.bus_log import BusLogWriter, read_frames
+from frictid_hil.recording.playback import LogBus, logged
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The smallest joint of the shipped robot alone, so that a run takes seconds."""
+    values = load_robot("hp3j").values()
+    values |= {"name": "replayed", "bus": "virtual:replayed", "joints": {"5": values["joints"]["5"]}}
+    values["procedure"] |= {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3}
+    path = tmp_path_factory.mktemp("robot") / "replayed.yaml"
+    path.write_text(dump(values))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def run(robot: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("runs") / "run"
+    result = calibrate(CalibrateOptions(robot, out=place), Silent())
+    assert result["outcome"] == "ok", result
+    return place
+
+
+def test_a_run_replays_to_the_identical_profile(run: Path, robot: str, tmp_path: Path) -> None:
+    result = replay(ReplayOptions(run, robot, out=tmp_path))
+    assert result["outcome"] == "ok"
+    assert result["identical"] is True
+    assert result["log"]["unknown"] == {} and result["log"]["lost_rows"] == {"5": 0}
+    live, played = load_profile(run / "profile.yaml"), load_profile(Path(result["profile"]))
+    assert live.content_sha256 == played.content_sha256
+
+
+def test_set_points_on_the_simulated_joint_move_it_as_recorded(run: Path, robot: str, tmp_path: Path) -> None:
+    result = replay(ReplayOptions(run, robot, out=tmp_path))
+    step_rad = 2 * np.pi / 131072 / load_robot(robot).file.joints["5"].gear_ratio
+    assert result["position_rms_rad"] < 2 * step_rad
+    # What is left of the torque is the drive's noise: 5 per mille of rated.
+    assert result["torque_rms_nm"] < 0.007 * load_robot(robot).file.joints["5"].rated_torque_nm
+    (csv,) = result["simulated"]
+    header, first, *_ = Path(csv).read_text().splitlines()
+    assert header.startswith("time_s,position_rad") and header.endswith("simulated_torque_nm")
+    assert len(first.split(",")) == len(header.split(","))
+
+
+def test_another_joint_is_told_apart(run: Path, robot: str, tmp_path: Path) -> None:
+    values = load_robot(robot).values()
+    values["joints"]["5"]["simulated"]["inertia_kg_m2"] *= 3.0
+    heavier = tmp_path / "heavier.yaml"
+    heavier.write_text(dump(values))
+    own, other = (replay(ReplayOptions(run, name))["torque_rms_nm"] for name in (robot, str(heavier)))
+    assert other > 1.3 * own
+
+
+def test_one_torque_changed_in_the_log_is_another_profile(run: Path, robot: str, tmp_path: Path) -> None:
+    frames = read_frames(run / "bus.blf")
+    (mark,) = [
+        m for m in json.loads((run / "manifest.json").read_text())["sessions"][0]["marks"] if m["name"] == "cycles"
+    ]
+    node = load_robot(robot).file.joints["5"].node
+    inside = np.flatnonzero((frames.can_id == 0x180 + node) & (frames.t_ns > (mark["start_ns"] + mark["end_ns"]) // 2))
+    frames.data[inside[:50], 6] ^= 0x40
+    result = replay(ReplayOptions(copied(run, tmp_path, list(logged(frames))), robot, simulation=False))
+    assert result["identical"] is False
+
+
+@pytest.mark.parametrize("kind", ["removed", "swapped", "doubled"])
+def test_one_percent_of_damage_is_told_and_changes_the_curve_by_less_than_one_percent(
+    run: Path, robot: str, tmp_path: Path, kind: str
+) -> None:
+    frames = list(logged(read_frames(run / "bus.blf")))
+    random = np.random.default_rng(7)
+    picked = set(random.choice(len(frames) - 1, len(frames) // 100, replace=False).tolist())
+    spoilt = []
+    for at, frame in enumerate(frames):
+        if kind == "swapped" and at - 1 in picked:
+            spoilt.insert(len(spoilt) - 1, frame)
+        elif kind != "removed" or at not in picked:
+            spoilt += [frame, frame] if kind == "doubled" and at in picked else [frame]
+    result = replay(ReplayOptions(copied(run, tmp_path, spoilt), robot, simulation=False))
+    joint, log = result["joints"]["5"], result["log"]
+    assert result["outcome"] == "ok" and joint["difference_percent"] < 1.0
+    told = {"removed": log["lost_rows"]["5"], "swapped": log["backwards"], "doubled": log["repeated"]}
+    assert told[kind] > 0
+
+
+def test_a_log_that_lacks_much_is_gated(run: Path, robot: str, tmp_path: Path) -> None:
+    frames = list(logged(read_frames(run / "bus.blf")))
+    random = np.random.default_rng(3)
+    kept = [frame for frame in frames if random.random() > 0.06]
+    result = replay(ReplayOptions(copied(run, tmp_path, kept), robot, simulation=False))
+    assert result["outcome"] == "gate_failed"
+    assert "missing from the log" in result["error"]["what"]
+
+
+def test_a_foreign_log_needs_a_frame_map_and_unknown_frames_are_named(run: Path, robot: str, tmp_path: Path) -> None:
+    session = json.loads((run / "manifest.json").read_text())["sessions"][0]
+    (mark,) = [mark for mark in session["marks"] if mark["name"] == "cycles"]
+    cut = (mark["start_ns"] - 300_000_000, mark["end_ns"])
+    frames = [frame for frame in logged(read_frames(run / "bus.blf")) if cut[0] <= frame[0] < cut[1]]
+    frames += [(frames[-1][0] + 1, 0x123, b"\1"), (frames[-1][0] + 2, 0x80000000 | 0x1ABCDE, b"")]
+    log = tmp_path / "foreign.asc"
+    with can.ASCWriter(log) as writer:
+        for t_ns, can_id, data in frames:
+            extended = bool(can_id >> 31)
+            writer.on_message_received(
+                can.Message(
+                    timestamp=1.7e9 + t_ns * 1e-9,
+                    arbitration_id=can_id & 0x1FFFFFFF,
+                    is_extended_id=extended,
+                    data=data,
+                )
+            )
+    with pytest.raises(UsageError, match="which frame carries what"):
+        replay(ReplayOptions(log, robot))
+    mapping = json.loads((run / "manifest.json").read_text())["frame_maps"]["bus.blf"]
+    described = tmp_path / "frames.yaml"
+    described.write_text(dump(mapping))
+    result = replay(
+        ReplayOptions(
+            log, robot, frames=described, procedure=Procedure(0.2, 1.5, 3, 0.8), profile=run, simulation=False
+        )
+    )
+    assert result["log"]["unknown"] == {"frame 0x123": 1, "extended frame 0x001abcde": 1}
+    assert result["joints"]["5"]["difference_percent"] is not None, result["joints"]["5"]["remarks"]
+    assert result["joints"]["5"]["difference_percent"] < 1.0
+
+
+def test_a_wrong_frame_map_is_told_with_its_place(run: Path, robot: str, tmp_path: Path) -> None:
+    described = tmp_path / "frames.yaml"
+    described.write_text("schema: frictid.frames/1\njoints:\n  '5': {node: 400, position_rad_per_unit: 1.0e-6}\n")
+    with pytest.raises(ConfigError, match="node"):
+        replay(ReplayOptions(run / "bus.blf", robot, frames=described))
+
+
+def test_a_log_of_other_frames_says_what_it_saw(robot: str, run: Path, tmp_path: Path) -> None:
+    other = copied(run, tmp_path, [(k * 1000, 0x321, b"\0") for k in range(50)])
+    with pytest.raises(InputFileError, match="no report") as told:
+        replay(ReplayOptions(other, robot))
+    assert "50 x frame 0x321" in told.value.cause
+
+
+def test_a_log_is_a_bus_that_paces_and_echoes(run: Path) -> None:
+    frames = read_frames(run / "bus.blf")
+    echo, ear = (can.Bus(interface="virtual", channel="echo-of-a-log") for _ in range(2))
+    with echo, ear, LogBus(frames, echo=echo) as bus:
+        first = bus.recv(0.1)
+        heard = ear.recv(0.1)
+        assert first is not None and heard is not None
+        assert (first.arbitration_id, bytes(first.data)) == (heard.arbitration_id, bytes(heard.data))
+    with LogBus(frames, paced=True) as bus:
+        start_ns = bus.take()[0]
+        later = next(t for t, *_ in logged(frames) if t > start_ns + 200_000_000)
+        began = time.monotonic()
+        while (taken := bus.take()) is not None and taken[0] < later:
+            pass
+        assert time.monotonic() - began > 0.19
+
+
+def test_lost_rows_are_counted_from_the_times() -> None:
+    time_ns = np.arange(1000) * 1_000_000
+    assert lost_rows(time_ns) == (0, 0.0)
+    assert lost_rows(np.delete(time_ns, [5, 6, 500]))[0] == 3
+
+
+def copied(run: Path, place: Path, frames: list[tuple[int, int, bytes]]) -> Path:
+    """The same run with other frames in its log."""
+    folder = place / "copy"
+    folder.mkdir()
+    for name in ("manifest.json", "profile.yaml"):
+        shutil.copy(run / name, folder / name)
+    with BusLogWriter(folder / "bus.blf") as writer:
+        for frame in frames:
+            writer.frame(*frame, False)
+    return folder

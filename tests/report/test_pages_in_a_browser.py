@@ -1,0 +1,142 @@
+"""Every page in a real browser: no console errors, and every figure with its axes, units and data."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from frictid_hil.config.attempts import Attempt
+from frictid_hil.config.policy import Policy
+from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile, ProcedureUsed
+from frictid_hil.config.provenance import Provenance
+from frictid_hil.config.store import ProfileStore
+from frictid_hil.jobs.judgement import judge
+from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.report.calibration import calibration_page
+from frictid_hil.report.index import index_page
+from frictid_hil.report.pages import Page, write_page
+from frictid_hil.report.recalibration import recalibration_page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+SPEEDS = (0.2, 0.8, 1.4, 2.0)
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (apt install chromium)")
+
+
+def profile(factor: float, day: int) -> FrictionProfile:
+    torque = tuple(factor * (4.0 + 2.0 * v) for v in SPEEDS)
+    joint = JointProfile(
+        method="aligned",
+        velocity_rad_s=SPEEDS,
+        torque_nm=torque,
+        torque_interval_nm=tuple((t - 0.1, t + 0.1) for t in torque),
+        coulomb_nm=Estimate(value=4.0 * factor, low=3.9 * factor, high=4.1 * factor),
+        temperature_c=20.0 + day,
+        procedure=ProcedureUsed(amplitude_rad=0.35, velocity_rad_s=2.0, cycles=4, ratio=0.8),
+        gates=(Gate(name="tracking", passed=True, message="the speeds were reached"),),
+    )
+    return FrictionProfile(
+        robot="arm", joints={"0": joint, "1": joint}, provenance=Provenance(created_utc=f"2026-03-{day:02d}T02:00:00Z")
+    )
+
+
+def recording(joint: str) -> Samples:
+    time_ns = np.arange(4000) * 1_000_000
+    phase = time_ns * 1e-9 * 2 * np.pi
+    return Samples(
+        joint,
+        time_ns,
+        position_rad=0.175 * (1 - np.cos(phase)),
+        velocity_rad_s=1.1 * np.sin(phase),
+        torque_nm=6 * np.sign(np.sin(phase)),
+        position_command_rad=0.175 * (1 - np.cos(phase)) + 1e-4,
+        marks=(Mark("cycles", 0, 4_000_000_000),),
+    )
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> ProfileStore:
+    store = ProfileStore(tmp_path / "store")
+    for day in range(1, 6):
+        store.promote("arm", store.add(profile(1 + 0.03 * day, day)), by="test", reason="night <script>")
+    return store
+
+
+def pages(store: ProfileStore) -> dict[str, Page]:
+    nights = [Attempt(f"2026-03-{day:02d}T02:00:00Z", "ok", 0, True, reason="fine") for day in range(1, 6)]
+    new, old = profile(1.3, 6), profile(1.0, 1)
+    verdict = judge(Policy(), new, old, old, failed={})
+    result = {
+        "outcome": "ok", "promoted": False, "reason": verdict.reason, "next_step": verdict.next_step, "run": "runs/x",
+        "stored": "id", "drift": verdict.joints, "joints": {name: {"outcome": "ok"} for name in new.joints},
+    }  # fmt: skip
+    index = index_page(
+        "arm", store.trends("arm"), store.promotions("arm"), nights, store.active("arm"), store.baseline("arm")
+    )
+    return {
+        "calibration": calibration_page(
+            new, {name: recording(name) for name in new.joints}, outcome="ok", previous=old
+        ),
+        "recalibration": recalibration_page(result, Policy(), new, old, old, store.trends("arm")),
+        "index": index,
+    }
+
+
+def in_browser(page: Path, profile_folder: Path) -> tuple[str, list[str]]:
+    """The page's DOM once its scripts have run, and what it wrote to the console."""
+    assert CHROMIUM is not None
+    command = [
+        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        f"--user-data-dir={profile_folder}", "--enable-logging=stderr", "--virtual-time-budget=8000", "--dump-dom",
+        page.as_uri(),
+    ]  # fmt: skip
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return shown.stdout, [line for line in shown.stderr.splitlines() if ":CONSOLE" in line]
+
+
+@needs_browser
+@pytest.mark.parametrize("name", ["calibration", "recalibration", "index"])
+def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: Path) -> None:
+    page = pages(history)[name]
+    figures = [figure for section in page.sections for figure in section.figures]
+    assert figures
+    dom, console = in_browser(write_page(page, tmp_path / f"{name}.html"), tmp_path / "browser")
+    assert console == []
+    drawn = re.split(r'id="figure-\d+"', dom)[1:]
+    assert len(drawn) == len(figures)
+    for figure, svg in zip(figures, drawn, strict=True):
+        for kind, title in (("xtitle", figure.x_title), ("ytitle", figure.y_title)):
+            (shown,) = re.findall(rf'class="{kind}"[^>]*>(.*?)</text>', svg)
+            assert html.unescape(re.sub(r"<[^>]+>", "", shown)) == title
+            assert re.search(r"\[.+\]$|\[.+\] *", title), "an axis without its unit"
+        assert len(re.findall(r'class="[^"]*(?:js-line|js-fill|point)"', svg)) >= len(figure.traces)
+
+
+@needs_browser
+def test_a_broken_page_would_be_noticed(history: ProfileStore, tmp_path: Path) -> None:
+    path = write_page(pages(history)["index"], tmp_path / "index.html")
+    path.write_text(path.read_text().replace("\ndraw();\n", "\ndraw();\nundefinedFunction();\n"))
+    _, console = in_browser(path, tmp_path / "browser")
+    assert any("undefinedFunction" in line for line in console)
+
+
+def test_pages_are_whole_in_themselves_and_escape_what_people_wrote(history: ProfileStore, tmp_path: Path) -> None:
+    for name, page in pages(history).items():
+        text = write_page(page, tmp_path / f"{name}.html").read_text()
+        assert not re.search(r'<(?:script|link|img)[^>]+(?:src|href)="(?!data:)', text), "something from elsewhere"
+        assert "night <script>" not in text
+        assert "prefers-color-scheme: dark" in text and "@media print" in text
+
+
+def test_an_index_page_of_nothing_says_so() -> None:
+    page = index_page("arm", {}, [], [], None, None)
+    assert "No profile was promoted" in page.headline
+    assert replace(page, title="x").title == "x"
