@@ -68,8 +68,7 @@ def flexible(values: Mapping[str, Any], resonance_hz: float) -> dict[str, Any]:
         simulated = dict(joint["simulated"])
         link = simulated["inertia_kg_m2"] * (1.0 - simulated["motor_inertia_share"])
         stiffness = link * (2 * math.pi * resonance_hz) ** 2
-        damping = 0.04 * math.sqrt(stiffness * link)
-        elastic = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
+        elastic = {"compliance_rad_per_nm": 1.0 / stiffness, "relaxation_s": 3e-4}
         simulated["effects"] = {**simulated["effects"], "joint_elasticity": elastic}
         robot["joints"][name] = {**joint, "simulated": simulated}
     return robot

@@ -169,15 +169,16 @@ def _run(planned: Planned, folder: RunFolder, options: CalibrateOptions, watcher
 
     with folder.keeping(setup, watcher.at) as keeper:
         try:
-            return run_plan(
-                planned.robot.driver(options.bus),
-                setup,
-                plan,
-                keeper,
-                notify=notify,
-                proceed=lambda preflight: watcher.confirm(plan, preflight),
-                care=Care(interlock=options.interlock),
-            )
+            with planned.robot.document.locating():
+                return run_plan(
+                    planned.robot.driver(options.bus),
+                    setup,
+                    plan,
+                    keeper,
+                    notify=notify,
+                    proceed=lambda preflight: watcher.confirm(plan, preflight),
+                    care=Care(interlock=options.interlock),
+                )
         except FrictidError as error:
             if isinstance(error, UsageError) or not keeper.rows:
                 if options.resume is None:

@@ -48,7 +48,8 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
     driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
     identities = {}
     try:
-        driver.open()
+        with robot.document.locating():
+            driver.open()
         findings.extend(driver.check(plan))
         identities = driver.identify()
     finally:

@@ -99,3 +99,17 @@ def test_errors_keep_file_line_and_column(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "site.yaml:6:5" in result.stderr
     assert "gear_ratio" in result.stderr, "the nearest known key is suggested"
+
+
+@pytest.mark.parametrize("verb", [("check",), ("calibrate", "--joint", "5", "--yes")])
+def test_a_simulated_joint_that_cannot_be_is_told_with_its_place(verb: tuple[str, ...], tmp_path: Path) -> None:
+    site = tmp_path / "site.yaml"
+    site.write_text(
+        "schema: frictid.robot/1\nextends: hp3j.yaml\nname: mine\nbus: virtual:mine\njoints:\n  '1':\n    simulated:\n"
+        "      effects:\n        backlash:\n          gap_deg: 1\n"
+    )
+    result = run(verb[0], "--robot", str(site), *verb[1:], cwd=tmp_path)
+    assert result.returncode == 2, result.stderr
+    assert "site.yaml:10:" in result.stderr
+    assert "gap_deg" in result.stderr
+    assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").rglob("*.mcap"))
