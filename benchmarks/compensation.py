@@ -4,6 +4,7 @@
     python benchmarks/compensation.py hand  --profile runs/benchmark/profile.yaml [--setting paper]
     python benchmarks/compensation.py track --profile runs/benchmark/profile.yaml
     python benchmarks/compensation.py stability --profile runs/benchmark/profile.yaml
+    python benchmarks/compensation.py wrong --profile runs/benchmark/profile.yaml
     python benchmarks/compensation.py cost
 
 All through the product's own command line, on the simulated bus, with the drives' torque steps, encoder counts and two
@@ -126,6 +127,59 @@ def cost(_options: argparse.Namespace) -> None:
     print(f"memory growth over 10^7 steps: {tracemalloc.get_traced_memory()[0] - before} bytes")
 
 
+def wrong(options: argparse.Namespace) -> None:
+    """Wrong profiles: refused by what; forced: stopped by what, at which share of the joint's speed limit."""
+    import numpy as np
+
+    from frictid_hil.config.profile import Estimate, FrictionProfile, load_profile
+    from frictid_hil.config.robot import load_robot
+    from frictid_hil.recording.read import read
+
+    whole, robot = load_profile(options.profile), load_robot(options.robot)
+    fresh = {"measured_range_rad_s": None, "slopes_nm_s_per_rad": None}
+
+    def doubled(entry):
+        stiffness = Estimate(value=2 * entry.presliding_stiffness_nm_per_rad.value)
+        return entry.model_copy(
+            update={
+                **fresh,
+                "torque_nm": tuple(2 * f for f in entry.torque_nm),
+                "torque_interval_nm": None,
+                "coulomb_nm": Estimate(value=2 * entry.coulomb_nm.value),
+                "presliding_stiffness_nm_per_rad": stiffness,
+            }
+        )
+
+    def gravity_flipped(entry):
+        names = ("gravity_cos_nm", "gravity_sin_nm")
+        return entry.model_copy(update={name: Estimate(value=-getattr(entry, name).value) for name in names})
+
+    print("| joint | profile | without --force | with --force | fastest, share of the joint's limit |")
+    print("|---|---|---|---|---|")
+    for joint in options.joint or JOINTS:
+        entry = whole.joints[joint]
+        other = whole.joints["1" if joint != "1" else "0"]
+        kinds = {"doubled": doubled(entry), "gravity negated": gravity_flipped(entry), "another joint's": other}
+        for name, changed in kinds.items():
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "wrong.yaml"
+                FrictionProfile(robot=whole.robot, joints={joint: changed}, provenance=whole.provenance).save(path)
+                told = []
+                for force in ((), ("--force",)):
+                    run = Path(folder) / f"run{len(force)}"
+                    result = call(
+                        *("compensate", "--robot", options.robot, "--profile", str(path), "--joint", joint),
+                        *("--task", "hand", "--mode", "mop", "--bus", options.bus, "--out", str(run), *force),
+                    )
+                    told.append(result.get("error", {}).get("what", "ran to its end").split(";")[0])
+                fastest = 0.0
+                if run.exists():
+                    samples = next(one for one in read(run) if one.joint == joint)
+                    fastest = float(np.abs(samples.velocity_rad_s).max())
+                share = fastest / robot.file.joints[joint].max_velocity_rad_s
+                print(f"| {joint} | {name} | {told[0]} | {told[1]} | {share:.2f} |", flush=True)
+
+
 def stability(options: argparse.Namespace) -> None:
     """Largest R and K at which a joint that was pushed comes to rest, free and under the PD of the track task."""
     from frictid_hil.config.profile import load_profile
@@ -224,7 +278,7 @@ class _Stability:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["calibrate", "hand", "track", "stability", "cost"])
+    parser.add_argument("what", choices=["calibrate", "hand", "track", "stability", "wrong", "cost"])
     parser.add_argument("--robot", default="hp3j.yaml")
     parser.add_argument("--bus", default="virtual:benchmark")
     parser.add_argument("--profile", default="runs/benchmark/profile.yaml")
@@ -234,7 +288,7 @@ def main() -> None:
     parser.add_argument("--speed", default="30deg/s")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    verbs = {"calibrate": calibrate, "hand": hand, "track": track, "stability": stability, "cost": cost}
+    verbs = {"calibrate": calibrate, "hand": hand, "track": track, "stability": stability, "wrong": wrong, "cost": cost}
     verbs[options.what](options)
 
 

@@ -158,10 +158,7 @@ def compensation_plan(
     inertia = entry.inertia_kg_m2.value or 0.0
     peak_nm = gravity.largest_nm + float(entry.curve().magnitude(np.array(moved.peak_velocity_rad_s)))
     peak_nm += inertia * wanted.peak_rad_s * 2 * math.pi / wanted.period_s
-    limit_nm = max(1.3 * peak_nm, *(law.torque_limit_nm for law in laws.values()))
-    if wanted.drive_mode is not Mode.TORQUE:
-        limit_nm = joint.max_torque_nm
-    moved = replace(moved, predicted_torque_nm=peak_nm, torque_limit_nm=min(joint.max_torque_nm, limit_nm))
+    moved = replace(moved, predicted_torque_nm=peak_nm)
     notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}", *warnings]
     return CompensationPlan(Plan(robot, setup.cycle_hz, (moved,), tuple(notes)), centre_rad, laws, tuple(warnings))
 

@@ -188,7 +188,7 @@ class Scheduler:
         for joint in self._setup.joints:
             driver.set_limits(
                 joint.name,
-                torque_nm=_drive_torque_nm(joint, plan),
+                torque_nm=joint.max_torque_nm,
                 position_min_rad=joint.position_min_rad,
                 position_max_rad=joint.position_max_rad,
             )
@@ -453,11 +453,6 @@ class Scheduler:
         except FrictidError:
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self._driver.quick_stop()
-
-
-def _drive_torque_nm(joint: JointSetup, plan: JointPlan) -> float:
-    """The limit set in a drive: the plan's own for the joint that moves, where it has one."""
-    return min(joint.max_torque_nm, plan.torque_limit_nm) if joint.name == plan.joint else joint.max_torque_nm
 
 
 class _SignWatch:
