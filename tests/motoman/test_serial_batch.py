@@ -204,6 +204,16 @@ def test_figures_beyond_24_bits_are_shifted_and_come_back(speed: int, torque: in
     assert record.torque_micro[0] == pytest.approx(torque, abs=2**torque_shift)
 
 
+def test_a_long_job_runs_on_a_controller_that_could_stream_as_well() -> None:
+    bench = make_bench()
+    driver = bench.driver()
+    driver.open()
+    assert not driver.capabilities().batch_only
+    columns = driver.run_batch(plan(Hold(START_RAD, 4.0)))
+    assert len(columns["time_ns"]) == 1001
+    driver.close()
+
+
 def test_a_stop_on_request_brings_the_joint_to_rest_and_keeps_the_record() -> None:
     bench = make_bench(layer="batch")
     driver = bench.driver()

@@ -200,7 +200,7 @@ class Emulator:
             self._settling_ticks -= 1
         self._hold_back_s = late_s
         self.batch.tick(dropped)
-        if self.stream is not None:
+        if self.stream is not None and (self._on_stream_line or self.stream.moving):
             self.stream.tick(dropped)
         self._hold_back_s = 0.0
         self.batch.compensate()
