@@ -321,7 +321,7 @@ class StreamApplication:
             here = [self._axes[number].issued for number in self._numbers]
             self._go([a + b for a, b in zip(here, speed, strict=True)])
             self._speed = speed
-        else:
+        if self._stopping == 0:
             self._panel.operating = False
         self._feed_forward([])
 
