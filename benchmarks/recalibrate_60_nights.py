@@ -1,0 +1,115 @@
+"""Sixty simulated nights of ``recalibrate``: one joint's friction drifts by 15 %, another is broken on night 40.
+
+    python benchmarks/recalibrate_60_nights.py [NIGHTS]
+
+Six joints of the shipped robot with a short procedure (A = 0.1 rad, V = 1 rad/s, 2 cycles), another noise every night,
+friction that wanders by 1 % from night to night on every joint, ambient and gear as the robot file has them. Printed:
+the first night on which the drift was flagged against the first on which the truth passed the policy's threshold, false
+flags on the other joints, and what became of the broken night.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.jobs import calibrate as calibration
+from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
+from frictid_hil.jobs.watch import Silent
+
+DRIFTING, BROKEN, BROKEN_NIGHT = "2", "4", 40
+DRIFT, WANDER, THRESHOLD_PERCENT = 0.15, 0.01, 10.0
+
+
+def main() -> None:
+    nights = int(sys.argv[1]) if len(sys.argv) > 1 else 60
+    random = np.random.default_rng(1)
+    flagged: dict[str, list[int]] = {}
+    passed: int | None = None
+    broken: dict[str, Any] = {}
+    failures: list[int] = []
+    began, cpu = time.monotonic(), time.process_time()
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(temporary)
+        first = None
+        for night in range(1, nights + 1):
+            factors = {name: 1.0 + WANDER * random.standard_normal() for name in load_robot("hp3j").joint_names}
+            factors[DRIFTING] *= 1.0 + DRIFT * (night - 1) / (nights - 1)
+            if night == BROKEN_NIGHT:
+                factors[BROKEN] *= 2.0
+            first = first or dict(factors)
+            if passed is None and 100 * (factors[DRIFTING] / first[DRIFTING] - 1) > THRESHOLD_PERCENT:
+                passed = night
+            before = active(place)
+            set_date(night)
+            result = recalibrate(
+                RecalibrateOptions(
+                    robot_file(place, factors), store=place / "store", seed=night, out=place / f"run-{night}"
+                ),
+                Silent(),
+            )
+            for name in result["drifted"]:
+                flagged.setdefault(name, []).append(night)
+            if night == BROKEN_NIGHT:
+                broken = {**result, "kept": result["active"] == before}
+            elif not result["promoted"]:
+                failures.append(night)
+            distance = result["drift"][DRIFTING]["distance_percent"] or 0.0
+            print(
+                f"night {night:2d}: truth {100 * (factors[DRIFTING] / first[DRIFTING] - 1):5.1f} %, measured "
+                f"{distance:5.1f} %, drifted {result['drifted']}, promoted {result['promoted']}",
+                file=sys.stderr,
+            )
+    others = {name: seen for name, seen in flagged.items() if name not in (DRIFTING, BROKEN)}
+    others |= {BROKEN: seen for seen in [[n for n in flagged.get(BROKEN, []) if n != BROKEN_NIGHT]] if seen}
+    print(
+        f"{nights} nights, six joints: {time.monotonic() - began:.0f} s, {time.process_time() - cpu:.0f} s of one core"
+    )
+    print(
+        f"truth passes {THRESHOLD_PERCENT:g} % on night {passed}; flagged first on {flagged.get(DRIFTING, ['never'])[0]}"
+    )
+    print(f"false flags on the other five joints: {others or 'none'}")
+    if broken:
+        print(f"broken night: {broken['outcome']}, old profile kept: {broken['kept']}; {broken['reason']}")
+    print(f"healthy nights that were not promoted: {failures or 'none'}")
+
+
+def robot_file(place: Path, factors: dict[str, float]) -> str:
+    values = load_robot("hp3j").values()
+    values |= {"name": "nights", "bus": "virtual:sixty-nights"}
+    values["procedure"] = {"amplitude_rad": 0.1, "velocity_rad_s": 1.0, "cycles": 2, "ratio": 0.8}
+    values["policy"] = {"drift_percent": THRESHOLD_PERCENT, "warm_up": {"fixed_s": 0.0}}
+    for name, joint in values["joints"].items():
+        joint["locked_position_rad"] = joint["start_position_rad"]
+        for key in ("coulomb_nm", "viscous_nm_s_per_rad"):
+            joint["simulated"]["friction"][key] *= factors[name]
+    path = place / "nights.yaml"
+    path.write_text(dump(values))
+    return str(path)
+
+
+def active(place: Path) -> str | None:
+    journal = place / "store" / "nights" / "promotions.jsonl"
+    if not journal.exists():
+        return None
+    last = json.loads(journal.read_text().splitlines()[-1])["id"]
+    return str((place / "store" / "nights" / "profiles" / f"{last}.yaml").resolve())
+
+
+def set_date(night: int) -> None:
+    """One night per simulated day, where profiles take their date from."""
+    day = datetime(2026, 1, 1, 2, 30, tzinfo=UTC) + timedelta(days=night - 1)
+    calibration.utc_now = lambda: day.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+if __name__ == "__main__":
+    main()
