@@ -69,14 +69,14 @@ def main() -> None:
                 f"{distance:5.1f} %, drifted {result['drifted']}, promoted {result['promoted']}",
                 file=sys.stderr,
             )
-    others = {name: seen for name, seen in flagged.items() if name not in (DRIFTING, BROKEN)}
-    others |= {BROKEN: seen for seen in [[n for n in flagged.get(BROKEN, []) if n != BROKEN_NIGHT]] if seen}
-    print(
-        f"{nights} nights, six joints: {time.monotonic() - began:.0f} s, {time.process_time() - cpu:.0f} s of one core"
-    )
-    print(
-        f"truth passes {THRESHOLD_PERCENT:g} % on night {passed}; flagged first on {flagged.get(DRIFTING, ['never'])[0]}"
-    )
+    meant = {DRIFTING: range(nights + 1), BROKEN: [BROKEN_NIGHT]}
+    others = {
+        name: false for name, seen in flagged.items() if (false := [n for n in seen if n not in meant.get(name, ())])
+    }
+    wall_s, cpu_s = time.monotonic() - began, time.process_time() - cpu
+    seen = flagged.get(DRIFTING, ["never"])[0]
+    print(f"{nights} nights, six joints: {wall_s:.0f} s, {cpu_s:.0f} s of one core")
+    print(f"truth passes {THRESHOLD_PERCENT:g} % on night {passed}; flagged first on {seen}")
     print(f"false flags on the other five joints: {others or 'none'}")
     if broken:
         print(f"broken night: {broken['outcome']}, old profile kept: {broken['kept']}; {broken['reason']}")
