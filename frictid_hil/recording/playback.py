@@ -1,4 +1,4 @@
-"""A bus log as a bus: its frames arrive one by one, at the pace at which they were recorded or as fast as they are read.
+"""A bus log as a python-can bus of its own: what was recorded comes again, at the recorded pace or at full speed.
 
 Nothing answers on this bus: no drive is on it, and what is sent to it goes nowhere but into the ears of whoever shares
 the ``echo`` bus. Everything that takes a python-can bus (a ``can.Notifier``, ``canopen``) can listen to a log this way.
