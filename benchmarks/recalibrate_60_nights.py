@@ -2,7 +2,7 @@
 
     python benchmarks/recalibrate_60_nights.py [NIGHTS]
 
-Six joints of the shipped robot with a short procedure (A = 0.1 rad, V = 1 rad/s, 2 cycles), another noise every night,
+Six joints of the shipped robot with a short procedure (A = 0.2 rad, V = 1.5 rad/s, 3 cycles), another noise every night,
 friction that wanders by 1 % from night to night on every joint, ambient and gear as the robot file has them. Printed:
 the first night on which the drift was flagged against the first on which the truth passed the policy's threshold, false
 flags on the other joints, and what became of the broken night.
@@ -86,7 +86,7 @@ def main() -> None:
 def robot_file(place: Path, factors: dict[str, float]) -> str:
     values = load_robot("hp3j").values()
     values |= {"name": "nights", "bus": "virtual:sixty-nights"}
-    values["procedure"] = {"amplitude_rad": 0.1, "velocity_rad_s": 1.0, "cycles": 2, "ratio": 0.8}
+    values["procedure"] = {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3, "ratio": 0.8}
     values["policy"] = {"drift_percent": THRESHOLD_PERCENT, "warm_up": {"fixed_s": 0.0}}
     for name, joint in values["joints"].items():
         joint["locked_position_rad"] = joint["start_position_rad"]

@@ -94,6 +94,10 @@ def calibrate(
         Path | None, typer.Option("--resume", help="Continue this run folder with the joints it still lacks.")
     ] = None,
     out: OutOption = None,
+    notify: Annotated[
+        str | None,
+        typer.Option("--notify", metavar="CMD", help="Command that is given the JSON on its standard input."),
+    ] = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -104,7 +108,7 @@ def calibrate(
     from frictid_hil.jobs.calibrate import calibrate as job
     from frictid_hil.plan import described
 
-    output = Output(as_json, quiet)
+    output = Output(as_json, quiet, notify)
     options = CalibrateOptions(
         robot=robot,
         bus=bus,
