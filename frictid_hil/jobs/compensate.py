@@ -7,18 +7,16 @@ joint probed in position control, and only then given its compensation (section 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
+from typing import Any
 
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.control import Compensated
-from frictid_hil.driver import Driver, Mode, RobotSetup
+from frictid_hil.driver import Mode, RobotSetup
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
+from frictid_hil.jobs.compensation_companions import Hand, Live, LiveFigures
 from frictid_hil.jobs.compensation_figures import ModeRun, figures, mode_run
 from frictid_hil.jobs.compensation_plan import MODES, CompensationPlan, Wanted, compensation_plan
 from frictid_hil.jobs.plans import expected_of
@@ -29,15 +27,10 @@ from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
-from frictid_hil.runner.ring import Rows
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RowKeeper, RunFolder
-from frictid_hil.units import degrees
 
 VERB = "compensate"
-_LIVE_NS = 500_000_000
-_HELD_BACK_NS = 1_000_000_000
-"""Of a service's figures: how it was ended is not counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,19 +76,6 @@ class CompensateOptions:
     realtime: bool = False
     seed: int = 0
     out: Path | None = None
-
-
-@runtime_checkable
-class GuidedBySimulation(Protocol):
-    """A driver whose robot has a simulated person."""
-
-    def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
-        """Guide the joint along centre + amplitude sin(2 pi f t) from now; frequency 0 lets go."""
-        ...
-
-
-Live = Callable[[str], None]
-"""Told a line of figures twice a second while a service runs."""
 
 
 @dataclass(slots=True)
@@ -178,7 +158,7 @@ def _run(
     progress = _Progress()
     joint = options.joint
     entry = profile.joint(joint)
-    hand = _Hand(joint, planned, wanted, watcher)
+    hand = Hand(joint, planned, wanted, watcher)
     begun = False
 
     def proceed(preflight: Preflight) -> bool:
@@ -208,7 +188,7 @@ def _run(
             _measure(folder.samples(event), planned, wanted, progress)
 
     with folder.keeping(setup, watcher.at) as keeper:
-        figures_live = _LiveFigures(keeper, setup, joint, wanted, live)
+        figures_live = LiveFigures(keeper, setup, joint, wanted, live)
         try:
             run_plan(
                 robot.driver(options.bus),
@@ -225,103 +205,10 @@ def _run(
                 raise
             progress.ended = error
             if wanted.endless:
-                figures_live.add_to(progress)
+                progress.marks.append(figures_live.mark())
             else:
                 _measure_what_was_finished(keeper, folder, setup, joint, planned, wanted, progress)
     return progress
-
-
-class _Hand:
-    """The simulated person, following the phases; on a real robot the person reads what to do."""
-
-    def __init__(self, joint: str, planned: CompensationPlan, wanted: Wanted, watcher: Watcher) -> None:
-        self._joint = joint
-        self._centre_rad = planned.centre_rad
-        names = {motion.name for motion in planned.plan.joints[0].motions}
-        # A person who does not rest lets go at the end of the swing.
-        self._last = {
-            name if (rest := name.replace("hand ", "rest ")) not in names else rest
-            for name in names
-            if name[:5] == "hand "
-        }
-        self._wanted = wanted
-        self._watcher = watcher
-        self._driver: GuidedBySimulation | None = None
-
-    def take_driver(self, driver: Driver) -> None:
-        if isinstance(driver, GuidedBySimulation):
-            self._driver = driver
-
-    def follow(self, event: Event) -> None:
-        if self._wanted.task != "hand":
-            return
-        if isinstance(event, PhaseStarted):
-            phase = event.phase.partition(" ")[0]
-            if phase == "hand":
-                self._guide(self._wanted.amplitude_rad)
-            elif phase == "rest":
-                self._guide(0.0)
-        elif isinstance(event, Marked) and event.mark.name in self._last and self._driver is not None:
-            self._driver.simulate_hand(self._joint, self._centre_rad, 0.0, 0.0)
-
-    def _guide(self, amplitude_rad: float) -> None:
-        if self._driver is not None:
-            self._driver.simulate_hand(self._joint, self._centre_rad, amplitude_rad, 1.0 / self._wanted.period_s)
-        elif amplitude_rad:
-            self._watcher.note(
-                f"move joint {self._joint} by hand, {degrees(amplitude_rad):.0f} deg to either side, "
-                f"back and forth in {self._wanted.period_s:g} s"
-            )
-        else:
-            self._watcher.note(f"bring joint {self._joint} back to {degrees(self._centre_rad):.0f} deg and hold it")
-
-
-class _LiveFigures:
-    """Keeps rows as the keeper does, forgets them, and tells what they say."""
-
-    def __init__(self, keeper: RowKeeper, setup: RobotSetup, joint: str, wanted: Wanted, live: Live | None) -> None:
-        self._keeper = keeper
-        self._index = [one.name for one in setup.joints].index(joint)
-        self._wanted = wanted
-        self._live = live
-        self._sums = np.zeros(3)
-        self._recent: list[Rows] = []
-        self._told_ns = 0
-        self._seen_ns = 0
-        self.counting = False
-
-    def samples(self, rows: Rows) -> None:
-        self._keeper.samples(rows)
-        now_ns = int(rows["t_ns"][-1]) + 1
-        mine = self._keeper.taken(self._index, self._seen_ns, now_ns)
-        self._seen_ns = now_ns
-        if not (mine.size and self.counting):
-            return
-        recent = np.concatenate([*self._recent, mine])
-        old = recent["t_ns"] < now_ns - _HELD_BACK_NS
-        counted, self._recent = recent[old], [recent[~old]]
-        torque = np.nan_to_num(counted["external_torque_nm"])
-        self._sums += (counted.size, float(np.sum(counted["velocity_rad_s"] ** 2)), float(np.sum(torque**2)))
-        if self._live is not None and now_ns - self._told_ns >= _LIVE_NS:
-            self._told_ns = now_ns
-            self._live(_live_line(recent))
-
-    def frames(self, rows: Rows) -> None:
-        self._keeper.frames(rows)
-
-    def add_to(self, progress: _Progress) -> None:
-        """The sums of a service as a mark of its own."""
-        progress.marks.append(Mark("service", 0, self._seen_ns, {"count_v2_t2": self._sums.tolist()}))
-
-
-def _live_line(rows: Rows) -> str:
-    last = rows[-1]
-    external = rows["external_torque_nm"]
-    hand = f"hand {np.sqrt(np.mean(external**2)):6.3f} N m rms" if np.isfinite(external).all() else "hand not measured"
-    return (
-        f"{last['t_ns'] * 1e-9:8.1f} s  {degrees(float(last['position_rad'])):8.2f} deg  "
-        f"{degrees(float(last['velocity_rad_s'])):7.1f} deg/s  drive {float(last['torque_nm']):7.2f} N m  {hand}"
-    )
 
 
 def _measure(samples: Samples, planned: CompensationPlan, wanted: Wanted, progress: _Progress) -> None:
