@@ -13,7 +13,7 @@ from frictid_hil.friction.trajectory import Array
 
 PALETTE = ("#c62828", "#c07a2c", "#3a9a5b", "#1f6fb2", "#6a4fb3", "#8a8f98")
 _LEFT, _RIGHT, _TOP, _BOTTOM, _LEGEND = 56, 12, 26, 40, 20
-_MOST_POINTS = 500
+_MOST_POINTS = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
