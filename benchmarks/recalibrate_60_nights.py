@@ -2,7 +2,7 @@
 
     python benchmarks/recalibrate_60_nights.py [NIGHTS]
 
-Six joints of the shipped robot with a short procedure (A = 0.2 rad, V = 1.5 rad/s, 3 cycles), another noise every night,
+Six joints of the shipped robot with a short procedure (A = 0.2 rad, V = 1.5 rad/s, 3 cycles), other noise every night,
 friction that wanders by 1 % from night to night on every joint, ambient and gear as the robot file has them. Printed:
 the first night on which the drift was flagged against the first on which the truth passed the policy's threshold, false
 flags on the other joints, and what became of the broken night.
