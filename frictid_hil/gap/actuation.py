@@ -19,6 +19,8 @@ from frictid_hil.gap.residuals import LowPass, Recording, demand_of, lagged, rms
 
 MAX_DELAY_S = 0.05
 MAX_LAG_S = 0.05
+CLEARED = 0.7
+"""Share of one log's low-passed squares that a candidate may leave to be taken though all logs show it little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +153,14 @@ def fit_actuation(
     def squares(drive: Drive) -> float:
         return float(sum(np.sum(left(drive, r) ** 2) for r in fitted))
 
+    def clears(before: Drive, after: Drive) -> bool:
+        # What shows in few logs or few rows (clipping) drowns in the white noise of all of them.
+        for r in fitted:
+            low_pass = LowPass.at(1.0 / r.step_s)
+            if rms(low_pass(left(after, r))) ** 2 < CLEARED * rms(low_pass(left(before, r))) ** 2:
+                return True
+        return False
+
     rows = sum(r.experiment.position_rad.size for r in fitted)
     drive, found, rivals = nominal, dict[str, float](), dict[str, float]()
     start = current = squares(nominal)
@@ -166,7 +176,7 @@ def fit_actuation(
             break
         name, (least, best) = min(tried.items(), key=lambda item: item[1][0])
         gain = 0.5 * rows * math.log(current / max(least, 1e-300))
-        if gain < least_gain or least > (1.0 - least_share) * current:
+        if gain < least_gain or (least > (1.0 - least_share) * current and not clears(drive, best)):
             break
         if not found:
             rivals = {other: 0.5 * rows * math.log(current / value) / gain for other, (value, _) in tried.items()}

@@ -1,6 +1,7 @@
 """Confidence: the chance that a named effect is really there, from how far its best rival stays behind.
 
-The map was fitted on generated joints (see docs/gap-diagnosis.md); nothing here knows a joint.
+The map is set by hand, not fitted: the blind check (docs/gap.md) holds it to its promise that causes named with
+0.9 or more are right in 95 of 100 joints. Nothing here knows a joint.
 """
 
 from __future__ import annotations

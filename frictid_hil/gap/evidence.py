@@ -101,6 +101,7 @@ class Evidence:
         noise_nm: float | None,
         *,
         tolerance_factor: float = 1.0,
+        late_s: float = 0.0,
     ) -> None:
         self.recordings = [r for r in recordings if r.view is not None and r.plant_nm is not None]
         views = [r.view for r in self.recordings if r.view is not None]
@@ -128,6 +129,11 @@ class Evidence:
             width += count
         self._prior = np.array([1.0 / (tolerance_factor * n.deviation) ** 2 for n in NUISANCES])
         self._bound = tolerance_factor * np.array([n.bound for n in NUISANCES])
+        if late_s > 0.0:
+            # A drive whose torque is late reports it at a time known no better than that.
+            timing = [n.name for n in NUISANCES].index("timing")
+            self._prior[timing] = min(self._prior[timing], late_s**-2)
+            self._bound[timing] = max(self._bound[timing], 1.5 * late_s)
         self._views = views
         self._refined: dict[Group, dict[str, float]] = {}
         self._weigh(parts, encoder_step_rad, noise_nm)

@@ -25,6 +25,10 @@ WORST_LOG = 1.03
 """RMS of any judged log over its RMS before, above which an effect has lost across logs."""
 TOLERANCE_FACTOR = 8.0
 """A joint without a controller is rarely a calibrated one: its tolerances count this many times wider."""
+SURE_IMPROVEMENT = 0.3
+"""Improvement, both ways, without which a cause found without a replay stays below ``UNSURE``."""
+UNSURE = 0.85
+"""Confidence that such a cause may have at most: its nominal model is rarely trustworthy."""
 CLOSE = 0.7
 """Improvement of a rival over the winner's from which the two are called confusable."""
 
@@ -76,6 +80,11 @@ def diagnose_without_replay(
         1.0, 0.5 * evidence.misfit_ratio(chosen) * (evidence.fitted.rows if evidence.fitted else 1.0)
     )
     causes, confusable = _causes(evidence, chosen, trials, judged_apart, "motion" in reasons)
+    if any(c.confidence > UNSURE for c in causes):
+        swapped = [replace(r, experiment=replace(r.experiment, validation=not r.experiment.validation)) for r in usable]
+        other = Evidence(swapped, kinematic.step_rad, allowed, None, tolerance_factor=TOLERANCE_FACTOR)
+        if not (_judged(evidence, (), chosen).improvement >= SURE_IMPROVEMENT and _same_way(evidence, other, chosen)):
+            causes = tuple(replace(c, confidence=min(c.confidence, UNSURE)) for c in causes)
     verdict = "explained" if causes else "none"
     if family_share > 0.35 and _family_wins(evidence, chosen, family[1]):
         verdict = "unknown"
@@ -104,6 +113,14 @@ def diagnose_without_replay(
         summary=_summary(experiments.name, verdict, causes, nominal_nm, after_nm),
         held_out={t.groups[0][0]: round(-100.0 * t.improvement, 2) for t in trials},
     )
+
+
+def _same_way(evidence: Evidence, other: Evidence, chosen: tuple[Group, ...]) -> bool:
+    """Whether the effects help as much with the logs' roles exchanged, and point the same way."""
+    trial = _judged(other, (), chosen)
+    count = sum(len(evidence.groups[g]) for g in chosen)
+    agree = np.sign(evidence.coefficients(chosen)[-count:]) == np.sign(other.coefficients(chosen)[-count:])
+    return trial.improvement >= SURE_IMPROVEMENT and trial.worst <= WORST_LOG and bool(agree.all())
 
 
 def _trials(evidence: Evidence) -> list[_Trial]:

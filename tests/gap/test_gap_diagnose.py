@@ -58,7 +58,7 @@ def test_traces_below_the_floor_are_not_reported() -> None:
     assert d.verdict == "none" and not d.causes
 
 
-@pytest.mark.parametrize("name", ["gravity_error", "torque_delay"])
+@pytest.mark.parametrize("name", ["gravity_error", pytest.param("torque_delay", marks=pytest.mark.slow)])
 def test_single_effect_is_named_and_closed(name: str) -> None:
     d = diagnose(gap_sets.make({name: SINGLES[name]}))
     assert d.verdict == "explained"
@@ -82,6 +82,19 @@ def test_parameters_come_back_with_intervals_that_hold_them() -> None:
     value = d.causes[0].parameters["error_share"]
     assert value.value == pytest.approx(0.08, abs=0.004)
     assert value.low is not None and value.high is not None and value.low < value.value < value.high
+
+
+@pytest.mark.slow
+def test_a_cause_seen_in_inverse_dynamics_alone_is_named() -> None:
+    # The controller hides most of this break-away from its own replay.
+    d = diagnose(gap_sets.make({"stiction_breakaway": {"share": 0.15, "dwell_time_s": 0.5, "travel_rad": 2e-3}}))
+    assert d.verdict == "explained" and d.causes[0].effect == "stiction_breakaway"
+
+
+@pytest.mark.slow
+def test_a_large_delay_is_explained_whatever_it_leaves_in_the_plant() -> None:
+    d = diagnose(gap_sets.make({"torque_delay": {"delay_s": 0.007}}))
+    assert d.verdict == "explained" and d.causes[0].effect == "torque_delay"
 
 
 @pytest.mark.slow
@@ -116,6 +129,7 @@ def test_same_answer_twice(healthy: ExperimentSet) -> None:
     assert diagnose(experiments).to_json() == diagnose(experiments).to_json()
 
 
+@pytest.mark.slow
 def test_improved_model_closes_the_gap_in_the_simulator() -> None:
     effect = {"direction_asymmetry": SINGLES["direction_asymmetry"]}
     experiments = gap_sets.make(effect)

@@ -86,6 +86,7 @@ def test_one_direction_only_is_never_sure(asymmetric: ExperimentSet) -> None:
     assert all(c.confidence < 0.9 for c in d.causes)
 
 
+@pytest.mark.slow
 def test_position_and_command_alone() -> None:
     made = gap_sets.make()
 
