@@ -2,7 +2,7 @@
 
     python benchmarks/store_kills.py [KILLS [PROFILES]]
 
-A child adds and promotes profiles without end and is killed after a random 1 to 60 ms; after every kill the store must
+A child adds and promotes profiles without end and is killed after a random 1 to 200 ms; after every kill the store must
 open, and the active profile must be whole and one of those that the child was promoting. Then the history and the index
 page of a robot with 10,000 profiles are timed in a process of their own.
 """
@@ -62,7 +62,7 @@ def killed(root: Path, kills: int) -> None:
             while True:
                 for number in (1, 2):
                     store.promote("arm", store.add(profile(number)))
-        time.sleep(chance.uniform(0.001, 0.060))
+        time.sleep(chance.uniform(0.001, 0.200))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         try:
