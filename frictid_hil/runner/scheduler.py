@@ -65,7 +65,7 @@ class Care:
         approach_rad_s: speed of moves to locked and start positions.
         still_rad: how far a joint may be from where it was locked.
         still_rad_s: speed below which a joint stands.
-        following_error_rad: bound on the following error.
+        following_error_rad: bound on the following error, beyond what the driver's own delay makes at full speed.
         velocity_margin: measured speed may exceed the planned peak by this factor ...
         velocity_slack_rad_s: ... plus this.
         travel_slack_rad: measured position may leave the planned travel by this.
@@ -136,6 +136,7 @@ class Scheduler:
         self._pump = pump
         self._care = care or Care()
         self._names = [joint.name for joint in setup.joints]
+        self._command_delay_s = 0.0
 
     def run(self) -> None:
         """The whole plan.
@@ -161,6 +162,7 @@ class Scheduler:
     def _preflight(self) -> Preflight:
         identities = self._driver.identify()
         findings = self._driver.check(self._plan)
+        self._command_delay_s = self._driver.capabilities().command_delay_s
         errors = [finding for finding in findings if finding.severity is Severity.ERROR]
         if errors:
             raise HardwareError(
@@ -242,7 +244,7 @@ class Scheduler:
             position_max_rad=high,
             velocity_rad_s=velocity,
             torque_nm=joint.max_torque_nm * 1.05,
-            following_error_rad=care.following_error_rad,
+            following_error_rad=care.following_error_rad + plan.peak_velocity_rad_s * self._command_delay_s,
             still_rad=care.still_rad,
             max_age_cycles=max(3, math.ceil(care.silence_s * self._plan.cycle_hz)),
         )
