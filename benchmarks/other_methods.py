@@ -172,7 +172,7 @@ def fourier(task: Task) -> Outcome:
             path = _fourier_path(task, base_hz, seed)
             motion = moved(task, path, np.zeros(path.size))
             for least in (0.02, 0.1, 0.3):
-                yield _from_regression(f"{base_hz:g} Hz, |v| > {least:g} rad/s", motion, least, knots=None)
+                yield _from_regression(f"{base_hz:g} Hz, abs(v) > {least:g} rad/s", motion, least, knots=None)
 
     return best(task, outcomes())
 
