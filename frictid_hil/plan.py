@@ -256,20 +256,17 @@ class Plan:
         cycle_hz: rate of set-points.
         joints: in order of execution.
         notes: sentences a person should read before saying yes.
-        together: all joints move at once, motion by motion, each as long for one as for the other.
     """
 
     robot: str
     cycle_hz: float
     joints: tuple[JointPlan, ...]
     notes: tuple[str, ...] = field(default=())
-    together: bool = False
 
     @property
     def duration_s(self) -> float:
-        """Sum over joints, or of one of them where all move together."""
-        durations = [joint.duration_s for joint in self.joints]
-        return max(durations, default=0.0) if self.together else sum(durations)
+        """Sum over joints."""
+        return sum(joint.duration_s for joint in self.joints)
 
 
 def described(plan: Plan) -> dict[str, Any]:
@@ -279,7 +276,6 @@ def described(plan: Plan) -> dict[str, Any]:
         "cycle_hz": plan.cycle_hz,
         "duration_s": plan.duration_s,
         "notes": list(plan.notes),
-        "together": plan.together,
         "joints": [
             {
                 "joint": joint.joint,
@@ -307,19 +303,12 @@ class Expected:
         gravity_nm: largest holding torque over the travel.
         friction_nm: at the highest planned speed.
         source: where these figures come from (``robot file``, ``active profile``), named in a refusal.
-        link_inertia_kg_m2: the part behind the gear, through which other joints' accelerations are felt; None: all.
     """
 
     inertia_kg_m2: float
     gravity_nm: float
     friction_nm: float
     source: str = "robot file"
-    link_inertia_kg_m2: float | None = None
-
-    @property
-    def coupled_kg_m2(self) -> float:
-        """What couples it with other joints."""
-        return self.inertia_kg_m2 if self.link_inertia_kg_m2 is None else self.link_inertia_kg_m2
 
 
 _ENDLESS_S = 10.0
