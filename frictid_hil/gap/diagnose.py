@@ -349,6 +349,7 @@ def _conclude(
         reasons=reasons,
         summary=_summary(experiments.name, verdict, causes, places, closed, place),
         model=judge.replay.model(hypothesis.effects if applied else {}),
+        candidate=judge.replay.model(hypothesis.effects),
         held_out={m.effects[0]: round(100.0 * (_ratio(evidence, m) - 1.0), 2) for m in ranking.singles},
     )
 

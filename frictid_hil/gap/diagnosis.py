@@ -85,6 +85,7 @@ class Diagnosis:
         reasons: why a figure is None, or what could not be concluded, by subject.
         summary: one sentence.
         model: the joint with its causes added, where the closed loop can be simulated.
+        candidate: the joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
         held_out: by effect, change of the held-out squares when it alone is added, percent.
     """
 
@@ -100,6 +101,7 @@ class Diagnosis:
     reasons: Mapping[str, str] = field(default_factory=dict)
     summary: str = ""
     model: JointModel | None = None
+    candidate: JointModel | None = None
     held_out: Mapping[str, float] = field(default_factory=dict)
 
     def improved_model(self) -> JointModel | None:

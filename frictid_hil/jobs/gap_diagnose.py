@@ -83,7 +83,7 @@ def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply
             cause=found.summary,
             next_step="record the next experiment, or add --apply to write the best candidate all the same",
         )
-    model = found.improved_model()
+    model = found.candidate if apply else found.improved_model()
     if model is None:
         raise UsageError(
             "the closed loop of this joint cannot be simulated, so there is no joint to write",
