@@ -25,7 +25,7 @@ SINGLES = {
     "joint_elasticity": {"compliance_rad_per_nm": 6e-4, "relaxation_s": 1e-3},
     "torque_delay": {"delay_s": 0.003},
     "torque_constant_error": {"error_share": 0.05},
-    "torque_saturation": {"limit_share": 0.22},
+    "torque_saturation": {"limit_share": 0.3},
     "velocity_lag": {"time_constant_s": 0.006},
     "encoder_offset": {"offset_rad": 0.06},
     "gravity_error": {"error_share": 0.08},
