@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from pathlib import Path
 
 import pytest
 import yaml
@@ -12,9 +11,10 @@ import yaml
 from frictid_drivers.cia402 import FrameMap
 from frictid_drivers.cia402.replay import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
+from frictid_hil.config.search import find
 from frictid_hil.driver import JointSetup, JointState, Mode, RobotSetup, SetPoint, Severity
 
-PROFILE = Path(__file__).parents[2] / "profiles" / "hp3j.yaml"
+PROFILE = find("hp3j.yaml").resolve()
 FIELDS = (
     "gear_ratio",
     "direction",

@@ -16,6 +16,7 @@ import pytest
 import yaml
 from scipy import signal
 
+from frictid_hil.config.search import find
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
@@ -24,7 +25,7 @@ from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.replay import Controller, closed_loop
 
-HP3J = Path(__file__).resolve().parents[2] / "profiles" / "hp3j.yaml"
+HP3J = find("hp3j.yaml").resolve()
 SEED = 20
 
 SIZES: dict[str, dict[str, tuple[float, float]]] = {

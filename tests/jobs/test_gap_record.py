@@ -10,6 +10,7 @@ import pytest
 import yaml
 from scipy import signal
 
+from frictid_hil.config.search import find
 from frictid_hil.errors import UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, full_set, names_of_plan, plan_document
@@ -18,7 +19,7 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan import Plan
 from frictid_hil.runner.events import Preflight
 
-HP3J = Path(__file__).resolve().parents[2] / "profiles" / "hp3j.yaml"
+HP3J = find("hp3j.yaml").resolve()
 NOISE_NM = 0.005 * 11.4
 
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import copy
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from frictid_hil.config.search import find
 from frictid_hil.friction.identify import function_a
 from frictid_hil.friction.trajectory import Procedure, peak_acceleration, position, sample_times
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
-FILE = yaml.safe_load((Path(__file__).parents[2] / "profiles" / "hp3j.yaml").read_text(encoding="utf-8"))
+FILE = yaml.safe_load(find("hp3j.yaml").read_text(encoding="utf-8"))
 JOINTS = FILE["joints"]
 DEGREE = math.pi / 180
 V = 115 * DEGREE
