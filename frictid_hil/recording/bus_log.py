@@ -6,7 +6,6 @@ and a killed file is readable up to its last flush. Read is whatever python-can 
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frictid_hil.errors import InputFileError
-from frictid_hil.files import could_not_write
 from frictid_hil.recording import blf
+from frictid_hil.recording.growing_file import GrowingFile
 
 EXTENDED = 0x8000_0000
 """Bit of ``can_id`` that says the frame has a 29-bit id."""
@@ -73,17 +72,12 @@ class BusLogWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._file = GrowingFile(path)
         self._pending: list[bytes] = []
         self._single: list[tuple[int, int, bytes, bool]] = []
         self._frames = 0
         self._content_size = blf.FILE_HEADER_SIZE
-        self._end = 0
-        try:
-            self._file = path.open("wb", buffering=0)
-        except OSError as error:
-            raise could_not_write(path, error) from error
-        self._write(blf.file_header(0, 0, 0))
+        self._file.write(blf.file_header(0, 0, 0))
 
     def frame(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
         """Take one frame; a ``driver.FrameSink``."""
@@ -105,12 +99,9 @@ class BusLogWriter:
         self._take_singles()
         pending, self._pending = self._pending, []
         for objects in pending:
-            self._write(blf.container(objects))
+            self._file.write(blf.container(objects))
             self._content_size += blf.OBJECT_HEAD.size + blf.CONTAINER_HEAD.size + len(objects)
-        try:
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise could_not_write(self._path, error) from error
+        self._file.sync()
 
     def close(self) -> None:
         """Flush, and fill in the file header; safe to call twice."""
@@ -118,9 +109,8 @@ class BusLogWriter:
             return
         try:
             self.flush()
-            self._file.seek(0)
-            self._file.write(blf.file_header(self._end, self._content_size, self._frames))
-            os.fsync(self._file.fileno())
+            self._file.rewrite_head(blf.file_header(self._file.end, self._content_size, self._frames))
+            self._file.sync()
         finally:
             self._file.close()
 
@@ -156,18 +146,6 @@ class BusLogWriter:
             part = slice(start, start + _FRAMES_PER_CONTAINER)
             self._pending.append(blf.frame_objects(t_ns[part], can_id[part], length[part], sent[part], data[part]))
         self._frames += t_ns.size
-
-    def _write(self, data: bytes) -> None:
-        """All of it or nothing, so that a full disk leaves a log that ends with a whole container."""
-        view = memoryview(data)
-        try:
-            while view:
-                view = view[self._file.write(view) :]
-        except OSError as error:
-            self._file.truncate(self._end)
-            self._file.seek(self._end)
-            raise could_not_write(self._path, error) from error
-        self._end += len(data)
 
 
 def read_frames(path: Path) -> Frames:

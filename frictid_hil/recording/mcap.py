@@ -8,7 +8,6 @@ seek; a file without it is read just as well, only slower.
 from __future__ import annotations
 
 import json
-import os
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -34,8 +33,8 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 import frictid_hil
-from frictid_hil.files import could_not_write
 from frictid_hil.recording import mcap_layout as layout
+from frictid_hil.recording.growing_file import GrowingFile
 from frictid_hil.recording.samples import Mark, Samples
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -67,7 +66,7 @@ class SampleWriter:
         *,
         prismatic: Collection[str] = (),
     ) -> None:
-        self._path = path
+        self._file = GrowingFile(path)
         self._channels = {joint: number for number, joint in enumerate(joints, start=_MARKS_CHANNEL + 1)}
         self._rows: list[NDArray[np.void]] = []
         self._pending = 0
@@ -76,12 +75,7 @@ class SampleWriter:
         self._index: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
         self._head = [*_schemas(), *self._channel_records(prismatic)]
-        try:
-            self._file = path.open("wb", buffering=0)
-        except OSError as error:
-            raise could_not_write(path, error) from error
-        self._end = 0
-        self._write(MAGIC + _bytes(Header("", f"frictid-hil {frictid_hil.__version__}"), *self._head))
+        self._file.write(MAGIC + _bytes(Header("", f"frictid-hil {frictid_hil.__version__}"), *self._head))
         if meta:
             self.metadata("recording", meta)
 
@@ -141,8 +135,8 @@ class SampleWriter:
         """Write provenance at once: ``recording`` for all joints, ``joint/<name>`` for one."""
         record = Metadata(name=name, metadata={key: json.dumps(value) for key, value in values.items()})
         data = _bytes(record)
-        self._metadata_index.append(MetadataIndex(offset=self._end, length=len(data), name=name))
-        self._write(data)
+        self._metadata_index.append(MetadataIndex(offset=self._file.end, length=len(data), name=name))
+        self._file.write(data)
 
     def flush(self) -> None:
         """Write what was taken and have it on the disk before returning.
@@ -152,10 +146,7 @@ class SampleWriter:
         """
         self._write_rows()
         self._write_marks()
-        try:
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise could_not_write(self._path, error) from error
+        self._file.sync()
 
     def close(self) -> None:
         """Flush, and add the summary; safe to call twice."""
@@ -163,11 +154,12 @@ class SampleWriter:
             return
         try:
             self.flush()
-            self._write(_bytes(DataEnd(0)))
-            start = self._end
+            self._file.write(_bytes(DataEnd(0)))
+            start = self._file.end
             summary = _bytes(*self._head, self._statistics(), *self._index, *self._metadata_index)
-            self._write(summary + _bytes(Footer(summary_start=start, summary_offset_start=0, summary_crc=0)) + MAGIC)
-            os.fsync(self._file.fileno())
+            footer = Footer(summary_start=start, summary_offset_start=0, summary_crc=0)
+            self._file.write(summary + _bytes(footer) + MAGIC)
+            self._file.sync()
         finally:
             self._file.close()
 
@@ -215,14 +207,14 @@ class SampleWriter:
                 uncompressed_size=len(content),
             )
         )
-        chunk_at = self._end
+        chunk_at = self._file.end
         index = bytearray()
         places: dict[int, int] = {}
         for channel in map(int, np.unique(channels)):
             mine = channels == channel
             places[channel] = chunk_at + len(chunk) + len(index)
             index += _message_index(channel, np.column_stack([times[mine], offsets[mine]]))
-        self._write(chunk + index)
+        self._file.write(chunk + index)
         self._index.append(
             ChunkIndex(
                 chunk_start_offset=chunk_at,
@@ -236,18 +228,6 @@ class SampleWriter:
                 message_index_offsets=places,
             )
         )
-
-    def _write(self, data: bytes) -> None:
-        """All of it or, as far as the reader is concerned, nothing."""
-        view = memoryview(data)
-        try:
-            while view:
-                view = view[self._file.write(view) :]
-        except OSError as error:
-            self._file.truncate(self._end)
-            self._file.seek(self._end)
-            raise could_not_write(self._path, error) from error
-        self._end += len(data)
 
     def _channel_records(self, prismatic: Collection[str]) -> list[McapRecord]:
         joints = [

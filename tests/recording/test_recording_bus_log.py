@@ -225,7 +225,7 @@ def test_a_full_disk_keeps_what_was_written(tmp_path: Path, monkeypatch: pytest.
         def __getattr__(self, name: str) -> object:
             return getattr(self.file, name)
 
-    monkeypatch.setattr(writer, "_file", FullFile(writer._file))
+    monkeypatch.setattr(writer._file, "_file", FullFile(writer._file._file))
     writer.append(rows(100))
     with pytest.raises(FrictidError, match="disk is full"):
         writer.flush()

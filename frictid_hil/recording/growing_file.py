@@ -1,0 +1,78 @@
+"""A file that grows by whole pieces: what a reader finds after any crash ends where a piece ended."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from frictid_hil.files import could_not_write
+
+
+class GrowingFile:
+    """Appends pieces to a new file, each of them all or nothing.
+
+    Args:
+        path: of the new file; an existing one is replaced.
+
+    Attributes:
+        end: bytes written so far.
+
+    Raises:
+        FrictidError: the file cannot be created (no permission, disk full).
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.end = 0
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise could_not_write(path, error) from error
+
+    @property
+    def closed(self) -> bool:
+        """Nothing can be written any more."""
+        return self._file.closed
+
+    def write(self, piece: bytes) -> None:
+        """Append a piece.
+
+        Raises:
+            FrictidError: disk full; the file ends where it did before.
+        """
+        view = memoryview(piece)
+        try:
+            while view:
+                view = view[self._file.write(view) :]
+        except OSError as error:
+            self._file.truncate(self.end)
+            self._file.seek(self.end)
+            raise could_not_write(self._path, error) from error
+        self.end += len(piece)
+
+    def rewrite_head(self, head: bytes) -> None:
+        """Replace the first bytes, for formats that tell there what only the end knows; nothing follows it.
+
+        Raises:
+            FrictidError: it cannot be written.
+        """
+        try:
+            self._file.seek(0)
+            self._file.write(head)
+        except OSError as error:
+            raise could_not_write(self._path, error) from error
+
+    def sync(self) -> None:
+        """Have everything on the disk before returning.
+
+        Raises:
+            FrictidError: the disk refuses; what was synced before is kept.
+        """
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise could_not_write(self._path, error) from error
+
+    def close(self) -> None:
+        """Release the file; safe to call twice."""
+        self._file.close()
