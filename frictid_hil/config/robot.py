@@ -25,7 +25,7 @@ from pydantic import Field, field_validator
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.schema import Pair, Strict, schema_version, validated
 from frictid_hil.config.search import find
-from frictid_hil.config.yaml import Document, KeyPath, merge, read
+from frictid_hil.config.yaml import Document, merge, read
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 from frictid_hil.friction.trajectory import Procedure
@@ -267,15 +267,6 @@ class Robot:
             realtime=realtime,
             seed=seed,
         )
-
-    def problems_at(self, problems: Sequence[FieldProblem], under: KeyPath = ()) -> ConfigError:
-        """Problems found later by someone else (the simulation), with their places in the file.
-
-        Args:
-            problems: with paths relative to ``under``.
-            under: e.g. ``("joints", "1", "simulated")``.
-        """
-        return self.document.error([FieldProblem(under + p.path, p.message) for p in problems])
 
 
 _ADDRESSED_BY = {"virtual": "node", "cia402": "node", "motoman": "axis"}

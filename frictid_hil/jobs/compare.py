@@ -10,7 +10,7 @@ import numpy as np
 
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.errors import InvalidFields, ProfileMismatch, UsageError
+from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance
 
@@ -76,16 +76,8 @@ def true_curve(robot: Robot, name: str, velocity_rad_s: float) -> FrictionCurve:
     """
     from frictid_hil.simulation.joint import JointModel  # loads numba; only truth needs it
 
-    joint = robot.file.joints[name]
-    try:
-        model = JointModel.from_mapping(
-            joint.simulated,
-            gear_ratio=joint.gear_ratio,
-            rated_torque_nm=joint.rated_torque_nm,
-            max_torque_nm=joint.max_torque_nm,
-        )
-    except InvalidFields as invalid:
-        raise robot.problems_at(invalid.problems, ("joints", name, "simulated")) from None
+    with robot.document.locating():
+        model = JointModel.of(robot.file.joints[name], name)
     speeds = np.linspace(0.0, velocity_rad_s, _TRUTH_POINTS + 1)[1:]
     return FrictionCurve.through(speeds, model.true_curve_nm(speeds), where=f"truth of joint {name}")
 

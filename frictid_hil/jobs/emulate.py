@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from types import FrameType
 
 from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import InvalidFields, UsageError
+from frictid_hil.errors import UsageError
 
 _GROUP = "frictid_hil.emulators"
 _DEFAULT_ROBOTS = {"motoman": "hp3j-serial.yaml"}
@@ -46,9 +46,8 @@ def emulate(
 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        serve(setup, announce=announce, faults=faults, stop=lambda: stopping)
-    except InvalidFields as invalid:
-        raise robot.problems_at(invalid.problems) from None
+        with robot.document.locating():
+            serve(setup, announce=announce, faults=faults, stop=lambda: stopping)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -13,7 +13,6 @@ from typing import Any
 
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.driver import JointIdentity, JointSetup
-from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.simulation.joint import CoulombViscous, JointModel
 
 SIMULATED_CONTROL_HZ = 1000
@@ -55,7 +54,7 @@ def belief_of(
     sections: dict[str, Any] = {"joint": {"gear_ratio": joint.gear_ratio}}
     sources: list[str] = []
     if joint.simulated:
-        sections = _of_model(_model(joint), simulated_drive=simulated_drive)
+        sections = _of_model(JointModel.of(joint, joint.name), simulated_drive=simulated_drive)
         sources.append("robot file, `simulated` without its effects")
     if profile is not None:
         sections["joint"] = {**sections["joint"], **_measured(profile)}
@@ -75,19 +74,6 @@ def read_back(sections: Mapping[str, Any], identity: JointIdentity) -> dict[str,
         if math.isfinite(value) and value > 0.0:
             section[key] = value
     return {**sections, "drive": drive, **({"encoder": encoder} if encoder else {})}
-
-
-def _model(joint: JointSetup) -> JointModel:
-    try:
-        return JointModel.from_mapping(
-            joint.simulated,
-            gear_ratio=joint.gear_ratio,
-            rated_torque_nm=joint.rated_torque_nm,
-            max_torque_nm=joint.max_torque_nm,
-        )
-    except InvalidFields as error:
-        prefix = ("joints", joint.name, "simulated")
-        raise InvalidFields([FieldProblem((*prefix, *p.path), p.message) for p in error.problems]) from None
 
 
 def _of_model(model: JointModel, *, simulated_drive: bool) -> dict[str, Any]:

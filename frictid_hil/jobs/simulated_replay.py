@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from frictid_hil.config.robot import Robot
-from frictid_hil.errors import InvalidFields
 from frictid_hil.files import write_whole
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.samples import Samples
@@ -71,16 +70,8 @@ def simulate(robot: Robot, samples: Samples) -> SimulatedReplay:
     from frictid_hil.simulation.joint import JointModel  # loads numba; a replay without simulation does not need it
     from frictid_hil.simulation.servo_loop import ServoLoop
 
-    joint = robot.file.joints[samples.joint]
-    try:
-        model = JointModel.from_mapping(
-            joint.simulated,
-            gear_ratio=joint.gear_ratio,
-            rated_torque_nm=joint.rated_torque_nm,
-            max_torque_nm=joint.max_torque_nm,
-        )
-    except InvalidFields as invalid:
-        raise robot.problems_at(invalid.problems, ("joints", samples.joint, "simulated")) from None
+    with robot.document.locating():
+        model = JointModel.of(robot.file.joints[samples.joint], samples.joint)
     quiet = replace(model, drive=replace(model.drive, torque_noise_per_mille=0.0))
     command = samples.position_command_rad
     note = "" if command is not None else "no set-points in the recording: the measured positions are followed"

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from frictid_hil.errors import IdentificationError
+from frictid_hil.errors import FieldProblem, IdentificationError, InvalidFields
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effects import all_effects
@@ -103,6 +103,30 @@ class HandImpedance:
     damping_nm_s_per_rad: float
 
 
+class Simulated(Protocol):
+    """What a robot file tells of a joint that is simulated."""
+
+    @property
+    def simulated(self) -> Mapping[str, Any]:
+        """Its ``simulated`` mapping, as read from YAML."""
+        ...
+
+    @property
+    def gear_ratio(self) -> float:
+        """Motor revolutions per joint revolution."""
+        ...
+
+    @property
+    def rated_torque_nm(self) -> float:
+        """Joint side."""
+        ...
+
+    @property
+    def max_torque_nm(self) -> float:
+        """Limit of the joint."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class JointModel:
     """One joint; see the module's first page. Built by ``from_mapping``.
@@ -178,6 +202,28 @@ class JointModel:
         top.no_others()
         top.finish()
         return replace(model, servo=gains, drive=replace(model.drive, torque_limit_nm=limit))
+
+    @staticmethod
+    def of(joint: Simulated, name: str) -> JointModel:
+        """The simulated joint of a robot file.
+
+        Args:
+            joint: of the file, or as a driver knows it.
+            name: of the joint.
+
+        Raises:
+            InvalidFields: what is wrong with it, by ``joints.NAME.simulated.KEY``.
+        """
+        try:
+            return JointModel.from_mapping(
+                joint.simulated,
+                gear_ratio=joint.gear_ratio,
+                rated_torque_nm=joint.rated_torque_nm,
+                max_torque_nm=joint.max_torque_nm,
+            )
+        except InvalidFields as error:
+            place = ("joints", name, "simulated")
+            raise InvalidFields([FieldProblem((*place, *p.path), p.message) for p in error.problems]) from None
 
     def to_mapping(self) -> dict[str, Any]:
         """The robot file's ``simulated`` form: plain values; ``from_mapping`` of it gives an equal joint."""

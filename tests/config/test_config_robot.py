@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
 from frictid_hil.config.write import dump
-from frictid_hil.errors import ConfigError, FieldProblem, UsageError
+from frictid_hil.errors import ConfigError, FieldProblem, InvalidFields, UsageError
 
 FIXTURE = Path(__file__).with_name("fixture_robot.yaml")
 TEXT = FIXTURE.read_text()
@@ -153,10 +153,9 @@ def test_the_address_must_be_of_the_kind_the_driver_uses() -> None:
 
 
 def test_problems_found_by_the_simulation_get_their_places() -> None:
-    error = load_robot(FIXTURE).problems_at(
-        [FieldProblem(("friction", "coulomb_nm"), "too large")], ("joints", "0", "simulated")
-    )
-    assert str(error) == "fixture_robot.yaml:24:30: joints.0.simulated.friction.coulomb_nm: too large"
+    with pytest.raises(ConfigError) as raised, load_robot(FIXTURE).document.locating(("joints", "0", "simulated")):
+        raise InvalidFields([FieldProblem(("friction", "coulomb_nm"), "too large")])
+    assert str(raised.value) == "fixture_robot.yaml:24:30: joints.0.simulated.friction.coulomb_nm: too large"
 
 
 def test_unattended_needs_a_person_a_day_and_an_interlock(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import can
 from frictid_drivers.virtual import channel, side_channel
 from frictid_drivers.virtual.faults import faults_of, missing_objects
 from frictid_drivers.virtual.faulty_rack import FaultyRack
-from frictid_drivers.virtual.joint_drive import model_of
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
@@ -34,6 +33,7 @@ from frictid_hil.driver import (
     WallClock,
 )
 from frictid_hil.errors import UsageError
+from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
     import filelock
@@ -66,7 +66,7 @@ class VirtualDriver:
         try:
             if self._setup.realtime:
                 for joint in self._setup.joints:
-                    model_of(joint)  # a mistake is better told here than by another process
+                    JointModel.of(joint, joint.name)  # a mistake is better told here than by another process
                 self._process = start_rack(self._setup)
             else:
                 self._rack.install(self._setup, missing=missing_objects(self._faults))

@@ -14,7 +14,7 @@ from fractions import Fraction
 from frictid_drivers.virtual.objects import Key, Value, key
 from frictid_drivers.virtual.servo import Send, Servo
 from frictid_hil.driver import JointSetup, RobotSetup
-from frictid_hil.errors import ConfigError, FieldProblem, InvalidFields
+from frictid_hil.errors import ConfigError
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
@@ -42,7 +42,7 @@ def servo_for(
     Raises:
         InvalidFields: the joint's ``simulated`` mapping is wrong.
     """
-    model = model_of(joint)
+    model = JointModel.of(joint, joint.name)
     gear = Fraction(joint.gear_ratio).limit_denominator(1000)
     counts = Fraction(model.encoder.counts_per_revolution).limit_denominator(1)
     if counts <= 0:
@@ -100,21 +100,3 @@ def servo_for(
         missing=missing,
         hold_hand=hold_hand if model.hand is not None else None,
     )
-
-
-def model_of(joint: JointSetup) -> JointModel:
-    """The simulated joint of a robot file.
-
-    Raises:
-        InvalidFields: what is wrong with it, by ``joints.NAME.simulated.KEY``.
-    """
-    try:
-        return JointModel.from_mapping(
-            joint.simulated,
-            gear_ratio=joint.gear_ratio,
-            rated_torque_nm=joint.rated_torque_nm,
-            max_torque_nm=joint.max_torque_nm,
-        )
-    except InvalidFields as error:
-        prefix = ("joints", joint.name, "simulated")
-        raise InvalidFields([FieldProblem((*prefix, *p.path), p.message) for p in error.problems]) from None

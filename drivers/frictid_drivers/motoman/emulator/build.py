@@ -132,18 +132,8 @@ def _plate(joint: JointSetup, tick_s: float) -> Plate:
 
 
 def _loop(setup: RobotSetup, joint: JointSetup) -> ServoLoop:
-    try:
-        model = JointModel.from_mapping(
-            joint.simulated,
-            gear_ratio=joint.gear_ratio,
-            rated_torque_nm=joint.rated_torque_nm,
-            max_torque_nm=joint.max_torque_nm,
-        )
-    except InvalidFields as error:
-        prefix = ("joints", joint.name, "simulated")
-        raise InvalidFields([FieldProblem((*prefix, *p.path), p.message) for p in error.problems]) from None
     return ServoLoop(
-        model,
+        JointModel.of(joint, joint.name),
         period_s=CONTROL_PERIOD_S,
         seed=zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode()),
         position_rad=joint.locked_position_rad,
