@@ -408,6 +408,15 @@ class FrameMapped(Protocol):
         ...
 
 
+@runtime_checkable
+class Ticked(Protocol):
+    """A driver whose controller interpolates on a clock of its own, which its robot file names."""
+
+    def cycle_quantum_s(self) -> float:
+        """As in ``Capabilities``; before ``open``, so that a plan can be made and shown without any hardware."""
+        ...
+
+
 def known_drivers() -> list[str]:
     """Names of the installed drivers, sorted."""
     return sorted(point.name for point in entry_points(group="frictid_hil.drivers"))
@@ -425,3 +434,16 @@ def load_driver(name: str) -> type[Driver]:
     raise InvalidFields(
         [FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")]
     )
+
+
+def planned_quantum_s(name: str, setup: RobotSetup) -> float:
+    """What cycle lengths are rounded to multiples of under this driver; 0 where they are not.
+
+    Raises:
+        InvalidFields: no such driver, or options that it does not take.
+    """
+    driver_class = load_driver(name)
+    if not issubclass(driver_class, Ticked):
+        return 0.0
+    driver: Ticked = driver_class(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    return driver.cycle_quantum_s()

@@ -7,14 +7,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from frictid_hil.config.policy import WarmUp
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import RobotSetup
+from frictid_hil.driver import RobotSetup, planned_quantum_s
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
-from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.jobs.programmes import Programme, programme
@@ -26,6 +28,7 @@ from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
 from frictid_hil.runner.scheduler import Care
+from frictid_hil.units import format_velocity
 
 VERB = "calibrate"
 
@@ -119,10 +122,18 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     robot.check_joints(wanted)
     resumed = RunFolder.resume(options.resume, robot) if options.resume else None
     kept = resumed.kept_joints() if resumed else {}
-    procedures = {name: _procedure(robot, name, options, chosen) for name in dict.fromkeys(wanted) if name not in kept}
+    with robot.document.locating():
+        quantum_s = planned_quantum_s(robot.driver(options.bus), setup)
+    procedures = {
+        name: _procedure(robot, setup, name, options, chosen, quantum_s)
+        for name in dict.fromkeys(wanted)
+        if name not in kept
+    }
     expected = expected_of(robot)
     rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
     notes = [chosen.note(procedure) for procedure in list(procedures.values())[:1]]
+    if quantum_s:
+        notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
     notes += _notes(procedures, expected, rehearse)
     plan = calibration_plan(robot, setup, procedures, expected, rehearse=rehearse, notes=notes, warm_up=options.warm_up)
     refuse_beyond_limits(plan, setup, expected)
@@ -317,14 +328,30 @@ def _provenance(
     )
 
 
-def _procedure(robot: Robot, name: str, options: CalibrateOptions, chosen: Programme) -> Procedure:
-    return robot.procedure(
+def _procedure(
+    robot: Robot, setup: RobotSetup, name: str, options: CalibrateOptions, chosen: Programme, quantum_s: float
+) -> Procedure:
+    procedure = robot.procedure(
         name,
         amplitude_rad=options.amplitude_rad,
         velocity_rad_s=options.velocity_rad_s,
         cycles=options.cycles,
         ratio=options.ratio,
         shares=chosen.shares,
+    )
+    if not quantum_s:
+        return procedure
+    try:
+        return in_whole_ticks(procedure, quantum_s, setup.joint(name).max_velocity_rad_s)
+    except ValueError as error:
+        raise UsageError(str(error), where=f"joint {name}") from None
+
+
+def _tick_note(procedure: Procedure, quantum_s: float) -> str:
+    ticks = np.rint(np.diff(procedure.cycle_starts_s) / quantum_s).astype(int)
+    return (
+        f"cycles last {', '.join(map(str, ticks))} ticks of {quantum_s * 1e3:g} ms, so that their peaks fall on ticks; "
+        f"speeds up to {format_velocity(procedure.velocity_rad_s)}"
     )
 
 

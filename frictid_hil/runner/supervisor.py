@@ -183,7 +183,9 @@ class Supervisor:
                     next_step="calibrate the joint again, or lower --compensation-ratio",
                 )
         if self._mode is Mode.POSITION:
-            error = set_point.position_rad - position
+            # Judged against what is in force, where the driver tells: a set-point may be due many ticks later.
+            in_force = report.position_command_rad
+            error = (set_point.position_rad if math.isnan(in_force) else in_force) - position
             if not abs(error) <= limits.following_error_rad:
                 raise self._abort(
                     index,

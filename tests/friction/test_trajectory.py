@@ -112,6 +112,39 @@ def test_equal_shares_are_the_papers_procedure() -> None:
     np.testing.assert_allclose(trajectory.position(named, time_s), trajectory.position(paper, time_s))
 
 
+TICK_S = 0.004
+
+
+def test_the_papers_cycles_on_a_4_ms_clock_are_the_published_tick_counts() -> None:
+    rounded = trajectory.in_whole_ticks(procedure(), TICK_S)
+    ticks = np.diff(rounded.cycle_starts_s) / TICK_S
+    np.testing.assert_allclose(ticks, [1364, 684, 456, 340, 272, 228, 196, 172, 152, 136], atol=1e-9)
+    change = rounded.peak_velocities_rad_s / procedure().peak_velocities_rad_s - 1
+    assert 0.0070 < np.abs(change).max() <= 0.0074
+    # The peaks fall on ticks: a sample there has the very speed that is recorded.
+    quarter_s = rounded.cycle_starts_s[:-1] + np.diff(rounded.cycle_starts_s) / 4
+    np.testing.assert_allclose(quarter_s / TICK_S, np.rint(quarter_s / TICK_S), atol=1e-6)
+    np.testing.assert_allclose(trajectory.velocity(rounded, quarter_s), rounded.peak_velocities_rad_s)
+
+
+@given(st.floats(4, 90), st.floats(20, 200), st.integers(2, 10), st.sampled_from([0.001, 0.004]))
+def test_rounding_never_exceeds_the_joints_speed(amplitude: float, velocity: float, cycles: int, tick_s: float) -> None:
+    asked = procedure(amplitude, velocity, cycles)
+    try:
+        rounded = trajectory.in_whole_ticks(asked, tick_s, asked.velocity_rad_s)
+    except ValueError:
+        return
+    assert rounded.velocity_rad_s <= asked.velocity_rad_s * (1 + 1e-12)
+    ticks = np.diff(rounded.cycle_starts_s) / tick_s
+    np.testing.assert_allclose(ticks, np.rint(ticks), atol=1e-6)
+    assert np.all(np.diff(ticks) < -0.5)
+
+
+def test_cycles_too_short_to_be_told_apart_are_refused() -> None:
+    with pytest.raises(ValueError, match="equally many ticks"):
+        trajectory.in_whole_ticks(procedure(0.5), TICK_S)
+
+
 def test_peak_acceleration_is_what_saturation_is_predicted_from():
     """2 V^2 / A at the reversals of the last cycle: halving the travel doubles the torque of inertia."""
     p = procedure()

@@ -22,25 +22,14 @@ from frictid_drivers.motoman.stream_frames import crc16
 from frictid_drivers.motoman.table import friction_table
 from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
 from frictid_hil.plan import Corners, Cycles, Hold, JointPlan, Motion, Move, Sine
 
 UNITS = AxisUnits(axis=0, pulses_per_rad=math.degrees(1000.0), gear_ratio=100.0, rated_torque_nm=20.0, direction=1)
 TICK_S = 0.004
 
 
-class WholeTicks(Procedure):
-    """Cycle lengths rounded to four ticks, so that both peaks and both zero crossings fall on ticks."""
-
-    __slots__ = ()
-
-    @property
-    def cycle_starts_s(self):  # type: ignore[no-untyped-def]
-        exact = 2 * math.pi / self.angular_frequencies_rad_s
-        return np.concatenate([[0.0], np.cumsum(4 * np.round(exact / (4 * TICK_S)))]) * TICK_S
-
-
-PROCEDURE = WholeTicks(math.radians(20), math.radians(115), 10)
+PROCEDURE = in_whole_ticks(Procedure(math.radians(20), math.radians(115), 10), TICK_S)
 
 
 def test_the_papers_cycles_become_the_published_tick_counts() -> None:

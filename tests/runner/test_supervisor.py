@@ -66,6 +66,13 @@ def test_each_quantity_out_of_bounds_ends_the_motion(changes: dict[str, object],
     assert caught.value.where == "joint 0"
 
 
+def test_the_following_error_is_judged_against_the_command_in_force() -> None:
+    # The set-point is due many ticks later; the controller tells what it follows now.
+    check(healthy(position_rad=0.2, position_command_rad=0.21), command=0.4)
+    with pytest.raises(SafetyAbort, match="following error"):
+        check(healthy(position_rad=0.2, position_command_rad=0.28), command=0.21)
+
+
 def test_torque_may_spike_but_not_stay() -> None:
     check(healthy(torque_nm=101.0), times=3)
     with pytest.raises(SafetyAbort, match="torque"):

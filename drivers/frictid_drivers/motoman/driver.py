@@ -126,7 +126,7 @@ class MotomanDriver:
                 torque_offset=reach.welcome is not None and reach.welcome.feed_forward,
                 drive_watchdog=True,
                 lock_step=self._open_line().port.lock_step,
-                cycle_quantum_s=tick_s,
+                cycle_quantum_s=self.cycle_quantum_s(),
                 table_download=table,
                 command_delay_s=self._command_delay_s(),
             )
@@ -137,10 +137,14 @@ class MotomanDriver:
                 drive_watchdog=True,
                 batch_only=True,
                 lock_step=self._open_line().port.lock_step,
-                cycle_quantum_s=tick_s,
+                cycle_quantum_s=self.cycle_quantum_s(),
                 table_download=table,
             )
         return Capabilities(max_cycle_hz=0.0, modes=frozenset())
+
+    def cycle_quantum_s(self) -> float:
+        """The interpolation clock that the robot file names; ``check`` compares it with the controller's."""
+        return self._tick_us * 1e-6
 
     def check(self, plan: Plan | None) -> list[Finding]:
         """Status, alarms, layers, limits of both sides, line load; reads only."""
