@@ -8,35 +8,38 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.output import (
+from frictid_hil.cli.options import (
+    METHODS,
+    AmplitudeOption,
     BusOption,
+    CyclesOption,
+    JointOption,
     JsonOption,
-    Output,
+    NotifyOption,
+    OutOption,
+    ProfileArgument,
     QuietOption,
-    Result,
+    RatioOption,
+    RealtimeOption,
     RobotOption,
+    SeedOption,
+    VelocityOption,
     YesOption,
-    quantity,
+    one_of,
+    robot_files,
 )
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.units import degrees, format_duration
 
-JointOption = Annotated[
-    list[str] | None, typer.Option("--joint", "-j", help="Only this joint; repeat for several. Default: all.")
-]
-AmplitudeOption = Annotated[
-    float | None,
-    typer.Option("--amplitude", "-A", parser=quantity("angle"), help="Peak-to-peak travel A, e.g. 20deg."),
-]
-VelocityOption = Annotated[
-    float | None,
-    typer.Option("--velocity", "-V", parser=quantity("angular velocity"), help="Peak speed V, e.g. 115deg/s."),
-]
-CyclesOption = Annotated[int | None, typer.Option("--cycles", "-N", min=2, help="Number of cycles N.")]
-RatioOption = Annotated[float | None, typer.Option("--ratio", "-c", min=0.0, max=0.999, help="Window ratio c.")]
 MethodOption = Annotated[
-    str, typer.Option("--method", help="function-a (as published), aligned (default), least-squares.")
+    str,
+    typer.Option(
+        "--method",
+        metavar="METHOD",
+        autocompletion=METHODS,
+        help="function-a (as published), aligned (default), least-squares.",
+    ),
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write to.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -80,24 +83,32 @@ def calibrate(
     ratio: RatioOption = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", help="function-a (as published), aligned, least-squares. Default: the programme's."),
+        typer.Option(
+            "--method",
+            metavar="METHOD",
+            autocompletion=METHODS,
+            help="function-a (as published), aligned, least-squares. Default: the programme's.",
+        ),
     ] = None,
     program: Annotated[
         str,
-        typer.Option("--program", help="thorough (N speeds, aligned), standard (3 speeds), quick (2): least squares."),
+        typer.Option(
+            "--program",
+            metavar="PROGRAM",
+            autocompletion=one_of("thorough", "standard", "quick"),
+            help="thorough (N speeds, aligned), standard (3 speeds), quick (2): least squares.",
+        ),
     ] = "thorough",
     bus: BusOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")] = False,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
+    realtime: RealtimeOption = False,
+    seed: SeedOption = 0,
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Continue this run folder with the joints it still lacks.")
+        Path | None,
+        typer.Option("--resume", metavar="RUN", help="Continue this run folder with the joints it still lacks."),
     ] = None,
     out: OutOption = None,
-    notify: Annotated[
-        str | None,
-        typer.Option("--notify", metavar="CMD", help="Command that is given the JSON on its standard input."),
-    ] = None,
+    notify: NotifyOption = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -146,18 +157,27 @@ def calibrate(
 
 def identify(
     log: Annotated[
-        list[Path], typer.Argument(help="Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them.")
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them."),
     ],
-    robot: Annotated[str | None, typer.Option("--robot", "-r", help="Robot file (limits, gear, timing).")] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot", "-r", metavar="FILE", help="Robot file (limits, gear, timing).", autocompletion=robot_files
+        ),
+    ] = None,
     joint: JointOption = None,
     amplitude: AmplitudeOption = None,
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
     method: MethodOption = "aligned",
-    columns: Annotated[str | None, typer.Option("--columns", help="Column map of a foreign file (emps.yaml).")] = None,
+    columns: Annotated[
+        str | None, typer.Option("--columns", metavar="FILE", help="Column map of a foreign file (emps.yaml).")
+    ] = None,
     executor: Annotated[
-        str | None, typer.Option("--executor", help="processes:N, or dask://host:port, for many recordings.")
+        str | None,
+        typer.Option("--executor", metavar="WHERE", help="processes:N, or dask://host:port, for many recordings."),
     ] = None,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -185,10 +205,16 @@ def identify(
 
 
 def compare(
-    profile: Annotated[Path, typer.Argument(help="Profile, or a run folder that holds one.")],
-    other: Annotated[Path | None, typer.Argument(help="Reference profile.")] = None,
+    profile: ProfileArgument,
+    other: Annotated[Path | None, typer.Argument(metavar="[OTHER]", help="Reference profile.")] = None,
     truth: Annotated[
-        str | None, typer.Option("--truth", help="Robot file whose simulated joints are the reference.")
+        str | None,
+        typer.Option(
+            "--truth",
+            metavar="FILE",
+            autocompletion=robot_files,
+            help="Robot file whose simulated joints are the reference.",
+        ),
     ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

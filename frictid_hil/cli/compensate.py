@@ -8,7 +8,20 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.output import BusOption, JsonOption, Output, QuietOption, Result, RobotOption, YesOption, quantity
+from frictid_hil.cli.options import (
+    BusOption,
+    JsonOption,
+    OneJointOption,
+    OutOption,
+    QuietOption,
+    RealtimeOption,
+    RobotOption,
+    SeedOption,
+    YesOption,
+    one_of,
+    quantity,
+)
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.driver import Mode
 from frictid_hil.errors import UsageError
 from frictid_hil.units import degrees
@@ -25,47 +38,78 @@ def _duration(text: str) -> float:
     return 0.0 if text.strip() == "0" else quantity("duration")(text)
 
 
-_duration.__name__ = "DURATION"
-
-
 def compensate(
     robot: RobotOption,
-    profile: Annotated[Path, typer.Option("--profile", "-p", help="Profile, or a run folder that holds one.")],
-    joint: Annotated[str, typer.Option("--joint", "-j", help="The joint.")],
+    profile: Annotated[
+        Path, typer.Option("--profile", "-p", metavar="PROFILE", help="Profile, or a run folder that holds one.")
+    ],
+    joint: OneJointOption,
     task: Annotated[
-        str, typer.Option("--task", help="hand (a person guides the joint), track (a triangle under a weak PD).")
+        str,
+        typer.Option(
+            "--task",
+            metavar="TASK",
+            autocompletion=one_of("hand", "track"),
+            help="hand (a person guides the joint), track (a triangle under a weak PD).",
+        ),
     ],
     mode: Annotated[
         str | None,
-        typer.Option("--mode", help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task."),
+        typer.Option(
+            "--mode",
+            metavar="MODES",
+            help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task.",
+        ),
     ] = None,
-    setting: Annotated[str, typer.Option("--setting", help="ours, or paper (R = 0.9, K = 10000 N m/rad).")] = "ours",
-    ratio: Annotated[float | None, typer.Option("--compensation-ratio", help="R, below 1.")] = None,
+    setting: Annotated[
+        str,
+        typer.Option(
+            "--setting",
+            metavar="SETTING",
+            autocompletion=one_of("ours", "paper"),
+            help="ours, or paper (R = 0.9, K = 10000 N m/rad).",
+        ),
+    ] = "ours",
+    ratio: Annotated[float | None, typer.Option("--compensation-ratio", metavar="R", help="R, below 1.")] = None,
     stiffness: Annotated[
-        float | None, typer.Option("--stiffness", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
+        float | None, typer.Option("--stiffness", metavar="K", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
     ] = None,
     viscosity: Annotated[
         float | None,
-        typer.Option("--viscosity", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0),
+        typer.Option(
+            "--viscosity", metavar="B_C", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0
+        ),
     ] = None,
     speed: Annotated[
-        float | None, typer.Option("--speed", parser=quantity("angular velocity"), help="Peak speed of the task.")
+        float | None,
+        typer.Option("--speed", metavar="SPEED", parser=quantity("angular velocity"), help="Peak speed of the task."),
     ] = None,
     duration: Annotated[
         float | None,
-        typer.Option("--duration", parser=_duration, help="Of each mode, 10s unless told; 0 runs until interrupted."),
+        typer.Option(
+            "--duration",
+            metavar="TIME",
+            parser=_duration,
+            help="Of each mode, 10s unless told; 0 runs until interrupted.",
+        ),
     ] = None,
     centre: Annotated[
-        float | None, typer.Option("--centre", parser=quantity("angle"), help="Middle of the travel.")
+        float | None, typer.Option("--centre", metavar="ANGLE", parser=quantity("angle"), help="Middle of the travel.")
     ] = None,
     drive_mode: Annotated[
-        str, typer.Option("--drive-mode", help="torque; position or velocity with the torque as offset (60B2).")
+        str,
+        typer.Option(
+            "--drive-mode",
+            metavar="MODE",
+            autocompletion=one_of("torque", "position", "velocity"),
+            help="torque; position or velocity with the torque as offset (60B2).",
+        ),
     ] = "torque",
     force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
     bus: BusOption = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write to.")] = None,
+    realtime: RealtimeOption = False,
+    seed: SeedOption = 0,
+    out: OutOption = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

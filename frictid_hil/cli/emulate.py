@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result
+from frictid_hil.cli.options import JsonOption, QuietOption, robot_files
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.errors import UsageError
 
 app = typer.Typer(help="Put a simulated controller on a port of this computer.", no_args_is_help=True)
@@ -21,10 +22,18 @@ def _group() -> None:
 def motoman(
     pty: Annotated[bool, typer.Option("--pty", help="On a pseudo terminal, whose name is printed first.")] = False,
     robot: Annotated[
-        str | None, typer.Option("--robot", "-r", help="Robot file whose joints stand behind it (hp3j-serial.yaml).")
+        str | None,
+        typer.Option(
+            "--robot",
+            "-r",
+            metavar="FILE",
+            autocompletion=robot_files,
+            help="Robot file whose joints stand behind it (hp3j-serial.yaml).",
+        ),
     ] = None,
     fault: Annotated[
-        list[str] | None, typer.Option("--fault", help="What shall go wrong, in the emulator's words; repeat.")
+        list[str] | None,
+        typer.Option("--fault", metavar="FAULT", help="What shall go wrong, in the emulator's words; repeat."),
     ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.output import BusOption, JsonOption, Output, QuietOption, Result, RobotOption, YesOption
+from frictid_hil.cli.options import (
+    BusOption,
+    JsonOption,
+    QuietOption,
+    RealtimeOption,
+    RobotOption,
+    SeedOption,
+    YesOption,
+)
+from frictid_hil.cli.output import Output, Result
 
 app = typer.Typer(
     help="Where the simulator differs from the machine, why, and how far it closes.", no_args_is_help=True
@@ -21,12 +30,12 @@ def diagnose(
         Path, typer.Argument(metavar="SET", help="Folder with nominal.yaml and one CSV per log.")
     ],
     write_model: Annotated[
-        Path | None, typer.Option("--write-model", help="Write the improved joint as a robot file.")
+        Path | None, typer.Option("--write-model", metavar="FILE", help="Write the improved joint as a robot file.")
     ] = None,
     apply: Annotated[
         bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
     ] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for the report page.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -43,13 +52,15 @@ def diagnose(
 
 @app.command("check")
 def check(
-    cases: Annotated[int, typer.Option("--cases", min=1, help="Joints to draw.")] = 40,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the draw.")] = 1,
-    processes: Annotated[int, typer.Option("--processes", min=1, help="Parallel processes.")] = 2,
+    cases: Annotated[int, typer.Option("--cases", metavar="N", min=1, help="Joints to draw.")] = 40,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the draw.")] = 1,
+    processes: Annotated[int, typer.Option("--processes", metavar="N", min=1, help="Parallel processes.")] = 2,
     leave_one_out: Annotated[
         bool, typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn.")
     ] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to keep cases, answers and scores in.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to keep cases, answers and scores in.")
+    ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -78,18 +89,18 @@ def check(
 @app.command("record")
 def record(
     robot: RobotOption,
-    joint: Annotated[str, typer.Option("--joint", "-j", help="The joint to record.")],
+    joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")],
     bus: BusOption = None,
     short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
     plan: Annotated[
-        Path | None, typer.Option("--plan", help="Record just what an ambiguous diagnosis asked for.")
+        Path | None, typer.Option("--plan", metavar="FILE", help="Record just what an ambiguous diagnosis asked for.")
     ] = None,
     profile: Annotated[
-        Path | None, typer.Option("--profile", help="Friction profile that the simulator believes.")
+        Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
     ] = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the experiment set.")] = None,
+    realtime: RealtimeOption = False,
+    seed: SeedOption = 0,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

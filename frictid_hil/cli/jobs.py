@@ -8,13 +8,18 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.calibrate import OutOption
-from frictid_hil.cli.output import BusOption, JsonOption, Output, QuietOption, Result, RobotOption
-from frictid_hil.cli.profiles import StoreOption
-
-NotifyOption = Annotated[
-    str | None, typer.Option("--notify", metavar="CMD", help="Command that is given the JSON on its standard input.")
-]
+from frictid_hil.cli.options import (
+    BusOption,
+    JsonOption,
+    NotifyOption,
+    OutOption,
+    QuietOption,
+    RealtimeOption,
+    RobotOption,
+    SeedOption,
+    StoreOption,
+)
+from frictid_hil.cli.output import Output, Result
 
 
 def register(app: typer.Typer) -> None:
@@ -27,8 +32,8 @@ def recalibrate(
     robot: RobotOption,
     bus: BusOption = None,
     store: StoreOption = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the virtual robot's noise.")] = 0,
+    realtime: RealtimeOption = False,
+    seed: SeedOption = 0,
     notify: NotifyOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -55,12 +60,16 @@ def recalibrate(
 
 def schedule(
     robot: RobotOption,
-    on_calendar: Annotated[str, typer.Option("--on-calendar", help='When, e.g. "Mon..Fri 02:30" (man systemd.time).')],
+    on_calendar: Annotated[
+        str, typer.Option("--on-calendar", metavar="WHEN", help='When, e.g. "Mon..Fri 02:30" (man systemd.time).')
+    ],
     bus: BusOption = None,
     system: Annotated[
         bool, typer.Option("--system/--user", help="For the whole machine, or for this person alone.")
     ] = False,
-    account: Annotated[str, typer.Option("--account", help="Account that a system service runs as.")] = "frictid",
+    account: Annotated[
+        str, typer.Option("--account", metavar="NAME", help="Account that a system service runs as.")
+    ] = "frictid",
     notify: NotifyOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,

@@ -10,13 +10,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NoReturn
+from typing import Any, NoReturn
 
 import typer
 from rich.console import Console
 
-from frictid_hil.errors import FrictidError, UsageError
-from frictid_hil.units import parse_quantity
+from frictid_hil.errors import FrictidError
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
 
@@ -24,29 +23,6 @@ NOTIFY_TIMEOUT_S = 60.0
 """A command of ``--notify`` may take this long."""
 
 Result = Mapping[str, Any]
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout, nothing else.")]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, errors only.")]
-RobotOption = Annotated[str, typer.Option("--robot", "-r", help="Robot file, by path or by name (hp3j.yaml).")]
-BusOption = Annotated[
-    str | None,
-    typer.Option("--bus", help="interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0)."),
-]
-
-
-def quantity(dimension: str) -> Callable[[str], float]:
-    """A parser for options typed with a unit, e.g. ``20deg``."""
-
-    def parse(text: str) -> float:
-        try:
-            return parse_quantity(text, dimension)
-        except UsageError as error:
-            hint = f"; {error.next_step}" if error.next_step else ""
-            raise typer.BadParameter(f"{error}{hint}") from None
-
-    parse.__name__ = dimension.upper().replace(" ", "-")
-    return parse
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result
+from frictid_hil.cli.options import JsonOption, ProfileArgument, QuietOption, StoreOption
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.units import degrees
 
-StoreOption = Annotated[
-    Path | None, typer.Option("--store", help="Folder of the profile store; default: the user's data folder.")
+RobotName = Annotated[
+    str | None, typer.Option("--robot", "-r", metavar="ROBOT", help="Name of the robot whose store is meant by ids.")
 ]
-RobotName = Annotated[str | None, typer.Option("--robot", "-r", help="Name of the robot whose store is meant by ids.")]
 
 app = typer.Typer(help="Show, compare and manage friction profiles.", no_args_is_help=True)
 
 
 @app.command("show")
 def show(
-    profile: Annotated[Path, typer.Argument(help="Profile, or a run folder that holds one.")],
+    profile: ProfileArgument,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -54,8 +53,10 @@ def show(
 
 @app.command("diff")
 def diff(
-    older: Annotated[str, typer.Argument(help="Profile, run folder; or with --robot an id, `active`, `baseline`.")],
-    newer: Annotated[str, typer.Argument(help="The same.")],
+    older: Annotated[
+        str, typer.Argument(metavar="PROFILE", help="Profile, run folder; or with --robot an id, `active`, `baseline`.")
+    ],
+    newer: Annotated[str, typer.Argument(metavar="PROFILE", help="The same.")],
     robot: RobotName = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
@@ -87,9 +88,11 @@ def diff(
 
 @app.command("promote")
 def promote(
-    profile: Annotated[str, typer.Argument(help="Profile, run folder; or with --robot an id of the store.")],
+    profile: Annotated[
+        str, typer.Argument(metavar="PROFILE", help="Profile, run folder; or with --robot an id of the store.")
+    ],
     robot: RobotName = None,
-    reason: Annotated[str, typer.Option("--reason", help="For the history.")] = "",
+    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
     baseline: Annotated[bool, typer.Option("--baseline", help="Measure drift from it from now on.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Although a quality gate failed.")] = False,
     store: StoreOption = None,
@@ -110,7 +113,7 @@ def promote(
 @app.command("rollback")
 def rollback(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
-    reason: Annotated[str, typer.Option("--reason", help="For the history.")] = "",
+    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
     store: StoreOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -129,7 +132,7 @@ def rollback(
 @app.command("history")
 def history(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
-    last: Annotated[int | None, typer.Option("--last", min=1, help="Only so many.")] = None,
+    last: Annotated[int | None, typer.Option("--last", metavar="N", min=1, help="Only so many.")] = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

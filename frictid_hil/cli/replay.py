@@ -8,8 +8,19 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from frictid_hil.cli.calibrate import AmplitudeOption, CyclesOption, JointOption, OutOption, RatioOption, VelocityOption
-from frictid_hil.cli.output import JsonOption, Output, QuietOption, Result, RobotOption
+from frictid_hil.cli.options import (
+    METHODS,
+    AmplitudeOption,
+    CyclesOption,
+    JointOption,
+    JsonOption,
+    OutOption,
+    QuietOption,
+    RatioOption,
+    RobotOption,
+    VelocityOption,
+)
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.units import degrees
 
 
@@ -25,20 +36,30 @@ def replay(
     robot: RobotOption,
     joint: JointOption = None,
     frames: Annotated[
-        Path | None, typer.Option("--frames", help="Mapping file of a foreign log: which frame is what.")
+        Path | None,
+        typer.Option("--frames", metavar="FILE", help="Mapping file of a foreign log: which frame is what."),
     ] = None,
-    eds: Annotated[Path | None, typer.Option("--eds", help="EDS or DCF file of the drives of a foreign log.")] = None,
+    eds: Annotated[
+        Path | None, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of the drives of a foreign log.")
+    ] = None,
     profile: Annotated[
-        Path | None, typer.Option("--profile", help="Profile to compare with; default: the run's own.")
+        Path | None,
+        typer.Option("--profile", metavar="PROFILE", help="Profile to compare with; default: the run's own."),
     ] = None,
     amplitude: AmplitudeOption = None,
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
-    method: Annotated[str | None, typer.Option("--method", help="Estimator; default: that of the profile.")] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            "--method", metavar="METHOD", autocompletion=METHODS, help="Estimator; default: that of the profile."
+        ),
+    ] = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
     echo: Annotated[
-        str | None, typer.Option("--echo", help="interface:channel of a bus on which every frame is sent again.")
+        str | None,
+        typer.Option("--echo", metavar="BUS", help="interface:channel of a bus on which every frame is sent again."),
     ] = None,
     simulate: Annotated[
         bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.output import JsonOption, Output, QuietOption
+from frictid_hil.cli.options import JsonOption, QuietOption
+from frictid_hil.cli.output import Output
 
 
 def register(app: typer.Typer) -> None:

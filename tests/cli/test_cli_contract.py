@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 
-VERBS = ["check", "calibrate", "identify", "compare", "report", "profile", "gap"]
+VERBS = "check calibrate identify compare compensate replay recalibrate schedule profile emulate gap report".split()
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -113,3 +114,19 @@ def test_a_simulated_joint_that_cannot_be_is_told_with_its_place(verb: tuple[str
     assert "site.yaml:10:" in result.stderr
     assert "gap_deg" in result.stderr
     assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").rglob("*.mcap"))
+
+
+def completed(line: str) -> list[str]:
+    """What a shell offers after ``line``."""
+    words = line.split(" ")
+    told = {"_FRICTID_HIL_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    program = Path(sys.executable).parent / "frictid-hil"
+    offered = subprocess.run([str(program)], env={**os.environ, **told}, capture_output=True, text=True, check=False)
+    return offered.stdout.split()
+
+
+def test_the_shell_completes_verbs_robot_files_and_choices() -> None:
+    assert "calibrate" in completed("frictid-hil cal")
+    assert "hp3j.yaml" in completed("frictid-hil calibrate --robot hp")
+    assert completed("frictid-hil calibrate --method al") == ["aligned"]
+    assert completed("frictid-hil compensate --task ") == ["hand", "track"]
