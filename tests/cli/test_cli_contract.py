@@ -11,7 +11,20 @@ from typing import Any
 
 import pytest
 
-VERBS = "check calibrate identify compare compensate replay recalibrate schedule profile emulate gap report".split()
+VERBS = [
+    "check",
+    "calibrate",
+    "identify",
+    "compare",
+    "compensate",
+    "replay",
+    "recalibrate",
+    "schedule",
+    "profile",
+    "emulate",
+    "gap",
+    "report",
+]
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
