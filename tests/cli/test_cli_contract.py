@@ -11,20 +11,8 @@ from typing import Any
 
 import pytest
 
-VERBS = [
-    "check",
-    "calibrate",
-    "identify",
-    "compare",
-    "compensate",
-    "replay",
-    "recalibrate",
-    "schedule",
-    "profile",
-    "emulate",
-    "gap",
-    "report",
-]
+VERBS = ["check", "calibrate", "identify", "compare", "compensate", "replay", "recalibrate", "schedule"]
+VERBS += ["profile", "emulate", "gap", "report"]
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,163 @@
+"""Configuring the drives: everything written is read back, and what cannot be is refused."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from cia402_bench import RAD, Bench, bench
+from cia402_wire import ScriptedDrive
+
+from frictid_hil.driver import Severity
+from frictid_hil.errors import HardwareError, PlanRefused
+
+
+def test_everything_is_written_and_read_back():
+    drive = ScriptedDrive(1)
+    b = Bench(drive, options={"watchdog_ms": 120}).open()
+    b.driver.configure(500.0, ["0"])
+    b.driver.set_limits("0", torque_nm=40.0, position_min_rad=-1.0, position_max_rad=0.5)
+    expected = {
+        (0x1006, 0): 2000,
+        (0x1016, 1): 127 << 16 | 120,
+        (0x1017, 0): 100,
+        (0x6007, 0): 3,
+        (0x605A, 0): 6,
+        (0x60A9, 0): 0xFDB44700,
+        (0x60C2, 2): -5,
+        (0x60C2, 1): 200,
+        (0x6060, 0): 8,
+        (0x6072, 0): 800,
+        (0x607D, 1): round(-1.0 / RAD),
+        (0x607D, 2): round(0.5 / RAD),
+        (0x1A00, 0): 3,
+        (0x1A00, 1): 0x60410010,
+        (0x1A00, 2): 0x60640020,
+        (0x1A00, 3): 0x60770010,
+        (0x1800, 1): 0x40000181,
+        (0x1800, 2): 1,
+        (0x1600, 2): 0x607A0020,
+        (0x1400, 1): 0x201,
+    }
+    assert {key: drive.values[key] for key in expected} == expected
+    requests = [struct.unpack_from("<BHB", data) for can_id, data in b.bus.sent if can_id == 0x601]
+    for at, (command, *address) in enumerate(requests):
+        if command >> 5 == 1 and address != [0x607A, 0]:
+            assert [command >> 5 == 2 and rest == address for command, *rest in requests[at + 1 : at + 2]] == [True]
+
+
+def test_decelerations_keep_their_worth_when_the_velocity_unit_changes():
+    drive = ScriptedDrive(1)
+    Bench(drive).open().driver.configure(1000.0, ["0"])
+    assert (drive.values[0x6084, 0], drive.values[0x6085, 0]) == (100_000, 200_000)
+
+
+def test_a_fixed_coarse_velocity_unit_is_lived_with():
+    drive = ScriptedDrive(1, refuses={(0x60A9, 0): 0x06010002})
+    b = Bench(drive).open()
+    b.driver.configure(1000.0, ["0"])
+    unit = b.driver.frame_map().joints[0].velocity_rad_s_per_unit
+    assert unit == pytest.approx(2 * math.pi / 60)
+    assert drive.values[0x6085, 0] == 200
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_limits_follow_the_direction(direction):
+    drive = ScriptedDrive(1)
+    b = Bench(drive, direction=direction).open()
+    b.driver.configure(1000.0, ["0"])
+    b.driver.set_limits("0", torque_nm=60.0, position_min_rad=-1.0, position_max_rad=0.5)
+    low, high = (-1.0, 0.5) if direction == 1 else (-0.5, 1.0)
+    assert (drive.values[0x607D, 1], drive.values[0x607D, 2]) == (round(low / RAD), round(high / RAD))
+
+
+@pytest.mark.parametrize("key", [(0x6007, 0), (0x605A, 0), (0x1016, 1), (0x1A00, 2), (0x1800, 2), (0x6065, 0)])
+def test_a_value_that_reads_back_otherwise_is_refused(key):
+    drive = ScriptedDrive(4, reads_back={key: 5})
+    b = Bench(drive).open()
+    with pytest.raises(HardwareError) as caught:
+        b.driver.configure(1000.0, ["0"])
+    assert "node 4" in caught.value.where and f"{key[0]:04X}:{key[1]:02X}" in caught.value.where
+    assert "wrote" in caught.value.what and "read back" in caught.value.what
+
+
+def test_a_refused_write_is_named():
+    b = Bench(ScriptedDrive(1, refuses={(0x6007, 0): 0x06090030})).open()
+    with pytest.raises(HardwareError, match=r"refuses abort connection option code = 3.*0609") as caught:
+        b.driver.configure(1000.0, ["0"])
+    assert "6007:00" in caught.value.where
+
+
+def test_a_powered_drive_is_not_touched():
+    drive = ScriptedDrive(1)
+    drive.values[0x6041, 0] = 0x0237
+    b = Bench(drive).open()
+    assert any("already on" in finding.message for finding in b.driver.check(None))
+    before = len(b.bus.sent)
+    with pytest.raises(HardwareError, match="power stage is already on"):
+        b.driver.configure(1000.0, ["0"])
+    assert not [can_id for can_id, data in b.bus.sent[before:] if can_id < 0x600 or data[0] >> 5 == 1]
+
+
+def test_a_drive_that_its_watchdog_stopped_is_switched_off_and_used():
+    drive = ScriptedDrive(1)
+    drive.values[0x6041, 0], drive.values[0x603F, 0] = 0x0217, 0x8130
+    b = Bench(drive).open()
+    findings = b.driver.check(None)
+    assert any("an earlier run was cut off" in finding.message for finding in findings)
+    assert not [finding for finding in findings if finding.severity is Severity.ERROR]
+    b.driver.configure(1000.0, ["0"])
+    assert drive.values[0x6041, 0] == 0x0250
+
+
+def test_a_drive_that_stays_in_quick_stop_is_told():
+    drive = ScriptedDrive(1, refuses={(0x6040, 0): 0x08000021})
+    drive.values[0x6041, 0] = 0x0217
+    with pytest.raises(HardwareError, match="controlword"):
+        Bench(drive).open().driver.configure(1000.0, ["0"])
+
+
+def test_a_layout_that_no_wire_can_carry_is_refused_with_the_rate_that_fits():
+    b = bench(*range(1, 7)).open()
+    before = len(b.bus.sent)
+    with pytest.raises(PlanRefused, match=r"6 of 6 joints.*% on average") as caught:
+        b.driver.configure(1000.0, [str(joint) for joint in range(6)])
+    assert len(b.bus.sent) == before
+    rate = float(caught.value.next_step.split("at most ")[1].split(" Hz")[0])
+    assert 250 <= rate < 340
+    b.driver.configure(rate, [str(joint) for joint in range(6)])
+
+
+def test_half_the_bitrate_refuses_1_khz():
+    b = bench(*range(1, 7), options={"bitrate": 500_000}).open()
+    with pytest.raises(PlanRefused):
+        b.driver.configure(1000.0, ["0"])
+    assert b.driver.capabilities().max_cycle_hz < 600
+
+
+def test_the_second_joint_costs_only_what_differs():
+    b = bench(*range(1, 7)).open()
+    b.driver.configure(1000.0, ["0"])
+    first = len(b.bus.sent)
+    b.driver.configure(1000.0, ["1"])
+    second = len(b.bus.sent) - first
+    assert second < 0.25 * first
+    assert b.drives[1].values[0x1800, 2] == 1 and b.drives[0].values[0x1800, 2] == 10
+
+
+def test_a_drive_that_was_reset_is_configured_anew():
+    b = bench(1).open()
+    b.driver.configure(1000.0, ["0"])
+    b.drives[0].values[0x1A00, 0] = 0
+    b.drives[0].values[0x1800, 1] |= 1 << 31
+    b.bus.put(0x701, b"\x00")
+    b.driver.configure(1000.0, ["0"])
+    assert b.drives[0].values[0x1A00, 0] == 3
+
+
+def test_unused_pdos_are_switched_off():
+    drive = ScriptedDrive(1)
+    drive.values[0x1803, 1] = 0x481
+    Bench(drive).open().driver.configure(1000.0, ["0"])
+    assert drive.values[0x1803, 1] >> 31
