@@ -223,12 +223,12 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class JointPlan:
-    """What one joint will do while all others are locked.
+    """What one joint will do while others are locked, or do the same in step with it.
 
     Attributes:
-        joint: name of the only joint that moves.
+        joint: name of the joint.
         motions: in order; the first starts where ``approach_from_rad`` ends.
-        locked: planned position of every other joint, rad.
+        locked: planned position of every joint that is locked meanwhile, rad.
         peak_velocity_rad_s: largest commanded speed of all motions.
         predicted_torque_nm: largest torque expected, by the best model at hand (0 where none is).
         travel_rad: (lowest, highest) commanded position.
@@ -256,17 +256,32 @@ class Plan:
         cycle_hz: rate of set-points.
         joints: in order of execution.
         notes: sentences a person should read before saying yes.
+        together: all joints move at once, motion by motion, each as long for one as for the other.
     """
 
     robot: str
     cycle_hz: float
     joints: tuple[JointPlan, ...]
     notes: tuple[str, ...] = field(default=())
+    together: bool = False
 
     @property
     def duration_s(self) -> float:
-        """Sum over joints."""
-        return sum(joint.duration_s for joint in self.joints)
+        """Sum over joints, or of one of them where all move together."""
+        durations = [joint.duration_s for joint in self.joints]
+        return max(durations, default=0.0) if self.together else sum(durations)
+
+    @property
+    def stretches(self) -> tuple[tuple[JointPlan, ...], ...]:
+        """Joints that move at the same time, in order of execution."""
+        if self.together:
+            return (self.joints,) if self.joints else ()
+        return tuple((entry,) for entry in self.joints)
+
+
+def stretch_name(entries: Sequence[JointPlan]) -> str:
+    """What marks and progress call joints that move at the same time: ``1``, or ``0, 1, 2``."""
+    return ", ".join(entry.joint for entry in entries)
 
 
 def described(plan: Plan) -> dict[str, Any]:
@@ -276,6 +291,7 @@ def described(plan: Plan) -> dict[str, Any]:
         "cycle_hz": plan.cycle_hz,
         "duration_s": plan.duration_s,
         "notes": list(plan.notes),
+        "together": plan.together,
         "joints": [
             {
                 "joint": joint.joint,
@@ -303,12 +319,19 @@ class Expected:
         gravity_nm: largest holding torque over the travel.
         friction_nm: at the highest planned speed.
         source: where these figures come from (``robot file``, ``active profile``), named in a refusal.
+        link_inertia_kg_m2: the part behind the gear, through which other joints' accelerations are felt; None: all.
     """
 
     inertia_kg_m2: float
     gravity_nm: float
     friction_nm: float
     source: str = "robot file"
+    link_inertia_kg_m2: float | None = None
+
+    @property
+    def coupled_kg_m2(self) -> float:
+        """What couples it with other joints."""
+        return self.inertia_kg_m2 if self.link_inertia_kg_m2 is None else self.link_inertia_kg_m2
 
 
 _ENDLESS_S = 10.0
@@ -316,12 +339,55 @@ _ENDLESS_S = 10.0
 
 
 def joint_plan(
-    joint: JointSetup, motions: Sequence[Motion], locked: Mapping[str, float], expected: Expected | None
+    joint: JointSetup,
+    motions: Sequence[Motion],
+    locked: Mapping[str, float],
+    expected: Expected | None,
+    *,
+    coupling_nm: float = 0.0,
 ) -> JointPlan:
     """The plan of one joint with its peaks filled in by sampling every motion at 1 ms.
 
     Corners of straight-line motions are left out of the torque: the drive rounds them.
+
+    Args:
+        joint: which.
+        motions: in order.
+        locked: positions of the joints that are locked meanwhile, rad.
+        expected: to predict the torque with.
+        coupling_nm: at most needed because of other joints' accelerations (``coupling_bound_nm``).
     """
+    travel, peak_rad_s, peak_rad_s2 = _peaks(motions)
+    torque_nm = 0.0
+    if expected is not None:
+        torque_nm = expected.inertia_kg_m2 * peak_rad_s2 + abs(expected.gravity_nm) + abs(expected.friction_nm)
+        torque_nm += coupling_nm
+    return JointPlan(joint.name, tuple(motions), dict(locked), peak_rad_s, torque_nm, travel)
+
+
+def coupling_bound_nm(joint: str, motions: Mapping[str, Sequence[Motion]], expected: Mapping[str, Expected]) -> float:
+    """What a joint needs at most because other joints accelerate, N m.
+
+    An arm's inertia matrix is positive definite, so that abs(M_ij) <= sqrt(M_ii M_jj): the link inertias alone bound
+    the coupling in every posture. Joints of which nothing is expected count nothing.
+
+    Args:
+        joint: whose torque.
+        motions: of every joint that moves at the same time, by name.
+        expected: link inertias, by name.
+    """
+    if joint not in expected:
+        return 0.0
+    own_kg_m2 = expected[joint].coupled_kg_m2
+    return sum(
+        math.sqrt(own_kg_m2 * expected[other].coupled_kg_m2) * _peaks(moved)[2]
+        for other, moved in motions.items()
+        if other != joint and other in expected
+    )
+
+
+def _peaks(motions: Sequence[Motion]) -> tuple[tuple[float, float], float, float]:
+    """(lowest, highest) position, peak speed and peak acceleration of a series of motions."""
     travel = [math.inf, -math.inf]
     peak_rad_s = peak_rad_s2 = 0.0
     for motion in motions:
@@ -334,10 +400,13 @@ def joint_plan(
         # A motion under a control law carries the path that it is meant to follow.
         if not isinstance(getattr(motion, "path", motion), Corners):
             peak_rad_s2 = max(peak_rad_s2, float(np.abs(np.diff(speeds)).max(initial=0.0)) / step_s)
-    torque_nm = 0.0
-    if expected is not None:
-        torque_nm = expected.inertia_kg_m2 * peak_rad_s2 + abs(expected.gravity_nm) + abs(expected.friction_nm)
-    return JointPlan(joint.name, tuple(motions), dict(locked), peak_rad_s, torque_nm, (travel[0], travel[1]))
+    return (travel[0], travel[1]), peak_rad_s, peak_rad_s2
+
+
+_TOGETHER_STEP = (
+    "; what other joints add is bounded by `expected: link_inertia_kg_m2` (the inertia behind the gear); without "
+    "--together it is nothing"
+)
 
 
 def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, Expected]) -> None:
@@ -364,7 +433,8 @@ def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, E
             source = expected[joint.name].source if joint.name in expected else "robot file"
             problems.append(
                 f"joint {joint.name}: predicted torque {entry.predicted_torque_nm:.1f} N m above the limit "
-                f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source})"
+                f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source}"
+                f"{', and the most that the other joints can add' if plan.together else ''})"
             )
         for name, locked_rad in entry.locked.items():
             other = setup.joint(name)
@@ -373,5 +443,6 @@ def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, E
     if problems:
         raise PlanRefused(
             "; ".join(dict.fromkeys(problems)),
-            next_step="raise the amplitude (peak torque grows as V^2/A), lower the velocity, or shift the start",
+            next_step="raise the amplitude (peak torque grows as V^2/A), lower the velocity, or shift the start"
+            + _TOGETHER_STEP * plan.together,
         )

@@ -6,7 +6,18 @@ import pytest
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.plan import Corners, Cycles, Expected, Hold, Move, Plan, Sine, joint_plan, refuse_beyond_limits
+from frictid_hil.plan import (
+    Corners,
+    Cycles,
+    Expected,
+    Hold,
+    Move,
+    Plan,
+    Sine,
+    coupling_bound_nm,
+    joint_plan,
+    refuse_beyond_limits,
+)
 
 DEG = math.pi / 180
 
@@ -80,3 +91,34 @@ def test_a_move_keeps_its_peak_speed() -> None:
     move = Move.within(0.0, 1.0, 0.35)
     speed = np.diff(move.position_rad(np.arange(0, move.duration_s, 1e-3))) / 1e-3
     assert speed.max() == pytest.approx(0.35, rel=1e-3)
+
+
+def test_other_joints_accelerations_count_where_all_move_together() -> None:
+    procedure = Procedure(20 * DEG, 115 * DEG)
+    motions = {"1": [Cycles(0.0, procedure)], "2": [Cycles(0.1, procedure)]}
+    expected = {"1": Expected(2.0, 30.0, 25.0, link_inertia_kg_m2=1.6), "2": Expected(0.5, 5.0, 5.0)}
+    acceleration_rad_s2 = 2 * procedure.velocity_rad_s**2 / procedure.amplitude_rad
+    bound_nm = coupling_bound_nm("1", motions, expected)
+    assert bound_nm == pytest.approx(math.sqrt(1.6 * 0.5) * acceleration_rad_s2, rel=0.01)
+    assert coupling_bound_nm("1", {"1": motions["1"]}, expected) == 0.0
+    alone = joint_plan(a_joint(), motions["1"], {}, expected["1"])
+    combined = joint_plan(a_joint(), motions["1"], {}, expected["1"], coupling_nm=bound_nm)
+    assert combined.predicted_torque_nm == pytest.approx(alone.predicted_torque_nm + bound_nm)
+
+
+def test_the_combined_motion_is_refused_for_its_torque() -> None:
+    joint = a_joint(max_torque_nm=110.0)
+    entry = joint_plan(
+        joint, [Cycles(0.0, Procedure(20 * DEG, 115 * DEG))], {}, Expected(2.0, 30.0, 25.0), coupling_nm=20.0
+    )
+    plan = Plan("arm", 250.0, (entry,), together=True)
+    with pytest.raises(PlanRefused, match="the most that the other joints can add"):
+        refuse_beyond_limits(plan, RobotSetup("arm", "virtual:x", 250.0, (joint,)), {})
+
+
+def test_joints_that_move_together_take_the_time_of_one() -> None:
+    entries = tuple(joint_plan(a_joint(name), [Hold(0.0, 2.0)], {}, None) for name in ("0", "1"))
+    assert Plan("arm", 250.0, entries).duration_s == 4.0
+    together = Plan("arm", 250.0, entries, together=True)
+    assert together.duration_s == 2.0
+    assert together.stretches == (entries,)

@@ -99,6 +99,14 @@ def calibrate(
             help="thorough (N speeds, aligned), standard (3 speeds), quick (2): least squares.",
         ),
     ] = "thorough",
+    together: Annotated[
+        bool,
+        typer.Option("--together", help="All joints at once, in phase, in the time of one; the cell must allow it."),
+    ] = False,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
+    ] = None,
     bus: BusOption = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")] = False,
     realtime: RealtimeOption = False,
@@ -113,7 +121,7 @@ def calibrate(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Identify the friction of every joint, one at a time, and write a friction profile."""
+    """Identify the friction of every joint, one at a time or all --together, and write a friction profile."""
     from frictid_hil.cli.progress import TerminalWatcher, print_plan
     from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
     from frictid_hil.jobs.calibrate import calibrate as job
@@ -130,6 +138,8 @@ def calibrate(
         ratio=ratio,
         method=method,
         program=program,
+        together=together,
+        rate_hz=rate,
         realtime=realtime,
         seed=seed,
         resume=resume,

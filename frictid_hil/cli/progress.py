@@ -14,14 +14,15 @@ from rich.table import Table
 from frictid_hil.cli.output import Output
 from frictid_hil.driver import RobotSetup, Severity
 from frictid_hil.errors import UsageError
-from frictid_hil.plan import Plan
+from frictid_hil.plan import Plan, stretch_name
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity
 
 
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
     """Joint order, travel, peaks, locked joints and duration, as a technician reads them."""
-    table = Table(title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz")
+    how = ", all joints together" if plan.together else ""
+    table = Table(title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}")
     for heading in ("joint", "travel", "peak speed", "predicted torque", "limit", "time", "others locked at"):
         table.add_column(heading)
     for joint in plan.joints:
@@ -36,7 +37,7 @@ def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
             predicted,
             format_torque(limit),
             format_duration(joint.duration_s),
-            f"{locked} deg",
+            f"{locked} deg" if locked else "none: all move",
         )
     console.print(table)
     for note in plan.notes:
@@ -70,7 +71,9 @@ class TerminalWatcher:
                 "motion needs a yes, and there is no terminal to ask on",
                 next_step="add --yes once the plan is right (see --dry-run)",
             )
-        self._planned = {joint.joint: joint.duration_s for joint in plan.joints}
+        self._planned = {
+            stretch_name(stretch): max(entry.duration_s for entry in stretch) for stretch in plan.stretches
+        }
         if not self._silent:
             print_plan(self._console, plan, setup)
 
@@ -81,10 +84,9 @@ class TerminalWatcher:
                 self.note(f"{finding.severity.value}: {finding.subject}: {finding.message}")
         if self._yes:
             return True
-        joints = ", ".join(joint.joint for joint in plan.joints)
-        return typer.confirm(
-            f"{plan.robot}: joints {joints} will move, one at a time, all others locked. Is the cell clear?", err=True
-        )
+        joints = stretch_name(plan.joints)
+        how = "ALL AT ONCE" if plan.together else "one at a time, all others locked"
+        return typer.confirm(f"{plan.robot}: joints {joints} will move, {how}. Is the cell clear?", err=True)
 
     def event(self, event: Event) -> None:
         """Follow the phases."""
@@ -147,9 +149,10 @@ class TerminalWatcher:
             self._progress.update(task, completed=self._done_s[event.joint], phase=event.phase)
 
     def _finish(self, event: JointRun) -> None:
-        if self._progress is not None and event.joint in self._tasks:
-            total = self._planned[event.joint]
-            self._progress.update(self._tasks[event.joint], completed=total, phase="done")
+        # Joints that moved together have one bar: the current one.
+        name = event.joint if event.joint in self._planned else self._joint
+        if self._progress is not None and name in self._tasks:
+            self._progress.update(self._tasks[name], completed=self._planned[name], phase="done")
 
 
 __all__ = ["TerminalWatcher", "format_angle", "print_plan"]

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from frictid_hil.config.provenance import Provenance
-from frictid_hil.config.schema import Numbers, Pair, Pairs, Strict, as_tuple, schema_version, validated
+from frictid_hil.config.schema import Names, Numbers, Pair, Pairs, Strict, as_tuple, schema_version, validated
 from frictid_hil.config.write import dump, plain, write_whole
 from frictid_hil.config.yaml import Document, KeyPath, Node, read
 from frictid_hil.errors import ConfigError, ProfileMismatch
@@ -98,7 +98,8 @@ class Ripple(Strict):
 class ProcedureUsed(Strict):
     """V, A, N, c that the curve was measured with, and the shares of V of a short programme.
 
-    None for recordings that followed no procedure.
+    None for recordings that followed no procedure. ``together`` names the joints that moved in phase with this one,
+    itself among them; None where all others were locked.
     """
 
     amplitude_rad: float = Field(gt=0)
@@ -106,6 +107,7 @@ class ProcedureUsed(Strict):
     cycles: int = Field(ge=1)
     ratio: float = Field(ge=0, lt=1)
     shares: Numbers | None = None
+    together: Names | None = None
 
 
 class DriveIdentity(Strict):
@@ -224,8 +226,10 @@ class JointProfile(Strict):
         for name in ("torque_interval_nm", "forward", "backward", "published", "ripple", "procedure", "temperature_c"):
             if values[name] is None:
                 del values[name]
-        if self.procedure is not None and self.procedure.shares is None:
-            del values["procedure"]["shares"]
+        if self.procedure is not None:
+            for name in ("shares", "together"):
+                if values["procedure"][name] is None:
+                    del values["procedure"][name]
         for value in values.values():
             if isinstance(value, dict) and "value" in value:
                 _drop_nothings(value)

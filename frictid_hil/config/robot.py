@@ -61,11 +61,14 @@ class ExpectedFile(Strict):
         inertia_kg_m2: in the posture of the run.
         gravity_nm: largest holding torque over the travel.
         friction_nm: at the highest planned speed.
+        link_inertia_kg_m2: the part of the inertia behind the gear; bounds what other joints' accelerations cost this
+            one when all move together. All of it where not given.
     """
 
     inertia_kg_m2: float = Field(ge=0)
     gravity_nm: float = Field(ge=0)
     friction_nm: float = Field(ge=0)
+    link_inertia_kg_m2: float | None = Field(default=None, ge=0)
 
 
 class JointFile(Strict):

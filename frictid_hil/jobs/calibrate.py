@@ -47,6 +47,8 @@ class CalibrateOptions:
         ratio: c.
         method: estimator; None for the programme's.
         program: ``thorough``, ``standard`` or ``quick``.
+        together: all joints move at once, in phase.
+        rate_hz: rate of set-points.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise.
         resume: run folder to continue.
@@ -65,6 +67,8 @@ class CalibrateOptions:
     ratio: float | None = None
     method: str | None = None
     program: str = "thorough"
+    together: bool = False
+    rate_hz: float | None = None
     realtime: bool = False
     seed: int = 0
     resume: Path | None = None
@@ -116,6 +120,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     if chosen.shares and options.cycles is not None:
         raise UsageError(f"programme {chosen.name} has {len(chosen.shares)} cycles; leave --cycles out")
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    if options.rate_hz is not None:
+        setup = replace(setup, cycle_hz=options.rate_hz)
     if options.interlock is not None:
         setup = _reporting_inputs(setup, options.interlock.joint)
     wanted = options.joints or robot.joint_names
@@ -135,7 +141,16 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
     notes += _notes(procedures, expected, rehearse)
-    plan = calibration_plan(robot, setup, procedures, expected, rehearse=rehearse, notes=notes, warm_up=options.warm_up)
+    plan = calibration_plan(
+        robot,
+        setup,
+        procedures,
+        expected,
+        rehearse=rehearse,
+        notes=notes,
+        warm_up=options.warm_up,
+        together=options.together,
+    )
     refuse_beyond_limits(plan, setup, expected)
     return Planned(robot, setup, plan, method, resumed)
 
@@ -319,7 +334,7 @@ def _provenance(
         config_sha256=robot.digest,
         driver=driver,
         bus=setup.bus,
-        settings={"cycle_hz": setup.cycle_hz, **dict(setup.options)},
+        settings={"cycle_hz": setup.cycle_hz, "together": options.together, **dict(setup.options)},
         realtime=setup.realtime or driver != "virtual",
         seed=setup.seed if driver == "virtual" else None,
         run=str(folder.path.resolve()),

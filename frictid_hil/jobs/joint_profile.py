@@ -61,7 +61,8 @@ def identify_joint(
                 "the recording was made with another procedure than the one asked for; leave the options out",
                 where=f"joint {samples.joint}",
             )
-        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles)
+        together = tuple(map(str, marks[0].details.get("together", ())))
+        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles, together)
     if procedure is not None:
         path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
         start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
@@ -95,7 +96,13 @@ def joint_result(profile: JointProfile) -> dict[str, Any]:
 
 
 def _from_cycles(
-    samples: Samples, procedure: Procedure, start_s: float, joint: JointSetup | None, method: str, late_cycles: int
+    samples: Samples,
+    procedure: Procedure,
+    start_s: float,
+    joint: JointSetup | None,
+    method: str,
+    late_cycles: int,
+    together: tuple[str, ...] = (),
 ) -> JointProfile:
     recording = _recording(samples, procedure, start_s, joint, late_cycles)
     result = estimate(recording, method)
@@ -133,6 +140,7 @@ def _from_cycles(
             cycles=procedure.cycles,
             ratio=procedure.ratio,
             shares=procedure.shares or None,
+            together=together or None,
         ),
         drive=_drive(samples.meta),
         quality={

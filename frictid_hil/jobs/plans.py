@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from frictid_hil.config import policy
 from frictid_hil.config.robot import Robot
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.plan import Corners, Cycles, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, WarmUp, joint_plan
+from frictid_hil.plan import (
+    Corners,
+    Cycles,
+    Expected,
+    Hold,
+    JointPlan,
+    Motion,
+    Move,
+    Plan,
+    Sine,
+    WarmUp,
+    coupling_bound_nm,
+    joint_plan,
+)
 
 APPROACH_RAD_S = math.radians(20.0)
 """Speed of moves between the locked position and the start, and of the rehearsal."""
@@ -63,16 +79,76 @@ def calibration_plan(
     rehearse: Sequence[str] = (),
     notes: Sequence[str] = (),
     warm_up: policy.WarmUp | None = None,
+    together: bool = False,
 ) -> Plan:
-    """The plan of a calibration, joint by joint in the order of ``procedures``."""
+    """The plan of a calibration: joint by joint in the order of ``procedures``, or all of them at once.
+
+    Raises:
+        UsageError: joints that shall move together have procedures of different timing.
+    """
     locked = {joint.name: joint.locked_position_rad for joint in setup.joints}
+    if together:
+        _refuse_different_timing(procedures)
+        # One that has not been rehearsed makes all of them rehearse: their travels combined are new.
+        rehearse = list(procedures) if rehearse else []
+    motions = {
+        name: calibration_motions(setup.joint(name), procedure, rehearse=name in rehearse, warm_up=warm_up)
+        for name, procedure in procedures.items()
+    }
+    if together:
+        motions = _in_step(motions)
     joints: list[JointPlan] = []
+    for name in procedures:
+        others = {other: at for other, at in locked.items() if other != name and not (together and other in procedures)}
+        coupling_nm = coupling_bound_nm(name, motions, expected) if together else 0.0
+        joints.append(joint_plan(setup.joint(name), motions[name], others, expected.get(name), coupling_nm=coupling_nm))
+    return Plan(robot.name, setup.cycle_hz, tuple(joints), tuple(notes), together=together)
+
+
+def _refuse_different_timing(procedures: Mapping[str, Procedure]) -> None:
+    """Joints that move together must reverse together: else the coupling does not cancel between the directions.
+
+    Raises:
+        UsageError: a joint whose cycles last otherwise than the first one's.
+    """
+    first, reference = next(iter(procedures.items()))
     for name, procedure in procedures.items():
-        joint = setup.joint(name)
-        motions = calibration_motions(joint, procedure, rehearse=name in rehearse, warm_up=warm_up)
-        others = {other: at for other, at in locked.items() if other != name}
-        joints.append(joint_plan(joint, motions, others, expected.get(name)))
-    return Plan(robot.name, setup.cycle_hz, tuple(joints), tuple(notes))
+        same = procedure.cycles == reference.cycles and procedure.shares == reference.shares
+        if not (same and math.isclose(procedure.duration_s, reference.duration_s, rel_tol=1e-9)):
+            raise UsageError(
+                f"its {procedure.cycles} cycles take {procedure.duration_s:.3f} s, the {reference.cycles} of joint "
+                f"{first} {reference.duration_s:.3f} s; joints that move together need identical timing",
+                where=f"joint {name}",
+                cause="the robot file gives this joint a procedure of its own",
+                next_step="give all joints the same A / V and N, or calibrate this one by itself with --joint",
+            )
+
+
+def _in_step(motions: Mapping[str, Sequence[Motion]]) -> dict[str, list[Motion]]:
+    """The same stretches for every joint, each as long as for the one that needs longest.
+
+    Only moves and slow sines differ: cycles have identical timing already.
+    """
+    moved_first = any(own[0].name == "move" for own in motions.values())
+    lists: dict[str, list[Motion]] = {}
+    for name, own in motions.items():
+        here_rad = float(own[0].position_rad(np.zeros(1))[0])
+        stays = moved_first and own[0].name != "move"  # it is locked where it starts
+        lists[name] = [Move(here_rad, here_rad, 0.0), *own] if stays else list(own)
+    longest_s = [max(motion.duration_s for motion in stretch) for stretch in zip(*lists.values(), strict=True)]
+    return {
+        name: [_lasting(motion, duration_s) for motion, duration_s in zip(own, longest_s, strict=True)]
+        for name, own in lists.items()
+    }
+
+
+def _lasting(motion: Motion, duration_s: float) -> Motion:
+    """The same motion, slower where it would be over earlier."""
+    if isinstance(motion, Move):
+        return replace(motion, duration_s=duration_s)
+    if isinstance(motion, Sine) and motion.duration_s < duration_s:
+        return replace(motion, peak_velocity_rad_s=motion.peak_velocity_rad_s * motion.duration_s / duration_s)
+    return motion
 
 
 def expected_of(robot: Robot) -> dict[str, Expected]:
@@ -81,7 +157,12 @@ def expected_of(robot: Robot) -> dict[str, Expected]:
     for name, joint in robot.file.joints.items():
         if joint.expected is not None:
             values = joint.expected
-            expected[name] = Expected(values.inertia_kg_m2, values.gravity_nm, values.friction_nm)
+            expected[name] = Expected(
+                values.inertia_kg_m2,
+                values.gravity_nm,
+                values.friction_nm,
+                link_inertia_kg_m2=values.link_inertia_kg_m2,
+            )
     return expected
 
 

@@ -8,7 +8,7 @@ that the joint never sees a jump.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -186,15 +186,33 @@ class CyclicLoop:
             SafetyAbort: by the supervisor.
             Interrupted: asked to stop; the joint has been decelerated to rest first unless a quick stop was asked.
         """
-        set_point = self.set_points[joint]
-        previous_rad = set_point.position_rad
+        self.run_together({joint: source}, ending=ending)
+
+    def run_together(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
+        """Stream one motion of every joint that moves, cycle by cycle, until the first one ends.
+
+        Args:
+            sources: of the set-points, by index of the joint.
+            ending: as for ``run``; only where one joint moves.
+
+        Raises:
+            SafetyAbort: by the supervisor.
+            Interrupted: asked to stop; all joints have been decelerated to rest first unless a quick stop was asked.
+        """
+        moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
+        previous_rad = [set_point.position_rad for _, _, set_point in moving]
         while True:
             level = self._stop.level
             if level:
-                self._end_early(joint, set_point.position_rad - previous_rad, level, ending)
-            previous_rad = set_point.position_rad
-            if not source.update(self.feedback[joint], set_point):
-                return
+                steps = {
+                    joint: set_point.position_rad - before
+                    for (joint, _, set_point), before in zip(moving, previous_rad, strict=True)
+                }
+                self._end_early(steps, level, ending)
+            for k, (joint, source, set_point) in enumerate(moving):
+                previous_rad[k] = set_point.position_rad
+                if not source.update(self.feedback[joint], set_point):
+                    return
             self.cycle()
 
     def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
@@ -218,18 +236,19 @@ class CyclicLoop:
         for _ in range(cycles):
             self.cycle(supervised=False)
 
-    def _end_early(self, joint: int, step_rad: float, level: int, ending: SetPointSource | None) -> None:
-        """Bring the commanded position to rest at constant deceleration within a tenth of a second."""
-        set_point = self.set_points[joint]
+    def _end_early(self, steps_rad: Mapping[int, float], level: int, ending: SetPointSource | None) -> None:
+        """Bring the commanded positions to rest at constant deceleration within a tenth of a second."""
         if ending is not None:
-            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], set_point):
+            (joint,) = steps_rad
+            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], self.set_points[joint]):
                 self.cycle()
-        elif level < QUICK_STOP and step_rad:
+        elif level < QUICK_STOP and any(steps_rad.values()):
             steps = max(2, round(0.1 / self.period_s))
             for k in range(steps):
                 if self._stop.level >= QUICK_STOP:
                     break
-                set_point.position_rad += step_rad * (1.0 - (k + 1) / steps)
+                for joint, step_rad in steps_rad.items():
+                    self.set_points[joint].position_rad += step_rad * (1.0 - (k + 1) / steps)
                 self.cycle()
         raise Interrupted(
             "stopped on request; the joint was brought to rest",

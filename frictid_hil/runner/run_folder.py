@@ -89,9 +89,12 @@ class RowKeeper:
             self._samples.metadata(f"joint/{joint}", identity)
 
     def taken(self, joint: int, start_ns: int, end_ns: int) -> Rows:
-        """One joint's rows in a stretch of run time; everything older is forgotten."""
+        """One joint's rows in a stretch of run time; everything older than its start is forgotten.
+
+        Joints that moved together are taken one after the other from the same stretch.
+        """
         every = np.concatenate(self._kept) if self._kept else np.empty(0, dtype=[("joint", "<u2"), ("t_ns", "<i8")])
-        self._kept = [every[every["t_ns"] >= end_ns]]
+        self._kept = [every[every["t_ns"] >= start_ns]]
         mine = (every["joint"] == joint) & (every["t_ns"] >= start_ns) & (every["t_ns"] < end_ns)
         taken: Rows = every[mine]
         return taken

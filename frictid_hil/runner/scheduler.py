@@ -1,10 +1,12 @@
 """The scheduler: reach the hardware, check, lock every joint except one, move it, lock it again, next joint.
 
+A plan whose joints move together has one such turn, with all of them moving in step.
+
 The order is always the same, and nothing in it is optional::
 
     open, identify, check         reads only; an error ends here
     proceed?                      a person (or --yes) has seen plan, identities and findings
-    per joint:
+    per joint, or once for all that move together:
         configure, limits         written and read back
         position reference        every joint reports, inside its limits, near where the plan expects it
         enable, lock others       and see them stand still
@@ -16,7 +18,7 @@ The order is always the same, and nothing in it is optional::
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,18 +32,19 @@ from frictid_hil.driver import (
     JointState,
     Mode,
     RobotSetup,
-    SetPoint,
     Severity,
 )
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, ProfileMismatch, SafetyAbort
-from frictid_hil.plan import JointPlan, Motion, Move, Plan, WarmUp
+from frictid_hil.plan import JointPlan, Motion, Move, Plan, WarmUp, stretch_name
 from frictid_hil.recording.samples import Mark
-from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, StopRequest, Stream
+from frictid_hil.runner.cycle import CyclicLoop, StopRequest, Stream
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.in_step import InStep
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.law_runner import LawRunner
 from frictid_hil.runner.probe import ProbeWatch
 from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.sign_watch import SignWatch
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 from frictid_hil.runner.warm_up import WarmUpWatch
 from frictid_hil.units import degrees, format_angle
@@ -154,8 +157,9 @@ class Scheduler:
             self._notify(preflight)
             if not self._proceed(preflight):
                 raise PlanRefused("not confirmed; nothing has moved")
-            for session, joint_plan in enumerate(self._plan.joints):
-                self._notify(self._run_joint(session, joint_plan))
+            for session, stretch in enumerate(self._plan.stretches):
+                for run in self._run_stretch(session, stretch):
+                    self._notify(run)
         finally:
             driver.close()
 
@@ -165,7 +169,8 @@ class Scheduler:
         self._command_delay_s = self._driver.capabilities().command_delay_s
         errors = [finding for finding in findings if finding.severity is Severity.ERROR]
         if errors:
-            raise HardwareError(
+            planned_wrong = all(finding.subject == "bus load" for finding in errors)
+            raise (PlanRefused if planned_wrong else HardwareError)(
                 "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
                 next_step=errors[0].next_step or "run `frictid-hil check`",
             )
@@ -178,13 +183,14 @@ class Scheduler:
             )
         return Preflight(identities, capabilities, tuple(findings))
 
-    # -- one joint ----------------------------------------------------------------------------------------------
+    # -- one joint, or several in step --------------------------------------------------------------------------
 
-    def _run_joint(self, session: int, plan: JointPlan) -> JointRun:
+    def _run_stretch(self, session: int, plans: Sequence[JointPlan]) -> list[JointRun]:
         driver = self._driver
-        moving = self._names.index(plan.joint)
-        self._notify(PhaseStarted(plan.joint, "configure", 0.0))
-        driver.configure(self._plan.cycle_hz, [plan.joint])
+        moving = {self._names.index(plan.joint): plan for plan in plans}
+        name = stretch_name(plans)
+        self._notify(PhaseStarted(name, "configure", 0.0))
+        driver.configure(self._plan.cycle_hz, [plan.joint for plan in plans])
         if session == 0 and isinstance(driver, FrameMapped):
             self._notify(Configured(driver.frame_map_values()))
         for joint in self._setup.joints:
@@ -194,10 +200,10 @@ class Scheduler:
                 position_min_rad=joint.position_min_rad,
                 position_max_rad=joint.position_max_rad,
             )
-        limits = [self._limits(joint, plan) for joint in self._setup.joints]
+        limits = [self._limits(joint, moving.get(at, plans[0])) for at, joint in enumerate(self._setup.joints)]
         supervisor = Supervisor(self._names, limits, self._care.interlock)
         for index in range(len(self._names)):
-            if index != moving:
+            if index not in moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
         driver.start_cycling()
         loop = CyclicLoop(
@@ -211,7 +217,12 @@ class Scheduler:
             pump=self._pump,
         )
         try:
-            marks = self._motions(loop, supervisor, moving, plan)
+            self._make_ready(loop, supervisor, moving, name)
+            if len(moving) > 1:
+                marks = self._motions_in_step(loop, supervisor, moving, name)
+            else:
+                ((index, plan),) = moving.items()
+                marks = {index: self._motions(loop, supervisor, index, plan)}
             self._power_off(loop)
         except BaseException:
             self._stop_everything(loop)
@@ -219,17 +230,20 @@ class Scheduler:
         driver.stop_cycling()
         self._recorder.offset_ns = loop.now_ns() + _SESSION_GAP_NS
         count = loop.count
-        return JointRun(
-            joint=plan.joint,
-            session=session,
-            marks=tuple(marks),
-            rate_hz=count.rate_hz,
-            cycles=count.cycles,
-            late_cycles=count.late,
-            missed_cycles=count.missed,
-            worst_lateness_s=count.worst_ns * 1e-9,
-            duration_s=(count.last_ns - count.first_ns) * 1e-9,
-        )
+        return [
+            JointRun(
+                joint=plan.joint,
+                session=session,
+                marks=tuple(marks[index]),
+                rate_hz=count.rate_hz,
+                cycles=count.cycles,
+                late_cycles=count.late,
+                missed_cycles=count.missed,
+                worst_lateness_s=count.worst_ns * 1e-9,
+                duration_s=(count.last_ns - count.first_ns) * 1e-9,
+            )
+            for index, plan in moving.items()
+        ]
 
     def _limits(self, joint: JointSetup, plan: JointPlan) -> JointLimits:
         care = self._care
@@ -249,23 +263,27 @@ class Scheduler:
             max_age_cycles=max(3, math.ceil(care.silence_s * self._plan.cycle_hz)),
         )
 
-    def _motions(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan) -> list[Mark]:
-        self._notify(PhaseStarted(plan.joint, "reference", 0.0))
-        self._verify_reference(loop, plan)
+    def _make_ready(self, loop: CyclicLoop, supervisor: Supervisor, moving: Mapping[int, JointPlan], name: str) -> None:
+        """Everything seen, powered, at its planned place and still; only the joints to be moved are not locked."""
+        planned_rad = next(iter(moving.values())).locked
+        self._notify(PhaseStarted(name, "reference", 0.0))
+        self._verify_reference(loop, planned_rad)
         self._verify_interlock(loop, supervisor)
-        self._notify(PhaseStarted(plan.joint, "enable", 0.0))
+        self._notify(PhaseStarted(name, "enable", 0.0))
         self._enable_all(loop)
-        marks: list[Mark] = []
         # Joints that are near, but not at, their planned locked position are brought there one by one.
         for index, joint in enumerate(self._setup.joints):
-            target_rad = plan.locked.get(joint.name)
+            target_rad = planned_rad.get(joint.name)
             here_rad = loop.set_points[index].position_rad
-            if index != moving and target_rad is not None and abs(target_rad - here_rad) > _AT_RAD:
+            if index not in moving and target_rad is not None and abs(target_rad - here_rad) > _AT_RAD:
                 approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
-                self._lock_all_but(index, loop, supervisor)
+                self._lock_all_but([index], loop, supervisor)
                 self._stream(loop, index, approach)
-        self._lock_all_but(moving, loop, supervisor)
+        self._lock_all_but(list(moving), loop, supervisor)
         self._see_standstill(loop)
+
+    def _motions(self, loop: CyclicLoop, supervisor: Supervisor, moving: int, plan: JointPlan) -> list[Mark]:
+        marks: list[Mark] = []
         motions = self._from_here(loop.set_points[moving].position_rad, plan.motions)
         joint = self._setup.joints[moving]
         laws = LawRunner(self._driver, loop, supervisor, joint, moving, self._limits(joint, plan))
@@ -286,6 +304,25 @@ class Scheduler:
                 mark = self._stream(loop, moving, motion)
             self._notify(Marked(plan.joint, mark))
             marks.append(mark)
+        return marks
+
+    def _motions_in_step(
+        self, loop: CyclicLoop, supervisor: Supervisor, moving: Mapping[int, JointPlan], name: str
+    ) -> dict[int, list[Mark]]:
+        """Every stretch of all joints at once."""
+        company = InStep(loop, supervisor, {index: self._setup.joints[index] for index in moving})
+        marks: dict[int, list[Mark]] = {index: [] for index in moving}
+        for stretch in company.stretches({at: plan.motions for at, plan in moving.items()}, self._care.approach_rad_s):
+            first = next(iter(stretch.values()))
+            self._notify(PhaseStarted(name, first.name, first.duration_s))
+            if first.name == "rehearsal":
+                limits = {index: self._limits(self._setup.joints[index], plan) for index, plan in moving.items()}
+                done = company.rehearse(stretch, limits)
+            else:
+                done = company.stream(stretch)
+            for index, mark in done.items():
+                self._notify(Marked(self._names[index], mark))
+                marks[index].append(mark)
         return marks
 
     def _from_here(self, here_rad: float, motions: Sequence[Motion]) -> list[Motion]:
@@ -309,19 +346,11 @@ class Scheduler:
         supervisor.set_limits(moving, replace(normal, torque_nm=0.5 * joint.max_torque_nm))
         steps = max(1, math.ceil(motion.duration_s / loop.period_s))
         positions = motion.position_rad(np.arange(steps) * loop.period_s)
-        watch = _SignWatch(Stream(positions.tolist()))
+        watch = SignWatch(Stream(positions.tolist()), joint.name)
         start_ns = loop.now_ns()
         loop.run(watch, moving)
         supervisor.set_limits(moving, normal)
-        half_difference_nm = watch.half_difference_nm()
-        if half_difference_nm is not None and half_difference_nm <= 0:
-            raise SafetyAbort(
-                f"moving forward took {-2 * half_difference_nm:.3g} N m less torque than moving back; "
-                "friction must oppose motion",
-                where=f"joint {joint.name}",
-                cause="the torque sign or the joint's direction is wrong, or the drive compensates friction itself",
-                next_step="check `direction` in the robot file and the drive's own friction compensation",
-            )
+        watch.judge()
         return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
 
     def _probe(self, loop: CyclicLoop, moving: int, probe: Probe) -> Mark:
@@ -358,10 +387,10 @@ class Scheduler:
 
     # -- power and locks ----------------------------------------------------------------------------------------
 
-    def _verify_reference(self, loop: CyclicLoop, plan: JointPlan) -> None:
+    def _verify_reference(self, loop: CyclicLoop, planned_rad: Mapping[str, float]) -> None:
         loop.wait_for(lambda feedback: all(report.valid for report in feedback), 1.0, "a first report of every joint")
         for joint, report, set_point in zip(self._setup.joints, loop.feedback, loop.set_points, strict=True):
-            expected_rad = plan.locked.get(joint.name, joint.locked_position_rad)
+            expected_rad = planned_rad.get(joint.name, joint.locked_position_rad)
             off_rad = report.position_rad - expected_rad
             if not abs(off_rad) <= self._care.reference_tolerance_rad:
                 raise SafetyAbort(
@@ -407,10 +436,10 @@ class Scheduler:
         for set_point, report in zip(loop.set_points, loop.feedback, strict=True):
             set_point.position_rad = report.position_rad
 
-    def _lock_all_but(self, moving: int, loop: CyclicLoop, supervisor: Supervisor) -> None:
+    def _lock_all_but(self, moving: Sequence[int], loop: CyclicLoop, supervisor: Supervisor) -> None:
         locked_at: dict[int, float] = {}
         for index, joint in enumerate(self._setup.joints):
-            if index == moving:
+            if index in moving:
                 self._driver.unlock(joint.name)
             else:
                 self._driver.lock(joint.name)
@@ -455,29 +484,3 @@ class Scheduler:
         except FrictidError:
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self._driver.quick_stop()
-
-
-class _SignWatch:
-    """Passes a stream on and keeps the mean torque of both directions."""
-
-    _MOVING_RAD_S = math.radians(2.0)
-
-    def __init__(self, source: SetPointSource) -> None:
-        self._source = source
-        self._sum = [0.0, 0.0]
-        self._count = [0, 0]
-
-    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """Count the report, then pass the next set-point on."""
-        if abs(feedback.velocity_rad_s) > self._MOVING_RAD_S and math.isfinite(feedback.torque_nm):
-            backward = feedback.velocity_rad_s < 0
-            self._sum[backward] += feedback.torque_nm
-            self._count[backward] += 1
-        return self._source.update(feedback, set_point)
-
-    def half_difference_nm(self) -> float | None:
-        """(mean forward - mean backward) / 2, None where one direction was never seen."""
-        if not all(self._count):
-            return None
-        forward, backward = (total / count for total, count in zip(self._sum, self._count, strict=True))
-        return 0.5 * (forward - backward)

@@ -56,7 +56,7 @@ class Supervisor:
     def __init__(self, names: Sequence[str], limits: Sequence[JointLimits], interlock: Interlock | None = None) -> None:
         self._names = list(names)
         self._limits = list(limits)
-        self._moving: int | None = None
+        self._moving: tuple[int, ...] = ()
         self._mode = Mode.POSITION
         self._locked_at: dict[int, float] = {}
         self._torque_high = [0] * len(self._names)
@@ -65,15 +65,15 @@ class Supervisor:
         self._interlock = interlock
         self._interlock_armed = False
 
-    def watch(self, moving: int | None, mode: Mode, locked_at: dict[int, float]) -> None:
+    def watch(self, moving: int | Sequence[int] | None, mode: Mode, locked_at: dict[int, float]) -> None:
         """Say what is allowed from now on.
 
         Args:
-            moving: index of the joint that may move, None while all stand.
-            mode: its commanded mode.
+            moving: index of the joint that may move, several where they move together, None while all stand.
+            mode: their commanded mode.
             locked_at: position of every locked joint by index, rad.
         """
-        self._moving = moving
+        self._moving = () if moving is None else (moving,) if isinstance(moving, int) else tuple(moving)
         self._mode = mode
         self._locked_at = dict(locked_at)
 
@@ -119,8 +119,7 @@ class Supervisor:
             SafetyAbort: naming joint, quantity, value and bound.
         """
         self.check_interlock(feedback)
-        moving = self._moving
-        if moving is not None:
+        for moving in self._moving:
             self._check_moving(moving, set_points[moving], feedback[moving])
         for index, held_rad in self._locked_at.items():
             report = feedback[index]

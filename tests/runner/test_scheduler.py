@@ -44,10 +44,12 @@ def run(
     change: Callable[[RobotSetup], RobotSetup] = lambda setup: setup,
     proceed: bool = True,
     stop: Stop | None = None,
+    together: bool = False,
+    cycle_hz: float = 1000.0,
 ) -> tuple[list[Event], Rows, Driver, FrictidError | None]:
-    setup = ROBOT.to_setup()
+    setup = replace(ROBOT.to_setup(), cycle_hz=cycle_hz)
     procedures = {name: Procedure(6 * DEG, 40 * DEG, cycles=2) for name in joints}
-    plan: Plan = calibration_plan(ROBOT, setup, procedures, expected_of(ROBOT), rehearse=joints)
+    plan: Plan = calibration_plan(ROBOT, setup, procedures, expected_of(ROBOT), rehearse=joints, together=together)
     setup = change(setup)
     stop = stop or Stop()
     events: list[Event] = []
@@ -154,3 +156,51 @@ def test_a_request_to_stop_brings_the_joint_to_rest(level: int) -> None:
 
 def test_states_are_what_the_protocol_names() -> None:
     assert {state.value for state in JointState} == {"unknown", "disabled", "enabled", "stopping", "fault"}
+
+
+def test_joints_that_move_together_do_so_in_step() -> None:
+    events, rows, _, ended = run(("1", "3", "4"), together=True, cycle_hz=400.0)
+    assert ended is None
+    runs = [event for event in events if isinstance(event, JointRun)]
+    assert [event.joint for event in runs] == ["1", "3", "4"]
+    assert {event.session for event in runs} == {0}
+    assert len({tuple((m.name, m.start_ns, m.end_ns) for m in event.marks) for event in runs}) == 1
+    cycles = next(mark for mark in runs[0].marks if mark.name == "cycles")
+    assert cycles.details["together"] == ["1", "3", "4"]
+    during = rows[(rows["t_ns"] >= cycles.start_ns) & (rows["t_ns"] < cycles.end_ns)]
+    paths = [during[during["joint"] == index]["position_command_rad"] for index in (1, 3, 4)]
+    for path, name in zip(paths, ("1", "3", "4"), strict=True):
+        start_rad = ROBOT.file.joints[name].start_position_rad
+        np.testing.assert_allclose(path - start_rad, paths[0] - paths[0][0], atol=1e-4)
+    for index in (0, 2, 5):
+        assert np.ptp(during["position_rad"][during["joint"] == index]) < 0.25 * DEG
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_request_to_stop_brings_all_joints_to_rest(level: int) -> None:
+    _, rows, _, ended = run(("3", "4"), stop=Stop(level), together=True, cycle_hz=400.0)
+    assert isinstance(ended, Interrupted)
+    for index in (3, 4):
+        last = rows[rows["joint"] == index][-20:]
+        assert np.abs(last["velocity_rad_s"]).max() < 0.5 * DEG
+        assert np.ptp(last["position_rad"]) < 0.01 * DEG
+
+
+def test_one_joint_out_of_bounds_stops_all() -> None:
+    def faulty(setup: RobotSetup) -> RobotSetup:
+        return replace(
+            setup, options={**setup.options, "faults": [{"kind": "stuck_encoder", "joint": "4", "at_s": 4.0}]}
+        )
+
+    _, rows, _, ended = run(("3", "4"), change=faulty, together=True, cycle_hz=400.0)
+    assert isinstance(ended, SafetyAbort)
+    assert "joint 4" in str(ended)
+    last = rows[rows["joint"] == 3][-20:]
+    assert np.abs(last["velocity_rad_s"]).max() < 0.5 * DEG
+
+
+def test_too_high_a_rate_for_all_at_once_is_refused_with_the_highest_that_fits() -> None:
+    _, rows, _, ended = run(ROBOT.joint_names, together=True, cycle_hz=1000.0)
+    assert isinstance(ended, PlanRefused)
+    assert "use a rate of at most 282 Hz" in ended.next_step
+    assert rows.size == 0

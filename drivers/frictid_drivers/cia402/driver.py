@@ -139,7 +139,9 @@ class Cia402Driver:
         """Everything that can be said without moving or writing."""
         fleet = self._reached()
         cycle_hz = plan.cycle_hz if plan is not None else self.setup.cycle_hz
-        active = [plan.joints[0].joint if plan is not None and plan.joints else self.setup.joints[0].name]
+        active = [self.setup.joints[0].name]
+        if plan is not None and plan.joints:
+            active = [entry.joint for entry in (plan.joints if plan.together else plan.joints[:1])]
         findings = [inspection.bus_finding(fleet.load(active, cycle_hz), fleet.highest_rate_hz(active))]
         if not fleet.sync_counter:
             findings.append(inspection.no_sync_counter(fleet.facts))
@@ -169,7 +171,8 @@ class Cia402Driver:
                 f"{len(active)} of {len(self.setup.joints)} joints reporting on every cycle load the bus with {load}",
                 where="bus load",
                 cause="more than 80 % on average or 100 % in one cycle; frames would come late or not at all",
-                next_step=f"use a rate of at most {fleet.highest_rate_hz(active):g} Hz, or fewer joints at once",
+                next_step=f"use a rate of at most {fleet.highest_rate_hz(active):g} Hz (`calibrate --rate`, or "
+                "`cycle_hz` in the robot file), or fewer joints at once",
             )
         layout = fleet.layout(active, cycle_hz)
         self._frame_map = fleet.configure(layout)

@@ -67,7 +67,7 @@ def bus_finding(load: BusLoad, highest_hz: float) -> Finding:
         Severity.ERROR,
         "bus load",
         f"{load}: more than 80 % on average or 100 % in one cycle",
-        f"use a rate of at most {highest_hz:g} Hz",
+        f"use a rate of at most {highest_hz:g} Hz (`calibrate --rate`, or `cycle_hz` in the robot file)",
     )
 
 

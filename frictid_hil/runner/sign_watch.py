@@ -1,0 +1,52 @@
+"""Friction must oppose motion: seen in the rehearsal, before any speed."""
+
+from __future__ import annotations
+
+import math
+
+from frictid_hil.driver import Feedback, SetPoint
+from frictid_hil.errors import SafetyAbort
+from frictid_hil.runner.cycle import SetPointSource
+
+
+class SignWatch:
+    """Passes a stream on and keeps the mean torque of both directions.
+
+    Args:
+        source: of the set-points.
+        joint: name, for the message.
+    """
+
+    _MOVING_RAD_S = math.radians(2.0)
+
+    def __init__(self, source: SetPointSource, joint: str) -> None:
+        self._source = source
+        self._joint = joint
+        self._sum = [0.0, 0.0]
+        self._count = [0, 0]
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """Count the report, then pass the next set-point on."""
+        if abs(feedback.velocity_rad_s) > self._MOVING_RAD_S and math.isfinite(feedback.torque_nm):
+            backward = feedback.velocity_rad_s < 0
+            self._sum[backward] += feedback.torque_nm
+            self._count[backward] += 1
+        return self._source.update(feedback, set_point)
+
+    def judge(self) -> None:
+        """Nothing to say where one direction was never seen.
+
+        Raises:
+            SafetyAbort: torque helps motion.
+        """
+        if not all(self._count):
+            return
+        forward, backward = (total / count for total, count in zip(self._sum, self._count, strict=True))
+        if forward <= backward:
+            raise SafetyAbort(
+                f"moving forward took {backward - forward:.3g} N m less torque than moving back; "
+                "friction must oppose motion",
+                where=f"joint {self._joint}",
+                cause="the torque sign or the joint's direction is wrong, or the drive compensates friction itself",
+                next_step="check `direction` in the robot file and the drive's own friction compensation",
+            )
