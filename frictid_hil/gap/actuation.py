@@ -1,4 +1,4 @@
-"""The actuation and the kinematic channel: delay, lag, clipping and velocity lag, each fitted as the drive would do it.
+"""The actuation channel: effects of the drive, each fitted as the drive would do it.
 
 Between the controller's demand and the reported torque there is nothing but the drive, so a candidate predicts the
 reported torque sample by sample. Candidates are added one by one while the prediction gets much better.
@@ -15,41 +15,59 @@ from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Controller
-from frictid_hil.gap.residuals import LowPass, Recording, demand_of, lagged, rms, settled
+from frictid_hil.gap.residuals import LowPass, Recording, demand_of, rms, settled
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView
+from frictid_hil.simulation.effects import all_effects
 
-MAX_DELAY_S = 0.05
-MAX_LAG_S = 0.05
 CLEARED = 0.7
 """Share of one log's low-passed squares that a candidate may leave to be taken though all logs show it little."""
 
 
+def _forms() -> dict[str, ActuationForm]:
+    """Every effect's form in this channel, in the order in which they act."""
+    forms = {name: effect.actuation for name, effect in all_effects().items() if effect.actuation is not None}
+    return dict(sorted(forms.items(), key=lambda item: item[1].order))
+
+
+def velocity_lag_s(effects: Mapping[str, Mapping[str, float]]) -> float:
+    """Time constant by which effects let the controller's velocity lag."""
+    return sum(
+        effects[name].get(form.parameter, 0.0)
+        for name, form in _forms().items()
+        if form.torque is None and name in effects
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What stands between demand and reported torque.
+    """What stands between demand and reported torque: parameters by effect."""
 
-    Attributes:
-        delay_s: dead time.
-        lag_s: first-order time constant.
-        limit_nm: clip level.
-        velocity_lag_s: extra lag of the velocity that the controller sees.
-    """
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
-    delay_s: float = 0.0
-    lag_s: float = 0.0
-    limit_nm: float = math.inf
-    velocity_lag_s: float = 0.0
+    @property
+    def velocity_lag_s(self) -> float:
+        """Extra lag of the velocity that the controller sees."""
+        return velocity_lag_s(self.effects)
 
-    def reported(self, demand_nm: Array, step_s: float) -> Array:
+    @property
+    def late_s(self) -> float:
+        """Time by which the torque comes late."""
+        forms = _forms()
+        return sum(values[forms[name].parameter] for name, values in self.effects.items() if forms[name].late)
+
+    def reported(self, demand_nm: Array, step_s: float, limit_nm: float) -> Array:
         """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
         torque = np.concatenate([demand_nm[:1], demand_nm[:-1]])
-        if self.delay_s > 0.0:
-            whole, part = divmod(self.delay_s / step_s, 1.0)
-            torque = (1.0 - part) * _shifted(torque, int(whole)) + part * _shifted(torque, int(whole) + 1)
-        if self.lag_s > 0.0:
-            torque = _lagged_mean(torque, step_s, self.lag_s)
-        if math.isfinite(self.limit_nm):
-            torque = np.clip(torque, -self.limit_nm, self.limit_nm)
+        for name, form in _forms().items():
+            if name in self.effects and form.torque is not None:
+                value = self.effects[name][form.parameter]
+                if value != all_effects()[name].off[form.parameter]:
+                    torque = form.torque(torque, value, step_s, limit_nm)
         return torque
+
+    def with_effect(self, name: str, value: float) -> Drive:
+        """The drive with one effect set."""
+        return Drive({**self.effects, name: {_forms()[name].parameter: value}})
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +101,8 @@ def residual(recording: Recording, controller: Controller, drive: Drive) -> Arra
     """Reported torque minus what controller and drive predict, N m, shape (n,)."""
     assert recording.experiment.torque_nm is not None
     demand = demand_of(controller, recording.experiment, recording.step_s, drive.velocity_lag_s)
-    return settled(recording.experiment.torque_nm - drive.reported(demand, recording.step_s), recording.step_s)
+    predicted = drive.reported(demand, recording.step_s, controller.torque_limit_nm)
+    return settled(recording.experiment.torque_nm - predicted, recording.step_s)
 
 
 def noise_rms(values: Array) -> float:
@@ -93,34 +112,12 @@ def noise_rms(values: Array) -> float:
     return float(np.std(np.diff(values, 2)) / math.sqrt(6.0))
 
 
-def _shifted(values: Array, rows: int) -> Array:
-    if rows <= 0:
-        return values
-    return np.concatenate([np.full(min(rows, values.size), values[0]), values[:-rows]])
-
-
-def _lagged_mean(torque: Array, step_s: float, time_constant_s: float) -> Array:
-    end = lagged(torque, step_s, time_constant_s)
-    start = np.concatenate([end[:1], end[:-1]])
-    mean: Array = torque + (start - torque) * (time_constant_s / step_s) * (1.0 - math.exp(-step_s / time_constant_s))
-    return mean
-
-
-_EFFECTS = ("torque_delay", "electrical_lag", "torque_saturation", "velocity_lag")
-_FIELD = {
-    "torque_delay": "delay_s",
-    "electrical_lag": "lag_s",
-    "torque_saturation": "limit_nm",
-    "velocity_lag": "velocity_lag_s",
-}
-
-
 def fit_actuation(
     recordings: Sequence[Recording],
     controller: Controller,
     nominal: Drive,
     library: Sequence[str],
-    velocity_lag_s: float,
+    seen: Mapping[str, float],
     least_gain: float = 25.0,
     least_share: float = 0.04,
 ) -> ActuationFit:
@@ -131,7 +128,7 @@ def fit_actuation(
         controller: the nominal one.
         nominal: the drive the nominal joint believes in.
         library: names of the effects that may be used.
-        velocity_lag_s: lag found in the reported velocity, tried as a lag of the controller's velocity; 0 for none.
+        seen: effect name -> value found in the kinematic channel; the controller may see the motion so, too.
         least_gain: score below which a candidate is not taken.
         least_share: share of the residual's squares that a candidate must remove.
     """
@@ -147,7 +144,8 @@ def fit_actuation(
 
     def left(drive: Drive, recording: Recording) -> Array:
         assert recording.experiment.torque_nm is not None
-        predicted = drive.reported(demand(recording, drive.velocity_lag_s), recording.step_s)
+        demanded = demand(recording, drive.velocity_lag_s)
+        predicted = drive.reported(demanded, recording.step_s, controller.torque_limit_nm)
         return settled(recording.experiment.torque_nm - predicted, recording.step_s)
 
     def squares(drive: Drive) -> float:
@@ -166,10 +164,11 @@ def fit_actuation(
     start = current = squares(nominal)
     for _ in range(3):
         tried: dict[str, tuple[float, Drive]] = {}
-        for name in _EFFECTS:
+        views = [_view(r, controller, demand(r, drive.velocity_lag_s)) for r in fitted]
+        for name, form in _forms().items():
             if name in found or name not in library:
                 continue
-            candidate = _best(name, drive, squares, demand, fitted, velocity_lag_s)
+            candidate = _best(name, drive, squares, form.guesses(views, seen.get(name)))
             if candidate is not None:
                 tried[name] = candidate
         if not tried:
@@ -205,47 +204,32 @@ def fit_actuation(
     )
 
 
-def _best(
-    name: str,
-    drive: Drive,
-    squares: Callable[[Drive], float],
-    demand: Callable[[Recording, float], Array],
-    fitted: Sequence[Recording],
-    velocity_lag_s: float,
-) -> tuple[float, Drive] | None:
-    if name == "velocity_lag":
-        if velocity_lag_s <= 0.0:
-            return None
-        candidate = _with(drive, name, velocity_lag_s)
-        return squares(candidate), candidate
-    if name == "torque_saturation":
-        highest = max(float(np.max(np.abs(demand(r, drive.velocity_lag_s)))) for r in fitted)
-        reported = max(float(np.quantile(np.abs(r.experiment.torque_nm), 0.999)) for r in fitted)  # type: ignore[arg-type]
-        if reported > 0.995 * highest:
-            return None
-        grid = np.linspace(0.7, 1.05, 15) * reported
-    else:
-        step = fitted[0].step_s
-        grid = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * step
-        grid = grid[grid <= (MAX_DELAY_S if name == "torque_delay" else MAX_LAG_S)]
-    costs = [squares(_with(drive, name, float(value))) for value in grid]
+def _view(recording: Recording, controller: Controller, demand_nm: Array) -> DriveView:
+    torque = recording.experiment.torque_nm
+    assert torque is not None
+    return DriveView(recording.step_s, controller.torque_limit_nm, demand_nm, torque)
+
+
+def _best(name: str, drive: Drive, squares: Callable[[Drive], float], grid: Array) -> tuple[float, Drive] | None:
+    """(squares left, drive) of the best value of one effect; None where it cannot show."""
+    if grid.size == 0:
+        return None
+    costs = [squares(drive.with_effect(name, float(value))) for value in grid]
     k = int(np.argmin(costs))
+    if grid.size == 1:
+        return costs[0], drive.with_effect(name, float(grid[0]))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)]
-    if k == 0 and name != "torque_saturation":
-        low = 0.0
+    off = all_effects()[name].off[_forms()[name].parameter]
+    if k == 0 and off < low:
+        low = off
     found = optimize.minimize_scalar(
-        lambda value: squares(_with(drive, name, float(value))),
+        lambda value: squares(drive.with_effect(name, float(value))),
         bounds=(low, high),
         method="bounded",
         options={"maxiter": 14},
     )
     value, cost = (float(found.x), float(found.fun)) if found.fun < costs[k] else (float(grid[k]), costs[k])
-    return cost, _with(drive, name, value)
-
-
-def _with(drive: Drive, name: str, value: float) -> Drive:
-    numbers = {f: getattr(drive, f) for f in ("delay_s", "lag_s", "limit_nm", "velocity_lag_s")}
-    return Drive(**{**numbers, _FIELD[name]: value})
+    return cost, drive.with_effect(name, value)
 
 
 def structured_share(recordings: Sequence[Recording], controller: Controller, drive: Drive) -> float:
@@ -297,9 +281,10 @@ def _intervals(
     """95 % half widths from the curvature of the squares at the fit."""
     widths = {}
     for name in found:
-        value = getattr(drive, _FIELD[name])
+        value = drive.effects[name][_forms()[name].parameter]
         h = 0.02 * value
-        bend = squares(_with(drive, name, value + h)) + squares(_with(drive, name, value - h)) - 2.0 * least
+        bend = squares(drive.with_effect(name, value + h)) + squares(drive.with_effect(name, value - h))
+        bend -= 2.0 * least
         variance = least / rows
         widths[name] = 1.96 * math.sqrt(2.0 * variance * h * h / bend) if bend > 0.0 else math.inf
     return widths

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share
+from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share, velocity_lag_s
 from frictid_hil.gap.confidence import confidence
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.forward import Replay, Replayed, pooled, settled_nm, why_not
+from frictid_hil.gap.forward import Replay, Replayed, bounded, pooled, settled_nm, why_not
 from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, needed, shares
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
@@ -22,15 +22,13 @@ from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recor
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.where import where
 from frictid_hil.gap.which import Model, Ranking, best_family, rank, replacements
+from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 
 FAMILY_SHARE = 0.25
 """Share of what is left that a family without a cause may explain before the answer is unknown."""
 FAMILY_AHEAD = 0.03
 """How far such a family alone may be ahead of the library's effects."""
-VELOCITY_EFFECTS = frozenset({"stribeck", "viscous_nonlinearity", "direction_asymmetry"})
-LATE = (("torque_delay", "delay_s"), ("electrical_lag", "time_constant_s"))
-"""Drive effects that make a torque late; the plant may then see it earlier or later than it is reported."""
 DRIVE_CLOSES = 0.25
 """Share of the squared gap above the floor that a fault of the drive may leave and still explain it."""
 COLOURED = 3.0
@@ -73,11 +71,11 @@ def _full(
 ) -> Diagnosis:
     nominal = experiments.nominal
     channels = drive_channels(experiments, logs, allowed)
-    late_s = sum(channels.drive.get(name, {}).get(key, 0.0) for name, key in LATE)
+    found = tuple(channels.actuation.found) if channels.actuation is not None else ()
+    late_s = Drive({name: channels.drive[name] for name in found}).late_s
     evidence = Evidence(logs, channels.kinematic.step_rad, allowed, None, late_s=late_s)
     ranking = rank(evidence)
-    found = channels.actuation.found if channels.actuation is not None else {}
-    replay = Replay(experiments, controller_lags="velocity_lag" in found)
+    replay = Replay(experiments, controller_lags=velocity_lag_s({name: channels.drive[name] for name in found}) > 0.0)
     judged = [r for r in logs if r.experiment.validation] or list(logs)
     has_validation = any(r.experiment.validation for r in logs)
     low_pass = LowPass.at(1.0 / logs[0].step_s)
@@ -173,7 +171,7 @@ def verdict_of(f: Features) -> tuple[str, str]:
     if not f.rivals and f.after**2 - 1.0 < DRIVE_CLOSES * (f.before**2 - 1.0):
         return "explained", ""
     # A velocity curve that fits better than a velocity effect's formula is still that effect.
-    same_kind = f.family_name == "velocity" and bool(VELOCITY_EFFECTS & set(f.names))
+    same_kind = f.family_name == "velocity" and any(_shapes_the_curve(name) for name in f.names)
     plant_alone = bool(f.rivals) and set(f.rivals) == set(f.names)
     if plant_alone and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1 and not same_kind:
         return "unknown", f.family_name
@@ -184,32 +182,27 @@ def verdict_of(f: Features) -> tuple[str, str]:
     return "explained", ""
 
 
+def _shapes_the_curve(name: str) -> bool:
+    """Whether an effect is above all a change of the friction curve."""
+    effect = all_effects()[name]
+    return effect.inverse is not None and effect.signature.regions[0] is Region.VELOCITY_BAND
+
+
 def drive_channels(experiments: ExperimentSet, logs: Sequence[Recording], allowed: Sequence[str]) -> _Channels:
     """What the kinematic and the actuation channel say."""
     nominal = experiments.nominal
-    kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s)
-    drive: dict[str, dict[str, float]] = {}
-    lag_s = 0.0
-    if "velocity_lag" in allowed and kinematic.lag_share > 0.5 and kinematic.before_rad_s > 1e-3:
-        lag_s = kinematic.velocity_lag_s
-        drive["velocity_lag"] = {"time_constant_s": lag_s}
-    if "encoder_quantisation" in allowed and kinematic.step_factor > 1.5:
-        drive["encoder_quantisation"] = {"step_rad": kinematic.step_rad}
+    kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s, allowed)
+    drive = {name: dict(values) for name, values in kinematic.found.items()}
     actuation = None
     left = 0.0
     if nominal.controller is not None and any(r.actuation_nm is not None for r in logs):
-        believed = Drive(nominal.torque_delay_s, nominal.current_lag_s)
         # The controller's own velocity may lag too; that is a fact of the recording, whatever effect it is called.
-        actuation = fit_actuation(logs, nominal.controller, believed, allowed, lag_s)
+        seen = {name: kinematic.read[name] for name in kinematic.found}
+        actuation = fit_actuation(logs, nominal.controller, Drive(nominal.believed_effects), allowed, seen)
         left = structured_share(logs, nominal.controller, actuation.drive)
-        if "torque_delay" in actuation.found:
-            drive["torque_delay"] = {"delay_s": actuation.drive.delay_s}
-        if "electrical_lag" in actuation.found:
-            drive["electrical_lag"] = {"time_constant_s": actuation.drive.lag_s}
-        if "torque_saturation" in actuation.found:
-            limit = nominal.controller.torque_limit_nm
-            if math.isfinite(limit):
-                drive["torque_saturation"] = {"limit_share": min(1.0, actuation.drive.limit_nm / limit)}
+        for name in actuation.found:
+            if name not in drive:
+                drive[name] = bounded(name, actuation.drive.effects[name])
     return _Channels(kinematic, actuation, drive, left)
 
 
@@ -245,14 +238,16 @@ def _needed_drive(
     kept: dict[str, dict[str, float]] = {}
     controller = experiments.nominal.controller
     for name, values in channels.drive.items():
-        if name == "velocity_lag":
+        form = all_effects()[name].kinematic if name in channels.kinematic.found else None
+        if form is not None and not form.position_step:
             kept[name] = values
-        elif name == "encoder_quantisation":
+        elif form is not None:
+            step_rad = values[form.parameter]
             view = judged[0].view
             assert view is not None
             inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
-            noise = inertia * values["step_rad"] / math.sqrt(12.0) * acceleration_gain(low_pass)
-            stuck = view.stiffness_nm_per_rad * values["step_rad"] / math.sqrt(12.0) * 0.2
+            noise = inertia * step_rad / math.sqrt(12.0) * acceleration_gain(low_pass)
+            stuck = view.stiffness_nm_per_rad * step_rad / math.sqrt(12.0) * 0.2
             if math.hypot(noise, stuck) > 0.8 * min(noise_nm, 0.75 * floor):
                 kept[name] = values
         else:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import gzip
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import yaml
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.effects import all_effects
 
 MAX_ROWS = 2_000_000
 """Rows of one log that are read; a longer one is refused with advice, not quietly cut."""
@@ -84,8 +85,7 @@ class Nominal:
         controller: of the position loop.
         rated_torque_nm: of the drive, joint side.
         torque_quantum_nm: step of the reported torque.
-        torque_delay_s: known delay from command to torque.
-        current_lag_s: known time constant of the current loop.
+        believed_effects: what the file already says of the drive (its delay, its current loop), as effects by name.
         encoder_resolution_rad: step of the reported position, joint side.
         velocity_filter_s: known time constant of the reported velocity.
         document: the whole file, for writing an improved one.
@@ -102,8 +102,7 @@ class Nominal:
     controller: Controller | None = None
     rated_torque_nm: float | None = None
     torque_quantum_nm: float | None = None
-    torque_delay_s: float = 0.0
-    current_lag_s: float = 0.0
+    believed_effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     encoder_resolution_rad: float | None = None
     velocity_filter_s: float = 0.0
     document: Mapping[str, Any] | None = None
@@ -215,8 +214,7 @@ def nominal_from_mapping(document: Mapping[str, Any], where: str) -> Nominal:
         ),
         rated_torque_nm=number.optional(drive, "rated_torque_nm"),
         torque_quantum_nm=number.optional(drive, "torque_quantum_nm"),
-        torque_delay_s=number.optional(drive, "torque_delay_s") or 0.0,
-        current_lag_s=number.optional(drive, "current_lag_s") or 0.0,
+        believed_effects=_believed_effects(drive, number),
         encoder_resolution_rad=number.optional(encoder, "resolution_rad"),
         velocity_filter_s=number.optional(encoder, "velocity_filter_s") or 0.0,
         document=document,
@@ -242,6 +240,15 @@ class _Numbers:
         if value is None:
             raise ConfigError(f"`{key}` is missing", where=self._where)
         return value
+
+
+def _believed_effects(drive: Mapping[str, Any], number: _Numbers) -> dict[str, dict[str, float]]:
+    found = {}
+    for name, effect in all_effects().items():
+        form = effect.actuation
+        if form is not None and form.believed_as and (value := number.optional(drive, form.believed_as)):
+            found[name] = {form.parameter: value}
+    return found
 
 
 def _command_rate(controller: Mapping[str, Any], where: str) -> str:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.actuation import velocity_lag_s
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, first_slide, friction_scales, rms
 from frictid_hil.simulation.effects import all_effects
@@ -66,11 +67,6 @@ def nominal_model(nominal: Nominal) -> JointModel:
     _, stiffness = friction_scales(nominal)
     rated = nominal.rated_torque_nm or 1.0
     quantum = nominal.torque_quantum_nm or 0.0
-    effects: dict[str, dict[str, float]] = {}
-    if nominal.torque_delay_s > 0.0:
-        effects["torque_delay"] = {"delay_s": nominal.torque_delay_s}
-    if nominal.current_lag_s > 0.0:
-        effects["electrical_lag"] = {"time_constant_s": nominal.current_lag_s}
     payload = nominal.payload
     return JointModel(
         inertia_kg_m2=nominal.inertia_kg_m2,
@@ -88,7 +84,7 @@ def nominal_model(nominal: Nominal) -> JointModel:
             nominal.controller.kp_nm_per_rad, nominal.controller.ki_nm_per_rad_s, nominal.controller.kd_nm_s_per_rad
         ),
         payload=None if payload is None else Payload(payload.inertia_kg_m2, payload.gravity_cos_nm),
-    ).with_effects(effects)
+    ).with_effects(nominal.believed_effects)
 
 
 def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
@@ -137,7 +133,7 @@ class Replay:
             substep_s: of the physics.
         """
         model = self.model(effects)
-        lag_s = effects.get("velocity_lag", {}).get("time_constant_s", 0.0) if self._lagging else 0.0
+        lag_s = velocity_lag_s(effects) if self._lagging else 0.0
         # Two first-order lags in a row are close to one of their summed time constants.
         controller = replace(self._controller, velocity_filter_s=self._controller.velocity_filter_s + lag_s)
         carried = any(all_effects()[name].carried for name in effects)
@@ -209,36 +205,18 @@ class Refined:
     squares: float
 
 
-FIXED = frozenset(
-    {
-        "cycles_per_motor_revolution",
-        "second_cycles_per_motor_revolution",
-        "power_w",
-        "rise_c",
-        "contact_relaxation_s",
-        "relaxation_s",
-        "step_rad",
-        "quadratic_per_nm",
-        "limit_share",
-        "loop_beta",
-    }
-)
-"""Parameters that a replay is not asked to refine: read elsewhere, or without a clear trace of their own."""
-
-
 def refine(replay: Replay, effects: Effects, rounds: int = 3) -> Refined:
     """Refine parameters by damped Gauss-Newton steps on the identification logs' torque, within the effects' bounds.
 
     Drive effects are left alone: the actuation channel sees them sample by sample, which a replay does not do better.
     """
-    drive = {"torque_delay", "electrical_lag", "torque_saturation", "velocity_lag", "encoder_quantisation"}
     current = {name: all_effects()[name].complete(bounded(name, values)) for name, values in effects.items()}
     free: list[tuple[str, str, float, float, float]] = []
     for name in current:
-        if name in drive:
+        if all_effects()[name].inverse is None:
             continue
         for p in all_effects()[name].parameters:
-            if p.name in FIXED or p.name not in effects[name]:
+            if not p.replayed or p.name not in effects[name]:
                 continue
             if p.name.startswith("second_") and current[name].get("second_amplitude_nm", 0.0) == 0.0:
                 continue

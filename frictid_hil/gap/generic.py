@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.residuals import lagged
 from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.inverse_loops import lagged
 
 DESCRIPTIONS = {
     "position": "a torque that depends on position alone",

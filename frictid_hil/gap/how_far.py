@@ -102,7 +102,7 @@ class Judge:
         best = list(groups)
         for k, group in enumerate(groups):
             form = all_effects()[group[0]].inverse
-            if form is None or len(form.shapes) < 3 or group[0] == "torque_ripple":
+            if form is None or len(form.shapes) < 3 or not form.continuous:
                 continue
             shape = {name: refined.effects[group[0]][name] for name in self.evidence.shape(group)}
             added = self.evidence.refine(group[0], shape)

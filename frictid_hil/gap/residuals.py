@@ -22,6 +22,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
 from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.inverse_loops import lagged
 
 CUTOFF_HZ = 20.0
 """Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
@@ -319,17 +320,6 @@ def _integrated(direct: Array, integral_step: Array, limit: float, start: float)
 def held(demand_nm: Array) -> Array:
     """Torque that a drive without delay reports for a demand in force from each sample on: one row later."""
     return np.concatenate([demand_nm[:1], demand_nm[:-1]])
-
-
-def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:
-    """First-order lag, exact for held input; starts settled."""
-    if time_constant_s <= 0.0:
-        return values
-    share = 1.0 - math.exp(-step_s / time_constant_s)
-    b, a = np.array([share]), np.array([1.0, share - 1.0])
-    out, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
-    filtered: Array = out
-    return filtered
 
 
 def settled(residual_nm: Array, step_s: float) -> Array:

@@ -18,7 +18,8 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.next_experiment import next_experiment
-from frictid_hil.gap.residuals import Recording, lagged, rms
+from frictid_hil.gap.residuals import Recording, rms
+from frictid_hil.simulation.inverse_loops import lagged
 
 LEAST_FALL = 0.1
 """Fall of the held-out RMS that a link of the chain must bring."""

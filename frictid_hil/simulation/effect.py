@@ -3,7 +3,9 @@
 The **forward** form is a set of hooks: plain scalar functions that the joint's kernel calls at named places (*stages*)
 of ``plant.py``. A hook names what it needs in its own signature: parameters of its effect, ``state`` and ``at`` (the
 flat state vector and the effect's first slot in it), or any quantity the stage knows (``velocity_rad_s``, ``step_s``).
-The **inverse** form turns a recording into regressors for the diagnosis. Nothing outside an effect's file lists it.
+The **inverse** forms tell the diagnosis how it shows in a recording: as columns of the torque balance (``inverse``),
+between demand and reported torque (``actuation``), in reported position and velocity (``kinematic``). Nothing outside
+an effect's file lists it.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from enum import Enum
 from typing import Any
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import ActuationForm, KinematicForm
 from frictid_hil.simulation.inverse import InverseForm
 
 
@@ -54,6 +57,7 @@ class Parameter:
         typical: a size met on real joints; the default of a parameter that a file leaves out.
         description: what it is.
         off: the value that makes the whole effect vanish, or None where the parameter only shapes it.
+        replayed: a replay of the closed loop can refine it; false where it is read elsewhere, or leaves no clear trace.
     """
 
     name: str
@@ -62,6 +66,7 @@ class Parameter:
     typical: float
     description: str
     off: float | None = None
+    replayed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +113,23 @@ class Hook:
 
 
 @dataclass(frozen=True, slots=True)
+class Parting:
+    """The experiment in which an effect behaves differently from one that looks like it.
+
+    Attributes:
+        rival: name of the other effect; either one's file may tell.
+        experiment: to record.
+        why: what happens in it, one line.
+        duration_s: of its motion.
+    """
+
+    rival: str
+    experiment: str
+    why: str
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Effect:
     """One physical effect; see the module's first page.
 
@@ -119,7 +141,10 @@ class Effect:
         signature: where it shows.
         hooks: the forward form.
         illustrate: a plot of the effect at given parameters (``typical`` ones when empty).
-        inverse: the inverse form, for effects that show in the plant; None for those of drive and encoder.
+        inverse: how it shows in the plant; None for effects of drive and encoder.
+        actuation: how it shows between demand and reported torque, where it does.
+        kinematic: how it shows in reported position and velocity, where it does.
+        parted: what tells it from effects that look like it.
         state_size: number of slots in the state vector.
         carried: its state survives from one recording to the next (temperature).
     """
@@ -132,6 +157,9 @@ class Effect:
     hooks: tuple[Hook, ...]
     illustrate: Callable[[Mapping[str, float]], Illustration]
     inverse: InverseForm | None = None
+    actuation: ActuationForm | None = None
+    kinematic: KinematicForm | None = None
+    parted: tuple[Parting, ...] = ()
     state_size: int = 0
     carried: bool = False
 

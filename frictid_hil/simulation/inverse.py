@@ -74,12 +74,15 @@ class InverseForm:
         regressors: (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
         parameters: (shape, coefficients (k,)) -> the effect's own parameters.
         first_coefficient: range of the first coefficient that makes physical sense; outside it is another effect.
+        continuous: shapes between the grid's points make sense, so that they may be refined.
+        continuous: shapes between the grid's points make sense, so that a replay may refine them.
     """
 
     shapes: tuple[Shape, ...]
     regressors: Callable[[Sequence[View], Shape], list[Array]]
     parameters: Callable[[Shape, Array], dict[str, float]]
     first_coefficient: tuple[float, float] = (-math.inf, math.inf)
+    continuous: bool = True
 
 
 def grid(**axes: Sequence[float]) -> tuple[Shape, ...]:

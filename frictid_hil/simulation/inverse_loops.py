@@ -1,4 +1,4 @@
-"""Compiled loops of the inverse forms: memories and transmissions driven by a measured motion."""
+"""Loops of the inverse forms: lags, memories and transmissions driven by a measured motion."""
 
 from __future__ import annotations
 
@@ -6,8 +6,20 @@ import math
 
 import numpy as np
 from numba import njit
+from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
+
+
+def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:
+    """First-order lag, exact for held input; starts settled."""
+    if time_constant_s <= 0.0:
+        return values
+    share = 1.0 - math.exp(-step_s / time_constant_s)
+    b, a = np.array([share]), np.array([1.0, share - 1.0])
+    out, _ = signal.lfilter(b, a, values, zi=signal.lfilter_zi(b, a) * values[0])
+    filtered: Array = out
+    return filtered
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -85,7 +85,9 @@ EFFECT = Effect(
     parameters=(
         Parameter("gap_rad", 0.0, 0.05, 1e-3, "whole play, joint side", off=0.0),
         Parameter("contact_stiffness_nm_per_rad", 1e3, 1e6, 2e4, "stiffness of the closed contact"),
-        Parameter("contact_relaxation_s", 0.0, 0.02, 1e-3, "damping over stiffness of the closed contact"),
+        Parameter(
+            "contact_relaxation_s", 0.0, 0.02, 1e-3, "damping over stiffness of the closed contact", replayed=False
+        ),
     ),
     signature=Signature((Channel.PLANT,), (Region.REVERSAL, Region.ACCELERATION, Region.FREQUENCY)),
     hooks=(
@@ -94,6 +96,14 @@ EFFECT = Effect(
         Hook("coupling_damping", coupling_damping, order=60),
     ),
     illustrate=illustrate,
+    parted=(
+        Parting(
+            "joint_elasticity",
+            "moves_payload",
+            "moves through zero load torque: play shows there alone, elasticity everywhere under acceleration",
+            12.0,
+        ),
+    ),
     inverse=InverseForm(
         shapes=grid(
             gap_rad=(1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 5e-3),

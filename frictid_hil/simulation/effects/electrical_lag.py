@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -29,6 +31,24 @@ def settle(state: Any, at: int, torque_nm: float) -> None:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: float) -> Array:
+    """Mean over each step of the lagging torque; exact for held input."""
+    from frictid_hil.simulation.inverse_loops import lagged
+
+    end = lagged(torque_nm, step_s, time_constant_s)
+    start = np.concatenate([end[:1], end[:-1]])
+    share = (time_constant_s / step_s) * (1.0 - math.exp(-step_s / time_constant_s))
+    mean: Array = torque_nm + (start - torque_nm) * share
+    return mean
+
+
+def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
+    """Up to eight samples."""
+    constants = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * views[0].step_s
+    return constants[constants <= EFFECT.parameters[0].upper]
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -59,5 +79,6 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    actuation=ActuationForm("time_constant_s", guesses, reported, order=40, late=True, believed_as="current_lag_s"),
     state_size=1,
 )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -52,6 +52,14 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION,)),
     hooks=(Hook("encoder", encoder),),
     illustrate=illustrate,
+    parted=(
+        Parting(
+            "gravity_error",
+            "second_posture",
+            "the slow triangle around a second posture: gravity's error follows cos(q), an offset's sin(q)",
+            26.0,
+        ),
+    ),
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import Believed, Finding, KinematicForm, MotionView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -17,6 +19,40 @@ def resolution(resolution_rad: float, step_rad: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+COARSER = 1.5
+"""Step over the stated resolution from which it is called coarser."""
+
+
+def read(views: Sequence[MotionView], believed: Believed) -> Finding | None:
+    """The lattice that the positions lie on."""
+    step_rad, factor = position_step([v.position_rad for v in views], believed.resolution_rad)
+    return Finding(step_rad, factor > COARSER)
+
+
+def position_step(positions: Sequence[Array], resolution_rad: float) -> tuple[float, float]:
+    """(step of the lattice that positions lie on, its multiple of the nominal resolution)."""
+    nominal = resolution_rad
+    values = np.unique(np.concatenate([p[:20_000] for p in positions[:6]]))
+    steps = np.diff(values)
+    steps = steps[steps > max(0.5 * nominal, 2e-7)]
+    if steps.size < 20:
+        return nominal, 1.0
+    smallest = float(np.quantile(steps, 0.02))
+    near = steps[steps < 1.5 * smallest]
+    step = float(np.median(near))
+    # Counting the steps from value to value refines the lattice; if there is none, values lie anywhere.
+    counts = np.cumsum(np.concatenate([[0.0], np.round(steps / step)]))
+    ladder = np.concatenate([[0.0], np.cumsum(steps)])
+    slope = float(counts @ ladder / max(counts @ counts, 1e-12))
+    off: Array = steps / slope - np.round(steps / slope)
+    if float(np.sqrt(np.mean(off**2))) > 0.15 or slope < 2e-6:
+        return nominal, 1.0
+    if nominal <= 0.0:
+        return slope, 1.0
+    factor = slope / nominal
+    return (slope, factor) if factor > COARSER else (nominal, 1.0)
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -39,8 +75,11 @@ EFFECT = Effect(
         "Source: R. C. Kavanagh, 'Shaft encoder characterization via theoretical model of differentiator with "
         "both differential and integral nonlinearities', IEEE Trans. Instrumentation and Measurement 49(4), 2000."
     ),
-    parameters=(Parameter("step_rad", 0.0, 5e-3, 1e-4, "true step of the position, joint side", off=0.0),),
+    parameters=(
+        Parameter("step_rad", 0.0, 5e-3, 1e-4, "true step of the position, joint side", off=0.0, replayed=False),
+    ),
     signature=Signature((Channel.KINEMATIC, Channel.PLANT), (Region.KINEMATICS, Region.STANDSTILL)),
     hooks=(Hook("resolution", resolution),),
     illustrate=illustrate,
+    kinematic=KinematicForm("step_rad", read, position_step=True),
 )

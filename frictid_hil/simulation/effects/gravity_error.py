@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -51,6 +51,14 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
     illustrate=illustrate,
+    parted=(
+        Parting(
+            "inertia_error",
+            "sines_payload",
+            "sines with the payload mounted: slow ones show gravity, fast ones inertia",
+            13.0,
+        ),
+    ),
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,

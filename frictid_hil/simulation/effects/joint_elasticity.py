@@ -78,7 +78,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("compliance_rad_per_nm", 0.0, 5e-3, 1e-4, "twist per torque; 0 is rigid", off=0.0),
-        Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness"),
+        Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness", replayed=False),
     ),
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
     hooks=(

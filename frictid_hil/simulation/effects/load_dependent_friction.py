@@ -60,7 +60,13 @@ EFFECT = Effect(
     parameters=(
         Parameter("linear_share", 0.0, 0.8, 0.05, "friction per transmitted torque, N m per N m", off=0.0),
         Parameter(
-            "quadratic_per_nm", 0.0, 0.1, 0.0, "friction per squared transmitted torque, N m per N^2 m^2", off=0.0
+            "quadratic_per_nm",
+            0.0,
+            0.1,
+            0.0,
+            "friction per squared transmitted torque, N m per N^2 m^2",
+            off=0.0,
+            replayed=False,
         ),
     ),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.ACCELERATION)),

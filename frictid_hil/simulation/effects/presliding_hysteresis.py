@@ -92,7 +92,9 @@ EFFECT = Effect(
         Parameter("share", 0.0, 0.9, 0.15, "part of the Coulomb level that builds up slowly", off=0.0),
         Parameter("distance_rad", 2e-4, 0.1, 0.01, "travel over which it builds up"),
         Parameter("loop_exponent", 0.5, 8.0, 1.0, "n: sharpness of the knee"),
-        Parameter("loop_beta", 0.0, 1.0, 1.0, "Bouc-Wen beta: 1 unloads as Dahl, 0.5 along a straight line"),
+        Parameter(
+            "loop_beta", 0.0, 1.0, 1.0, "Bouc-Wen beta: 1 unloads as Dahl, 0.5 along a straight line", replayed=False
+        ),
     ),
     signature=Signature((Channel.PLANT,), (Region.REVERSAL, Region.STANDSTILL)),
     hooks=(

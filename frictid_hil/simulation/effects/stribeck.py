@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -78,6 +78,14 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level),),
     illustrate=illustrate,
+    parted=(
+        Parting(
+            "stiction_breakaway",
+            "breakaway",
+            "break-away after rests of 0.3 to 2.4 s at creep speed: only stiction depends on the rest",
+            14.0,
+        ),
+    ),
     inverse=InverseForm(
         shapes=grid(stribeck_velocity_rad_s=(0.008, 0.015, 0.025, 0.04, 0.06, 0.09, 0.13, 0.2), exponent=(1.0, 2.0)),
         regressors=regressors,

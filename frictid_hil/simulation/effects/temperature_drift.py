@@ -108,8 +108,8 @@ EFFECT = Effect(
         Parameter("coulomb_share", -0.5, 0.9, 0.1, "fall of the sliding level at H = 1", off=0.0),
         Parameter("viscous_share", -0.5, 0.9, 0.3, "fall of the rate part at H = 1", off=0.0),
         Parameter("time_constant_s", 1.0, 5000.0, 200.0, "of warming and cooling"),
-        Parameter("power_w", 0.05, 500.0, 5.0, "friction power that leads to H = 1"),
-        Parameter("rise_c", 0.0, 80.0, 15.0, "temperature rise at H = 1"),
+        Parameter("power_w", 0.05, 500.0, 5.0, "friction power that leads to H = 1", replayed=False),
+        Parameter("rise_c", 0.0, 80.0, 15.0, "temperature rise at H = 1", replayed=False),
     ),
     signature=Signature((Channel.PLANT,), (Region.TEMPERATURE, Region.VELOCITY_BAND)),
     hooks=(

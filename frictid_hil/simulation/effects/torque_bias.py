@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -52,6 +52,20 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft),),
     illustrate=illustrate,
+    parted=(
+        Parting(
+            "direction_asymmetry",
+            "sines_large",
+            "sines over twice the travel up to top speed: a bias stays the same, an asymmetry grows with friction",
+            26.0,
+        ),
+        Parting(
+            "encoder_offset",
+            "second_posture",
+            "the slow triangle around a second posture: a bias stays, an offset's torque follows sin(q)",
+            26.0,
+        ),
+    ),
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -37,6 +39,26 @@ def settle(state: Any, at: int, torque_nm: float) -> None:
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
+
+def reported(torque_nm: Array, delay_s: float, step_s: float, limit_nm: float) -> Array:
+    """The torque of ``delay_s`` before; between samples, the mean of both."""
+    whole, part = divmod(delay_s / step_s, 1.0)
+    late: Array = (1.0 - part) * _shifted(torque_nm, int(whole)) + part * _shifted(torque_nm, int(whole) + 1)
+    return late
+
+
+def _shifted(torque_nm: Array, rows: int) -> Array:
+    if rows <= 0:
+        return torque_nm
+    return np.concatenate([np.full(min(rows, torque_nm.size), torque_nm[0]), torque_nm[:-rows]])
+
+
+def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
+    """Up to eight samples."""
+    delays = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * views[0].step_s
+    return delays[delays <= EFFECT.parameters[0].upper]
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -65,5 +87,15 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    actuation=ActuationForm("delay_s", guesses, reported, order=20, late=True, believed_as="torque_delay_s"),
+    parted=(
+        Parting("electrical_lag", "chirp", "a chirp up to 8 Hz: a lag damps high frequencies, a delay does not", 11.0),
+        Parting(
+            "presliding_hysteresis",
+            "triangle_slow",
+            "a slow triangle: presliding follows travel, a delay follows time",
+            26.0,
+        ),
+    ),
     state_size=1025,
 )

@@ -87,10 +87,10 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("amplitude_nm", 0.0, 50.0, 0.3, "amplitude, joint side", off=0.0),
-        Parameter("cycles_per_motor_revolution", 0.5, 64.0, 2.0, "spatial frequency k"),
+        Parameter("cycles_per_motor_revolution", 0.5, 64.0, 2.0, "spatial frequency k", replayed=False),
         Parameter("phase_rad", -6.2832, 6.2832, 0.0, "phase at joint position 0"),
         Parameter("second_amplitude_nm", 0.0, 50.0, 0.1, "amplitude of a second line, joint side", off=0.0),
-        Parameter("second_cycles_per_motor_revolution", 0.5, 64.0, 4.0, "its spatial frequency"),
+        Parameter("second_cycles_per_motor_revolution", 0.5, 64.0, 4.0, "its spatial frequency", replayed=False),
         Parameter("second_phase_rad", -6.2832, 6.2832, 0.0, "its phase at joint position 0"),
     ),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.FREQUENCY)),
@@ -101,5 +101,6 @@ EFFECT = Effect(
         + tuple({"first": a, "second": b} for a, b in ((1.0, 2.0), (2.0, 4.0), (1.0, 4.0))),
         regressors=regressors,
         parameters=ripples,
+        continuous=False,
     ),
 )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -19,6 +22,22 @@ def current(current_nm: float, limit_nm: float, limit_share: float) -> float:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: float) -> Array:
+    """The torque, clipped."""
+    return np.clip(torque_nm, -limit_share * limit_nm, limit_share * limit_nm)
+
+
+def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
+    """Around the highest torque reported, where more was asked for; none without a stated limit to share."""
+    limit = views[0].limit_nm
+    asked = max(float(np.max(np.abs(v.demand_nm))) for v in views)
+    given = max(float(np.quantile(np.abs(v.torque_nm), 0.999)) for v in views)
+    if not math.isfinite(limit) or given > 0.995 * asked:
+        return np.empty(0)
+    return np.linspace(0.7, 1.05, 15) * given / limit
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -41,8 +60,9 @@ EFFECT = Effect(
         "(CiA 402-2, objects 6072 and 6073); L. Zaccarian, A. R. Teel, 'Modern Anti-windup Synthesis', 2011, for "
         "what follows in the loop."
     ),
-    parameters=(Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0),),
+    parameters=(Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0, replayed=False),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.ACCELERATION)),
     hooks=(Hook("current", current, order=30),),
     illustrate=illustrate,
+    actuation=ActuationForm("limit_share", guesses, reported, order=50),
 )

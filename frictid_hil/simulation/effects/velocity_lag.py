@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import optimize
 
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import ActuationForm, Believed, DriveView, Finding, KinematicForm, MotionView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -27,6 +30,50 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+LEAST_SHARE = 0.5
+"""Part of the channel's squares that a lag must explain."""
+LEAST_RAD_S = 1e-3
+"""RMS of the channel below which nothing is looked for."""
+
+
+def read(views: Sequence[MotionView], believed: Believed) -> Finding | None:
+    """The lag between differenced position and reported velocity, fitted where not judged."""
+    from frictid_hil.simulation.inverse_loops import lagged
+
+    logs = [v for v in views if v.velocity_rad_s is not None]
+    if not logs:
+        return None
+    fitted = [v for v in logs if not v.validation] or logs
+    judged = [v for v in logs if v.validation] or logs
+
+    def squares(view: MotionView, lag_s: float) -> Array:
+        difference = np.diff(view.position_rad, prepend=view.position_rad[0]) / view.step_s
+        nominal = lagged(difference, view.step_s, believed.velocity_filter_s)
+        assert view.velocity_rad_s is not None
+        return np.square(view.velocity_rad_s - lagged(nominal, view.step_s, lag_s))
+
+    def cost(lag_s: float) -> float:
+        return float(sum(np.sum(squares(v, lag_s)) for v in fitted))
+
+    def left(lag_s: float) -> float:
+        return sum(float(np.mean(squares(v, lag_s))) for v in judged) / len(judged)
+
+    grid = [k * fitted[0].step_s for k in (0.3, 0.6, 1, 1.5, 2.5, 4, 7, 12, 20)]
+    grid = [lag for lag in grid if lag < EFFECT.parameters[0].upper]
+    best = int(np.argmin([cost(lag) for lag in grid]))
+    low = grid[best - 1] if best > 0 else 1e-6
+    high = grid[min(best + 1, len(grid) - 1)] * 1.2
+    lag_s = float(optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"maxiter": 15}).x)
+    before, after = left(0.0), left(lag_s)
+    shows = math.sqrt(before) > LEAST_RAD_S and 1.0 - after / before > LEAST_SHARE
+    return Finding(lag_s, shows)
+
+
+def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
+    """What the report shows: the controller's own velocity may lag as much."""
+    return np.array([seen]) if seen is not None else np.empty(0)
+
 
 # -- the effect ---------------------------------------------------------------------------------------------------
 
@@ -58,5 +105,7 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    actuation=ActuationForm("time_constant_s", guesses, None),
+    kinematic=KinematicForm("time_constant_s", read),
     state_size=1,
 )
