@@ -19,6 +19,9 @@ from frictid_hil.errors import PlanRefused
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 
+REHEARSAL = "rehearsal"
+"""Name of the motion that shows a joint's whole travel slowly, with the torque watched."""
+
 
 class Motion(Protocol):
     """One stretch of set-points of one joint.

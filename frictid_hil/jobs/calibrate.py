@@ -25,6 +25,7 @@ from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, refuse_beyond_limits
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
+from frictid_hil.runner.rehearsals import Rehearsals
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
 from frictid_hil.runner.scheduler import Care
@@ -136,7 +137,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         if name not in kept
     }
     expected = expected_of(robot)
-    rehearse = RunFolder.not_yet_rehearsed(robot, list(procedures), robot.driver(options.bus))
+    rehearsals = Rehearsals(robot, options.bus)
+    rehearse = _unseen(rehearsals, setup, procedures, together=options.together)
     notes = [chosen.note(procedure) for procedure in list(procedures.values())[:1]]
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
@@ -184,12 +186,14 @@ def _run(planned: Planned, folder: RunFolder, options: CalibrateOptions, watcher
     setup, plan = planned.setup, planned.plan
 
     before = dict(folder.manifest["identities"])
+    rehearsals = Rehearsals(planned.robot, options.bus)
 
     def notify(event: Event) -> None:
         watcher.event(event)
         if isinstance(event, Preflight):
             _refuse_other_drives(before, event, folder)
         folder.note(event)
+        rehearsals.heed(event, plan)
         if isinstance(event, JointRun):
             _identify(event, folder, planned, watcher, progress)
 
@@ -262,7 +266,6 @@ def _identify(run: JointRun, folder: RunFolder, planned: Planned, watcher: Watch
     progress.joints[run.joint] = profile
     progress.results[run.joint] = {**joint_result(profile), **result}
     folder.keep_joint(run.joint, profile, progress.results[run.joint])
-    folder.remember_rehearsed(run.joint)
     outcome = progress.results[run.joint]["outcome"]
     watcher.joint(run.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
 
@@ -370,11 +373,24 @@ def _tick_note(procedure: Procedure, quantum_s: float) -> str:
     )
 
 
+def _unseen(
+    rehearsals: Rehearsals, setup: RobotSetup, procedures: Mapping[str, Procedure], *, together: bool
+) -> list[str]:
+    """Joints whose travel was never seen slowly."""
+    moving = tuple(procedures) if together else ()
+    starts = {name: setup.joint(name).start_position_rad for name in procedures}
+    return [
+        name
+        for name, procedure in procedures.items()
+        if not rehearsals.covers(name, starts[name], starts[name] + procedure.amplitude_rad, moving)
+    ]
+
+
 def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
     notes = []
     if rehearse:
         notes.append(
-            f"first run on this robot: joints {', '.join(rehearse)} rehearse their whole travel slowly, torque watched"
+            f"first run of this travel on this robot: joints {', '.join(rehearse)} rehearse it slowly, torque watched"
         )
     unknown = [name for name in procedures if name not in expected]
     if unknown:

@@ -45,7 +45,8 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
                     "add `expected:` to the joint in the robot file",
                 )
             )
-    driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    with robot.document.locating():
+        driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
     identities = {}
     try:
         with robot.document.locating():

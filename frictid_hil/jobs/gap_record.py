@@ -33,9 +33,21 @@ from frictid_hil.jobs.gap_belief import Belief, belief_of, read_back
 from frictid_hil.jobs.gap_set import existing_set, write_set
 from frictid_hil.jobs.plans import APPROACH_RAD_S, expected_of
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan, refuse_beyond_limits
+from frictid_hil.plan import (
+    REHEARSAL,
+    Expected,
+    Hold,
+    JointPlan,
+    Motion,
+    Move,
+    Plan,
+    Sine,
+    joint_plan,
+    refuse_beyond_limits,
+)
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.events import Event, JointRun, Preflight
+from frictid_hil.runner.rehearsals import Rehearsals
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
 
@@ -106,12 +118,13 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
             where=str(options.out),
             next_step="choose another --out, or add what a diagnosis asked for with --plan",
         )
-    plans = _plans(robot, setup, joint, experiments, belief)
+    rehearsals = Rehearsals(robot, setup.bus)
+    plans = _plans(robot, setup, joint, experiments, belief, rehearsals)
     for plan, expected in plans:
         refuse_beyond_limits(plan, setup, expected)
     folder = RunFolder.create(robot, VERB, None)
     loaded = [payload for payload in (False, True) if any(e.payload == payload for e in experiments)]
-    run = _Run(driver_name, setup, joint.name, watcher, folder, loaded)
+    run = _Run(driver_name, rehearsals, setup, joint.name, watcher, folder, loaded)
     try:
         run.everything([plan for plan, _ in plans])
     finally:
@@ -187,11 +200,15 @@ def _read_plan(path: Path) -> tuple[str, ...]:
 
 
 def _plans(
-    robot: Robot, setup: RobotSetup, joint: JointSetup, experiments: Sequence[Experiment], belief: Belief
+    robot: Robot,
+    setup: RobotSetup,
+    joint: JointSetup,
+    experiments: Sequence[Experiment],
+    belief: Belief,
+    rehearsals: Rehearsals,
 ) -> list[tuple[Plan, dict[str, Expected]]]:
     """One plan without the payload and one with it, each with what is expected of the joint."""
     expected = expected_of(robot)
-    rehearse = RunFolder.not_yet_rehearsed(robot, [joint.name], robot.driver(setup.bus))
     locked = {other.name: other.locked_position_rad for other in setup.joints if other.name != joint.name}
     plans = []
     for loaded in (False, True):
@@ -212,7 +229,9 @@ def _plans(
                     inertia_kg_m2=expected[joint.name].inertia_kg_m2 + payload["inertia_kg_m2"],
                     gravity_nm=expected[joint.name].gravity_nm + abs(payload["gravity_torque_nm"]),
                 )
-        motions = _motions(joint, group, rehearse=bool(rehearse))
+        # A payload makes another machine of it, whatever was seen without.
+        rehearse = loaded or not rehearsals.covers(joint.name, *_travel(group))
+        motions = _motions(joint, group, rehearse=rehearse)
         entry: JointPlan = joint_plan(joint, motions, locked, of_group.get(joint.name))
         plans.append((Plan(robot.name, setup.cycle_hz, (entry,), tuple(notes)), of_group))
     return plans
@@ -232,7 +251,7 @@ def _motions(joint: JointSetup, experiments: Sequence[Experiment], *, rehearse: 
     if rehearse:
         low, high = _travel(experiments)
         move_to(low)
-        motions.append(Sine(low, high - low, APPROACH_RAD_S, name="rehearsal"))
+        motions.append(Sine(low, high - low, APPROACH_RAD_S, name=REHEARSAL))
     for experiment in experiments:
         move_to(experiment.start_rad)
         motions += [Relax(experiment.start_rad), *experiment.marked_motions]
@@ -253,9 +272,17 @@ class _Run:
     """
 
     def __init__(
-        self, driver_name: str, setup: RobotSetup, joint: str, watcher: Watcher, folder: RunFolder, loaded: list[bool]
+        self,
+        driver_name: str,
+        rehearsals: Rehearsals,
+        setup: RobotSetup,
+        joint: str,
+        watcher: Watcher,
+        folder: RunFolder,
+        loaded: list[bool],
     ) -> None:
         self._driver_name = driver_name
+        self._rehearsals = rehearsals
         self._setup = setup
         self._joint = joint
         self._watcher = watcher
@@ -292,7 +319,7 @@ class _Run:
                     self._setup,
                     plan,
                     keeper,
-                    notify=self._notice,
+                    notify=lambda event: self._notice(event, plan),
                     proceed=lambda preflight: self._proceed(plan, preflight),
                     prepare=self._remember,
                 )
@@ -310,9 +337,10 @@ class _Run:
         self._mount()
         return True
 
-    def _notice(self, event: Event) -> None:
+    def _notice(self, event: Event, plan: Plan) -> None:
         self._watcher.event(event)
         self._folder.note(event)
+        self._rehearsals.heed(event, plan)
         if isinstance(event, Preflight):
             self.identity = event.identities[self._joint]
         elif isinstance(event, JointRun):

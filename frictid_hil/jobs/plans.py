@@ -14,6 +14,7 @@ from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.plan import (
+    REHEARSAL,
     Corners,
     Cycles,
     Expected,
@@ -45,7 +46,7 @@ def calibration_motions(
     drift_speed = float(procedure.peak_velocities_rad_s[procedure.cycles // 4])
     motions: list[Motion] = [Move.within(home, start, APPROACH_RAD_S)] if home != start else []
     if rehearse:
-        motions.append(Sine(start, amplitude, min(APPROACH_RAD_S, procedure.velocity_rad_s), name="rehearsal"))
+        motions.append(Sine(start, amplitude, min(APPROACH_RAD_S, procedure.velocity_rad_s), name=REHEARSAL))
     longest_s = 0.0 if warm_up is None else warm_up.max_s if warm_up.fixed_s is None else warm_up.fixed_s
     if warm_up is not None and longest_s > 0.0:
         limit = warm_up.settled_percent_per_min if warm_up.fixed_s is None else None

@@ -15,7 +15,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -176,14 +175,6 @@ class RunFolder:
             )
         return RunFolder(path, robot, manifest)
 
-    @staticmethod
-    def not_yet_rehearsed(robot: Robot, joints: list[str], driver: str) -> list[str]:
-        """Joints whose whole travel was never seen slowly with this configuration; a simulated robot's always."""
-        if driver == "virtual":
-            return joints
-        known = _rehearsed(robot)
-        return [joint for joint in joints if joint not in known]
-
     @contextmanager
     def keeping(self, setup: RobotSetup, at: Callable[[float], None]) -> Iterator[RowKeeper]:
         """The files of a run, closed whatever happens."""
@@ -252,13 +243,6 @@ class RunFolder:
             except (ValueError, KeyError, TypeError) as error:
                 raise ConfigError(f"not a finished joint of a run: {error}", where=str(path)) from error
         return kept
-
-    def remember_rehearsed(self, joint: str) -> None:
-        """This joint's whole travel was seen slowly with this configuration."""
-        known = _rehearsed(self._robot) | {joint}
-        place = _rehearsed_path(self._robot)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(place, json.dumps({"config_sha256": self._robot.digest, "joints": sorted(known)}))
 
     def write_profile(self, profile: FrictionProfile) -> Path:
         """Write ``profile.yaml``."""
@@ -346,16 +330,3 @@ def _unused(parent: Path, name: str) -> Path:
         k += 1
         path = parent / f"{name}-{k}"
     return path
-
-
-def _rehearsed_path(robot: Robot) -> Path:
-    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return state / "frictid-hil" / "rehearsed" / f"{robot.name}.json"
-
-
-def _rehearsed(robot: Robot) -> set[str]:
-    try:
-        known = json.loads(_rehearsed_path(robot).read_text())
-        return set(known["joints"]) if known["config_sha256"] == robot.digest else set()
-    except (OSError, ValueError, KeyError, TypeError):
-        return set()  # never rehearsed, or a file that cannot be trusted: rehearse again

@@ -35,7 +35,7 @@ from frictid_hil.driver import (
     Severity,
 )
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, ProfileMismatch, SafetyAbort
-from frictid_hil.plan import JointPlan, Motion, Move, Plan, WarmUp, stretch_name
+from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move, Plan, WarmUp, stretch_name
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, StopRequest, Stream
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
@@ -298,7 +298,7 @@ class Scheduler:
                 mark = self._probe(loop, moving, motion)
             elif isinstance(motion, WarmUp):
                 mark = self._warm_up(loop, moving, motion)
-            elif motion.name == "rehearsal":
+            elif motion.name == REHEARSAL:
                 mark = self._rehearse(loop, supervisor, moving, plan, motion)
             else:
                 mark = self._stream(loop, moving, motion)

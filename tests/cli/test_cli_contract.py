@@ -103,6 +103,13 @@ def test_errors_keep_file_line_and_column(tmp_path: Path) -> None:
     assert "gear_ratio" in result.stderr, "the nearest known key is suggested"
 
 
+def test_what_a_driver_misses_is_told_with_its_place() -> None:
+    result = run("check", "--robot", "hp3j.yaml", "--bus", "serial:/dev/nowhere")
+    assert result.returncode == 2
+    assert "hp3j.yaml:" in result.stderr
+    assert "joints.0.options.pulses_per_degree" in result.stderr
+
+
 @pytest.mark.parametrize("verb", [("check",), ("calibrate", "--joint", "5", "--yes")])
 def test_a_simulated_joint_that_cannot_be_is_told_with_its_place(verb: tuple[str, ...], tmp_path: Path) -> None:
     site = tmp_path / "site.yaml"

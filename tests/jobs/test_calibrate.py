@@ -9,10 +9,11 @@ import pytest
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import PlanRefused
-from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan import REHEARSAL
 from frictid_hil.runner.run_folder import load_manifest
 
 
@@ -68,6 +69,12 @@ def test_the_same_seed_gives_the_same_bytes_but_for_provenance(joint_5: Path, tm
     first = (joint_5 / "profile.yaml").read_text().split("provenance:")[0]
     second = (tmp_path / "second" / "profile.yaml").read_text().split("provenance:")[0]
     assert first == second
+
+
+def test_a_run_on_simulated_drives_spares_no_real_joint_its_rehearsal(joint_5: Path) -> None:
+    planned = plan_calibration(CalibrateOptions("hp3j.yaml", bus="socketcan:can0", joints=("5",)))
+    assert REHEARSAL in [motion.name for motion in planned.plan.joints[0].motions]
+    assert "rehearse it slowly" in " ".join(planned.plan.notes)
 
 
 def test_the_plan_is_refused_before_anything_is_written(tmp_path: Path) -> None:
