@@ -6,6 +6,8 @@
 ``least-squares`` one linear model of the whole recording
 ================  =====================================================================================
 
+Where the recording shows a link swinging on a soft joint, the last two leave its torque out.
+
 The published result always stands beside the chosen one.
 """
 
@@ -21,6 +23,7 @@ from frictid_hil.friction import intervals, least_squares
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.least_squares import RippleTable
+from frictid_hil.friction.link import Link, soft_link, without
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.regression import Fit, fit
 from frictid_hil.friction.rigid_body import COVERAGE, Measured, RigidBody, rigid_body
@@ -96,10 +99,15 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     published = _published(recording, notes, required=method == "function-a")
     windows = intervals.aligned_pairs(recording, motion)
     level = float(np.mean(windows.torque_nm))
+    link = _link(recording, motion, level, notes)
+    if link is not None:
+        motion = without(motion, link)
+        windows = intervals.aligned_pairs(recording, motion)
     drift = intervals.repeated(recording, motion, windows)
     solved: Fit | None = None
+    doubtful = None if link is None else link.columns
     try:
-        solved = fit(recording, motion, least_squares.curve_knots(recording), level)
+        solved = fit(recording, motion, least_squares.curve_knots(recording), level, doubtful=doubtful)
     except IdentificationError as problem:
         if method == "least-squares":
             raise
@@ -113,10 +121,10 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         assert solved is not None
         kept = least_squares.trusted(recording, solved, level)
         curve = least_squares.curve_of(solved, kept, recording.where)
-        terms = intervals.least_squares_terms(recording, motion, solved, kept, drift)
+        terms = intervals.least_squares_terms(recording, motion, solved, kept, drift, link)
         half = terms.half_width_nm
     else:
-        terms = intervals.window_terms(recording, motion, windows, solved, drift)
+        terms = intervals.window_terms(recording, motion, windows, solved, drift, link)
         half = terms.half_width_nm
         if method == "function-a":
             assert published is not None
@@ -126,7 +134,6 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         curve = pairs.curve(where=recording.where)
         half = half[np.argsort(pairs.velocity_rad_s, kind="stable")]
 
-    soft, ripple = _optional(recording, motion, level, notes)
     speeds = np.asarray(curve.velocity_rad_s)
     return Estimate(
         method=method,
@@ -137,8 +144,8 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         pairs=pairs,
         published=published,
         rigid_body=None if solved is None else rigid_body(recording, solved),
-        ripple=ripple,
-        link_resonance_hz=soft,
+        ripple=_ripple(recording, motion, level, notes),
+        link_resonance_hz=None if link is None else link.resonance_hz,
         drift=drift,
         terms=terms,
         notes=tuple(notes),
@@ -177,17 +184,23 @@ def _published(recording: CycleRecording, notes: list[str], *, required: bool) -
         return None
 
 
-def _optional(
-    recording: CycleRecording, motion: Motion, level: float, notes: list[str]
-) -> tuple[Measured | None, RippleTable | None]:
+def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> Link | None:
     try:
-        soft = least_squares.link_resonance_hz(recording, motion, level)
+        link = soft_link(recording, motion, level)
     except IdentificationError as problem:
-        notes.append(f"the link's resonance is not known: {problem.what}")
-        soft = None
+        notes.append(f"whether the link swings is not known: {problem.what}")
+        return None
+    if link is not None:
+        notes.append(
+            f"a soft joint: the link swings at {link.resonance_hz.value:.1f} Hz; its torque was computed from the "
+            "position and taken off"
+        )
+    return link
+
+
+def _ripple(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> RippleTable | None:
     try:
-        ripple = least_squares.ripple_table(recording, motion, level)
+        return least_squares.ripple_table(recording, motion, level)
     except IdentificationError as problem:
         notes.append(f"the torque ripple is not known: {problem.what}")
-        ripple = None
-    return soft, ripple
+        return None

@@ -4,7 +4,8 @@
   and friction that depends on the place show as their disagreement;
 * **skew**: one standard deviation of undeclared delay between torque and position, through the very same windows;
 * **model**: the distance between windows and global least squares, two estimators that fail differently;
-* **drift**: friction changed between the first and the second run of the repeated cycle.
+* **drift**: friction changed between the first and the second run of the repeated cycle;
+* **link**: the swinging of a soft joint's link, taken off the torque, is known only so well.
 
 For least squares, scatter comes from leaving out one quarter cycle after the other (a jackknife over passes, so that
 misfit that lasts a pass is counted once, not per sample), and the model term from the bend that a line cannot follow.
@@ -20,6 +21,7 @@ from scipy.stats import t as student
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
+from frictid_hil.friction.link import Link
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
@@ -40,17 +42,20 @@ class Terms:
         skew: undeclared torque delay.
         model: what the estimator leaves out.
         drift: friction that changed while it was measured.
+        link: torque of the swinging link.
     """
 
     scatter: Array
     skew: Array
     model: Array
     drift: Array
+    link: Array
 
     @property
     def half_width_nm(self) -> Array:
         """Half of the 95 % interval, shape (N,)."""
-        half: Array = COVERAGE * np.sqrt(self.scatter**2 + self.skew**2 + self.model**2 + self.drift**2)
+        terms = self.scatter, self.skew, self.model, self.drift, self.link
+        half: Array = COVERAGE * np.sqrt(sum(term**2 for term in terms))
         return half
 
 
@@ -82,7 +87,12 @@ def aligned_pairs(recording: CycleRecording, motion: Motion, column: Array | Non
 
 
 def window_terms(
-    recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs, solved: Fit | None, drift: Drift | None
+    recording: CycleRecording,
+    motion: Motion,
+    pairs: IdentifiedPairs,
+    solved: Fit | None,
+    drift: Drift | None,
+    link: Link | None,
 ) -> Terms:
     """Terms of the aligned Function A.
 
@@ -92,6 +102,7 @@ def window_terms(
         pairs: of the same columns.
         solved: the least-squares model of the same columns; None where it could not be solved.
         drift: the repeated cycle; None without one.
+        link: what was taken off the torque; None of a rigid joint.
     """
     rate = np.gradient(motion.torque_nm, motion.smoother.step_s)
     slope = aligned_pairs(recording, motion, rate).torque_nm
@@ -104,11 +115,23 @@ def window_terms(
         skew=np.abs(slope) * recording.skew.uncertainty_s,
         model=model,
         drift=pairs.torque_nm * _drift_share(recording, scatter, drift),
+        link=np.zeros_like(slope) if link is None else _spread(_windowed(recording, motion, link), link.covariance),
     )
 
 
+def _windowed(recording: CycleRecording, motion: Motion, link: Link) -> Array:
+    """What each window makes of the link's columns, shape (N, m)."""
+    return np.column_stack([aligned_pairs(recording, motion, column).torque_nm for column in link.columns.T])
+
+
+def _spread(weights: Array, covariance: Array) -> Array:
+    """Standard deviation of ``weights @ x``, shape (N,) for weights of shape (N, m)."""
+    spread: Array = np.sqrt(np.einsum("nj,jk,nk->n", weights, covariance, weights))
+    return spread
+
+
 def least_squares_terms(
-    recording: CycleRecording, motion: Motion, solved: Fit, kept: slice, drift: Drift | None
+    recording: CycleRecording, motion: Motion, solved: Fit, kept: slice, drift: Drift | None, link: Link | None
 ) -> Terms:
     """Terms of the global least squares at its trusted knots."""
     odd, knots = solved.odd_nm, solved.knots
@@ -123,6 +146,7 @@ def least_squares_terms(
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
         model=bend[kept],
         drift=np.abs(odd[kept]) * _drift_share(recording, _scatter(recording, motion, solved), drift),
+        link=np.zeros_like(odd[kept]) if link is None else _spread(solved.per_doubt[odd_block], link.covariance)[kept],
     )
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.recording import CycleRecording, Motion
-from frictid_hil.friction.regression import COARSE, RIPPLE_ORDERS, Fit, fit
-from frictid_hil.friction.rigid_body import COVERAGE, Measured
+from frictid_hil.friction.regression import RIPPLE_ORDERS, Fit, fit
+from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
 _SLOW = np.array([0.0, 0.006, 0.0125, 0.019, 0.027, 0.037, 0.055])
@@ -41,6 +41,11 @@ def curve_knots(recording: CycleRecording) -> Array:
     return np.concatenate([_SLOW, _FAST]) * recording.procedure.velocity_rad_s
 
 
+def few_knots(recording: CycleRecording) -> Array:
+    """Every second slow knot and all fast ones: enough where not the curve is asked for but what goes beside it."""
+    return curve_knots(recording)[[0, 2, 4, 6, *range(7, 17)]]
+
+
 def trusted(recording: CycleRecording, solved: Fit, level_nm: float) -> slice:
     """The knots that make the curve: all fast ones, and slow ones down to the first that is not known well."""
     half = COVERAGE * solved.deviation(recording.skew.uncertainty_s)[solved.blocks.odd]
@@ -54,28 +59,6 @@ def curve_of(solved: Fit, kept: slice, where: str) -> FrictionCurve:
     return FrictionCurve.through(solved.knots[kept], solved.odd_nm[kept], where=where)
 
 
-def link_resonance_hz(recording: CycleRecording, motion: Motion, level_nm: float) -> Measured | None:
-    """Frequency at which the link behind the gear would swing, or None while the joint looks rigid.
-
-    A soft joint's torque follows I a - (I / w_r^2) d2a/dt2 far below its resonance w_r (of the two masses free of each
-    other's support, for a link as heavy as the motor side). A wide kernel keeps the ringing itself out.
-
-    Raises:
-        IdentificationError: as ``regression.fit``.
-    """
-    knots = curve_knots(recording)[[0, 2, 4, 6, *range(7, 17)]]
-    solved = fit(recording, motion, knots, level_nm, width_rad=COARSE, compliance=True)
-    index = solved.blocks.compliance
-    assert index is not None
-    inertia = solved.values[solved.blocks.inertia]
-    softness = -solved.values[index] / inertia
-    half = COVERAGE * np.sqrt(solved.covariance[index, index]) / inertia
-    if softness < 1.5 * half or softness <= 0:
-        return None
-    frequency = 1 / (2 * np.pi * np.sqrt(softness))
-    return Measured(float(frequency), float(frequency * half / softness / 2))
-
-
 def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, points: int = 64) -> RippleTable | None:
     """The ripple over one motor revolution, or None where it is not known or not larger than its uncertainty.
 
@@ -84,8 +67,9 @@ def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, 
     """
     if recording.prismatic or not np.isfinite(recording.gear_ratio):
         return None
-    knots = curve_knots(recording)[[0, 2, 4, 6, *range(7, 17)]]
-    solved = fit(recording, motion, knots, level_nm, width_rad=0.0)  # the narrowest kernel: ripple is fast
+    solved = fit(
+        recording, motion, few_knots(recording), level_nm, width_rad=0.0
+    )  # the narrowest kernel: ripple is fast
     count = (solved.blocks.ripple.stop - solved.blocks.ripple.start) // 3
     plain = slice(solved.blocks.ripple.start, solved.blocks.ripple.start + count)
     values = solved.values[plain]

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, gaussian_filter1d
+from scipy.ndimage import binary_dilation
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.recording import CycleRecording, Motion
@@ -31,9 +31,8 @@ BIAS_PRIOR = 0.15
 """Over a short travel a constant and gravity look alike; a bias is expected within this share of the friction."""
 BEND_PRIOR = 0.005
 """Above the slow knots a curve is expected to leave its neighbours' line by this share of the friction."""
-FINE, COARSE = 0.2, 0.5
-"""Widths of the kernel in radians of the fastest cycle: one that keeps the curve, one that keeps vibration out."""
-
+FINE = 0.2
+"""Width of the kernel in radians of the fastest cycle: it keeps the curve."""
 
 _REACH = 4.5
 """Half length of the kernel in widths."""
@@ -50,7 +49,7 @@ class Blocks:
         odd: F_k at the knots.
         even: E_k at EVEN_KNOTS but the first, times the highest knot.
         ripple: cos of every order, sin of every order; plain, times direction, times velocity.
-        compliance: index of the second derivative of the acceleration (None where not asked for).
+        extra: further columns that the caller brought.
         size: number of columns.
     """
 
@@ -60,7 +59,7 @@ class Blocks:
     odd: slice
     even: slice
     ripple: slice
-    compliance: int | None
+    extra: slice
     size: int
 
 
@@ -74,6 +73,7 @@ class Fit:
         values: coefficients, shape (size,).
         covariance: by leaving out one quarter cycle after the other, shape (size, size).
         per_second_of_skew: change of the coefficients per second of undeclared torque delay, shape (size,).
+        per_doubt: change of the coefficients for one of each doubtful column less in the torque, shape (size, m).
         unobserved: speeds of the hats that too few samples saw; they were left out.
         residual_rms_nm: of the filtered torque.
     """
@@ -83,6 +83,7 @@ class Fit:
     values: Array
     covariance: Array
     per_second_of_skew: Array
+    per_doubt: Array
     unobserved: Array
     residual_rms_nm: float
 
@@ -111,7 +112,8 @@ def fit(
     level_nm: float,
     *,
     width_rad: float = FINE,
-    compliance: bool = False,
+    extra: Array | None = None,
+    doubtful: Array | None = None,
 ) -> Fit:
     """Solve the model on every sample of the cycles that is not guarded.
 
@@ -121,11 +123,105 @@ def fit(
         knots: speeds of the odd hats, increasing, the first may be 0, shape (k,).
         level_nm: typical friction torque; scale of the prior on the bias.
         width_rad: of the kernel, in radians of the fastest cycle.
-        compliance: also ask for the torque that goes with the acceleration's second derivative (a soft link).
+        extra: further columns of the model, shape (n, m).
+        doubtful: columns of which the torque may hold more or less than was taken off, shape (n, m).
 
     Raises:
         IdentificationError: too few samples remain, or the columns are linearly dependent.
     """
+    chosen = _choose(recording, motion, width_rad)
+    observed = chosen.observed(motion, knots)
+    columns, blocks = _columns(recording, motion, knots[observed], extra)
+    late = np.gradient(motion.torque_nm, motion.smoother.step_s)
+    doubts = np.zeros((late.size, 0)) if doubtful is None else doubtful
+    both = np.column_stack([columns, motion.torque_nm, late, doubts])
+    both = _smoothed_rows(both, chosen.rows, chosen.width)
+    values, covariance, drawn, residual_rms = _solve(
+        both[:, : blocks.size],
+        both[:, blocks.size :],
+        chosen.quarter[chosen.rows],
+        _priors(blocks, knots[observed], level_nm, chosen.rows_alike),
+        recording.where,
+    )
+    return Fit(
+        blocks,
+        knots[observed],
+        values,
+        covariance,
+        per_second_of_skew=-drawn[:, 0],
+        per_doubt=-drawn[:, 1:],
+        unobserved=knots[~observed],
+        residual_rms_nm=residual_rms,
+    )
+
+
+class Unexplained:
+    """What the model leaves of the torque, and how much less it would leave with one column more."""
+
+    def __init__(
+        self, recording: CycleRecording, motion: Motion, knots: Array, *, width_rad: float, extra: Array
+    ) -> None:
+        """Arguments and errors are those of ``fit``."""
+        self._chosen = _choose(recording, motion, width_rad)
+        observed = self._chosen.observed(motion, knots)
+        columns, _ = _columns(recording, motion, knots[observed], extra)
+        both = self._smoothed(np.column_stack([columns, motion.torque_nm]))
+        scale = np.linalg.norm(both, axis=0)
+        scale[scale < 1e-9 * scale.max()] = np.inf
+        self._basis = np.linalg.qr(both[:, :-1] / scale[:-1])[0]
+        self._rest = self._outside(both[:, -1:])[:, 0]
+
+    def power_with(self, columns: Array) -> Array:
+        """Mean square that remains with each of the columns added alone, never with a negative amount, shape (k,).
+
+        Args:
+            columns: shape (n, k).
+        """
+        outside = self._outside(self._smoothed(columns))
+        power = np.sum(outside**2, axis=0)
+        gained = np.maximum(self._rest @ outside, 0.0) ** 2 / np.where(power > 0, power, np.inf)
+        remaining: Array = (self._rest @ self._rest - gained) / self._rest.size
+        return remaining
+
+    @property
+    def power(self) -> float:
+        """Mean square that remains without."""
+        return float(self._rest @ self._rest) / self._rest.size
+
+    def _smoothed(self, columns: Array) -> Array:
+        return _smoothed_rows(columns, self._chosen.rows, self._chosen.width)
+
+    def _outside(self, columns: Array) -> Array:
+        outside: Array = columns - self._basis @ (self._basis.T @ columns)
+        return outside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chosen:
+    """Which samples the model is solved on, and by which kernel.
+
+    Attributes:
+        width: of the kernel, in samples.
+        quarter: quarter cycle of every sample.
+        kept: samples that are not guarded.
+        rows: those that are used of them.
+        rows_alike: rows that are not independent of each other.
+    """
+
+    width: float
+    quarter: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    rows: NDArray[np.int64]
+    rows_alike: float
+
+    def observed(self, motion: Motion, knots: Array) -> NDArray[np.bool_]:
+        """Hats that enough samples saw."""
+        seen = np.square(hat_functions(np.abs(motion.velocity_rad_s[self.kept]), knots)).sum(axis=0)
+        observed: NDArray[np.bool_] = seen > 10
+        return observed
+
+
+def _choose(recording: CycleRecording, motion: Motion, width_rad: float) -> _Chosen:
     step_s = motion.smoother.step_s
     width_s = width_rad / float(recording.procedure.angular_frequencies_rad_s[-1])
     width = float(np.clip(width_s, 3 * step_s, max(0.02, 3 * step_s))) / step_s
@@ -143,21 +239,7 @@ def fit(
             where=recording.where,
             cause="cycles too short for this sampling rate",
         )
-    seen = np.square(hat_functions(np.abs(motion.velocity_rad_s[kept]), knots)).sum(axis=0)
-    observed = seen > 10
-    columns, blocks = _columns(recording, motion, knots[observed], compliance)
-    late = np.gradient(motion.torque_nm, step_s)
-    both = np.column_stack([columns, motion.torque_nm, late])
-    both = _smoothed_rows(both, rows, width)
-    rows_alike = 2 * np.sqrt(np.pi) * width / every
-    values, covariance, drawn, residual_rms = _solve(
-        both[:, :-2],
-        both[:, -2:],
-        quarter[rows],
-        _priors(blocks, knots[observed], level_nm, rows_alike),
-        recording.where,
-    )
-    return Fit(blocks, knots[observed], values, covariance, -drawn, knots[~observed], residual_rms)
+    return _Chosen(width, quarter, kept, rows, 2 * np.sqrt(np.pi) * width / every)
 
 
 def _smoothed_rows(columns: Array, rows: NDArray[np.int64], width: float) -> Array:
@@ -191,16 +273,13 @@ def ripple_waves(recording: CycleRecording, position_rad: Array) -> Array:
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def _columns(recording: CycleRecording, motion: Motion, knots: Array, compliance: bool) -> tuple[Array, Blocks]:
+def _columns(recording: CycleRecording, motion: Motion, knots: Array, extra: Array | None) -> tuple[Array, Blocks]:
     q, v, a = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
     if knots.size < 3:
         raise IdentificationError("too few speeds were observed for a curve", where=recording.where)
     sign, speed = np.sign(v)[:, None], np.abs(v)
     waves = ripple_waves(recording, q)
     gravity: Array = np.zeros((q.size, 0)) if recording.prismatic else np.column_stack([np.cos(q), np.sin(q)])
-    snap: Array = np.zeros((q.size, 0))
-    if compliance:
-        snap = gaussian_filter1d(a, 1.0, order=2, truncate=6.0)[:, None] / motion.smoother.step_s**2
     parts = (
         a[:, None],
         gravity,
@@ -208,7 +287,7 @@ def _columns(recording: CycleRecording, motion: Motion, knots: Array, compliance
         sign * hat_functions(speed, knots),
         hat_functions(speed, knots[-1] * EVEN_KNOTS)[:, 1:],
         np.column_stack([waves, sign * waves, v[:, None] * waves]),
-        snap,
+        np.zeros((q.size, 0)) if extra is None else extra,
     )
     ends = np.cumsum([part.shape[1] for part in parts]).tolist()
     blocks = Blocks(
@@ -218,7 +297,7 @@ def _columns(recording: CycleRecording, motion: Motion, knots: Array, compliance
         odd=slice(ends[2], ends[3]),
         even=slice(ends[3], ends[4]),
         ripple=slice(ends[4], ends[5]),
-        compliance=ends[5] if compliance else None,
+        extra=slice(ends[5], ends[6]),
         size=ends[6],
     )
     return np.column_stack(parts), blocks
@@ -282,7 +361,7 @@ def _priors(blocks: Blocks, knots: Array, level_nm: float, rows_alike: float) ->
 def _solve(
     x: Array, targets: Array, quarter: NDArray[np.int64], priors: list[_Prior], where: str
 ) -> tuple[Array, Array, Array, float]:
-    """Coefficients, their covariance, those of the second target, and the rms of what remains of the first."""
+    """Coefficients, their covariance, those of the other targets, and the rms of what remains of the first."""
     scale = np.linalg.norm(x, axis=0)
     scale[scale < 1e-9 * scale.max()] = np.inf  # a column of nothing (ripple filtered away) gets coefficient 0
     x = x / scale
@@ -315,7 +394,7 @@ def _solve(
     pulled = np.linalg.solve(left, np.array(pulls).T) / scale[:, None]
     covariance = spread.T @ spread * (len(gram) - 1) / len(gram) + pulled @ pulled.T
     rest = targets[:, 0] - x @ solution[:, 0]
-    return solution[:, 0] / scale, covariance, solution[:, 1] / scale, float(np.sqrt(np.mean(rest**2)))
+    return solution[:, 0] / scale, covariance, solution[:, 1:] / scale[:, None], float(np.sqrt(np.mean(rest**2)))
 
 
 def _product(x: Array, y: Array) -> Array:

@@ -40,6 +40,8 @@ class Joint:
     drift: float = 0.0
     link_share: float = 0.0
     link_frequency_hz: float = 30.0
+    link_hardening: float = 0.0
+    """By which share the spring is stiffer under the torque that the drive is rated for."""
     max_torque: float = 213.0
     rated_torque: float = 71.0
     noise: float = 0.005
@@ -61,7 +63,7 @@ class Joint:
 NUMBERS = (
     "inertia", "link_share", "link_stiffness", "gravity_cos", "gravity_sin", "gravity_level", "bias", "coulomb",
     "stribeck", "stribeck_velocity", "viscous", "saturating", "saturating_velocity", "asymmetry", "stiffness",
-    "gear_ratio", "ripple", "load", "drift", "max_torque", "quantum_nm", "count_rad",
+    "gear_ratio", "ripple", "load", "drift", "max_torque", "quantum_nm", "count_rad", "link_hardening", "rated_torque",
 )  # fmt: skip
 """A joint as the compiled loop takes it: a record of floats (a class of ours would be named in numba's cache)."""
 
@@ -115,7 +117,9 @@ def _simulate(command, velocity_command, step, substeps, j, shares, gains, blend
                 z[i] = min(max(z[i] + j.stiffness * shares[i] * v * h, -bound), bound)
                 friction += z[i]
             if flexible:
-                twist = j.link_stiffness * (q - q_link) + damping * (v - v_link)
+                twist = j.link_stiffness * (q - q_link)
+                twist *= 1.0 + j.link_hardening * (twist / j.rated_torque) ** 2
+                twist += damping * (v - v_link)
                 v += h * (applied - friction - j.bias - twist) / motor
                 v_link += h * (twist - gravity) / link
                 q += h * v

@@ -37,12 +37,6 @@ def test_at_20_degrees_each_method_keeps_its_bar(plants, index):
     assert inner <= 0.2 and whole <= 1.6
 
 
-def test_a_soft_joint_keeps_the_aligned_bars(plants):
-    joint = replace(plants.arm[2], link_share=0.5, link_frequency_hz=30.0)
-    assert errors(plants, joint, plants.record(joint, plants.procedure(20)), "aligned")[1] <= 0.7
-    assert errors(plants, joint, plants.record(joint, plants.procedure(10)), "aligned")[1] <= 1.7
-
-
 def test_at_5_degrees_least_squares_keeps_one_percent(plants):
     joint = plants.arm[3]
     assert errors(plants, joint, plants.record(joint, plants.procedure(5)), "least-squares")[1] <= 1.0
@@ -114,14 +108,6 @@ def test_asymmetry_is_the_even_part_without_its_constant(plants, heavy):
     speed = np.array(result.curve.velocity_rad_s)
     truth = joint.asymmetry * (joint.viscous * speed + joint.saturating * np.tanh(speed / joint.saturating_velocity))
     assert np.allclose(result.asymmetry_nm, truth, atol=0.01 * joint.coulomb)
-
-
-def test_a_soft_link_is_seen_and_a_rigid_one_is_not(plants, heavy):
-    joint, recording = heavy
-    assert estimate(recording).link_resonance_hz is None
-    soft = replace(joint, link_share=0.5, link_frequency_hz=30.0)
-    seen = estimate(plants.record(soft, recording.procedure)).link_resonance_hz
-    assert seen.value == pytest.approx(30.0, rel=0.15)
 
 
 def test_ripple_is_found_where_there_is_some(plants):

@@ -1,0 +1,77 @@
+"""A link on a spring: found in the recording, its torque taken off - and never found on a rigid joint."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frictid_hil.friction import link
+from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.friction.quality import gates
+from frictid_hil.friction.recording import Skew, synchronised
+
+SOFT = {"link_share": 0.5, "link_frequency_hz": 28.0}
+
+
+def error(joint, recording, method):
+    """Percent over the curve's own range."""
+    top = recording.procedure.velocity_rad_s
+    return curve_distance(estimate(recording, method).curve, joint.truth(top), top).e_percent_measured_range
+
+
+@pytest.mark.parametrize("effects", [{}, {"ripple": 0.1}, {"link_hardening": 0.5}, {"load": 0.05}])
+def test_a_soft_joint_at_10_degrees_keeps_the_bar_of_a_rigid_one(plants, effects):
+    """Also where the spring hardens by half under rated torque, which no estimator here knows of."""
+    joint = replace(plants.arm[1], **SOFT, **effects)
+    recording = plants.record(joint, plants.procedure(10))
+    assert error(joint, recording, "aligned") <= 0.5
+    assert error(joint, recording, "least-squares") <= 0.5
+
+
+def test_without_the_link_the_same_windows_are_several_times_worse(plants, monkeypatch):
+    joint = replace(plants.arm[1], **SOFT)
+    recording = plants.record(joint, plants.procedure(10))
+    with_link = error(joint, recording, "aligned")
+    monkeypatch.setattr("frictid_hil.friction.estimate.soft_link", lambda *_: None)
+    assert error(joint, recording, "aligned") > 3 * with_link
+
+
+def test_at_5_degrees_a_soft_joint_is_flagged_even_where_it_is_right(plants):
+    joint = replace(plants.arm[2], **SOFT)
+    recording = plants.record(joint, plants.procedure(5))
+    result = estimate(recording)
+    assert error(joint, recording, "aligned") <= 1.0
+    (gate,) = [gate for gate in gates(recording, result) if gate.name == "link_resonance"]
+    assert not gate.passed
+    assert any("soft joint" in note for note in result.notes)
+
+
+def test_frequency_and_inertia_of_the_link_are_found_within_their_intervals(plants):
+    joint = replace(plants.arm[1], **SOFT)
+    recording = plants.record(joint, plants.procedure(20))
+    found = link.soft_link(recording, synchronised(recording), 25.0)
+    assert found.resonance_hz.value == pytest.approx(28.0, abs=max(0.3, found.resonance_hz.half_width))
+    assert found.inertia_kg_m2 == pytest.approx(joint.inertia / 2, rel=0.05)
+    assert found.damping == pytest.approx(0.02, rel=0.3)
+
+
+@pytest.mark.parametrize("effects", [{}, {"ripple": 0.1}, {"load": 0.05}])
+@pytest.mark.parametrize("amplitude", [20, 5])
+def test_a_rigid_joint_has_no_link(plants, effects, amplitude):
+    joint = replace(plants.arm[2], **effects)
+    assert estimate(plants.record(joint, plants.procedure(amplitude))).link_resonance_hz is None
+
+
+def test_undeclared_delay_is_not_taken_for_a_link(plants):
+    recording = plants.record(plants.arm[1], plants.procedure(20))
+    assert estimate(replace(recording, skew=Skew(torque_delay_s=-0.0015))).link_resonance_hz is None
+
+
+def test_the_link_of_a_slow_motion_follows_the_motor(plants):
+    """a_l - a_m = -(w_m / w)^2-fold motion far below the resonance: a sine gives its own second derivative."""
+    recording = plants.record(plants.arm[2], plants.procedure(20))
+    motion = synchronised(recording)
+    sine = np.sin(2 * np.pi * 1.0 * motion.time_s)
+    moved = link.swinging(replace(motion, acceleration_rad_s2=sine), 20.0, 0.02)
+    assert np.allclose(moved[5000:], sine[5000:] / (20.0**2 - 1), atol=2e-4)
