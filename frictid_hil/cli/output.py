@@ -95,7 +95,7 @@ class Output:
         """Give the result to the command of ``notify``; what becomes of that changes no result."""
         if self.notify is None:
             return
-        text = json.dumps(_finite(result), default=_jsonable) + "\n"
+        text = _json_text(result) + "\n"
         try:
             told = subprocess.run(
                 shlex.split(self.notify),
@@ -132,9 +132,16 @@ def _plain(text: str) -> str:
 
 
 def _print_json(value: Mapping[str, Any]) -> None:
-    json.dump(_finite(value), sys.stdout, indent=None, separators=(", ", ": "), default=_jsonable)
-    sys.stdout.write("\n")
+    sys.stdout.write(_json_text(value) + "\n")
     sys.stdout.flush()
+
+
+def _json_text(value: Mapping[str, Any]) -> str:
+    """One line; looks for NaN only where there is one, because a history may hold half a million figures."""
+    try:
+        return json.dumps(value, allow_nan=False, default=_jsonable)
+    except ValueError:
+        return json.dumps(_finite(value), default=_jsonable)
 
 
 def _finite(value: Any) -> Any:
@@ -149,6 +156,8 @@ def _finite(value: Any) -> Any:
 
 
 def _jsonable(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
     if hasattr(value, "tolist"):
         return _finite(value.tolist())
     return str(value)

@@ -15,6 +15,9 @@ RobotName = Annotated[
     str | None, typer.Option("--robot", "-r", metavar="ROBOT", help="Name of the robot whose store is meant by ids.")
 ]
 
+_SHOWN = 50
+"""Profiles, promotions and nights in a table that a person reads."""
+
 app = typer.Typer(help="Show, compare and manage friction profiles.", no_args_is_help=True)
 
 
@@ -132,7 +135,12 @@ def rollback(
 @app.command("history")
 def history(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
-    last: Annotated[int | None, typer.Option("--last", metavar="N", min=1, help="Only so many.")] = None,
+    last: Annotated[
+        int | None,
+        typer.Option(
+            "--last", metavar="N", min=0, help="Only so many, 0 for all. Default: 50 in a table, all with --json."
+        ),
+    ] = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -157,8 +165,11 @@ def history(
             output.out.print(
                 f"{one['utc']} {one['action']} {one['id']} by {one['by']}: {one['reason']}", soft_wrap=True
             )
+        if older := result["profiles_kept"] - len(result["profiles"]):
+            output.out.print(f"{older} older profiles are not shown; see them with --last 0")
 
-    output.run("profile_history", lambda: job(ProfileStore(store), robot, last=last), show)
+    shown = last if last is not None else 0 if as_json else _SHOWN
+    output.run("profile_history", lambda: job(ProfileStore(store), robot, last=shown or None), show)
 
 
 def _cell(joint: Result | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +41,20 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     Raises:
         FrictidError: disk full, or no permission; the journal is as before.
     """
+    append_lines(path, [value])
+
+
+def append_lines(path: Path, values: Iterable[Mapping[str, Any]]) -> None:
+    """Add lines; as ``append_line``. A crash in the middle leaves the first few of them."""
     new = not path.exists()
     with path.open("ab", buffering=0) as file:
         end = _end_of_whole_lines(path)
         try:
             # What a crash cut off never counted; it must not begin to by getting its line end now.
             file.truncate(end)
-            line = memoryview(json.dumps(value).encode() + b"\n")
-            while line:
-                line = line[file.write(line) :]
+            left = memoryview(b"".join(json.dumps(value).encode() + b"\n" for value in values))
+            while left:
+                left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError as error:
             file.truncate(end)

@@ -17,8 +17,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from typing import Any
 import filelock
 
 from frictid_hil.config.drift import joint_drift
-from frictid_hil.config.journal import append_line, journal_lines
+from frictid_hil.config.journal import append_line, append_lines, journal_lines
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.search import user_data_dir
@@ -143,11 +143,12 @@ class ProfileStore:
         with self._locked(profile.robot) as folder:
             _tidy(folder)
             path = _profile_path(folder, identity)
-            if not path.exists():
-                write_whole(path, text)
-                path.chmod(0o444)
-            if identity not in self._index(profile.robot):
-                append_line(folder / "index.jsonl", _line(_summary(identity, profile, self._reference(profile.robot))))
+            if path.exists():
+                return identity
+            write_whole(path, text)
+            path.chmod(0o444)
+            # A crash just here costs nothing: `history` finds the profile and writes its line.
+            append_line(folder / "index.jsonl", _line(_summary(identity, profile, self._reference(profile.robot))))
         return identity
 
     def path(self, robot: str, identity: str) -> Path:
@@ -161,6 +162,8 @@ class ProfileStore:
             UsageError: there is none, or more than one.
         """
         folder = self._folder(robot)
+        if _ID.fullmatch(identity) and (whole := _profile_path(folder, identity)).exists():
+            return whole  # a store may hold ten thousand: look at the folder only for a beginning of an id
         found = [name for name in _profile_ids(folder) if name.startswith(identity)]
         if len(found) != 1 or not identity:
             count = "no profile" if not found else f"{len(found)} profiles"
@@ -254,12 +257,19 @@ class ProfileStore:
         return [Promotion(**line) for line in lines if line.keys() == Promotion.__dataclass_fields__.keys()]
 
     def history(self, robot: str) -> list[Stored]:
-        """Every profile of a robot, oldest first; those that the index lost are read anew."""
-        index = self._index(robot)
-        lost = [identity for identity in _profile_ids(self._folder(robot)) if identity not in index]
-        if lost:
+        """Every profile of a robot, oldest first; those that the index lost are read anew, and noted for next time.
+
+        Raises:
+            ConfigError: the file of one that the index lost was changed.
+        """
+        folder = self._folder(robot)
+        present = _profile_ids(folder)
+        index = _index(folder, robot, present)
+        if len(index) < len(present):
             reference = self._reference(robot)
-            index |= {identity: _summary(identity, self.load(robot, identity), reference) for identity in lost}
+            found = [_summary(lost, self.load(robot, lost), reference) for lost in sorted(present - index.keys())]
+            index |= {stored.id: stored for stored in found}
+            self._note(robot, found)
         return [index[identity] for identity in sorted(index)]
 
     def rebuild_index(self, robot: str) -> None:
@@ -279,11 +289,15 @@ class ProfileStore:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
         reference = self._reference(robot)
         trends: dict[str, list[TrendPoint]] = {}
+        measured_anew = []
         for stored in self.history(robot):
             if stored.baseline != reference.id:
                 stored = _summary(stored.id, self.load(robot, stored.id), reference)
+                measured_anew.append(stored)
             for name, joint in stored.joints.items():
                 trends.setdefault(name, []).append(TrendPoint(stored.id, stored.created_utc, joint))
+        if measured_anew:
+            self._note(robot, measured_anew)
         return trends
 
     def _folder(self, robot: str) -> Path:
@@ -307,16 +321,10 @@ class ProfileStore:
         baseline = self.baseline(robot)
         return _Reference(baseline, None if baseline is None else self.load(robot, baseline))
 
-    def _index(self, robot: str) -> dict[str, Stored]:
-        """The summaries whose profiles are there, by id."""
-        folder = self._folder(robot)
-        present = _profile_ids(folder)
-        index = {}
-        for line in journal_lines(folder / "index.jsonl"):
-            stored = _stored(line, robot)
-            if stored is not None and stored.id in present:
-                index[stored.id] = stored
-        return index
+    def _note(self, robot: str, found: Sequence[Stored]) -> None:
+        """Add lines to the index; it only saves time, so a store that may not be written stays as it is."""
+        with suppress(FrictidError), self._locked(robot) as folder:
+            append_lines(folder / "index.jsonl", [_line(stored) for stored in found])
 
     @contextmanager
     def _locked(self, robot: str) -> Iterator[Path]:
@@ -342,6 +350,16 @@ class _Reference:
 
     id: str | None
     profile: FrictionProfile | None
+
+
+def _index(folder: Path, robot: str, present: Set[str]) -> dict[str, Stored]:
+    """The summaries whose profiles are there, by id."""
+    index = {}
+    for line in journal_lines(folder / "index.jsonl"):
+        stored = _stored(line, robot)
+        if stored is not None and stored.id in present:
+            index[stored.id] = stored
+    return index
 
 
 def _summary(identity: str, profile: FrictionProfile, reference: _Reference) -> Stored:

@@ -23,7 +23,9 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
     Raises:
         UsageError: nothing is known of such a robot.
     """
-    profiles, promotions, nights = _known(store, robot)
+    profiles, promotions, nights = store.history(robot), store.promotions(robot), attempts(store.root, robot)
+    if not profiles and not nights:
+        raise _unknown(store, robot)
     active, baseline = store.active(robot), store.baseline(robot)
     kept = slice(-last if last else None, None)
     return {
@@ -31,6 +33,7 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
         "robot": robot,
         "active": active.id if active else None,
         "baseline": baseline,
+        "profiles_kept": len(profiles),
         "profiles": [
             {
                 "id": stored.id,
@@ -65,20 +68,17 @@ def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) 
     Raises:
         UsageError: nothing is known of such a robot.
     """
-    _, promotions, nights = _known(store, robot)
-    active = store.active(robot)
-    page = index_page(robot, store.trends(robot), promotions, nights, active, store.baseline(robot))
+    trends, nights = store.trends(robot), attempts(store.root, robot)
+    if not trends and not nights:
+        raise _unknown(store, robot)
+    page = index_page(robot, trends, store.promotions(robot), nights, store.active(robot), store.baseline(robot))
     return write_page(page, path or store.root / robot / "index.html")
 
 
-def _known(store: ProfileStore, robot: str) -> tuple[Any, Any, Any]:
-    profiles, promotions = store.history(robot), store.promotions(robot)
-    nights = attempts(store.root, robot)
-    if not profiles and not nights:
-        robots = ", ".join(store.robots()) or "none"
-        raise UsageError(
-            f"the store knows no robot named {robot!r}; it has {robots}",
-            where=str(store.root),
-            next_step="promote a profile with `frictid-hil profile promote RUN`",
-        )
-    return profiles, promotions, nights
+def _unknown(store: ProfileStore, robot: str) -> UsageError:
+    robots = ", ".join(store.robots()) or "none"
+    return UsageError(
+        f"the store knows no robot named {robot!r}; it has {robots}",
+        where=str(store.root),
+        next_step="promote a profile with `frictid-hil profile promote RUN`",
+    )
