@@ -1,4 +1,4 @@
-"""``report``: the HTML page of a run."""
+"""``report``: the HTML page of a run, or of a robot."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.options import JsonOption, QuietOption
-from frictid_hil.cli.output import Output
+from frictid_hil.cli.options import JsonOption, QuietOption, StoreOption
+from frictid_hil.cli.output import Output, Result
 
 
 def register(app: typer.Typer) -> None:
@@ -17,12 +17,28 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="Run folder.")] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            "-r",
+            metavar="ROBOT",
+            help="The page of a robot with its history: its name in the store, or its file.",
+        ),
+    ] = None,
+    store: StoreOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Write the self-contained HTML page of a run."""
+    """Write the self-contained HTML page of a run, or the index page of a robot."""
     from frictid_hil.jobs.report import report as job
 
     output = Output(as_json, quiet)
-    output.run("report", lambda: job(run), lambda result: output.out.print(result["report"], soft_wrap=True))
+
+    def show(result: Result) -> None:
+        for key in ("report", "recalibration_report"):
+            if key in result:
+                output.out.print(result[key], soft_wrap=True)
+
+    output.run("report", lambda: job(run, robot=robot, store=store), show)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from frictid_hil.config.policy import WarmUp
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.config.store import ProfileStore
 from frictid_hil.driver import RobotSetup, planned_quantum_s
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
@@ -57,6 +59,7 @@ class CalibrateOptions:
         verb: that the run is part of.
         warm_up: every joint is warmed up before it is measured.
         interlock: must be closed before and during motion.
+        store: folder of the profile store, whose active profile the page compares with; None for the user's own.
     """
 
     robot: str
@@ -77,6 +80,7 @@ class CalibrateOptions:
     verb: str = VERB
     warm_up: WarmUp | None = None
     interlock: Interlock | None = None
+    store: Path | None = None
 
 
 @dataclass(slots=True)
@@ -315,10 +319,20 @@ def _finish(
             "cause": ended.cause,
             "next_step": ended.next_step,
         }
+    folder.compared_with(_active_file(robot, options.store))
     folder.finish(result)
     if profile_path is not None:
         result["report"] = str(write_run_page(folder.path, load_profile(profile_path), folder.manifest).resolve())
     return result
+
+
+def _active_file(robot: Robot, store: Path | None) -> Path | None:
+    """The profile in force when the run ended, for the page; None where there is none to be read."""
+    with contextlib.suppress(FrictidError):
+        kept = ProfileStore(store)
+        active = kept.active(robot.name)
+        return None if active is None else kept.path(robot.name, active.id).resolve()
+    return None
 
 
 def _provenance(

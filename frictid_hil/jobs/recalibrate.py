@@ -103,6 +103,7 @@ def _night(options: RecalibrateOptions, robot: Robot, store: ProfileStore, watch
             verb=VERB,
             warm_up=_warm_up(policy),
             interlock=interlock,
+            store=options.store,
         ),
         watcher,
     )
@@ -160,8 +161,6 @@ def _concluded(
         result["next_step"] = measured["error"]["next_step"] or "see the run folder"
     if measured["profile"] is not None:
         newer = load_profile(measured["profile"])
-        identity = store.add(newer)
-        result["stored"] = identity
         failed = {
             name: "; ".join(joint.get("remarks") or [joint["outcome"]])
             for name, joint in measured["joints"].items()
@@ -169,7 +168,9 @@ def _concluded(
         }
         verdict = judge(robot.policy, newer, active, baseline, failed=failed)
         result |= {"drift": dict(verdict.joints), "drifted": list(verdict.drifted)}
+        # What an aborted night got done stays in its run folder: half a robot is no point of a trend.
         if measured["outcome"] in ("ok", "gate_failed"):
+            result["stored"] = identity = store.add(newer)
             _apply(verdict, result, store, robot.name, identity, options.by)
         _write_page(result, robot, store, newer, active, baseline)
     current = store.active(robot.name)

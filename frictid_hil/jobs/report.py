@@ -1,4 +1,4 @@
-"""``frictid-hil report``: the HTML page of a run, made from what lies in its folder."""
+"""``frictid-hil report``: the HTML page of a run, made from what lies in its folder; or the page of a robot."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import FrictidError, UsageError
+from frictid_hil.jobs.history import write_index_page
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 from frictid_hil.report.calibration import calibration_page
@@ -15,21 +18,41 @@ from frictid_hil.report.pages import write_page
 from frictid_hil.runner.run_folder import load_manifest
 
 
-def report(run: Path) -> dict[str, Any]:
-    """Write ``report.html`` into a run folder.
+def report(run: Path | None = None, *, robot: str | None = None, store: Path | None = None) -> dict[str, Any]:
+    """Write ``report.html`` into a run folder, or the index page of a robot.
+
+    Args:
+        run: folder. A run of compensation has its page since it ended, and is told where it is.
+        robot: instead of a run: robot file, or name of a robot that the store knows.
+        store: folder of the profile store; None for the user's own.
 
     Raises:
-        UsageError: not a run folder, or nothing was identified in it.
+        UsageError: neither or both; not a run folder; nothing was identified in it; nothing known of the robot.
     """
+    if (run is None) == (robot is None):
+        raise UsageError("name one: the folder of a run, or a robot with --robot")
+    if robot is not None:
+        page = write_index_page(ProfileStore(store), _name_of(robot))
+        return {"outcome": "ok", "report": str(page.resolve())}
+    assert run is not None  # by the check above
     manifest = load_manifest(run)
-    if not (run / "profile.yaml").exists():
+    if (run / "profile.yaml").exists():
+        page = write_run_page(run, load_profile(run / "profile.yaml"), manifest)
+    elif not (page := run / "report.html").exists():
         raise UsageError(
             "nothing was identified in this run",
             where=str(run),
             next_step="look at manifest.json for how it ended; `frictid-hil identify` reads its samples",
         )
-    page = write_run_page(run, load_profile(run / "profile.yaml"), manifest)
-    return {"outcome": "ok", "report": str(page.resolve())}
+    result = {"outcome": "ok", "report": str(page.resolve())}
+    if (run / "recalibration.html").exists():
+        result["recalibration_report"] = str((run / "recalibration.html").resolve())
+    return result
+
+
+def _name_of(robot: str) -> str:
+    """The name in a robot file, given by its path; else the word itself is the name."""
+    return load_robot(robot).name if Path(robot).suffix in (".yaml", ".yml") else robot
 
 
 def write_run_page(run: Path, profile: FrictionProfile, manifest: dict[str, Any]) -> Path:
@@ -40,6 +63,17 @@ def write_run_page(run: Path, profile: FrictionProfile, manifest: dict[str, Any]
         samples = {one.joint: one for one in read(run) if one.marks}
     error = manifest.get("error") or {}
     page = calibration_page(
-        profile, samples, outcome=str(manifest.get("outcome") or "interrupted"), error=str(error.get("what", ""))
+        profile,
+        samples,
+        outcome=str(manifest.get("outcome") or "interrupted"),
+        error=str(error.get("what", "")),
+        previous=_active_then(manifest),
     )
     return write_page(page, run / "report.html")
+
+
+def _active_then(manifest: dict[str, Any]) -> FrictionProfile | None:
+    """The profile that was in force when the run ended, where it is still at hand."""
+    with contextlib.suppress(FrictidError):
+        return load_profile(manifest["active_profile"]) if manifest.get("active_profile") else None
+    return None

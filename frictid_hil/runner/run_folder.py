@@ -258,6 +258,10 @@ class RunFolder:
             if path.suffix in (".mcap", ".blf", ".asc")
         }
 
+    def compared_with(self, profile: Path | None) -> None:
+        """Note the profile that was in force, so that the page can be written again as it was."""
+        self.manifest["active_profile"] = None if profile is None else str(profile)
+
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write how the run ended."""
         self.manifest["ended_utc"] = utc_now()
