@@ -184,6 +184,34 @@ def test_a_lost_or_spoilt_index_costs_nothing_but_time(store: ProfileStore, tmp_
     assert len(index.read_bytes().splitlines()) == 6
 
 
+def test_what_the_index_lost_is_read_once(store: ProfileStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    for night in range(4):
+        store.add(profile(night=night))
+    store.promote("hp3j", store.add(profile(night=5)))
+    before = store.trends("hp3j")
+    (store.root / "hp3j" / "index.jsonl").unlink()
+    assert store.trends("hp3j") == before
+    baseline = store.baseline("hp3j")
+    read = []
+    load = ProfileStore.load
+    monkeypatch.setattr(ProfileStore, "load", lambda self, robot, one: read.append(one) or load(self, robot, one))
+    assert store.trends("hp3j") == before
+    assert set(read) <= {baseline}, "all others are told by the index"
+
+
+def test_a_store_that_may_not_be_written_is_told_all_the_same(
+    store: ProfileStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.promote("hp3j", store.add(profile()))
+    (store.root / "hp3j" / "index.jsonl").unlink()
+
+    def denied(_path: Path, _values: object) -> None:
+        raise FrictidError("no permission to write")
+
+    monkeypatch.setattr(store_module, "append_lines", denied)
+    assert len(store.history("hp3j")) == 1
+
+
 def test_a_line_that_a_crash_cut_off_is_no_promotion(store: ProfileStore, tmp_path: Path) -> None:
     first, second = store.add(profile()), store.add(profile(1.1))
     store.promote("hp3j", first)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from frictid_hil.config.profile import load_profile
-from frictid_hil.errors import PlanRefused
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.store import ProfileStore
+from frictid_hil.config.write import dump
+from frictid_hil.errors import Interrupted, PlanRefused, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.identify import IdentifyOptions, identify
+from frictid_hil.jobs.report import report
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan import REHEARSAL
+from frictid_hil.runner.events import Event, PhaseStarted
 from frictid_hil.runner.run_folder import load_manifest
 
 
@@ -98,3 +105,92 @@ def test_the_manifest_is_plain_json(joint_5: Path) -> None:
     manifest = json.loads((joint_5 / "manifest.json").read_text())
     assert manifest["identities"]["5"]["serial"]
     assert [mark["name"] for mark in manifest["sessions"][0]["marks"]][3] == "cycles"
+
+
+# -- going on after an interruption -----------------------------------------------------------------------------------
+
+
+class StoppedAt(Silent):
+    """A person who presses Ctrl-C when a joint begins its cycles."""
+
+    def __init__(self, joint: str) -> None:
+        self._joint = joint
+
+    def event(self, event: Event) -> None:
+        if isinstance(event, PhaseStarted) and (event.joint, event.phase) == (self._joint, "cycles"):
+            raise Interrupted("stopped on request; the joint was brought to rest")
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """A robot of two joints, and a run of it that was stopped during the second one."""
+    place = tmp_path_factory.mktemp("interrupted")
+    values = load_robot("hp3j").values()
+    values |= {"name": "two", "bus": "virtual:two", "joints": {name: values["joints"][name] for name in ("4", "5")}}
+    values["procedure"] |= {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3}
+    robot = place / "two.yaml"
+    robot.write_text(dump(values))
+    result = calibrate(CalibrateOptions(str(robot), out=place / "run"), StoppedAt("5"))
+    assert (result["outcome"], result["exit_code"]) == ("interrupted", 130)
+    assert list(result["joints"]) == ["4"] and load_profile(result["profile"]).joints.keys() == {"4"}
+    return str(robot), place / "run"
+
+
+def resume(robot: str, run: Path) -> dict[str, Any]:
+    return calibrate(CalibrateOptions(robot, resume=run), Silent())
+
+
+def test_a_run_is_continued_with_the_joints_it_lacks(interrupted: tuple[str, Path], tmp_path: Path) -> None:
+    robot, run = interrupted
+    whole = tmp_path / "run"
+    shutil.copytree(run, whole)
+    before = load_profile(run / "profile.yaml").joints["4"]
+    result = resume(robot, whole)
+    assert result["outcome"] == "ok" and list(result["joints"]) == ["4", "5"]
+    profile = load_profile(whole / "profile.yaml")
+    assert profile.joints["4"] == before and profile.joints.keys() == {"4", "5"}
+    assert [session["joint"] for session in load_manifest(whole)["sessions"]] == ["4", "5"]
+
+
+def test_a_run_of_another_drive_is_not_continued(interrupted: tuple[str, Path], tmp_path: Path) -> None:
+    robot, run = interrupted
+    other = tmp_path / "run"
+    shutil.copytree(run, other)
+    manifest = load_manifest(other)
+    manifest["identities"]["4"]["serial"] = "of another drive"
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    before = {path.name: path.read_bytes() for path in other.glob("joints/*")}
+    with pytest.raises(UsageError, match=r"joint 4.*serial number .* began with of another drive"):
+        resume(robot, other)
+    assert {path.name: path.read_bytes() for path in other.glob("joints/*")} == before
+    assert [session["joint"] for session in load_manifest(other)["sessions"]] == ["4"], "nothing has moved"
+
+
+def test_a_run_of_a_changed_robot_file_is_not_continued(interrupted: tuple[str, Path], tmp_path: Path) -> None:
+    robot, run = interrupted
+    values = load_robot(robot).values()
+    values["joints"]["5"]["gear_ratio"] += 1
+    changed = tmp_path / "two.yaml"
+    changed.write_text(dump(values))
+    with pytest.raises(UsageError, match="robot file has changed since this run began"):
+        resume(str(changed), run)
+
+
+# -- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_compares_with_the_profile_in_force(interrupted: tuple[str, Path], tmp_path: Path) -> None:
+    robot, run = interrupted
+    whole, store = tmp_path / "run", ProfileStore(tmp_path / "store")
+    shutil.copytree(run, whole)
+    assert "no earlier profile" in (whole / "report.html").read_text()
+    old = load_profile(whole / "profile.yaml")
+    slower = {
+        n: one.model_copy(update={"torque_nm": tuple(1.5 * t for t in one.torque_nm)}) for n, one in old.joints.items()
+    }
+    store.promote("two", store.add(old.model_copy(update={"joints": slower})))
+    calibrate(CalibrateOptions(robot, resume=whole, store=store.root), Silent())
+    assert "from the active profile" in (whole / "report.html").read_text()
+    (whole / "report.html").unlink()
+    page = Path(report(whole)["report"]).read_text()
+    assert "from the active profile" in page and "active before" in page

@@ -18,6 +18,7 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import load_robot
+from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
 from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import HardwareBusy, UsageError
@@ -104,6 +105,19 @@ def test_an_interlock_that_opens_in_motion_stops_it(tmp_path: Path) -> None:
     result = night(tmp_path, 1, policy={"unattended": unattended}, options=faults)
     assert (result["outcome"], result["exit_code"], result["promoted"]) == ("aborted", 4, False)
     assert "interlock is open" in result["error"]["what"] and result["next_step"]
+
+
+def test_half_a_robot_is_no_point_of_a_trend(tmp_path: Path) -> None:
+    joints = {name: load_robot("hp3j").values()["joints"][name] for name in ("4", "5")}
+    unattended = {"allowed_by": "Iwatani", "date": "2026-11-21", "interlock_input": INTERLOCK}
+    faults = {"faults": [{"kind": "interlock_open", "joint": "5", "at_s": 20.0}]}
+    values = {"joints": joints, "cycle_hz": 500}
+    result = night(tmp_path, 1, policy={"unattended": unattended}, options=faults, values=values)
+    assert (result["outcome"], result["stored"], result["promoted"]) == ("aborted", None, False)
+    assert load_profile(Path(result["profile"])).joints.keys() == {"4"}, "what was measured is kept in the run folder"
+    store = ProfileStore(tmp_path / "store")
+    assert store.history("night") == [] and store.trends("night") == {}
+    assert "aborted" in Path(result["history"]).read_text()
 
 
 def test_closed_interlock_lets_it_run(tmp_path: Path) -> None:

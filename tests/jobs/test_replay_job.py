@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import configparser
 import json
 import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
 import pytest
 
+import frictid_drivers.virtual
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
@@ -145,6 +150,48 @@ def test_a_foreign_log_needs_a_frame_map_and_unknown_frames_are_named(run: Path,
     assert result["log"]["unknown"] == {"frame 0x123": 1, "extended frame 0x001abcde": 1}
     assert result["joints"]["5"]["difference_percent"] is not None, result["joints"]["5"]["remarks"]
     assert result["joints"]["5"]["difference_percent"] < 1.0
+
+
+def test_a_candump_log_and_an_eds_give_the_same_curve(run: Path, robot: str, tmp_path: Path) -> None:
+    """From the shell, as somebody with a logger and a vendor's tool has it: no run folder, no manifest."""
+    manifest = json.loads((run / "manifest.json").read_text())
+    (mark,) = [mark for mark in manifest["sessions"][0]["marks"] if mark["name"] == "cycles"]
+    with can.CanutilsLogWriter(tmp_path / "drive.log") as writer:
+        for t_ns, can_id, data in logged(read_frames(run / "bus.blf")):
+            if mark["start_ns"] - 300_000_000 <= t_ns < mark["end_ns"]:
+                stamp = 1.7e9 + t_ns * 1e-9
+                message = can.Message(timestamp=stamp, arbitration_id=can_id, is_extended_id=False, data=data)
+                writer.on_message_received(message)
+    eds = mapped_eds(manifest["frame_maps"]["bus.blf"]["joints"]["5"], robot, tmp_path / "drive.dcf")
+    command = [sys.executable, "-m", "frictid_hil.cli.app", "replay", str(tmp_path / "drive.log"), "--robot", robot]
+    command += ["--eds", str(eds), "--profile", str(run), "--no-simulate", "--json"]
+    command += ["--amplitude", "0.2rad", "--velocity", "1.5rad/s", "--cycles", "3", "--ratio", "0.8"]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert answer.returncode == 0, answer.stderr
+    result = json.loads(answer.stdout)
+    # A data sheet of drives does not tell of the host, whose heartbeat they watch.
+    assert result["log"]["unknown"].keys() == {"heartbeat of node 127"} and result["log"]["lost_rows"] == {"5": 0}
+    assert result["joints"]["5"]["difference_percent"] < 1.0
+
+
+def mapped_eds(frames: dict[str, Any], robot: str, path: Path) -> Path:
+    """The simulated drive's EDS with the mapping of a run as parameter values: a DCF, as commissioning tools export."""
+    dcf = configparser.ConfigParser(interpolation=None)
+    dcf.optionxform = str  # type: ignore[assignment,method-assign]  # keys keep their case
+    dcf.read(Path(frictid_drivers.virtual.__file__).with_name("frictid_servo.eds"))
+    for communication, mapping, described in ((0x1800, 0x1A00, "reports"), (0x1400, 0x1600, "commands")):
+        for number, frame in enumerate(frames[described]):
+            dcf[f"{communication + number:04X}sub1"]["ParameterValue"] = hex(frame["cob_id"])
+            dcf[f"{mapping + number:04X}sub0"]["ParameterValue"] = str(len(frame["objects"]))
+            for sub, named in enumerate(frame["objects"], start=1):
+                index, object_sub, bits = named[:4], named[5:7], int(named.split()[1][1:])
+                dcf[f"{mapping + number:04X}sub{sub}"]["ParameterValue"] = f"0x{index}{object_sub}{bits:02X}"
+    joint = load_robot(robot).file.joints["5"]
+    assert joint.rated_torque_nm is not None
+    dcf["6076"]["ParameterValue"] = str(round(1000 * joint.rated_torque_nm / joint.gear_ratio))
+    with path.open("w") as file:
+        dcf.write(file, space_around_delimiters=False)
+    return path
 
 
 def test_a_wrong_frame_map_is_told_with_its_place(run: Path, robot: str, tmp_path: Path) -> None:
