@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from pathlib import Path
 
 from frictid_hil.config.attempts import attempts
@@ -111,14 +112,18 @@ def killed_nights(place: Path, kills: int) -> None:
         began = time.monotonic()
         child = os.fork()
         if child == 0:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            night(place, number)
+            try:
+                night(place, number)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(1)
             os._exit(0)
         time.sleep(chance.uniform(0.0, lasts_s))
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         shutil.rmtree(place / f"run-{number}", ignore_errors=True)
         if os.WIFEXITED(status):
+            assert os.WEXITSTATUS(status) == 0, f"night {number} failed by itself"
             finished += 1
             lasts_s = min(lasts_s, time.monotonic() - began)
         try:
