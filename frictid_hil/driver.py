@@ -183,7 +183,7 @@ class Capabilities:
         modes: set-point modes that every joint supports.
         torque_offset: a torque can be added on top of position or velocity control (60B2).
         drive_watchdog: the drive stops by itself when the host dies.
-        batch_only: no cyclic exchange; ``run_batch`` instead.
+        batch_only: no cyclic exchange; the driver is ``Batched`` instead.
         lock_step: virtual time: cycles run as fast as the processor allows and never late.
         cycle_quantum_s: durations of motions are rounded to multiples of this (0: no rounding); 4 ms ticks on serial.
         external_torque: feedback carries a force sensor's torque.
@@ -382,10 +382,6 @@ class Driver(Protocol):
         """
         ...
 
-    def run_batch(self, plan: JointPlan) -> Mapping[str, Any]:
-        """Drivers with ``batch_only``: run one joint's whole motion on the controller, return the columns logged."""
-        ...
-
     def quick_stop(self) -> None:
         """Stop every joint by the fastest safe way, from any state; never raises, never waits for an answer."""
         ...
@@ -405,6 +401,50 @@ class FrameMapped(Protocol):
 
     def frame_map_values(self) -> Mapping[str, Any]:
         """Which frame carries what, as configured, as plain values that name their ``schema``; after ``configure``."""
+        ...
+
+
+@runtime_checkable
+class Batched(Protocol):
+    """A driver whose controller runs whole motions by itself and hands its recording over afterwards (``batch_only``).
+
+    Its ``start_cycling`` and ``stop_cycling`` begin and end a stretch under power; in between there are ``standing``
+    and ``run_batch`` instead of ``exchange``, and all joints but the one that runs are held by the controller.
+
+    Attributes:
+        batch_columns: what was fetched of the last job; after an error, as far as the transfer came.
+    """
+
+    batch_columns: Mapping[str, Any]
+
+    def standing(self) -> Sequence[Feedback]:
+        """Position and state of every joint, slowly read; without velocity and torque."""
+        ...
+
+    def run_batch(
+        self,
+        plan: JointPlan,
+        *,
+        stop: Callable[[], bool],
+        progress: Callable[[str, float], None],
+        look: Callable[[Sequence[Feedback]], None],
+    ) -> Mapping[str, Any]:
+        """One joint's motions as one job; blocks until the joint stands again and its recording is here.
+
+        Args:
+            plan: the joint stands where its first motion begins.
+            stop: asked often; True brings the joint to rest and raises ``Interrupted``.
+            progress: told ``motion`` or ``transfer`` and the share that is done.
+            look: given ``standing`` several times while the joint moves; its ``SafetyAbort`` brings the joint to rest.
+
+        Returns:
+            Columns of shape (n,): ``time_ns`` (run time), ``position_rad``, ``velocity_rad_s``, ``torque_nm``,
+            ``position_command_rad``; ``motion_starts_ns``, shape (motions + 1,), the last one the end; and
+            ``dropped_pulses``, how much of the command the controller left out.
+
+        Raises:
+            FrictidError: whatever ended it; ``batch_columns`` keep what was measured.
+        """
         ...
 
 

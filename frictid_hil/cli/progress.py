@@ -15,7 +15,7 @@ from frictid_hil.cli.output import Output
 from frictid_hil.driver import RobotSetup, Severity
 from frictid_hil.errors import UsageError
 from frictid_hil.plan import Plan, stretch_name
-from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity
 
 
@@ -92,6 +92,8 @@ class TerminalWatcher:
         """Follow the phases."""
         if isinstance(event, PhaseStarted):
             self._start_phase(event)
+        elif isinstance(event, JobProgress):
+            self._show_job(event)
         elif isinstance(event, JointRun):
             self._finish(event)
         elif isinstance(event, Warned):
@@ -147,6 +149,19 @@ class TerminalWatcher:
         task = self._tasks.get(event.joint)
         if task is not None:
             self._progress.update(task, completed=self._done_s[event.joint], phase=event.phase)
+
+    def _show_job(self, event: JobProgress) -> None:
+        """A job moves the bar; the transfer of its recording shows its own share."""
+        if self._silent:
+            return
+        if self._progress is not None and event.joint in self._tasks:
+            done_s = self._done_s[event.joint] + event.share * self._phase_s
+            if event.stage == "motion":
+                self._progress.update(self._tasks[event.joint], completed=done_s)
+            else:
+                self._progress.update(self._tasks[event.joint], phase=f"{event.stage} {event.share:.0%}")
+        elif event.stage == "transfer" and event.share >= 1.0:
+            self._console.print(f"joint {event.joint}: recording fetched")
 
     def _finish(self, event: JointRun) -> None:
         # Joints that moved together have one bar: the current one.

@@ -92,10 +92,25 @@ class Marked:
 
 
 @dataclass(frozen=True, slots=True)
+class JobProgress:
+    """How far a job on the controller, or the transfer of its recording, has come; about once a second.
+
+    Attributes:
+        joint: name.
+        stage: ``motion`` or ``transfer``.
+        share: done, 0..1.
+    """
+
+    joint: str
+    stage: str
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
 class Warned:
     """Something a person should know that does not end the run."""
 
     message: str
 
 
-Event = Preflight | Configured | PhaseStarted | Marked | JointRun | Warned
+Event = Preflight | Configured | PhaseStarted | JobProgress | Marked | JointRun | Warned

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from frictid_hil.driver import (
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, ProfileMismatch, SafetyAbort
 from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move, Plan, WarmUp, stretch_name
 from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.batch import BatchDriver, BatchRunner
 from frictid_hil.runner.cycle import CyclicLoop, StopRequest, Stream
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.in_step import InStep
@@ -181,6 +183,12 @@ class Scheduler:
                 where=self._setup.bus,
                 next_step="run `frictid-hil calibrate` with a person watching",
             )
+        if capabilities.batch_only and self._plan.together:
+            raise PlanRefused(
+                "this controller runs one joint's job at a time",
+                next_step="leave --together out",
+                where=self._setup.bus,
+            )
         return Preflight(identities, capabilities, tuple(findings))
 
     # -- one joint, or several in step --------------------------------------------------------------------------
@@ -205,6 +213,8 @@ class Scheduler:
         for index in range(len(self._names)):
             if index not in moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
+        if driver.capabilities().batch_only:
+            return [self._run_in_batch(session, plans[0], supervisor, limits)]
         driver.start_cycling()
         loop = CyclicLoop(
             driver,
@@ -244,6 +254,30 @@ class Scheduler:
             )
             for index, plan in moving.items()
         ]
+
+    def _run_in_batch(
+        self, session: int, plan: JointPlan, supervisor: Supervisor, limits: Sequence[JointLimits]
+    ) -> JointRun:
+        driver = cast(BatchDriver, self._driver)
+        runner = BatchRunner(
+            driver,
+            self._setup,
+            supervisor,
+            limits,
+            self._recorder.samples,
+            offset_ns=self._recorder.offset_ns,
+            care=self._care,
+            notify=self._notify,
+            stop=self._stop,
+            pump=self._pump,
+        )
+        try:
+            run, end_ns = runner.run(session, plan)
+        except BaseException:
+            driver.quick_stop()
+            raise
+        self._recorder.offset_ns = end_ns + _SESSION_GAP_NS
+        return run
 
     def _limits(self, joint: JointSetup, plan: JointPlan) -> JointLimits:
         care = self._care

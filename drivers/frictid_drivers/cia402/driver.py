@@ -39,7 +39,7 @@ from frictid_hil.driver import (
     WallClock,
 )
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
-from frictid_hil.plan import JointPlan, Plan
+from frictid_hil.plan import Plan
 
 _SETTLE_S = 2.0
 _RESET_S = 0.5
@@ -292,10 +292,6 @@ class Cia402Driver:
         if cycle is None:
             raise HardwareError("exchange before start_cycling")
         return cycle.exchange(set_points)
-
-    def run_batch(self, plan: JointPlan) -> Mapping[str, Any]:
-        """Not offered: this driver cycles."""
-        raise HardwareError("CiA-402 drives are driven cycle by cycle; they run no batches", where=self.setup.bus)
 
     def quick_stop(self) -> None:
         """Torque to zero and controlword 02 to every drive, past the cyclic loop, from any thread; never raises."""

@@ -229,7 +229,12 @@ class BatchClient:
         self._host.order(f"FSTOP 1,{number}", within_s=within_s)
 
     def watch(
-        self, number: int, duration_s: float, stop: Callable[[], bool], progress: Callable[[float], None]
+        self,
+        number: int,
+        duration_s: float,
+        stop: Callable[[], bool],
+        progress: Callable[[float], None],
+        look: Callable[[], None] = lambda: None,
     ) -> JobState:
         """Wait for the end of a running job; asking is also what keeps its watchdog quiet.
 
@@ -238,6 +243,7 @@ class BatchClient:
             duration_s: planned.
             stop: asked often; True ends the job.
             progress: told the share that is done.
+            look: called once per question; a ``SafetyAbort`` of it ends the job and is raised once the joint stands.
 
         Returns:
             The state of the finished job.
@@ -250,12 +256,22 @@ class BatchClient:
         patience_s = duration_s * 1.2 + 10.0
         until_s = self._now_s() + patience_s
         stopping = False
+        wrong: SafetyAbort | None = None
         while True:
             state = self.state(number)
             progress(state.done_ticks / max(1, state.total_ticks))
+            if state.state not in (_FINISHED, _STOPPED) and not stopping:
+                try:
+                    look()
+                except SafetyAbort as seen:
+                    wrong, stopping = seen, True
+                    self.stop(number)
+                    continue
             if state.state == _FINISHED:
                 return state
             if state.state == _STOPPED:
+                if wrong is not None:
+                    raise wrong
                 if stopping:
                     raise Interrupted("stopped on request; the joint was brought to rest")
                 why, next_step = _STOP_REASONS.get(state.reason, (f"reason {state.reason}", ""))
@@ -278,14 +294,28 @@ class BatchClient:
                     break
                 self._host.listen(min(0.05, poll_until_s - self._now_s()))
 
-    def fetch(self, number: int, state: JobState, samples: int, progress: Callable[[float], None]) -> Record:
+    def fetch(
+        self,
+        number: int,
+        state: JobState,
+        samples: int,
+        progress: Callable[[float], None],
+        rows: dict[int, tuple[int, int, int]] | None = None,
+    ) -> Record:
         """FREAD until every sample is here; goes on after a broken transfer.
+
+        Args:
+            number: of the job.
+            state: of the job, which is over.
+            samples: how many to fetch.
+            progress: told the share that is here.
+            rows: filled as they come, by number; what is in it after an error may be kept (``record``).
 
         Raises:
             LinkError: a part cannot be transferred in several attempts.
             BadReply: what arrives instead is not this job's record.
         """
-        rows: dict[int, tuple[int, int, int]] = {}
+        rows = {} if rows is None else rows
         failures = 0
         while len(rows) < samples:
             before, first = len(rows), _first_missing(rows, samples)
@@ -300,8 +330,7 @@ class BatchClient:
             if failures >= _FETCH_ATTEMPTS:
                 raise failure
             progress(len(rows) / samples)
-        table = np.array([rows[k] for k in range(samples)], dtype=np.int64).reshape(samples, 3)
-        return Record(table[:, 0], table[:, 1], table[:, 2], state.dropped_pulses)
+        return record(rows, state.dropped_pulses)
 
     def download(self, table: FrictionTable) -> None:
         """FTABLE, read back and compared.
@@ -317,6 +346,13 @@ class BatchClient:
     def compensate(self, axis_mask: int) -> None:
         """FCOMP: apply the tables of these axes from now on; 0 ends it."""
         self._host.order(f"FCOMP 1,{axis_mask}")
+
+
+def record(rows: dict[int, tuple[int, int, int]], dropped_pulses: int) -> Record:
+    """The samples from the first on, up to the first that is missing."""
+    count = next(k for k in range(len(rows) + 1) if k not in rows)
+    table = np.array([rows[k] for k in range(count)], dtype=np.int64).reshape(count, 3)
+    return Record(table[:, 0], table[:, 1], table[:, 2], dropped_pulses)
 
 
 class _BlockCollector:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_drivers.motoman.batch import BatchClient, JobOrder, Record
+from frictid_drivers.motoman.batch import BatchClient, JobOrder, Record, record
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
@@ -48,6 +48,8 @@ class BatchRun:
         units: of its axis.
         bounds: see there.
         tick_s: interpolation clock.
+        number: of the job.
+        now_ns: run time.
 
     Attributes:
         number: of the job.
@@ -64,6 +66,7 @@ class BatchRun:
         bounds: JobBounds,
         tick_s: float,
         number: int,
+        now_ns: Callable[[], int],
     ) -> None:
         self._batch = batch
         self._host = host
@@ -71,6 +74,8 @@ class BatchRun:
         self._units = units
         self._bounds = bounds
         self._tick_s = tick_s
+        self._now_ns = now_ns
+        self._started_ns = 0
         self.number = number
         self.running = False
         self.columns: dict[str, Any] = {}
@@ -81,6 +86,7 @@ class BatchRun:
         power_on: Callable[[], None],
         stop: Callable[[], bool],
         progress: Callable[[str, float], None],
+        look: Callable[[], None],
     ) -> None:
         """The whole job; see ``MotomanDriver.run_batch``."""
         motion = motion_segments(plan.motions, self._units, self._tick_s)
@@ -91,7 +97,8 @@ class BatchRun:
         duration_s = len(motion.command) * self._tick_s
         try:
             self._batch.start(self.number)
-            self._batch.watch(self.number, duration_s, stop, lambda share: progress("motion", share))
+            self._started_ns = self._now_ns()
+            self._batch.watch(self.number, duration_s, stop, lambda share: progress("motion", share), look)
         except HardwareError:
             # The line failed: the controller stops by its watchdog, and whoever closes the line tries to stop it too.
             raise
@@ -138,22 +145,27 @@ class BatchRun:
         state = self._batch.state(self.number)
         if state.done_ticks == 0:
             return
-        record = self._batch.fetch(self.number, state, state.done_ticks, lambda share: progress("transfer", share))
-        self.columns = self._columns(motion, record)
+        rows: dict[int, tuple[int, int, int]] = {}
+        try:
+            self._batch.fetch(self.number, state, state.done_ticks, lambda share: progress("transfer", share), rows)
+        finally:
+            # A transfer that broke for good leaves what came before it.
+            if 0 in rows:
+                self.columns = self._columns(motion, record(rows, state.dropped_pulses))
 
-    def _columns(self, motion: JobMotion, record: Record) -> dict[str, Any]:
+    def _columns(self, motion: JobMotion, kept: Record) -> dict[str, Any]:
         units = self._units
-        n = len(record.pulses)
+        n = len(kept.pulses)
         # A job that was stopped early goes on recording while it decelerates: its command ends before its samples.
         command = np.concatenate([motion.command[:n], np.full(max(0, n - len(motion.command)), motion.command[-1])])
         tick_ns = round(self._tick_s * 1e9)
         sign = units.direction
         return {
-            "time_ns": np.arange(n, dtype=np.int64) * tick_ns,
-            "position_rad": record.pulses / units.pulses_per_rad,
-            "velocity_rad_s": record.speed_tenths * 0.1 / units.pulses_per_rad,
-            "torque_nm": record.torque_micro * (1e-6 * units.gear_ratio * sign),
+            "time_ns": self._started_ns + np.arange(n, dtype=np.int64) * tick_ns,
+            "position_rad": kept.pulses / units.pulses_per_rad,
+            "velocity_rad_s": kept.speed_tenths * 0.1 / units.pulses_per_rad,
+            "torque_nm": kept.torque_micro * (1e-6 * units.gear_ratio * sign),
             "position_command_rad": command / units.pulses_per_rad,
-            "motion_starts_ns": np.array(motion.motion_ticks, dtype=np.int64) * tick_ns,
-            "dropped_pulses": record.dropped_pulses,
+            "motion_starts_ns": self._started_ns + np.array(motion.motion_ticks, dtype=np.int64) * tick_ns,
+            "dropped_pulses": kept.dropped_pulses,
         }

@@ -8,7 +8,7 @@ time t moves the arm at run time t, and the marks of a recording agree with its 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.stream import StreamSession
@@ -23,7 +23,10 @@ _KEEP_ALIVE_TICKS = 100
 
 
 class TickClock:
-    """Run time by the controller's ticks; see the module's first page. Zero while nothing streams."""
+    """Run time by the controller's ticks; see the module's first page. Zero while nothing streams.
+
+    Between jobs of a batch there are no ticks to go by: it is then the time on this side since ``start``.
+    """
 
     def __init__(self) -> None:
         self._session: StreamSession | None = None
@@ -31,6 +34,12 @@ class TickClock:
         self._first_tick = 0
         self._tick_ns = 1
         self._lead_ticks = 0
+        self._since: Callable[[], float] | None = None
+
+    def start(self, now_s: Callable[[], float]) -> None:
+        """Begin on a clock of this side: now is run time zero."""
+        begun_s = now_s()
+        self._since = lambda: now_s() - begun_s
 
     def follow(self, session: StreamSession, first_tick: int, tick_ns: int, lead_ticks: int) -> None:
         """Begin: this tick is run time zero."""
@@ -40,8 +49,9 @@ class TickClock:
         self._lead_ticks = lead_ticks
 
     def release(self) -> None:
-        """The stream is over."""
+        """The stream, or the batch, is over."""
         self._session = None
+        self._since = None
 
     def tick_ns(self, tick: int) -> int:
         """Run time of a tick."""
@@ -50,6 +60,8 @@ class TickClock:
     def now_ns(self) -> int:
         """Run time that targets sent now are due at; it goes in whole ticks, by the clock while a report is overdue."""
         session = self._session
+        if self._since is not None:
+            return round(self._since() * 1e9)
         if session is None or session.report is None:
             return 0
         overdue_ticks = session.overdue_ns() // self._tick_ns

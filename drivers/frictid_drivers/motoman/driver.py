@@ -27,6 +27,7 @@ from frictid_hil.driver import (
     Finding,
     FrameSink,
     JointIdentity,
+    JointState,
     Mode,
     RobotSetup,
     SetPoint,
@@ -82,6 +83,7 @@ class MotomanDriver:
         self._limits = {
             joint.name: (joint.position_min_rad, joint.position_max_rad, joint.max_torque_nm) for joint in setup.joints
         }
+        self._batching = False
         self.clock = TickClock()
         self.batch_columns: dict[str, Any] = {}
 
@@ -139,6 +141,7 @@ class MotomanDriver:
                 lock_step=self._open_line().port.lock_step,
                 cycle_quantum_s=self.cycle_quantum_s(),
                 table_download=table,
+                command_delay_s=self._command_delay_s(),
             )
         return Capabilities(max_cycle_hz=0.0, modes=frozenset())
 
@@ -192,11 +195,19 @@ class MotomanDriver:
     # -- cycling -----------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:
-        """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick."""
+        """Servo power on (the arm holds where it stands), then streaming; run time starts at the first tick.
+
+        In batch, power stays on from here on, between the jobs as well, and run time starts now.
+        """
         line = self._open_line()
+        if self._reach.layer is Layer.BATCH:
+            self._power.on()
+            self._batching = True
+            self.clock.start(line.port.now_s)
+            return
         welcome = self._reach.welcome
         if welcome is None:
-            raise HardwareError("this controller does not stream", next_step="use run_batch")
+            raise HardwareError("this controller does not stream", next_step="see `frictid-hil check`")
         active = self._mask(self._active or self._units)
         mask = streamed_mask(self._mask(self._units), active, self._options.stream_baud, welcome.tick_us)
         self._power.on()
@@ -240,6 +251,10 @@ class MotomanDriver:
     def stop_cycling(self) -> None:
         """Back to host control, servo power off."""
         cycle, self._cycle = self._cycle, None
+        if self._batching:
+            self._batching = False
+            self.clock.release()
+            self._power.off()
         if cycle is None:
             return
         line = self._open_line()
@@ -265,6 +280,7 @@ class MotomanDriver:
             return
         cycle, self._cycle = self._cycle, None
         job, self._job = self._job, None
+        self._batching = False
         self.clock.release()
         try:
             if cycle is not None:
@@ -287,6 +303,7 @@ class MotomanDriver:
         *,
         stop: Callable[[], bool] = lambda: False,
         progress: Callable[[str, float], None] = lambda phase, share: None,
+        look: Callable[[Sequence[Feedback]], None] | None = None,
     ) -> Mapping[str, Any]:
         """One joint's motions as one job on the controller.
 
@@ -294,16 +311,19 @@ class MotomanDriver:
             plan: the joint must stand where its first motion begins; all others are held by the controller.
             stop: asked often; True brings the joint to rest and raises ``Interrupted``.
             progress: told ``motion`` or ``transfer`` and the share that is done.
+            look: given what ``standing`` says, about twice a second while the job runs; its ``SafetyAbort`` stops it.
 
         Returns:
             Columns of shape (n,): ``time_ns``, ``position_rad``, ``velocity_rad_s``, ``torque_nm``,
-            ``position_command_rad``; and ``motion_starts_ns``, shape (motions + 1,), the last one the end.
+            ``position_command_rad``; ``motion_starts_ns``, shape (motions + 1,), the last one the end; and
+            ``dropped_pulses``. Times are run time, from the controller's answer to the start on.
 
         Raises:
             PlanRefused: a motion that the controller cannot make.
-            SafetyAbort: the controller stopped; what was recorded is in ``batch_columns``.
+            SafetyAbort: the controller stopped, or ``look`` did; what was recorded is in ``batch_columns``.
             Interrupted: ``stop`` asked for it; likewise.
-            HardwareError: the line failed, or the joint does not stand at the start.
+            HardwareError: the line failed (``batch_columns`` then hold what had come), or the joint does not stand at
+                the start.
         """
         line, batch, reach = self._open_line(), self._batch, self._reach
         if batch is None or reach.batch is None:
@@ -320,13 +340,35 @@ class MotomanDriver:
             JobBounds(low_rad, high_rad, torque_nm, self._options.watchdog_s),
             self._tick_us * 1e-6,
             self._job_number,
+            self.clock.now_ns,
         )
+        self.batch_columns = {}
         try:
-            self._job.run(plan, self._power.on, stop, progress)
+            self._job.run(
+                plan, self._power.on, stop, progress, (lambda: look(self.standing())) if look else (lambda: None)
+            )
         finally:
             self.batch_columns = self._job.columns
-        self._power.off()
+        if not self._batching:
+            self._power.off()
         return self.batch_columns
+
+    def standing(self) -> Sequence[Feedback]:
+        """Every joint as stock host control sees it: position and state, no velocity and no torque; about 0.1 s."""
+        host = self._open_line().host
+        status, pulses = host.status(), host.pulses()
+        state = JointState.ENABLED if status.servo_on else JointState.DISABLED
+        return [
+            Feedback(
+                t_ns=self.clock.now_ns(),
+                position_rad=self._units[joint.name].position_rad(pulses[self._units[joint.name].axis]),
+                state=JointState.FAULT if status.faulty else state,
+                mode=Mode.POSITION,
+                status_raw=status.data_1 | status.data_2 << 8,
+                valid=True,
+            )
+            for joint in self._setup.joints
+        ]
 
     def download_table(
         self,
@@ -368,7 +410,8 @@ class MotomanDriver:
 
     def _command_delay_s(self) -> float:
         """Averaging and servo; where the controller does not know its averaging, what the robot file allows."""
-        known_ms = self._reach.welcome.averaging_ms if self._reach.welcome is not None else None
+        greeting = self._reach.welcome or self._reach.batch
+        known_ms = greeting.averaging_ms if greeting is not None else None
         averaging_ms = self._options.command_delay_ms if known_ms is None else known_ms
         return averaging_ms * 1e-3 + _SERVO_LAG_S
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from frictid_drivers.motoman.batch import BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import HostControl, Status
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.layers import Layer, Reach, busy_share, streamed_mask
+from frictid_drivers.motoman.segments import motion_segments
 from frictid_drivers.motoman.settings import SerialOptions
 from frictid_hil.driver import Finding, JointIdentity, JointSetup, RobotSetup, Severity
 from frictid_hil.errors import PlanRefused
@@ -79,8 +81,27 @@ def findings(
     ]
     if plan is not None and reach.layer is not Layer.HOST and round(1e6 / plan.cycle_hz) != round(1e6 / setup.cycle_hz):
         found.append(Finding(Severity.ERROR, "rate", f"the plan runs at {plan.cycle_hz:g} Hz, not at the tick's rate"))
+    if reach.layer is Layer.BATCH and reach.batch is not None and plan is not None:
+        found += _of_jobs(plan, units, reach.batch)
     if reach.layer is Layer.STREAM and reach.welcome is not None:
         found.append(_of_load(setup, units, options, reach, [entry.joint for entry in plan.joints] if plan else []))
+    return found
+
+
+def _of_jobs(plan: Plan, units: Mapping[str, AxisUnits], batch: BatchHello) -> list[Finding]:
+    """Whether every motion of the plan can be a job, before the first one begins."""
+    found: list[Finding] = []
+    for entry in plan.joints:
+        subject = f"joint {entry.joint}"
+        try:
+            motion = motion_segments(entry.motions, units[entry.joint], batch.tick_us * 1e-6)
+        except PlanRefused as refused:
+            found.append(Finding(Severity.ERROR, subject, refused.what, refused.next_step))
+            continue
+        ticks = len(motion.command)
+        if ticks > batch.most_ticks:
+            message = f"its motions take {ticks} ticks, the controller records at most {batch.most_ticks}"
+            found.append(Finding(Severity.ERROR, subject, message, "plan fewer cycles, or a shorter warm-up"))
     return found
 
 

@@ -38,7 +38,7 @@ from frictid_hil.simulation.joint import JointModel
 if TYPE_CHECKING:
     import filelock
 
-    from frictid_hil.plan import JointPlan, Plan
+    from frictid_hil.plan import Plan
 
 
 class VirtualDriver:
@@ -180,10 +180,6 @@ class VirtualDriver:
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """As ``Driver.exchange``."""
         return self._host.exchange(set_points)
-
-    def run_batch(self, plan: JointPlan) -> Mapping[str, Any]:
-        """As ``Driver.run_batch``."""
-        return self._host.run_batch(plan)
 
     def quick_stop(self) -> None:
         """As ``Driver.quick_stop``."""

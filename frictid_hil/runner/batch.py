@@ -1,0 +1,278 @@
+"""One joint on a controller that runs whole motions by itself: job by job, every sample supervised once it is fetched.
+
+::
+
+    reference       every joint where the plan expects it; then power, and all of them seen to stand
+    job             the rehearsal first and alone, so that nothing fast runs before its torque was looked at
+        while it runs     all other joints are read, and must not have moved
+        once it stands    its recording is fetched, kept, and passed through the supervisor
+    power off
+
+The controller keeps travel, step and torque within the job's own bounds meanwhile, and stops when it hears nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from frictid_hil.driver import Batched, Driver, Feedback, JointState, Mode, RobotSetup, SetPoint
+from frictid_hil.errors import Interrupted, SafetyAbort
+from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move
+from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.cycle import StopRequest
+from frictid_hil.runner.events import Event, JobProgress, JointRun, Marked, PhaseStarted, Warned
+from frictid_hil.runner.reference import verify_reference
+from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.sign_watch import SignWatch
+from frictid_hil.runner.supervisor import JointLimits, Supervisor
+
+if TYPE_CHECKING:
+    from frictid_hil.runner.scheduler import Care
+
+_REHEARSAL_TORQUE = 0.5
+_AT_RAD = 1e-4
+_LOOKS_AT_STANDSTILL = 20
+_COLUMNS = ("position_rad", "velocity_rad_s", "torque_nm", "position_command_rad")
+
+
+class BatchDriver(Batched, Driver, Protocol):
+    """What this module needs of a driver."""
+
+
+class BatchRunner:
+    """Runs one joint's plan; power comes on and goes off again in here.
+
+    Args:
+        driver: configured, limits set, not yet under power.
+        setup: the robot.
+        supervisor: knows the limits of every joint.
+        limits: of every joint, same order.
+        samples: ring for every fetched sample.
+        offset_ns: added to run time.
+        care: tolerances.
+        notify: told what happens.
+        stop: asked often.
+        pump: called to empty the rings where this process writes the files.
+    """
+
+    def __init__(
+        self,
+        driver: BatchDriver,
+        setup: RobotSetup,
+        supervisor: Supervisor,
+        limits: Sequence[JointLimits],
+        samples: Ring,
+        *,
+        offset_ns: int,
+        care: Care,
+        notify: Callable[[Event], None],
+        stop: StopRequest,
+        pump: Callable[[], None] | None,
+    ) -> None:
+        self._driver = driver
+        self._joints = setup.joints
+        self._names = [joint.name for joint in setup.joints]
+        self._supervisor = supervisor
+        self._limits = list(limits)
+        self._samples = samples
+        self._offset_ns = offset_ns
+        self._care = care
+        self._notify = notify
+        self._stop = stop
+        self._pump = pump or (lambda: None)
+        self._count = 0
+
+    def run(self, session: int, plan: JointPlan) -> tuple[JointRun, int]:
+        """The whole plan of one joint; also the run time at its end, in ns.
+
+        Raises:
+            SafetyAbort: by the supervisor, or by the controller.
+            Interrupted: asked to stop; the joint stands.
+            HardwareError: the line failed, or a transfer broke for good.
+        """
+        driver, moving = self._driver, self._names.index(plan.joint)
+        self._notify(PhaseStarted(plan.joint, "reference", 0.0))
+        verify_reference(self._joints, driver.standing(), plan.locked, self._care.reference_tolerance_rad)
+        self._notify(PhaseStarted(plan.joint, "enable", 0.0))
+        driver.start_cycling()
+        self._see_power()
+        at_rad = self._see_standstill()
+        for index, name in enumerate(self._names):
+            target_rad = plan.locked.get(name)
+            if index != moving and target_rad is not None and abs(target_rad - at_rad[index]) > _AT_RAD:
+                self._job(index, [self._approach(at_rad[index], target_rad)], at_rad)
+                at_rad[index] = target_rad
+        marks: list[Mark] = []
+        self._count = 0
+        for motions in self._jobs(at_rad[moving], plan.motions):
+            marks += self._job(moving, motions, at_rad)
+        end_ns = driver.clock.now_ns() + self._offset_ns
+        driver.stop_cycling()
+        run = JointRun(
+            joint=plan.joint,
+            session=session,
+            marks=tuple(marks),
+            rate_hz=driver.capabilities().max_cycle_hz,
+            cycles=self._count,
+            late_cycles=0,
+            missed_cycles=0,
+            worst_lateness_s=0.0,
+            duration_s=(end_ns - marks[0].start_ns) * 1e-9,
+        )
+        return run, end_ns
+
+    # -- one job ------------------------------------------------------------------------------------------------
+
+    def _jobs(self, here_rad: float, motions: Sequence[Motion]) -> list[list[Motion]]:
+        """The motions, with an approach where they begin elsewhere, cut behind the rehearsal.
+
+        What is measured stays in one job: no transfer, and no standing still, comes in between.
+        """
+        every = list(motions)
+        first_rad = float(every[0].position_rad(np.zeros(1))[0])
+        if abs(first_rad - here_rad) > _AT_RAD:
+            every.insert(0, self._approach(here_rad, first_rad))
+        cut = max((k + 1 for k, motion in enumerate(every) if motion.name == REHEARSAL), default=0)
+        return [job for job in (every[:cut], every[cut:]) if job]
+
+    def _job(self, index: int, motions: Sequence[Motion], at_rad: Sequence[float]) -> list[Mark]:
+        """Run it, keep what it recorded, and judge that; the marks of its motions."""
+        if self._stop.level:
+            raise Interrupted("stopped on request before the motion began")
+        driver, joint, normal = self._driver, self._joints[index], self._limits[index]
+        rehearsing = motions[-1].name == REHEARSAL
+        share = _REHEARSAL_TORQUE if rehearsing else 1.0
+        driver.set_limits(
+            joint.name,
+            torque_nm=share * joint.max_torque_nm,
+            position_min_rad=joint.position_min_rad,
+            position_max_rad=joint.position_max_rad,
+        )
+        held = {k: rad for k, rad in enumerate(at_rad) if k != index}
+        self._look(held, driver.standing())
+        longest = max(motions, key=lambda motion: motion.duration_s)
+        self._notify(PhaseStarted(joint.name, longest.name, sum(motion.duration_s for motion in motions)))
+        marks: list[Mark] = []
+        try:
+            driver.run_batch(
+                JointPlan(joint.name, tuple(motions), {}),
+                stop=lambda: self._stop.level > 0,
+                progress=_EverySecond(lambda stage, done: self._notify(JobProgress(joint.name, stage, done))),
+                look=lambda reports: self._look(held, reports),
+            )
+        finally:
+            # Kept also where the job was stopped, or its transfer broke for good.
+            marks = self._keep(index, motions, driver.batch_columns)
+            for mark in marks:
+                self._notify(Marked(joint.name, mark))
+        columns = driver.batch_columns
+        self._supervisor.set_limits(index, replace(normal, torque_nm=share * normal.torque_nm))
+        self._pass_on(index, columns)
+        self._supervisor.set_limits(index, normal)
+        if rehearsing:
+            self._judge_signs(joint.name, columns, marks[-1])
+        self._look(held, driver.standing())
+        if columns["dropped_pulses"]:
+            dropped = int(columns["dropped_pulses"])
+            self._notify(Warned(f"joint {joint.name}: the controller's speed limiter dropped {dropped} pulses"))
+        return marks
+
+    def _keep(self, index: int, motions: Sequence[Motion], columns: Mapping[str, Any]) -> list[Mark]:
+        """Every fetched sample into the ring; the marks of the motions that are there as a whole."""
+        if not columns:
+            return []
+        times_ns = columns["time_ns"] + self._offset_ns
+        nan = float("nan")
+        for time_ns, position, velocity, torque, command in zip(times_ns.tolist(), *_rows(columns), strict=True):
+            self._samples.append(time_ns, position, velocity, torque, command, 0.0, nan, nan, 0, index, 0)
+        self._pump()
+        self._count += len(times_ns)
+        bounds_ns = (columns["motion_starts_ns"] + self._offset_ns).tolist()
+        return [
+            Mark(motion.name, start_ns, end_ns, motion.details())
+            for motion, (start_ns, end_ns) in zip(motions, pairwise(bounds_ns), strict=True)
+            if end_ns <= int(times_ns[-1])
+        ]
+
+    def _pass_on(self, index: int, columns: Mapping[str, Any]) -> None:
+        """Every fetched sample through the supervisor."""
+        self._supervisor.watch(index, Mode.POSITION, {})
+        report = Feedback(state=JointState.ENABLED, mode=Mode.POSITION, valid=True)
+        reports, set_points = [report for _ in self._names], [SetPoint() for _ in self._names]
+        for position, velocity, torque, command in zip(*_rows(columns), strict=True):
+            report.position_rad, report.velocity_rad_s, report.torque_nm = position, velocity, torque
+            report.position_command_rad = command
+            self._supervisor.check(set_points, reports)
+
+    def _judge_signs(self, name: str, columns: Mapping[str, Any], rehearsal: Mark) -> None:
+        """Friction must oppose motion."""
+        times_ns = columns["time_ns"] + self._offset_ns
+        inside = (times_ns >= rehearsal.start_ns) & (times_ns < rehearsal.end_ns)
+        watch, set_point = SignWatch(_Endless(), name), SetPoint()
+        for velocity, torque in zip(
+            columns["velocity_rad_s"][inside].tolist(), columns["torque_nm"][inside].tolist(), strict=True
+        ):
+            watch.update(Feedback(velocity_rad_s=velocity, torque_nm=torque), set_point)
+        watch.judge()
+
+    def _look(self, held: Mapping[int, float], reports: Sequence[Feedback]) -> None:
+        """Every joint but the one that runs stands under power where it is held."""
+        self._supervisor.watch(None, Mode.POSITION, dict(held))
+        self._supervisor.check([SetPoint() for _ in reports], reports)
+
+    # -- before the first job -----------------------------------------------------------------------------------
+
+    def _approach(self, from_rad: float, to_rad: float) -> Move:
+        return Move.within(from_rad, to_rad, self._care.approach_rad_s, name="approach")
+
+    def _see_power(self) -> None:
+        for name, report in zip(self._names, self._driver.standing(), strict=True):
+            if report.state is not JointState.ENABLED:
+                raise SafetyAbort(
+                    f"could not be enabled: state {report.state.value} (status {report.status_raw:#06x})",
+                    where=f"joint {name}",
+                    next_step="look at the pendant, clear the cause, then start again",
+                )
+
+    def _see_standstill(self) -> list[float]:
+        """Where every joint stands, once two looks in a row agree."""
+        before = self._driver.standing()
+        for _ in range(_LOOKS_AT_STANDSTILL):
+            here = self._driver.standing()
+            apart_s = (here[0].t_ns - before[0].t_ns) * 1e-9
+            moved_rad = [abs(b.position_rad - a.position_rad) for a, b in zip(before, here, strict=True)]
+            if max(moved_rad) <= self._care.still_rad_s * apart_s:
+                return [report.position_rad for report in here]
+            before = here
+        raise SafetyAbort(f"standstill of every joint not seen in {_LOOKS_AT_STANDSTILL} looks")
+
+
+class _Endless:
+    """A source that never ends."""
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        return True
+
+
+class _EverySecond:
+    """Passes progress on once a second, and every end."""
+
+    def __init__(self, tell: Callable[[str, float], None]) -> None:
+        self._tell = tell
+        self._told_s = 0.0
+
+    def __call__(self, stage: str, done: float) -> None:
+        now_s = time.monotonic()
+        if done >= 1.0 or now_s - self._told_s >= 1.0:
+            self._told_s = now_s
+            self._tell(stage, done)
+
+
+def _rows(columns: Mapping[str, Any]) -> list[list[float]]:
+    return [columns[name].tolist() for name in _COLUMNS]
