@@ -169,3 +169,5 @@ def _print_diagnosis(output: Output, result: Result) -> None:
     for key in ("model", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)
+    if result.get("model_refused"):
+        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)

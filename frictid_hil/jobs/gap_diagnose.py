@@ -15,6 +15,7 @@ from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.jobs.improved_robot import improved_robot
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
+from frictid_hil.simulation.joint import JointModel
 
 
 def diagnose(
@@ -30,14 +31,21 @@ def diagnose(
 
     Raises:
         InputFileError, ConfigError: the set is unusable.
-        UsageError: a model was asked for and there is none to write.
+        UsageError: the page cannot be written.
+
+    Returns:
+        The JSON of the verb. Any verdict is a result: where a model was asked for and none is written, ``model`` is
+        null and ``model_refused`` says why and what to do.
     """
     experiments = ExperimentSet.load(folder)
     found = find_causes(experiments)
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
     del result["schema"]  # the command line's own
     if write_model is not None:
-        result["model"] = str(_write_model(write_model, experiments, found, apply).resolve())
+        refused = _why_no_model(found, apply)
+        result["model"] = None if refused else str(_write_model(write_model, experiments, found, apply).resolve())
+        if refused:
+            result["model_refused"] = refused
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -75,21 +83,25 @@ def _side_by_side(experiments: ExperimentSet, found: Diagnosis) -> tuple[SideByS
     return tuple(logs)
 
 
-def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply: bool) -> Path:
+def _why_no_model(found: Diagnosis, apply: bool) -> str:
+    """Why the simulator shall stay as it is; "" where a model may be written."""
     if found.verdict in ("unknown", "ambiguous") and not apply:
-        raise UsageError(
-            f"the verdict is {found.verdict}: no cause is sure enough to change the simulator",
-            where=experiments.name,
-            cause=found.summary,
-            next_step="record the next experiment, or add --apply to write the best candidate all the same",
+        return (
+            f"the verdict is {found.verdict}: no cause is sure enough to change the simulator; record the next "
+            "experiment, or add --apply to write the best candidate all the same"
         )
-    model = found.candidate if apply else found.improved_model()
-    if model is None:
-        raise UsageError(
-            "the closed loop of this joint cannot be simulated, so there is no joint to write",
-            where=experiments.name,
-            cause="; ".join(f"{name}: {why}" for name, why in found.reasons.items()),
-            next_step="add controller, drive and encoder to nominal.yaml",
-        )
+    if _chosen(found, apply) is None:
+        reasons = "; ".join(f"{name}: {why}" for name, why in found.reasons.items())
+        return f"the closed loop of this joint cannot be simulated, so there is no joint to write ({reasons})"
+    return ""
+
+
+def _chosen(found: Diagnosis, apply: bool) -> JointModel | None:
+    return found.candidate if apply else found.improved_model()
+
+
+def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply: bool) -> Path:
+    model = _chosen(found, apply)
+    assert model is not None  # by _why_no_model
     write_whole(path, dump(improved_robot(experiments, model)))
     return path

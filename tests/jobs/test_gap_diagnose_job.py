@@ -10,7 +10,6 @@ import pytest
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
-from frictid_hil.errors import UsageError
 from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.replay import Controller, closed_loop
@@ -110,6 +109,7 @@ def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_
     result = diagnose(bare)
     assert result["gap"]["before"]["forward_torque_nm"] is None
     assert result["reasons"]
-    with pytest.raises(UsageError):
-        diagnose(bare, write_model=tmp_path / "improved.yaml")
+    asked = diagnose(bare, write_model=tmp_path / "improved.yaml")
+    assert asked["verdict"] == result["verdict"], "the diagnosis is told all the same"
+    assert asked["model"] is None and "closed loop" in asked["model_refused"]
     assert not (tmp_path / "improved.yaml").exists()
