@@ -231,7 +231,7 @@ class Feedback:
         external_torque_nm: force sensor, NaN where there is none.
         temperature_c: NaN where unknown.
         position_command_rad: the set-point in force at ``t_ns`` as it went out, rounded to the drive's counts; NaN
-            where the driver does not tell, or none was sent yet.
+            where the driver does not tell, none was sent yet, or the mode follows none.
         digital_inputs: bits of the drive's inputs (60FD), None before their first report or where none is configured.
         digital_inputs_age_cycles: cycles since they were reported.
         state: of the power stage.
@@ -267,6 +267,10 @@ class Severity(Enum):
     ERROR = "error"
 
 
+OWN_FRICTION_COMPENSATION = "own friction compensation"
+"""Topic of the finding that a drive compensates friction by itself."""
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """One line of ``frictid-hil check``.
@@ -276,12 +280,14 @@ class Finding:
         subject: joint, object or setting (``joint 1``, ``bus``).
         message: what was found, with numbers and units.
         next_step: what to do about it ("" when nothing).
+        topic: by which a job recognises what it judges by itself; "" for most.
     """
 
     severity: Severity
     subject: str
     message: str
     next_step: str = ""
+    topic: str = ""
 
 
 FrameSink = Callable[[int, int, bytes, bool], None]

@@ -76,6 +76,7 @@ class Care:
         travel_slack_rad: measured position may leave the planned travel by this.
         silence_s: how long the moving joint may go without a report; never less than three cycles.
         interlock: must be closed before and during motion; None where a person watches.
+        tolerated: topics of the driver's findings that the caller judges by itself when asked to proceed.
     """
 
     reference_tolerance_rad: float = math.radians(10.0)
@@ -88,6 +89,7 @@ class Care:
     travel_slack_rad: float = math.radians(2.0)
     silence_s: float = 0.02
     interlock: Interlock | None = None
+    tolerated: frozenset[str] = frozenset()
 
 
 class Recorder:
@@ -169,7 +171,8 @@ class Scheduler:
         identities = self._driver.identify()
         findings = self._driver.check(self._plan)
         self._command_delay_s = self._driver.capabilities().command_delay_s
-        errors = [finding for finding in findings if finding.severity is Severity.ERROR]
+        tolerated = self._care.tolerated
+        errors = [f for f in findings if f.severity is Severity.ERROR and f.topic not in tolerated]
         if errors:
             planned_wrong = all(finding.subject == "bus load" for finding in errors)
             raise (PlanRefused if planned_wrong else HardwareError)(

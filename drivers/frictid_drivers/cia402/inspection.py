@@ -12,7 +12,7 @@ from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DriveState, drive_state
-from frictid_hil.driver import Finding, JointIdentity, JointSetup, Mode, Severity, Timing
+from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Finding, JointIdentity, JointSetup, Mode, Severity, Timing
 from frictid_hil.units import format_angle, format_torque
 
 Said = Callable[..., Finding]
@@ -110,11 +110,13 @@ def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, settings: BusS
     for setting, value in read_settings(drive, facts.vendor, facts.product).items():
         if setting.effect is Effect.FRICTION_COMPENSATION and value:
             findings.append(
-                said(
+                Finding(
                     Severity.ERROR,
+                    subject,
                     f"the drive compensates friction by itself ({setting.object} = {value}): "
                     "it would hide what is to be measured",
                     "switch it off with the vendor's tool",
+                    OWN_FRICTION_COMPENSATION,
                 )
             )
     return findings
