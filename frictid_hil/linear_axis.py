@@ -21,6 +21,7 @@ _LINEAR = {
     "slopes_nm_s_per_rad": "slopes_n_s_per_m",
     "measured_range_rad_s": "measured_range_m_s",
     "presliding_stiffness_nm_per_rad": "presliding_stiffness_n_per_m",
+    "presliding_level_nm": "presliding_level_n",
     "inertia_kg_m2": "mass_kg",
     "gravity_cos_nm": "gravity_cos_n",
     "gravity_sin_nm": "gravity_sin_n",

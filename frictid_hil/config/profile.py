@@ -149,6 +149,7 @@ class JointProfile(Strict):
         torque_interval_nm: 95 % interval of each F_n, shape (N, 2), or None.
         coulomb_nm: F_0.
         presliding_stiffness_nm_per_rad: from a slow small reversal.
+        presliding_level_nm: friction of creeping motion, from the same: where presliding yields.
         inertia_kg_m2: of the whole joint.
         gravity_cos_nm: of ``gravity_cos * cos(q) + gravity_sin * sin(q)``.
         gravity_sin_nm: see there.
@@ -175,6 +176,7 @@ class JointProfile(Strict):
     slopes_nm_s_per_rad: Numbers | None = None
     coulomb_nm: Estimate
     presliding_stiffness_nm_per_rad: Estimate = Field(default_factory=_not_identified)
+    presliding_level_nm: Estimate = Field(default_factory=_not_identified)
     inertia_kg_m2: Estimate = Field(default_factory=_not_identified)
     gravity_cos_nm: Estimate = Field(default_factory=_not_identified)
     gravity_sin_nm: Estimate = Field(default_factory=_not_identified)
@@ -230,6 +232,8 @@ class JointProfile(Strict):
             for name in ("shares", "together"):
                 if values["procedure"][name] is None:
                     del values["procedure"][name]
+        if self.presliding_level_nm.value is None:
+            del values["presliding_level_nm"]  # the stiffness beside it says why
         for value in values.values():
             if isinstance(value, dict) and "value" in value:
                 _drop_nothings(value)

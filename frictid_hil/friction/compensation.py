@@ -31,11 +31,32 @@ FORMS = ("mo", "mol", "mop")
 PAPER_RATIO = 0.9
 PAPER_STIFFNESS_NM_PER_RAD = 10_000.0
 OUR_RATIO = 0.95
-OUR_SHARE_OF_PRESLIDING = 0.8
-"""K of the setting ``ours``, as a share of the identified presliding stiffness.
 
-That is identified at rest, where static friction stands above its sliding level and stiffens the presliding spring by
-as much; a joint that begins to hunt slides, and has the lower stiffness."""
+RATIO_MARGIN = 0.02
+STIFFNESS_MARGIN = 0.1
+"""The setting ``ours`` is to stand with R larger by the one and K larger by this share."""
+
+
+def stiffness_with_margin(
+    presliding_nm_per_rad: float, presliding_level_nm: float, coulomb_nm: float, ratio: float
+) -> float:
+    """K of the setting ``ours``: the largest for which R K < presliding stiffness holds with both margins.
+
+    Presliding is a spring that yields after a travel x = level / stiffness. Both are identified from a joint that
+    creeps, under static friction. A joint that begins to hunt slides: its friction falls to F_0 while x stays, and so
+    its stiffness falls to F_0 / x. That is what R K has to stay below.
+
+    Delay asks for no margin: near rest the joint obeys I q'' + sigma q = R K q(t - T), and to first order in T this is
+    I q'' + R K T q' + (sigma - R K) q = 0: torque that helps, given late, damps.
+
+    Args:
+        presliding_nm_per_rad: the low end of its interval.
+        presliding_level_nm: the high end of its interval.
+        coulomb_nm: F_0.
+        ratio: R.
+    """
+    sliding_nm_per_rad = presliding_nm_per_rad * min(1.0, coulomb_nm / presliding_level_nm)
+    return sliding_nm_per_rad / ((1.0 + STIFFNESS_MARGIN) * (ratio + RATIO_MARGIN))
 
 
 @dataclass(frozen=True, slots=True)

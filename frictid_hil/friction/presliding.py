@@ -8,7 +8,8 @@ yields. Two shapes of that passage are fitted, x being the travel since the turn
 
 and the one that leaves less decides. sigma is the slope midway, where friction passes zero: the stiffness of a joint
 at rest. Right after the turning point a gradual joint is twice as stiff, but only until it has moved; a compensation
-spring as stiff as that would give back more than the joint takes.
+spring as stiff as that would give back more than the joint takes. D / 2 is the friction of a joint that creeps, static
+friction included: the level at which the spring of a joint at rest yields.
 """
 
 from __future__ import annotations
@@ -35,13 +36,26 @@ _LEAST_CLARITY = 4.0
 
 
 @dataclass(frozen=True, slots=True)
+class Presliding:
+    """A joint before it slides.
+
+    Attributes:
+        stiffness_nm_per_rad: sigma.
+        level_nm: friction of creeping motion, half of D.
+    """
+
+    stiffness_nm_per_rad: Measured
+    level_nm: Measured
+
+
+@dataclass(frozen=True, slots=True)
 class _Passage:
     travel: Array  # since the turning point, positive
     drop: Array  # torque, signed so that it falls
 
 
-def presliding_stiffness(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Measured:
-    """Stiffness of the joint before it slides, N m/rad, with its 95 % interval.
+def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Presliding:
+    """Stiffness of the joint before it slides, and the friction at which it does, with their 95 % intervals.
 
     Args:
         time_s: increasing, shape (n,).
@@ -71,9 +85,13 @@ def presliding_stiffness(time_s: Array, position_rad: Array, torque_nm: Array, *
             where=where,
             cause="the reversal is shorter than the presliding travel, or torque is too noisy",
         )
-    stiffness, _ = min(shapes, key=lambda fitted: fitted[1])
-    half = float(student.ppf(0.975, stiffness.size - 1) * stiffness.std(ddof=1) / np.sqrt(stiffness.size))
-    return Measured(float(stiffness.mean()), half)
+    found, _ = min(shapes, key=lambda fitted: fitted[1])
+    return Presliding(_mean(found[:, 0]), _mean(0.5 * found[:, 1]))
+
+
+def _mean(values: Array) -> Measured:
+    half = float(student.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size))
+    return Measured(float(values.mean()), half)
 
 
 def _turning_points(position: Array) -> list[int]:
@@ -111,8 +129,11 @@ def _gradually(travel: Array, start: float, stiffness: float, change: float) -> 
 
 
 def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Array, float] | None:
-    """Stiffness of every passage that could be fitted, and the mean square left; None where fewer than two could."""
-    found: list[float] = []
+    """(Stiffness, change) of every passage that could be fitted, shape (n, 2), and the mean square left.
+
+    None where fewer than two could.
+    """
+    found: list[tuple[float, float]] = []
     left = 0.0
     for passage in passages:
         travel, drop = passage.travel, passage.drop
@@ -130,7 +151,7 @@ def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Arr
             continue
         rest = float(np.mean((shape(travel, *values) - drop) ** 2))
         if np.sqrt(spread[1, 1]) < 0.5 * values[1] and values[2] > _LEAST_CLARITY * np.sqrt(rest):
-            found.append(float(values[1]))
+            found.append((float(values[1]), float(values[2])))
             left += rest
     if len(found) < 2:
         return None

@@ -27,10 +27,10 @@ from frictid_hil.driver import JointSetup, Mode, RobotSetup
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.compensation import (
     OUR_RATIO,
-    OUR_SHARE_OF_PRESLIDING,
     PAPER_RATIO,
     PAPER_STIFFNESS_NM_PER_RAD,
     CompensationSettings,
+    stiffness_with_margin,
 )
 from frictid_hil.jobs.plans import APPROACH_RAD_S
 from frictid_hil.plan import Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
@@ -214,10 +214,15 @@ def friction_settings(
     stiffness = wanted.stiffness_nm_per_rad
     if stiffness is None and not ours:
         stiffness = PAPER_STIFFNESS_NM_PER_RAD
-    if stiffness is None:
-        found = _needed(entry.presliding_stiffness_nm_per_rad, "presliding stiffness", where)
-        stiffness = OUR_SHARE_OF_PRESLIDING * found
     curve = entry.curve()
+    if stiffness is None:
+        found, level = entry.presliding_stiffness_nm_per_rad, entry.presliding_level_nm
+        stiffness = stiffness_with_margin(
+            found.low or _needed(found, "presliding stiffness", where),
+            level.high or _needed(level, "presliding level", where),
+            curve.coulomb_nm,
+            ratio,
+        )
     asymmetry = tuple(entry.quality.get("asymmetry_nm", ())) if ours else ()
     settings = CompensationSettings.of(
         curve,
@@ -363,6 +368,6 @@ def _needed(figure: Estimate, what: str, where: str) -> float:
         raise ProfileMismatch(
             f"the profile has no {what}: {figure.reason}",
             where=where,
-            next_step="calibrate the joint with its whole procedure, slow reversal included",
+            next_step="identify its run again, or calibrate the joint with its whole procedure, slow reversal included",
         )
     return figure.value

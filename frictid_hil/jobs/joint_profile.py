@@ -16,11 +16,11 @@ from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.driver import JointSetup
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
-from frictid_hil.friction.estimate import Estimate, estimate
+from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
-from frictid_hil.friction.presliding import presliding_stiffness
+from frictid_hil.friction.presliding import presliding
 from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
 from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Procedure
@@ -111,6 +111,7 @@ def _from_cycles(
     curve = result.curve
     half = result.half_width_nm
     temperature = samples.temperature_c
+    stiffness, level = _presliding(samples, recording)
     return JointProfile(
         method=result.method,
         prismatic=samples.prismatic,
@@ -120,7 +121,8 @@ def _from_cycles(
             (float(f - h), float(f + h)) for f, h in zip(curve.torque_nm, half.tolist(), strict=True)
         ),
         coulomb_nm=_figure(result.coulomb_nm),
-        presliding_stiffness_nm_per_rad=_presliding(samples, recording, result),
+        presliding_stiffness_nm_per_rad=stiffness,
+        presliding_level_nm=level,
         inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, "inertia and gravity could not be separated"),
         gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, "inertia and gravity could not be separated"),
         gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, "inertia and gravity could not be separated"),
@@ -244,17 +246,18 @@ def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
     )
 
 
-def _presliding(samples: Samples, recording: CycleRecording, result: Estimate) -> Figure:
+def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Figure]:
+    """Stiffness and level."""
     reversals = samples.marked("reversal")
     if not reversals:
-        return Figure.none("the recording has no slow reversal")
+        return (Figure.none("the recording has no slow reversal"),) * 2
     part = samples.during(reversals[0])
     assert part.torque_nm is not None  # by the caller
     try:
-        stiffness = presliding_stiffness(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
+        found = presliding(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
     except IdentificationError as problem:
-        return Figure.none(problem.what)
-    return _figure(stiffness)
+        return (Figure.none(problem.what),) * 2
+    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm)
 
 
 def _figure(measured: Measured | None, reason: str = "") -> Figure:

@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from frictid_hil.errors import UsageError
-from frictid_hil.friction.compensation import Compensation, CompensationSettings, least_squares_viscosity
+from frictid_hil.friction.compensation import (
+    Compensation,
+    CompensationSettings,
+    least_squares_viscosity,
+    stiffness_with_margin,
+)
 from frictid_hil.friction.curve import FrictionCurve
 
 CURVE = FrictionCurve((0.2, 0.8, 2.0), (5.5, 6.4, 7.6))
@@ -94,6 +99,16 @@ def test_a_spring_stiffer_than_presliding_is_refused() -> None:
     with pytest.raises(UsageError, match="presliding") as refusal:
         settings().refuse_unstable(0.99 * R * K)
     assert "hunt" in refusal.value.cause
+
+
+@given(st.floats(1e3, 3e4), st.floats(0.5, 20.0), st.floats(0.5, 1.5), st.floats(0.5, 0.97))
+def test_our_stiffness_holds_with_both_margins_on_a_joint_that_slides(
+    presliding: float, coulomb: float, static_share: float, ratio: float
+) -> None:
+    stiffness = stiffness_with_margin(presliding, static_share * coulomb, coulomb, ratio)
+    sliding = presliding * min(1.0, 1.0 / static_share)
+    assert (ratio + 0.02) * 1.1 * stiffness == pytest.approx(sliding)
+    settings(stiffness_nm_per_rad=stiffness, ratio=ratio).refuse_unstable(presliding)
 
 
 def test_an_unknown_form_is_refused() -> None:

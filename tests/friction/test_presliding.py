@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.errors import IdentificationError
-from frictid_hil.friction.presliding import presliding_stiffness
+from frictid_hil.friction.presliding import presliding
 
 STEP = 1e-3
 
@@ -41,9 +41,10 @@ def test_stiffness_at_rest_is_found_through_noise_steps_and_gravity(model, stiff
     torque = model(path, stiffness, level) + 40 * np.cos(0.3 + path) + 0.005 * rated * rng.normal(size=path.size)
     torque = np.round(torque / (rated * 1e-3)) * rated * 1e-3
     counts = np.round(path / 5e-7) * 5e-7
-    found = presliding_stiffness(time, counts, torque)
-    assert found.value == pytest.approx(stiffness, rel=0.05)
-    assert found.half_width < 0.15 * stiffness
+    found = presliding(time, counts, torque)
+    assert found.stiffness_nm_per_rad.value == pytest.approx(stiffness, rel=0.05)
+    assert found.stiffness_nm_per_rad.half_width < 0.15 * stiffness
+    assert found.level_nm.value == pytest.approx(level, rel=0.04)
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -52,8 +53,8 @@ def test_a_servo_controlled_joint_tells_its_stiffness(plants, index):
     time, path = triangles()
     path = joint.start + np.concatenate([np.zeros(300), path])
     q, _, torque = plants.drive(joint, path, np.gradient(path, STEP))
-    found = presliding_stiffness(time, q[300:], torque[300:])
-    assert found.value == pytest.approx(joint.stiffness, rel=0.03)
+    found = presliding(time, q[300:], torque[300:])
+    assert found.stiffness_nm_per_rad.value == pytest.approx(joint.stiffness, rel=0.03)
 
 
 def test_a_joint_of_many_small_springs_is_not_called_stiffer_than_all_of_them(plants):
@@ -61,18 +62,18 @@ def test_a_joint_of_many_small_springs_is_not_called_stiffer_than_all_of_them(pl
     time, path = triangles()
     path = joint.start + np.concatenate([np.zeros(300), path])
     q, _, torque = plants.drive(joint, path, np.gradient(path, STEP))
-    found = presliding_stiffness(time, q[300:], torque[300:])
-    assert 0.6 * joint.stiffness < found.value <= 1.02 * joint.stiffness
+    found = presliding(time, q[300:], torque[300:])
+    assert 0.6 * joint.stiffness < found.stiffness_nm_per_rad.value <= 1.02 * joint.stiffness
 
 
 def test_motion_without_reversals_says_so():
     time = np.arange(2000) * STEP
     with pytest.raises(IdentificationError, match="fewer than two turning points"):
-        presliding_stiffness(time, 1e-3 * time, np.ones(2000))
+        presliding(time, 1e-3 * time, np.ones(2000))
 
 
 def test_a_frictionless_joint_has_no_presliding():
     time, path = triangles()
     torque = 1e-3 * np.random.default_rng(0).normal(size=path.size)
     with pytest.raises(IdentificationError):
-        presliding_stiffness(time, path, torque)
+        presliding(time, path, torque)
