@@ -14,13 +14,14 @@ from typing import Any
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.control import Compensated
-from frictid_hil.driver import Mode, RobotSetup
+from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Mode, RobotSetup
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
 from frictid_hil.jobs.compensation_companions import Hand, Live, LiveFigures
 from frictid_hil.jobs.compensation_figures import ModeRun, figures, mode_run
 from frictid_hil.jobs.compensation_plan import MODES, CompensationPlan, Wanted, compensation_plan
 from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.profile_fit import doubts_of_drive, doubts_of_file, refuse
+from frictid_hil.jobs.tracking_floor import tracking_floor_rad
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import refuse_beyond_limits
 from frictid_hil.recording.samples import Mark, Samples
@@ -29,6 +30,7 @@ from frictid_hil.report.pages import write_page
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RowKeeper, RunFolder
+from frictid_hil.runner.scheduler import Care
 
 VERB = "compensate"
 
@@ -197,6 +199,8 @@ def _run(
                 figures_live if wanted.endless else keeper,
                 notify=notify,
                 proceed=proceed,
+                # Told with the profile's other doubts, and forced like them.
+                care=Care(tolerated=frozenset({OWN_FRICTION_COMPENSATION})),
                 prepare=hand.take_driver,
             )
         except FrictidError as error:
@@ -247,7 +251,7 @@ def _finish(
     progress: _Progress,
 ) -> dict[str, Any]:
     inertia, source = _inertia(setup, options.joint, entry, simulated=wanted.simulated)
-    found = figures(progress.runs, wanted.task, inertia)
+    found = figures(progress.runs, wanted.task, inertia, _floors(planned, wanted, entry, inertia))
     modes: dict[str, Any] = {mode: figure.values() for mode, figure in found.items()}
     modes |= _service_figures(wanted, progress)
     friction = next((law.friction for law in planned.laws.values() if law.friction is not None), None)
@@ -294,6 +298,26 @@ def _finish(
         )
         result["report"] = str(write_page(page, folder.path / "report.html").resolve())
     return result
+
+
+def _floors(
+    planned: CompensationPlan, wanted: Wanted, entry: JointProfile, inertia_kg_m2: float | None
+) -> dict[str, float]:
+    """By mode, what remains of the tracking error with friction out of the way; not for nc or a drive's own loop."""
+    if wanted.task != "track" or inertia_kg_m2 is None:
+        return {}
+    return {
+        motion.law.mode: tracking_floor_rad(
+            motion.path,
+            motion.law.gains,
+            inertia_kg_m2,
+            entry.curve(),
+            first_s=wanted.period_s,
+            follows_reference=motion.law.follows_reference,
+        )
+        for motion in planned.plan.joints[0].motions
+        if isinstance(motion, Compensated) and motion.law.gains is not None and motion.law.friction is not None
+    }
 
 
 def _service_figures(wanted: Wanted, progress: _Progress) -> dict[str, Any]:

@@ -32,6 +32,7 @@ class ModeRun:
         reference_rad: the path.
         torque_nm: of the drive.
         external_torque_nm: a person's; None without a force sensor.
+        velocity_delay_s: by which the reported velocity is older than its row.
     """
 
     mode: str
@@ -41,6 +42,7 @@ class ModeRun:
     reference_rad: Array
     torque_nm: Array
     external_torque_nm: Array | None
+    velocity_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,8 @@ class ModeFigures:
         reduction_percent: of the task's own measure against nc: F_s for ``hand``, E_s for ``track``.
         reduction_inertia_removed_percent: of the one with inertia removed.
         tracking_rms_rad: E_s of (28).
-        ceiling_percent: raw reduction against nc of a joint without any friction that moves as this one did.
+        ceiling_percent: reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without
+            any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor``).
         inertial_rms_nm: of inertia times acceleration.
         reasons: by figure.
     """
@@ -99,30 +102,52 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
         reference_rad=motion.position_rad(time_s),
         torque_nm=part.torque_nm,
         external_torque_nm=part.external_torque_nm,
+        velocity_delay_s=_velocity_delay_s(samples.meta),
     )
 
 
-def figures(runs: Mapping[str, ModeRun], task: str, inertia_kg_m2: float | None) -> dict[str, ModeFigures]:
+def figures(
+    runs: Mapping[str, ModeRun], task: str, inertia_kg_m2: float | None, floors_rad: Mapping[str, float] | None = None
+) -> dict[str, ModeFigures]:
     """All modes in numbers, each against ``nc`` where that ran.
 
     Args:
         runs: by mode.
         task: ``hand`` or ``track``.
         inertia_kg_m2: that is removed from the hand torque.
+        floors_rad: by mode, the tracking error that an ideal joint would have.
     """
+    floors_rad = floors_rad or {}
     alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}
     base = alone.get("nc")
-    return {mode: _against(figure, base, task) for mode, figure in alone.items()}
+    return {mode: _against(figure, base, task, floors_rad.get(mode)) for mode, figure in alone.items()}
 
 
 def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:
-    """(acceleration rad/s^2, hand torque N m) through the same smoothing, ends cut off; for runs with a hand torque."""
+    """(acceleration rad/s^2, hand torque N m) through the same smoothing, ends cut off; for runs with a hand torque.
+
+    On the wall clock a loop comes late now and then, or misses a cycle: rows are brought to an even grid first, and the
+    acceleration is the rate of the drive's velocity. Differencing the position twice would make v dt / s^2 out of a
+    drive that heard SYNC dt later than its row says (at 60 deg/s, 1 ms and s = 4 ms: 65 rad/s^2); differencing the
+    velocity once makes a dt / s of it, a hundredth of that.
+    """
     assert run.external_torque_nm is not None
     step_s = float(np.median(np.diff(run.time_s)))
+    even_s = np.arange(run.time_s[0], run.time_s[-1] + 0.5 * step_s, step_s)
+    velocity, torque_nm = (
+        np.interp(even_s, run.time_s, column) for column in (run.velocity_rad_s, run.external_torque_nm)
+    )
     kernel = Gaussian(step_s, max(_WIDTH_S, step_s))
-    cut = int(np.ceil(kernel.reach_s / step_s)) + 1
+    cut = int(np.ceil((kernel.reach_s + run.velocity_delay_s) / step_s)) + 1
     inside = slice(cut, -cut)
-    return kernel.curvature(run.position_rad)[inside], kernel.smooth(run.external_torque_nm)[inside]
+    return kernel.rate(velocity, run.velocity_delay_s)[inside], kernel.smooth(torque_nm)[inside]
+
+
+def _velocity_delay_s(meta: Mapping[str, object]) -> float:
+    """As the drive or its robot file declares it."""
+    timing = meta.get("timing")
+    delay_s = timing.get("velocity_delay_s") if isinstance(timing, Mapping) else None
+    return float(delay_s) if isinstance(delay_s, int | float) else 0.0
 
 
 def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
@@ -150,13 +175,17 @@ def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
     )
 
 
-def _against(figure: ModeFigures, base: ModeFigures | None, task: str) -> ModeFigures:
+def _against(figure: ModeFigures, base: ModeFigures | None, task: str, floor_rad: float | None) -> ModeFigures:
     reasons = dict(figure.reasons or {})
     if base is None:
         reasons["reduction_percent"] = "nc did not run"
         return replace(figure, reasons=reasons)
     if task == "track":
-        return replace(figure, reduction_percent=_reduction(figure.tracking_rms_rad, base.tracking_rms_rad))
+        return replace(
+            figure,
+            reduction_percent=_reduction(figure.tracking_rms_rad, base.tracking_rms_rad),
+            ceiling_percent=_reduction(floor_rad, base.tracking_rms_rad),
+        )
     return replace(
         figure,
         reduction_percent=_reduction(figure.torque_rms_nm, base.torque_rms_nm),

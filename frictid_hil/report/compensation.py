@@ -78,7 +78,11 @@ def compensation_page(
         headline += f" The run ended as {outcome}{': ' + error if error else ''}."
     names = list(runs)
     hand = task == "hand"
-    figures = (_moving(runs), *_hand_bars(names, modes)) if hand else (*_following(runs), _tracking_bars(names, modes))
+    figures: tuple[Figure, ...]
+    if hand:
+        figures = (*_over_time(runs), _moving(runs), *_hand_bars(names, modes))
+    else:
+        figures = (*_following(runs), _tracking_bars(names, modes))
     section = Section(
         "Moved by hand" if hand else "Tracking a triangle", tables=(_table(names, modes, hand=hand),), figures=figures
     )
@@ -126,11 +130,36 @@ def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]
             _NAMES.get(name, name),
             _number(modes[name]["tracking_rms_rad"], degrees(1.0)),
             _percent(modes[name]["reduction_percent"]),
+            _percent(modes[name].get("ceiling_percent")),
             _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
         )
         for name in names
     )
-    return Table(("mode", "E_s [deg]", "less", "V_s [deg/s]"), rows, "The same gains in all modes.")
+    caption = (
+        "The same gains in all modes. The ceiling is what they would reach on a joint without friction, or with the "
+        "reference velocity on one whose friction is given back exactly: so weak a PD still has to turn the inertia."
+    )
+    return Table(("mode", "E_s [deg]", "less", "ceiling", "V_s [deg/s]"), rows, caption)
+
+
+def _over_time(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
+    velocities, torques = [], []
+    for mode, run in runs.items():
+        shown = _first_cycles(run)
+        time_s, color = run.time_s[shown], _color(mode)
+        velocities.append(line(mode, time_s, degrees(1.0) * run.velocity_rad_s[shown], color, width=1))
+        if run.external_torque_nm is not None:
+            torques.append(line(mode, time_s, run.external_torque_nm[shown], color, width=1))
+    return (
+        Figure("Velocity (Fig. 11)", tuple(velocities), "time [s]", "velocity [deg/s]"),
+        Figure(
+            "Torque of the hand (Fig. 11)",
+            tuple(torques),
+            "time [s]",
+            "hand torque [N m]",
+            caption="" if torques else "No force sensor: the torque of the hand is not known.",
+        ),
+    )
 
 
 def _moving(runs: Mapping[str, Run]) -> Figure:
@@ -139,7 +168,7 @@ def _moving(runs: Mapping[str, Run]) -> Figure:
         if run.external_torque_nm is not None:
             traces.append(line(mode, degrees(1.0) * run.velocity_rad_s, run.external_torque_nm, _color(mode), width=1))
     return Figure(
-        "Torque of the hand over velocity (Fig. 11)",
+        "Torque of the hand over velocity",
         tuple(traces),
         "velocity [deg/s]",
         "hand torque [N m]",

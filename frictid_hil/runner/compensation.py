@@ -43,6 +43,8 @@ class Controller:
         self._period_s = period_s
         self._step_nm = law.slew_nm_per_s * period_s
         self._position_rad = math.nan
+        self._velocity_rad_s = 0.0
+        self._reported_ns = 0
 
     def update(self, report: Feedback, reference: Reference) -> float:
         """Torque for the coming cycle, N m: clamped, and near the last one."""
@@ -54,7 +56,12 @@ class Controller:
         self._position_rad = position
         velocity = report.velocity_rad_s
         if velocity != velocity:  # a drive that reports none
-            velocity = increment / self._period_s
+            # Over the time that passed, which is more than a period after a missed cycle, and none without a report.
+            elapsed_ns = report.t_ns - self._reported_ns
+            if elapsed_ns > 0:
+                self._velocity_rad_s = increment / (elapsed_ns * 1e-9)
+            velocity = self._velocity_rad_s
+        self._reported_ns = report.t_ns
         torque = law.gravity.torque_nm(position)
         if law.gains is not None:
             torque += law.gains.stiffness_nm_per_rad * (reference[0] - position)
@@ -100,13 +107,12 @@ class LawSource:
         """The law's torque at the present reference, in the way the drive's mode takes it."""
         torque_nm = self.controller.update(feedback, self.reference)
         position_rad, velocity_rad_s = self.reference
+        # In torque mode nobody follows it; it is recorded beside the measured position.
+        set_point.position_rad = position_rad
         if self.drive_mode is Mode.TORQUE:
             set_point.torque_nm = torque_nm
-            # Recorded beside the measured position; a joint that a person guides has no reference.
-            set_point.position_rad = feedback.position_rad if self.controller.law.gains is None else position_rad
             return
         set_point.torque_offset_nm = torque_nm
-        set_point.position_rad = position_rad
         if self.drive_mode is Mode.VELOCITY:
             set_point.velocity_rad_s = velocity_rad_s + _VELOCITY_LOOP_PER_S * (position_rad - feedback.position_rad)
 

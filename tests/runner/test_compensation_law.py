@@ -7,6 +7,8 @@ import pickle
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.control import Bounds, Compensated, ControlLaw, Gravity, PositionGains, Probe, RippleTorque, Swing
@@ -39,8 +41,8 @@ def law(**changes: object) -> ControlLaw:
     return ControlLaw(**(values | changes))  # type: ignore[arg-type]
 
 
-def moving(position: float, velocity: float) -> Feedback:
-    return Feedback(position_rad=position, velocity_rad_s=velocity, state=JointState.ENABLED, valid=True)
+def moving(position: float, velocity: float, t_ns: int = 0) -> Feedback:
+    return Feedback(t_ns=t_ns, position_rad=position, velocity_rad_s=velocity, state=JointState.ENABLED, valid=True)
 
 
 def test_a_standing_joint_is_given_its_gravity_alone() -> None:
@@ -58,13 +60,42 @@ def test_torque_is_clamped_and_changes_no_faster_than_it_may() -> None:
     assert torques[-1] == 30.0
 
 
-def test_a_drive_without_velocity_is_helped_out() -> None:
+@settings(max_examples=50)
+@given(st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-6.0, 6.0)), min_size=1, max_size=60))
+def test_whatever_a_drive_reports_torque_stays_in_its_bounds(reports: list[tuple[float, float]]) -> None:
+    ripple = RippleTorque(0.1, (0.0, 1.0, 0.0, -1.0))
+    controller = Controller(law(gains=PositionGains(1e4, 50.0), ripple=ripple), DT, 5.0)
+    last = 5.0
+    for k, (position, velocity) in enumerate(reports):
+        torque = controller.update(moving(position, velocity, k * 1_000_000), (0.0, 0.0))
+        assert abs(torque) <= 30.0
+        assert abs(torque - last) <= 2.0 + 1e-9
+        last = torque
+
+
+def test_a_drive_without_velocity_is_helped_out_through_late_and_missed_cycles() -> None:
     free = law(gravity=Gravity(), slew_nm_per_s=1e9)
     with_velocity, without = Controller(free, DT, 0.0), Controller(free, DT, 0.0)
-    for k in range(100):
-        expected = with_velocity.update(moving(k * 0.5 * DT, 0.5), (0.0, 0.0))
-        found = without.update(moving(k * 0.5 * DT, math.nan), (0.0, 0.0))
-    assert found == pytest.approx(expected)
+    ticks = [0, 1, 2, 3, 5, 6, 7, 17, 18, 18.4, 19, 20]
+    for tick in ticks:
+        at, t_ns = 0.01 + tick * 0.5 * DT, 1_000_000 + round(tick * 1e6)
+        expected = with_velocity.update(moving(at, 0.5, t_ns), (0.0, 0.0))
+        found = without.update(moving(at, math.nan, t_ns), (0.0, 0.0))
+        if tick:
+            assert found == pytest.approx(expected)
+    # No report this cycle: neither position nor time went on.
+    assert without.update(moving(at, math.nan, t_ns), (0.0, 0.0)) == pytest.approx(expected)
+
+
+def test_no_travel_is_lost_where_cycles_were_missed() -> None:
+    curve = FrictionCurve((0.2, 2.0), (5.5, 7.5))
+    soft = CompensationSettings.of(curve, "mo", stiffness_nm_per_rad=10.0, ratio=0.9)
+    every, some = (Controller(law(gravity=Gravity(), friction=soft, slew_nm_per_s=1e9), DT, 0.0) for _ in range(2))
+    for k in range(101):
+        expected = every.update(moving(k * 1e-3, 1.0, k * 1_000_000), (0.0, 0.0))
+        if k % 7 == 0 or k == 100:
+            found = some.update(moving(k * 1e-3, 1.0, k * 1_000_000), (0.0, 0.0))
+    assert found == pytest.approx(expected) == pytest.approx(0.9 * 10.0 * 0.1)
 
 
 def test_ripple_repeats_and_is_linear_between_its_steps() -> None:
@@ -90,6 +121,8 @@ def test_each_drive_mode_is_told_in_its_own_way(mode: Mode) -> None:
         assert set_point.torque_offset_nm == pytest.approx(gravity) and set_point.torque_nm == 0.0
     if mode is Mode.VELOCITY:
         assert set_point.velocity_rad_s == pytest.approx(0.5)
+    assert source.update(moving(0.1, 0.0), set_point)
+    assert set_point.position_rad == pytest.approx(0.5e-3)  # the reference, not where the joint is
 
 
 def test_a_path_ends_and_an_endless_one_does_not() -> None:

@@ -174,8 +174,9 @@ class Axis:
         secondary.pack()
 
     def sent(self) -> None:
-        """The primary command went out: its target is in force from the next SYNC on."""
-        self.feedback.position_command_rad = self.primary.value("target_position") * self._scale.position_rad
+        """The primary command went out: its target is in force from the next SYNC on, in the mode that follows it."""
+        target_rad = self.primary.value("target_position") * self._scale.position_rad
+        self.feedback.position_command_rad = target_rad if self.mode is Mode.POSITION else math.nan
 
     def emergency(self) -> tuple[Command, Command]:
         """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
