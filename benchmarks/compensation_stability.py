@@ -1,0 +1,262 @@
+"""Where compensated joints stand still, and where they begin to hunt or run away.
+
+    python benchmarks/compensation.py calibrate --out runs/benchmark
+    python benchmarks/compensation_stability.py bus --profile runs/benchmark/profile.yaml
+    python benchmarks/compensation_stability.py limits --profile runs/benchmark/profile.yaml
+
+With ``--elastic 30`` the links resonate at 30 Hz; the profile is then one identified on such joints (``calibrate
+--robot`` with the file that ``robot --elastic 30 --out FILE`` writes).
+
+``bus``: R + 0.02 and K + 10 %, with 2 and 5 cycles of delay, through driver, bus and drive. ``free``: a person swings
+the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
+it. ``limits``: the largest R and K, by bisection; without the bus, by the product's own controller on the simulated
+joint. A joint stands where its true speed in the last second is below 0.01 deg/s rms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from compensation_robots import variant
+
+from frictid_drivers.virtual import joint_drive
+from frictid_hil.config.profile import JointProfile, load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.control import Bounds, Compensated, ControlLaw, Swing
+from frictid_hil.driver import Feedback, JointSetup, Mode
+from frictid_hil.errors import FrictidError
+from frictid_hil.jobs.compensation_plan import Wanted, law_of
+from frictid_hil.plan import Hold, Motion, Move, Plan, joint_plan
+from frictid_hil.runner.compensation import Controller
+from frictid_hil.runner.events import Event, PhaseStarted
+from frictid_hil.runner.run import run_plan
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.servo_loop import ServoLoop
+
+JOINTS = ("0", "1", "2", "3", "4", "5")
+STILL_DEG_S = 0.01
+MORE_RATIO, MORE_STIFFNESS = 0.02, 1.1
+PUSHED_RAD_S, PUSHED_HZ = math.radians(20.0), 0.5
+REST_S = 5.0
+
+
+def changed_law(entry: JointProfile, setup: JointSetup, hold: bool, ratio: float, stiffness: float) -> ControlLaw:
+    """Mode mop of setting ``ours`` with R plus ``ratio`` and K times ``stiffness``."""
+    law = law_of(entry, setup, "mop", Wanted("track" if hold else "hand", ("mop",)), [])
+    assert law.friction is not None
+    friction = law.friction
+    return replace(
+        law,
+        friction=replace(
+            friction,
+            ratio=friction.ratio + ratio,
+            stiffness_nm_per_rad=friction.stiffness_nm_per_rad * stiffness,
+        ),
+    )
+
+
+# -- through the bus ---------------------------------------------------------------------------------------------------
+
+
+class Truth(ServoLoop):
+    """The simulated joint, remembering how fast it really was."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.speeds: list[float] = []
+        built.append(self)
+
+    def advance(self, *arguments: Any, **options: Any) -> None:
+        """As the simulated joint's."""
+        super().advance(*arguments, **options)
+        self.speeds.append(self.true_velocity_rad_s)
+
+
+built: list[Truth] = []
+
+
+class Forgetful:
+    """Keeps nothing."""
+
+    def samples(self, rows: object) -> None:
+        """Ignore."""
+
+    def frames(self, rows: object) -> None:
+        """Ignore."""
+
+
+def on_the_bus(robot: Path, bus: str, entry: JointProfile, joint: str, hold: bool, seed: int) -> tuple[float, str]:
+    """(True speed of the last second, deg/s rms; what stopped it) at R + 0.02 and K + 10 %."""
+    loaded = load_robot(str(robot))
+    setup = loaded.to_setup(bus, seed=seed)
+    one = setup.joint(joint)
+    law = changed_law(entry, one, hold, MORE_RATIO, MORE_STIFFNESS)
+    centre = one.start_position_rad + math.radians(10.0)
+    wide = Bounds(one.position_min_rad, one.position_max_rad, one.max_velocity_rad_s, math.inf)
+    amplitude = PUSHED_RAD_S / (2 * math.pi * PUSHED_HZ)
+    motions: list[Motion] = [Move.within(one.locked_position_rad, centre, math.radians(20.0)), Hold(centre, 0.3)]
+    if hold:
+        there = Move.within(centre, centre + math.radians(5.0), math.radians(20.0))
+        motions.append(Compensated("there", there, law, wide))
+        motions.append(Compensated("rest", Hold(centre + math.radians(5.0), REST_S), law, wide))
+    else:
+        motions.append(Compensated("swing", Swing(centre, amplitude, PUSHED_HZ, 2.0 / PUSHED_HZ), law, wide))
+        motions.append(Compensated("rest", Hold(centre, REST_S), law, wide))
+    # The joint is looked at while it rests under the law; the run ends there.
+    plan = Plan(loaded.name, setup.cycle_hz, (joint_plan(one, motions, {}, None),))
+    drivers: list[Any] = []
+    built.clear()
+
+    def notify(event: Event) -> None:
+        if isinstance(event, PhaseStarted) and event.phase == "swing":
+            drivers[0].simulate_hand(joint, centre, amplitude, PUSHED_HZ)
+        elif isinstance(event, PhaseStarted) and event.phase == "rest":
+            if not hold:
+                drivers[0].simulate_hand(joint, centre, 0.0, 0.0)
+            begun.append(len(built[0].speeds))
+
+    begun: list[int] = []
+    stopped = ""
+    try:
+        run_plan("virtual", setup, plan, Forgetful(), notify=notify, proceed=lambda _: True, prepare=drivers.append)
+    except FrictidError as error:
+        stopped = error.what
+    if not begun:
+        return math.inf, stopped
+    end = begun[0] + round(REST_S * setup.cycle_hz)
+    last = np.array(built[0].speeds[end - round(setup.cycle_hz) : end])
+    return (math.degrees(float(np.sqrt(np.mean(last**2)))) if last.size else math.inf), stopped
+
+
+def bus(options: argparse.Namespace) -> None:
+    profile = load_profile(options.profile)
+    joint_drive.ServoLoop = Truth  # type: ignore[misc]
+    print(f"# through the bus, R + 0.02, K + 10 %, seed {options.seed}, elastic {options.elastic:g} Hz")
+    print("| joint | R | K [N m/rad] | delay [cycles] | free [deg/s rms] | PD hold [deg/s rms] | stands |")
+    print("|---|---|---|---|---|---|---|")
+    for joint in options.joint or JOINTS:
+        for delay in (2, 5):
+            with tempfile.TemporaryDirectory() as folder:
+                robot = variant(
+                    Path(folder) / "robot.yaml", joints=[joint], elastic_hz=options.elastic, delay_cycles=delay
+                )
+                entry = profile.joints[joint]
+                found = [on_the_bus(robot, options.bus, entry, joint, hold, options.seed) for hold in (False, True)]
+                friction = changed_law(
+                    entry, load_robot(str(robot)).to_setup().joint(joint), False, MORE_RATIO, MORE_STIFFNESS
+                ).friction
+            told = "; ".join(stopped for _, stopped in found if stopped)
+            stands = "yes" if not told and all(speed < STILL_DEG_S for speed, _ in found) else f"NO {told}"
+            assert friction is not None
+            print(
+                f"| {joint} | {friction.ratio:.2f} | {friction.stiffness_nm_per_rad:.0f} | {delay} "
+                f"| {found[0][0]:.5f} | {found[1][0]:.5f} | {stands} |",
+                flush=True,
+            )
+
+
+# -- limits ------------------------------------------------------------------------------------------------------------
+
+
+def limits(options: argparse.Namespace) -> None:
+    profile = load_profile(options.profile)
+    print(f"# pushed to 20 deg/s and let go, seed {options.seed}, elastic {options.elastic:g} Hz; K over presliding")
+    print("| joint | delay [cycles] | our K | largest R, free | largest K, free | largest K, PD hold |")
+    print("|---|---|---|---|---|---|")
+    for joint in options.joint or JOINTS:
+        entry = profile.joints[joint]
+        presliding = entry.presliding_stiffness_nm_per_rad.value or math.nan
+        for delay in (2, 5):
+            with tempfile.TemporaryDirectory() as folder:
+                robot = variant(Path(folder) / "robot.yaml", joints=[joint], elastic_hz=options.elastic)
+                setup = load_robot(str(robot)).to_setup().joint(joint)
+            ours = changed_law(entry, setup, False, 0.0, 1.0).friction
+            assert ours is not None
+            share = ours.stiffness_nm_per_rad / presliding
+
+            def stands(more_ratio: float, factor: float, hold: bool, entry=entry, setup=setup, delay=delay) -> bool:
+                law = changed_law(entry, setup, hold, more_ratio, factor)
+                return alone(law, setup, delay) < STILL_DEG_S
+
+            largest_ratio = largest(lambda r, own=ours.ratio: stands(r - own, 1.0, False), 0.9, 1.3)
+            largest_k = [
+                largest(lambda k, share=share, hold=hold: stands(0.0, k / share, hold), 0.5, 4.0)
+                for hold in (False, True)
+            ]
+            print(
+                f"| {joint} | {delay} | {share:.2f} | {largest_ratio:.2f} | {largest_k[0]:.2f} | {largest_k[1]:.2f} |",
+                flush=True,
+            )
+
+
+def largest(good: Callable[[float], bool], low: float, high: float) -> float:
+    """By bisection; ``high`` where nothing goes wrong below it."""
+    if good(high):
+        return high
+    while high - low > 0.01:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int) -> float:
+    """True speed of the last of five seconds, deg/s rms, of one simulated joint under one law."""
+    model = JointModel.from_mapping(
+        setup.simulated,
+        gear_ratio=setup.gear_ratio,
+        rated_torque_nm=setup.rated_torque_nm,
+        max_torque_nm=setup.max_torque_nm,
+    )
+    centre = setup.start_position_rad + math.radians(10)
+    loop = ServoLoop(model, period_s=0.001, position_rad=centre)
+    loop.brake(False)
+    loop.power(True)
+    loop.set_mode(Mode.TORQUE.value)
+    controller = Controller(law, 0.001, law.gravity.torque_nm(centre))
+    step_nm = setup.rated_torque_nm / 1000.0
+    # One cycle of the delay is the simulated joint's own.
+    queue = [controller.torque_nm] * (delay_cycles - 1)
+    assert law.friction is not None
+    push_nm = 2.0 * law.friction.coulomb_nm
+    report, velocities, pushing = Feedback(valid=True), [], True
+    for k in range(5000):
+        report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
+        torque = controller.update(report, (centre, 0.0))
+        pushing = pushing and k < 1000 and abs(loop.true_velocity_rad_s) < PUSHED_RAD_S
+        queue.append(torque + (push_nm if pushing else 0.0))
+        loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)
+        velocities.append(loop.true_velocity_rad_s)
+        if abs(loop.true_velocity_rad_s) > 20.0:
+            return math.inf
+    return math.degrees(float(np.sqrt(np.mean(np.square(velocities[4000:])))))
+
+
+def robot(options: argparse.Namespace) -> None:
+    print(variant(Path(options.out), elastic_hz=options.elastic))
+
+
+VERBS = {"bus": bus, "limits": limits, "robot": robot}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=list(VERBS))
+    parser.add_argument("--bus", default="virtual:stability")
+    parser.add_argument("--profile", default="runs/benchmark/profile.yaml")
+    parser.add_argument("--out", default="elastic.yaml")
+    parser.add_argument("--joint", action="append")
+    parser.add_argument("--elastic", type=float, default=0.0)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    VERBS[options.what](options)
+
+
+if __name__ == "__main__":
+    main()
