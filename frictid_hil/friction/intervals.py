@@ -199,7 +199,8 @@ def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) 
     again = (time >= repeat.start_s) & (time < repeat.start_s + last - first)
     if again.sum() < 0.98 * (last - first) / motion.smoother.step_s:
         return None
-    before, after = (time >= 0) & (time < first), (time >= last) & (time < starts[-1])
+    # A repeat that follows at once shares its first sample with the end of the cycles, to the last bit of a float.
+    before, after = (time >= 0) & (time < first), (time >= last) & (time < starts[-1]) & ~again
     rows = np.concatenate([np.flatnonzero(part) for part in (before, again, after)])
     exchanged = replace(
         motion,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +49,8 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path
         plan = FaultPlan(Fault.parse(text) for text in faults)
 
         def driver(setup: RobotSetup) -> MotomanDriver:
-            emulator = build(replace(setup, options={**setup.options, "parity": "N"}), plan)
-            return MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, "N"))
+            emulator = build(setup, plan)
+            return MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
 
         monkeypatch.setattr(run_module, "load_driver", lambda name: driver)
         path = tmp_path / "bench.yaml"
@@ -82,7 +81,7 @@ def test_one_joint_in_batch_at_19200_is_within_the_bar(robot: Callable[..., Path
             events.append(event)
 
     result = calibrate(options(path, tmp_path / "run", joints=("1",), program="thorough"), Watching())
-    assert result["outcome"] == "ok", result
+    assert result["outcome"] == "ok", result["joints"]["1"]["remarks"]
     distance = compare(tmp_path / "run", None, str(path))["joints"]["1"]
     assert distance["e_percent_measured_range"] < 0.5
     # What was really planned is recorded, not what was asked for.
@@ -122,3 +121,25 @@ def test_a_fault_in_batch_keeps_the_recording_and_resumes(
     resumed = calibrate(options(path, tmp_path / "run", resume=tmp_path / "run"), Silent())
     assert resumed["outcome"] == "ok", resumed
     assert resumed["joints"]["5"]["rate_hz"] == 250.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layer", ["stream", "batch"])
+def test_an_averaging_filter_of_150_ms_ends_in_the_gates_refusal(
+    robot: Callable[..., Path], tmp_path: Path, layer: str
+) -> None:
+    """Not in a safety abort, and not in wrong friction: the fast cycles are named, and so is the filter."""
+    result = calibrate(
+        options(
+            robot(layer=layer, averaging_ms=150),
+            tmp_path / "run",
+            joints=("3",),
+            program="thorough",
+            amplitude_rad=0.349,
+        ),
+        Silent(),
+    )
+    assert (result["outcome"], result["exit_code"]) == ("gate_failed", 5), result
+    (remark,) = [text for text in result["joints"]["3"]["remarks"] if text.startswith("tracking")]
+    assert "averag" in remark
+    assert "cycle 10" in remark
