@@ -19,6 +19,8 @@ from frictid_hil.gap.residuals import LowPass, Recording, demand_of, rms, settle
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
 
+BLOCK_S = 1.0
+"""Length of the blocks that a validation log is cut into where it must be fitted and judged at once."""
 CLEARED = 0.7
 """Share of one log's low-passed squares that a candidate may leave to be taken though all logs show it little."""
 
@@ -82,6 +84,9 @@ class ActuationFit:
         ratio: by log name, low-passed residual over what white noise of its high frequencies would leave.
         before_ratio: the same without the found effects.
         intervals: effect name -> half width of a 95 % interval of its parameter.
+        motion_ratio: what is left while the demand changes fast over what is left while it rests; noise gives 1.
+        judged_in_blocks: effects that show in no identification log; fitted on every other block of the validation
+            logs, judged on the blocks between.
     """
 
     nominal: Drive
@@ -91,6 +96,8 @@ class ActuationFit:
     ratio: Mapping[str, float] = field(default_factory=dict)
     before_ratio: Mapping[str, float] = field(default_factory=dict)
     intervals: Mapping[str, float] = field(default_factory=dict)
+    motion_ratio: float = 1.0
+    judged_in_blocks: tuple[str, ...] = ()
 
     def residual(self, recording: Recording, controller: Controller) -> Array:
         """A of one recording with the fitted drive."""
@@ -161,7 +168,7 @@ def fit_actuation(
 
     rows = sum(r.experiment.position_rad.size for r in fitted)
     drive, found, rivals = nominal, dict[str, float](), dict[str, float]()
-    start = current = squares(nominal)
+    current = squares(nominal)
     for _ in range(3):
         tried: dict[str, tuple[float, Drive]] = {}
         views = [_view(r, controller, demand(r, drive.velocity_lag_s)) for r in fitted]
@@ -181,7 +188,12 @@ def fit_actuation(
             rivals = {other: 0.5 * rows * math.log(current / value) / gain for other, (value, _) in tried.items()}
         found[name] = gain
         drive, current = best, least
-    del start
+    in_blocks: tuple[str, ...] = ()
+    hidden = _in_validation_alone(logs, drive, controller, [n for n in library if n not in found], seen, demand, left)
+    if hidden is not None:
+        name, found[name], drive = hidden
+        in_blocks = (name,)
+        current = squares(drive)
     gain_of_noise = {r.experiment.name: LowPass.at(1.0 / r.step_s) for r in logs}
 
     def ratios(which: Drive) -> dict[str, float]:
@@ -200,8 +212,71 @@ def fit_actuation(
         {k: v for k, v in rivals.items() if k not in found},
         ratios(drive),
         ratios(nominal),
-        _intervals(drive, found, squares, current, rows),
+        _intervals(drive, [name for name in found if name not in in_blocks], squares, current, rows),
+        _motion_ratio([(demand(r, drive.velocity_lag_s), left(drive, r), r.step_s) for r in logs]),
+        in_blocks,
     )
+
+
+def _motion_ratio(channels: Sequence[tuple[Array, Array, float]]) -> float:
+    """RMS left in the fastest seventh of the demand over that in its slowest third, all logs together.
+
+    The noise of a torque sensor does not care how fast the demand changes; a command path that loses some does.
+    """
+    rates, rests = [], []
+    for demand_nm, rest_nm, step_s in channels:
+        low_pass = LowPass.at(1.0 / step_s)
+        rates.append(np.abs(low_pass(np.gradient(low_pass(demand_nm), step_s)))[5:-5])
+        rests.append(rest_nm[5:-5])
+    rate, rest = np.concatenate(rates), np.concatenate(rests)
+    slow, fast = np.quantile(rate, [0.3, 0.85])
+    quiet = rms(rest[rate <= slow])
+    return rms(rest[rate >= fast]) / quiet if quiet > 0.0 else 1.0
+
+
+def _in_validation_alone(
+    logs: Sequence[Recording],
+    drive: Drive,
+    controller: Controller,
+    names: Sequence[str],
+    seen: Mapping[str, float],
+    demand: Callable[[Recording, float], Array],
+    left: Callable[[Drive, Recording], Array],
+) -> tuple[str, float, Drive] | None:
+    """(effect, its score on blocks not fitted, drive) of an effect that shows in validation logs alone, if there is.
+
+    A demand that no identification log reached says nothing about a limit there; one block in two of the validation
+    logs is fitted, and the others must confirm it.
+    """
+    judged = [r for r in logs if r.experiment.validation]
+    if not judged:
+        return None
+
+    def parts(which: Drive, odd: bool) -> Array:
+        out = []
+        for r in judged:
+            low_passed = LowPass.at(1.0 / r.step_s)(left(which, r))
+            block = (np.arange(low_passed.size) * r.step_s / BLOCK_S).astype(int)
+            out.append(low_passed[(block % 2 == 1) == odd])
+        return np.concatenate(out)
+
+    def squares(which: Drive) -> float:
+        return float(np.sum(parts(which, odd=False) ** 2))
+
+    views = [_view(r, controller, demand(r, drive.velocity_lag_s)) for r in judged]
+    fitted, unseen = squares(drive), float(np.sum(parts(drive, odd=True) ** 2))
+    tried = []
+    for name, form in _forms().items():
+        candidate = _best(name, drive, squares, form.guesses(views, seen.get(name))) if name in names else None
+        if candidate is not None and candidate[0] < CLEARED * fitted:
+            tried.append((float(np.sum(parts(candidate[1], odd=True) ** 2)), name, candidate[1]))
+    if not tried:
+        return None
+    least, name, best = min(tried, key=lambda t: t[0])
+    if least > CLEARED * unseen:
+        return None
+    rows = sum(r.experiment.position_rad.size for r in judged) // 2
+    return name, 0.5 * rows * math.log(unseen / max(least, 1e-300)), best
 
 
 def _view(recording: Recording, controller: Controller, demand_nm: Array) -> DriveView:
@@ -276,7 +351,7 @@ def structured_share(recordings: Sequence[Recording], controller: Controller, dr
 
 
 def _intervals(
-    drive: Drive, found: Mapping[str, float], squares: Callable[[Drive], float], least: float, rows: int
+    drive: Drive, found: Sequence[str], squares: Callable[[Drive], float], least: float, rows: int
 ) -> dict[str, float]:
     """95 % half widths from the curvature of the squares at the fit."""
     widths = {}

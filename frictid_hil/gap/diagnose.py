@@ -31,6 +31,10 @@ FAMILY_AHEAD = 0.03
 """How far such a family alone may be ahead of the library's effects."""
 DRIVE_CLOSES = 0.25
 """Share of the squared gap above the floor that a fault of the drive may leave and still explain it."""
+FOLLOWS_MOTION = 1.5
+"""Actuation residual in fast changes of the demand over that at rest; healthy drives reach 1.1."""
+UNEXPLAINED = 3.0
+"""Held-out squares per row of a plant that cannot be called healthy, whatever its replay shows."""
 COLOURED = 3.0
 """Low-passed actuation residual over what its white part leaves; slow noise of a healthy drive reaches 2."""
 QUIET = 1.25
@@ -113,6 +117,7 @@ def _full(
         rival_drive=dict(channels.actuation.rivals) if channels.actuation is not None else {},
         drive_gain=dict(channels.actuation.found) if channels.actuation is not None else {},
         actuation_ratio=float(np.median(list(channels.actuation.ratio.values()))) if channels.actuation else 1.0,
+        actuation_motion=channels.actuation.motion_ratio if channels.actuation else 1.0,
         coarse=channels.kinematic.step_factor,
         floor_nm=floor,
     )
@@ -155,18 +160,20 @@ class Features:
     rival_drive: Mapping[str, float]
     drive_gain: Mapping[str, float]
     actuation_ratio: float
+    actuation_motion: float
     coarse: float
     floor_nm: float
 
 
 def verdict_of(f: Features) -> tuple[str, str]:
     """(verdict, where it lives if unknown)."""
-    if f.actuation_left > 0.3 or f.actuation_ratio > COLOURED:
+    if f.actuation_left > 0.3 or f.actuation_ratio > COLOURED or f.actuation_motion > FOLLOWS_MOTION:
         return "unknown", "actuation"
     if f.held_share > HELD_SHARE:
         return "unknown", "kinematics: positions repeat while the joint moves"
     if not f.names:
-        return ("unknown", f.family_name) if f.before > 1.6 and f.misfit_before > 1.5 else ("none", "")
+        there = (f.before > 1.6 and f.misfit_before > 1.5) or f.misfit_before > UNEXPLAINED
+        return ("unknown", f.family_name) if there else ("none", "")
     # What a late torque leaves in the plant is its own trace where the drive alone closes the gap.
     if not f.rivals and f.after**2 - 1.0 < DRIVE_CLOSES * (f.before**2 - 1.0):
         return "explained", ""
@@ -286,8 +293,13 @@ def _conclude(
     inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
     step = experiments.nominal.encoder_resolution_rad or 0.0
     encoder = inertia * step / math.sqrt(12.0) * acceleration_gain(low_pass)
-    floor = Figures(math.hypot(noise_nm, encoder), noise_nm, step / math.sqrt(12.0) if step else None)
     before = Figures(inverse_before, pooled(bare, "torque_nm"), pooled(bare, "position_rad"))
+    # Noise is a part of what is measured, so an estimate of it above the gap is known to be too high.
+    floor = Figures(
+        min(math.hypot(noise_nm, encoder), inverse_before),
+        min(noise_nm, before.forward_torque_nm or noise_nm),
+        min(step / math.sqrt(12.0), before.forward_position_rad or math.inf) if step else None,
+    )
     closed = 0.0
     if before.forward_torque_nm and before.forward_torque_nm > noise_nm:
         rest = pooled(after, "torque_nm") ** 2 - noise_nm**2
@@ -306,7 +318,7 @@ def _conclude(
             )
         )
         del rival_gain, rival
-    causes.sort(key=lambda c: -(c.gap_closed_percent or 0.0) * (0.25 + c.confidence))
+    causes.sort(key=lambda c: (c.confidence, c.gap_closed_percent or 0.0), reverse=True)
     reasons: dict[str, str] = dict(hints)
     upcoming = None
     if "motion" in hints:
@@ -328,6 +340,11 @@ def _conclude(
         reasons["cause"] = f"no effect of the library explains the gap; it lives in: {place}"
     if verdict in ("unknown", "ambiguous"):
         reasons["after"] = "nothing is applied on this verdict, so the gap after is the gap before"
+    if channels.actuation is not None and channels.actuation.judged_in_blocks:
+        reasons["gap"] = (
+            f"{', '.join(channels.actuation.judged_in_blocks)} shows in validation logs only: its level was read from "
+            "every other second of them and confirmed on the seconds between"
+        )
     if not any(r.experiment.validation for r in logs):
         reasons["gap"] = "the set has no validation log; figures are of the logs that were fitted"
     places = where(judged, encoder)

@@ -20,7 +20,7 @@ from frictid_hil.gap.actuation import noise_rms
 from frictid_hil.gap.generic import families
 from frictid_hil.gap.residuals import LowPass, Recording, first_slide, rms, slip_state
 from frictid_hil.simulation.effects import all_effects
-from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.inverse import Shape, View
 
 FOLDS = 4
 BLOCKS_PER_FOLD = 2
@@ -107,13 +107,15 @@ class Evidence:
         views = [r.view for r in self.recordings if r.view is not None]
         self.low_pass = LowPass.at(1.0 / self.recordings[0].step_s)
         self.groups: dict[Group, tuple[int, ...]] = {}
+        self._grid: dict[str, tuple[Shape, ...]] = {}
         parts: list[list[Array]] = [self._thin(_nuisance(views))]
         width = parts[0][0].shape[1]
         self._nuisances = tuple(range(width))
         for name, form in ((n, e.inverse) for n, e in all_effects().items() if n in library):
             if form is None:
                 continue
-            for index, shape in enumerate(form.shapes):
+            self._grid[name] = form.grid_for(views)
+            for index, shape in enumerate(self._grid[name]):
                 columns = self._thin(form.regressors(views, shape))
                 # A column of nothing: the nominal joint lacks what this effect acts on.
                 if not any(np.any(np.abs(part) > 1e-12) for part in columns):
@@ -193,19 +195,21 @@ class Evidence:
             added = columns[k][EDGE_ROWS : EDGE_ROWS + residual.size] / self.deviation_nm[k][:, None]
             self.thin[k] = (np.concatenate([table, added], axis=1), residual)
         width = self.thin[0][0].shape[1]
-        group = (effect, len(form.shapes) + len(self._refined))
+        group = (effect, len(self._grid[effect]) + len(self._refined))
         self.groups[group] = tuple(range(width - columns[0].shape[1], width))
         self._refined[group] = shape
         self._reduce()
         return group
 
+    def probes(self, effect: str) -> tuple[Shape, ...]:
+        """The effect's own grid for this joint; empty where the effect is not in the library."""
+        return self._grid.get(effect, ())
+
     def shape(self, group: Group) -> dict[str, float]:
         """Nonlinear parameters of a group."""
         if group in self._refined:
             return self._refined[group]
-        form = all_effects()[group[0]].inverse
-        assert form is not None
-        return dict(form.shapes[group[1]])
+        return dict(self._grid[group[0]][group[1]])
 
     def parameters(self, model: Sequence[Group]) -> dict[str, dict[str, float]]:
         """The effects' own parameters, fitted on all identification logs."""

@@ -134,8 +134,10 @@ class Replay:
         """
         model = self.model(effects)
         lag_s = velocity_lag_s(effects) if self._lagging else 0.0
-        # Two first-order lags in a row are close to one of their summed time constants.
-        controller = replace(self._controller, velocity_filter_s=self._controller.velocity_filter_s + lag_s)
+        controller = replace(
+            self._controller,
+            velocity_filter_s=lag_in_row(self._controller.velocity_filter_s, lag_s, 1.0 / self._controller.rate_hz),
+        )
         carried = any(all_effects()[name].carried for name in effects)
         state: CarryOver | None = None
         result: dict[str, Replayed] = {}
@@ -176,6 +178,19 @@ class Replay:
             low_pass(experiment.position_rad - rows.position_rad),
             min(held, experiment.time_s.size // 3),
         ), rows.state
+
+
+def lag_in_row(first_s: float, second_s: float, period_s: float) -> float:
+    """Time constant of the one sampled first-order lag that is as late, on the mean, as two of them in a row.
+
+    Sampled, a lag of time constant T is late by period / (exp(period / T) - 1), which is less than T.
+    """
+
+    def late(time_constant_s: float) -> float:
+        return 1.0 / math.expm1(period_s / time_constant_s) if time_constant_s > 0.0 else 0.0
+
+    ticks = late(first_s) + late(second_s)
+    return period_s / math.log1p(1.0 / ticks) if ticks > 0.0 else 0.0
 
 
 def pooled(differences: Mapping[str, Replayed], part: str) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 from frictid_hil.gap.evidence import Evidence, Group
-from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled, refine, settled_nm
+from frictid_hil.gap.forward import SEARCH_SUBSTEP_S, Effects, Replay, Replayed, pooled, refine, settled_nm
 from frictid_hil.gap.which import Model, Ranking
 from frictid_hil.simulation.effects import all_effects
 
@@ -31,6 +31,12 @@ CLOSE_RIVAL = 0.80
 """Gain over the best one's from which a rival is replayed too."""
 WIDER_GAIN = 100.0
 """Log-likelihood, per misfit ratio, from which a second effect is replayed."""
+NO_GAP = 1.05
+"""Torque difference over the floor at which a plant with healthy held-out squares needs no effect."""
+PROBE_FROM = 1.2
+"""Torque difference over the floor from which effects are also searched for by replay."""
+PROBE_TAKES = 0.5
+"""Share of the squared difference above the floor that an effect found by replay alone must take off."""
 AT_FLOOR = 1.15
 """Torque difference over the floor at which nothing more is sought."""
 
@@ -41,6 +47,7 @@ class Hypothesis:
 
     Attributes:
         groups: plant effects and their (refined) shapes.
+        replayed: plant effects that only the replay shows; inverse dynamics along the measured motion loses them.
         effects: parameters of all effects, drive included.
         intervals: half widths of 95 % intervals by (effect, parameter).
         fitted_nm: torque difference left on the identification logs, RMS.
@@ -56,17 +63,23 @@ class Hypothesis:
     judged_nm: float
     misfit: float
     inverse_nm: float
+    replayed: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Plant effects."""
-        return tuple(g[0] for g in self.groups)
+        return (*(g[0] for g in self.groups), *self.replayed)
 
     @property
     def cost(self) -> float:
         """Log of what replay and inverse dynamics leave together; smaller is better."""
         replayed = 0.5 * (self.fitted_nm**2 + self.judged_nm**2)
         return math.log(max(replayed, 1e-30)) + math.log(self.misfit)
+
+
+def swinging() -> tuple[str, ...]:
+    """Effects that let the link swing by itself, of which a joint has one at a time."""
+    return tuple(name for name, effect in all_effects().items() if effect.inverse is not None and effect.inverse.swings)
 
 
 class Judge:
@@ -89,6 +102,40 @@ class Judge:
         if key not in self._known:
             self._known[key] = self._refined(tuple(groups))
         return self._known[key]
+
+    def probed(self, given: Hypothesis, name: str) -> Hypothesis | None:
+        """``given`` with a transmission effect found by replay, or in the place of its transmission effect."""
+        shapes = self.evidence.probes(name)
+        if not shapes or name in given.names:
+            return None
+        rest = {n: v for n, v in given.effects.items() if n not in swinging()}
+        tried = [(self._squares({**rest, name: dict(shape)}), k) for k, shape in enumerate(shapes)]
+        least, best = min(tried)
+        if least > given.fitted_nm**2:
+            return None
+        refined = refine(self.replay, {**rest, name: dict(shapes[best])})
+        groups = tuple(g for g in given.groups if g[0] not in swinging())
+        return Hypothesis(
+            groups=groups,
+            effects=refined.effects,
+            intervals=refined.intervals,
+            fitted_nm=math.sqrt(refined.squares),
+            judged_nm=settled_nm(self.judged(refined.effects)),
+            misfit=self.evidence.misfit_ratio(groups),
+            inverse_nm=self.evidence.judged_nm(groups),
+            replayed=(name,),
+        )
+
+    def without(self, given: Hypothesis, name: str) -> Hypothesis:
+        """``given`` without one effect, the rest fitted again."""
+        rest = self(tuple(g for g in given.groups if g[0] != name))
+        for hidden in given.replayed:
+            if hidden != name:
+                rest = self.probed(rest, hidden) or rest
+        return rest
+
+    def _squares(self, effects: Effects) -> float:
+        return settled_nm(self.replay(effects, validation=False, substep_s=SEARCH_SUBSTEP_S)) ** 2
 
     def _refined(self, groups: tuple[Group, ...]) -> Hypothesis:
         start = {**self.drive, **self.evidence.parameters(groups)}
@@ -124,6 +171,13 @@ class Judge:
 def choose(judge: Judge, ranking: Ranking, floor_nm: float) -> Hypothesis:
     """The hypothesis that replays best with as few effects as it takes."""
     current = judge(())
+    if current.judged_nm <= NO_GAP * floor_nm and current.misfit < UNHEALTHY:
+        return current
+    return _with_probed(judge, _chosen_by_plant(judge, ranking, current, floor_nm), floor_nm)
+
+
+def _chosen_by_plant(judge: Judge, ranking: Ranking, current: Hypothesis, floor_nm: float) -> Hypothesis:
+    """The best of what inverse dynamics proposes."""
     if not ranking.singles or ranking.singles[0].gain < 12.0 * max(1.0, ranking.misfit_chosen):
         return current
     top = ranking.singles[0].gain
@@ -145,6 +199,24 @@ def choose(judge: Judge, ranking: Ranking, floor_nm: float) -> Hypothesis:
         if set(current.names) < set(triple.names) and _stands_out(current, triple, floor_nm, STANDS_BESIDE):
             current = triple
     return current
+
+
+def _with_probed(judge: Judge, current: Hypothesis, floor_nm: float) -> Hypothesis:
+    """The hypothesis with an effect that a replay shows and the plant channel cannot.
+
+    Play and a soft gear let the link swing. Driven by the measured motion of the motor, a simulated link soon swings
+    out of step with the real one; in closed loop both stay in step, so there the difference has a clear valley.
+    """
+    if current.judged_nm < PROBE_FROM * floor_nm:
+        return current
+    tried = [h for h in map(lambda n: judge.probed(current, n), swinging()) if h is not None]
+    if not tried:
+        return current
+    best = min(tried, key=lambda h: h.fitted_nm)
+    excess = current.judged_nm**2 - floor_nm**2
+    if current.judged_nm**2 - best.judged_nm**2 < PROBE_TAKES * excess or best.fitted_nm > 0.95 * current.fitted_nm:
+        return current
+    return best
 
 
 def _stands_out(before: Hypothesis, after: Hypothesis, floor_nm: float, share: float) -> bool:
@@ -188,27 +260,28 @@ def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[s
 
 def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
     """The hypothesis without effects that the validation logs do not need; the rest is fitted again."""
-    while hypothesis.groups:
+    while hypothesis.names:
         taken: dict[str, float] = {}
-        for group in hypothesis.groups:
-            others = tuple(g for g in hypothesis.groups if g != group)
-            quick = {**judge.drive, **judge.evidence.parameters(others)}
+        for name in hypothesis.names:
+            others = tuple(g for g in hypothesis.groups if g[0] != name)
+            hidden = {n: hypothesis.effects[n] for n in hypothesis.replayed if n != name}
+            quick = {**judge.drive, **judge.evidence.parameters(others), **hidden}
             without = replace(
                 hypothesis,
                 groups=others,
                 judged_nm=settled_nm(judge.judged(quick)),
                 inverse_nm=judge.evidence.judged_nm(others),
             )
-            taken[group[0]] = _taken(without, hypothesis, floor_nm)
+            taken[name] = _taken(without, hypothesis, floor_nm)
         # What a quick controller hides from its replay, held-out inverse dynamics may still show beyond doubt.
         bare = judge.evidence.misfit_ratio(())
         clear = bare > max(UNHEALTHY, CLEAR * hypothesis.misfit)
-        alone = len(hypothesis.groups) == 1 and not judge.drive and not clear
+        alone = len(hypothesis.names) == 1 and not judge.drive and not clear
         least = (STANDS_ALONE if alone else STANDS_BESIDE) ** 2
         weakest = min(taken, key=lambda n: taken[n])
         if taken[weakest] >= least:
             return hypothesis
-        rest = judge(tuple(g for g in hypothesis.groups if g[0] != weakest))
+        rest = judge.without(hypothesis, weakest)
         if _taken(rest, hypothesis, floor_nm) >= least:
             return hypothesis
         hypothesis = rest

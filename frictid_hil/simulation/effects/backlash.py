@@ -34,6 +34,9 @@ def coupling_damping(
     return max(coupling_nm_s_per_rad, contact_relaxation_s * coupling_nm_per_rad)
 
 
+STIFFNESS_BOUNDS = (100.0, 1e7)
+"""From a wrist of 0.01 kg m2 to a base joint of tens of kg m2 that rings at 100 Hz."""
+
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
@@ -60,6 +63,28 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
+GAPS_RAD = (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 5e-3, 1e-2)
+SHAPES = grid(gap_rad=GAPS_RAD, contact_stiffness_nm_per_rad=(1.2e4, 4e4), contact_relaxation_s=(5e-4,))
+"""For joints whose inertia is not known."""
+
+
+def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
+    """Gaps whose closed contact lets the link ring at 35 or at 70 Hz, whatever the joint's size."""
+    link = max((v.link_inertia_kg_m2 for v in views), default=0.0)
+    if link <= 0.0:
+        return SHAPES
+    found: list[Shape] = []
+    for frequency_hz in (35.0, 70.0):
+        pulsation = 2.0 * np.pi * frequency_hz
+        stiffness = float(np.clip(link * pulsation**2, *STIFFNESS_BOUNDS))
+        found += grid(
+            gap_rad=GAPS_RAD,
+            contact_stiffness_nm_per_rad=(stiffness,),
+            contact_relaxation_s=(2.0 * 0.08 / pulsation,),
+        )
+    return tuple(found)
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -84,7 +109,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("gap_rad", 0.0, 0.05, 1e-3, "whole play, joint side", off=0.0),
-        Parameter("contact_stiffness_nm_per_rad", 1e3, 1e6, 2e4, "stiffness of the closed contact"),
+        Parameter("contact_stiffness_nm_per_rad", *STIFFNESS_BOUNDS, 2e4, "stiffness of the closed contact"),
         Parameter(
             "contact_relaxation_s", 0.0, 0.02, 1e-3, "damping over stiffness of the closed contact", replayed=False
         ),
@@ -105,11 +130,9 @@ EFFECT = Effect(
         ),
     ),
     inverse=InverseForm(
-        shapes=grid(
-            gap_rad=(1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 5e-3),
-            contact_stiffness_nm_per_rad=(1.2e4, 4e4),
-            contact_relaxation_s=(5e-4,),
-        ),
+        shapes=SHAPES,
+        shapes_for=shapes_for,
+        swings=True,
         regressors=regressors,
         parameters=lambda shape, coefficients: {
             **shape,

@@ -25,6 +25,9 @@ def coupling_damping(
     return relaxation_s * coupling_nm_per_rad if compliance_rad_per_nm > 0.0 else coupling_nm_s_per_rad
 
 
+COMPLIANCE_BOUNDS = (1e-7, 0.2)
+"""From a large joint's stiff gear to a wrist of 0.01 kg m2 that swings at 4 Hz."""
+
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
@@ -49,6 +52,26 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
         rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
         columns.append((torque - rigid)[:, None])
     return columns
+
+
+SHAPES = grid(
+    compliance_rad_per_nm=(3e-5, 6e-5, 1e-4, 2e-4, 3.5e-4, 6e-4, 1e-3, 1.7e-3, 3e-3), relaxation_s=(5e-4, 3e-3)
+)
+"""For joints whose inertia is not known."""
+
+
+def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
+    """Resonances of the link from 4 to 60 Hz, lightly and well damped, whatever the joint's size."""
+    link = max((v.link_inertia_kg_m2 for v in views), default=0.0)
+    if link <= 0.0:
+        return SHAPES
+    found: list[Shape] = []
+    for frequency_hz in (4.0, 6.0, 8.0, 11.0, 15.0, 21.0, 30.0, 45.0):
+        pulsation = 2.0 * np.pi * frequency_hz
+        for ratio in (0.03, 0.12):
+            compliance = float(np.clip(1.0 / (link * pulsation**2), *COMPLIANCE_BOUNDS))
+            found.append({"compliance_rad_per_nm": compliance, "relaxation_s": 2.0 * ratio / pulsation})
+    return tuple(found)
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
@@ -77,7 +100,7 @@ EFFECT = Effect(
         "Syst. Meas. Control 109, 1987; Tuttle and Seering 1996."
     ),
     parameters=(
-        Parameter("compliance_rad_per_nm", 0.0, 5e-3, 1e-4, "twist per torque; 0 is rigid", off=0.0),
+        Parameter("compliance_rad_per_nm", 0.0, COMPLIANCE_BOUNDS[1], 1e-4, "twist per torque; 0 is rigid", off=0.0),
         Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness", replayed=False),
     ),
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
@@ -87,9 +110,9 @@ EFFECT = Effect(
     ),
     illustrate=illustrate,
     inverse=InverseForm(
-        shapes=grid(
-            compliance_rad_per_nm=(3e-5, 6e-5, 1e-4, 2e-4, 3.5e-4, 6e-4, 1e-3, 1.7e-3, 3e-3), relaxation_s=(5e-4, 3e-3)
-        ),
+        shapes=SHAPES,
+        shapes_for=shapes_for,
+        swings=True,
         regressors=regressors,
         parameters=lambda shape, coefficients: {
             "compliance_rad_per_nm": shape["compliance_rad_per_nm"] * max(0.05, float(coefficients[0])),
