@@ -36,11 +36,11 @@ def run_gap_check(
         ``high``, ``right``, ``of``), ``scores`` (everything), ``leave_one_out`` (or None), ``out``.
 
     Raises:
-        UsageError: no case asked for, or ``out`` holds the result of another run.
+        UsageError: no case asked for, or ``out`` holds the result of a finished check. An interrupted one goes on.
     """
     if cases < 1:
         raise UsageError(f"{cases} cases cannot be scored", next_step="ask for at least 20: `gap check --cases 20`")
-    if out is not None and (out / "commitment.json").exists():
+    if out is not None and (out / "result.json").exists():
         raise UsageError("this folder holds an earlier check", where=str(out), next_step="name a new folder")
     result = run_check(
         cases,

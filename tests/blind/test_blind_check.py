@@ -59,6 +59,25 @@ def test_truth_is_sealed_until_the_last_answer(tmp_path: Path, scripted: tuple[s
     assert result["scores"]["cases"] == 4
 
 
+def test_an_interrupted_check_goes_on_where_it_stopped(tmp_path: Path, scripted: tuple[str, ...]) -> None:
+    out = tmp_path / "check"
+
+    def stop(phase: str, done: int, of: int) -> None:
+        if phase == "diagnose":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_check(3, 21, out=out, diagnoser=scripted, progress=stop)
+    (answered,) = (out / "answers.jsonl").read_text().splitlines()
+    with (out / "answers.jsonl").open("a") as file:
+        file.write('{"phase": "diagnose", "case": "case_0')
+    mute = (sys.executable, "-c", "raise SystemExit(3)")
+    result = run_check(3, 21, out=out, diagnoser=mute)
+    assert len(result["scores"]["errors"]) == 2, answered
+    other = run_check(3, 22, out=tmp_path / "check", diagnoser=mute)
+    assert len(other["scores"]["errors"]) == 3
+
+
 @pytest.mark.slow
 def test_equal_seeds_seal_equal_truth_whatever_the_processes(scripted: tuple[str, ...]) -> None:
     once = run_check(1, 5, diagnoser=scripted)["truth_sha256"]
@@ -67,7 +86,7 @@ def test_equal_seeds_seal_equal_truth_whatever_the_processes(scripted: tuple[str
 
 
 def test_a_folder_with_an_earlier_check_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "commitment.json").write_text("{}")
+    (tmp_path / "result.json").write_text("{}")
     with pytest.raises(UsageError, match="earlier check"):
         run_gap_check(cases=3, out=tmp_path)
     with pytest.raises(UsageError, match="cannot be scored"):

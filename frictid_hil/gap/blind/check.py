@@ -65,7 +65,8 @@ def run_check(
     Args:
         cases: how many joints.
         seed: of everything drawn; equal seeds give equal cases, whatever ``processes``.
-        out: folder to keep the commitment, the cases, the answers, the truth and the result in; kept nowhere if None.
+        out: folder to keep the commitment, the cases, the answers, the truth and the result in, and to go on in after
+            an interruption; kept nowhere if None.
         processes: how many diagnose (and draw) at once.
         leave_one_out: also diagnose every visible joint with one effect by a library that lacks this effect.
         progress: see ``Progress``.
@@ -78,10 +79,10 @@ def run_check(
     with _folder(out) as folder:
         sealed = draw_sealed(assignments(cases, seed), seed, folder / "cases", processes, report)
         # The commitment stands before the first answer is asked for.
-        commitment = {"schema": SCHEMA, "cases": cases, "truth_sha256": sealed.digest}
-        (folder / "commitment.json").write_text(json.dumps(commitment, indent=2) + "\n")
+        commitment = {"schema": SCHEMA, "cases": cases, "truth_sha256": sealed.digest, "code_sha256": code_digest()}
+        kept = _Kept.in_folder(folder, commitment)
         requests = [{"case": name, "left_out": None} for name in sealed.truths]
-        lines = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "diagnose")
+        lines = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "diagnose", kept)
         answers = {line["case"]: Answer.from_json(line) for line in lines}
         result: dict[str, Any] = {
             **commitment,
@@ -96,12 +97,54 @@ def run_check(
                 for name, truth in sealed.truths.items()
                 if truth["kind"] == "single" and truth["visible"]
             ]
-            left_out = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "leave one out")
+            left_out = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "leave one out", kept)
             result["leave_one_out"] = score_left_out(
                 [(sealed.truths[line["case"]], Answer.from_json(line)) for line in left_out]
             )
         _open_seal(folder, sealed, {"answers": lines, "answers_left_out": left_out, "result": result})
     return result
+
+
+def code_digest() -> str:
+    """SHA-256 over the source files that answer, hexadecimal."""
+    room = Path(__file__).parents[2]
+    files = [path for path in sorted(room.rglob("*.py")) if "blind" not in path.parts]
+    text = b"".join(path.relative_to(room).as_posix().encode() + path.read_bytes() for path in files)
+    return hashlib.sha256(text).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Answers on disk, one a line, each with its phase."""
+
+    path: Path
+
+    @staticmethod
+    def in_folder(folder: Path, commitment: dict[str, Any]) -> _Kept:
+        """Those of an earlier start of the very same check; none where the folder's commitment is another one."""
+        stated, answers = folder / "commitment.json", folder / "answers.jsonl"
+        if not stated.exists() or json.loads(stated.read_text()) != commitment:
+            answers.unlink(missing_ok=True)
+            stated.write_text(json.dumps(commitment, indent=2) + "\n")
+        answers.touch()
+        return _Kept(answers)
+
+    def add(self, phase: str, answer: dict[str, Any]) -> None:
+        """One more."""
+        with self.path.open("a") as file:
+            file.write(json.dumps({"phase": phase, **answer}) + "\n")
+
+    def of(self, phase: str) -> dict[str, dict[str, Any]]:
+        """By case. A line cut short by the interruption counts for nothing."""
+        found = {}
+        for line in self.path.read_text().splitlines():
+            try:
+                answer = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            if answer.pop("phase") == phase and "diagnosis" in answer:
+                found[answer["case"]] = answer
+        return found
 
 
 def draw_sealed(dealt: Sequence[Assignment], seed: int, folder: Path, processes: int, progress: Progress) -> Sealed:
@@ -139,24 +182,27 @@ def _diagnosed(
     processes: int,
     progress: Progress,
     phase: str,
+    kept: _Kept,
 ) -> list[dict[str, Any]]:
     """All answers, in the order of the requests; a process that dies answers its request with its exit code."""
     todo: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     done: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    for request in requests:
+    by_case = kept.of(phase)
+    asked = [request for request in requests if request["case"] not in by_case]
+    for request in asked:
         todo.put(request)
     workers = [
         threading.Thread(target=_attend, args=(command, folder, todo, done), daemon=True)
-        for _ in range(min(max(processes, 1), len(requests)))
+        for _ in range(min(max(processes, 1), len(asked)))
     ]
     for worker in workers:
         todo.put(None)
         worker.start()
-    by_case: dict[str, dict[str, Any]] = {}
-    for count in range(1, len(requests) + 1):
+    for _ in asked:
         answer = done.get()
+        kept.add(phase, answer)
         by_case[answer["case"]] = answer
-        progress(phase, count, len(requests))
+        progress(phase, len(by_case), len(requests))
     for worker in workers:
         worker.join()
     return [by_case[request["case"]] for request in requests]
