@@ -184,6 +184,7 @@ class Scheduler:
             raise HardwareError(
                 "this driver cannot watch a digital input, and the robot file names one as interlock",
                 where=self._setup.bus,
+                cause="no input reaches the cyclic exchange here; on a serial port none is read while the arm moves",
                 next_step="run `frictid-hil calibrate` with a person watching",
             )
         if capabilities.batch_only and self._plan.together:

@@ -15,6 +15,7 @@ import pytest
 from serial_bench import Streamed, stream_motion
 
 from frictid_drivers.motoman import MotomanDriver
+from frictid_drivers.motoman.emulator.pty import Waits
 from frictid_drivers.motoman.port import SerialPort
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError
@@ -133,6 +134,17 @@ def test_unplugging_is_noticed_at_once() -> None:
         driver.close()
         assert time.monotonic() - stopped_s < 1.0
         assert len(streamed.rows) > 20
+
+
+def test_the_emulator_tells_how_long_it_waited_for_a_late_host() -> None:
+    waits = Waits()
+    for passed_s in (0.004, 0.004):
+        waits.begin()
+        waits.last(passed_s)
+    waits.end()
+    waits.begin()
+    waits.last(0.004)
+    assert "waited 2 times, 8 ms at most" in str(waits)
 
 
 STREAMED = [
