@@ -128,27 +128,30 @@ def rounding(options: argparse.Namespace) -> None:
     A drive that calls a tenth as much 1000 per mille has steps a tenth as large; its noise stays what it was.
     """
     print(f"# hand 0.5 Hz +-20 deg, setting {options.setting}, seed {options.seed}, robot {options.robot}")
-    print("| joint | step [N m] | inertia removed | with a tenth of the step | difference |")
-    print("|---|---|---|---|---|")
+    print("| joint | step [N m] | inertia removed | step [N m] | inertia removed | difference |")
+    print("|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
-        found = []
+        found, steps_nm = [], []
         for finer in (1, 10):
             with tempfile.TemporaryDirectory() as folder:
                 values = load_robot(options.robot).values()
                 drive = values["joints"][joint]
-                step_nm = drive["rated_torque_nm"] / 1000.0
-                drive["rated_torque_nm"] /= finer
-                drive["simulated"]["drive"]["torque_noise_per_mille"] *= finer
+                rated_nm, gear = drive["rated_torque_nm"], drive["gear_ratio"]
+                if finer > 1:
+                    # Drives know their rated torque in whole mN m of the motor.
+                    drive["rated_torque_nm"] = max(1, round(1000.0 * rated_nm / gear / finer)) * gear / 1000.0
+                share = rated_nm / drive["rated_torque_nm"]
+                drive["simulated"]["drive"]["torque_noise_per_mille"] *= share
                 robot = Path(folder) / "robot.yaml"
                 robot.write_text(dump(values))
                 mine = argparse.Namespace(**vars(options) | {"robot": str(robot)})
                 # --force: the profile says, rightly, that this is not the drive it was identified with.
                 result = compensation(mine, joint, "hand", "nc,mop", "--setting", options.setting, "--force")
             found.append(result["modes"]["mop"]["reduction_inertia_removed_percent"])
-            if finer == 1:
-                first_nm = step_nm
+            steps_nm.append(drive["rated_torque_nm"] / 1000.0)
         print(
-            f"| {joint} | {first_nm:.4f} | {found[0]:.2f} % | {found[1]:.2f} % | {found[1] - found[0]:+.2f} |",
+            f"| {joint} | {steps_nm[0]:.4f} | {found[0]:.3f} % | {steps_nm[1]:.4f} | {found[1]:.3f} % "
+            f"| {found[1] - found[0]:+.3f} |",
             flush=True,
         )
 

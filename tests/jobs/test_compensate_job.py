@@ -235,6 +235,21 @@ def test_a_doubled_profile_that_is_forced_is_stopped_before_the_speed_limit(
         assert "mop" not in result["modes"] and "nc" in result["modes"]
 
 
+def test_a_stale_profile_of_a_stiffer_gear_that_is_forced_trips_while_the_joint_must_stand(
+    go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path, robot: Path
+) -> None:
+    colder = scaled(profile, tmp_path / "colder.yaml", 1.4)
+    stale = edited(colder, tmp_path / "stale.yaml", provenance={"created_utc": "2020-01-01T00:00:00Z"})
+    with pytest.raises(ProfileMismatch, match="days old"):
+        go(profile=stale)
+    result = go(modes=("mop",), profile=stale, force=True)
+    assert result["outcome"] == "aborted" and result["exit_code"] == 4
+    samples = next(one for one in read(tmp_path / "run") if one.joint == JOINT)
+    assert samples.velocity_rad_s is not None
+    limit = load_robot(robot).to_setup().joint(JOINT).max_velocity_rad_s
+    assert float(np.abs(samples.velocity_rad_s).max()) < 0.5 * limit
+
+
 def test_a_profile_with_the_wrong_sign_is_refused_even_when_forced(
     go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
 ) -> None:
