@@ -147,6 +147,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
     notes += _notes(procedures, expected, rehearse)
+    if options.together:
+        notes.append(_TOGETHER_NOTE)
     plan = calibration_plan(
         robot,
         setup,
@@ -398,6 +400,12 @@ def _unseen(
         for name, procedure in procedures.items()
         if not rehearsals.covers(name, starts[name], starts[name] + procedure.amplitude_rad, moving)
     ]
+
+
+_TOGETHER_NOTE = (
+    "all joints at once is experimental: where links drive each other, inertia and gravity come out as those of the "
+    "combined motion, curves differ by up to 0.7 % from one by one, and no workspace box is checked"
+)
 
 
 def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
