@@ -101,7 +101,7 @@ EFFECT = Effect(
     ),
     parameters=(
         Parameter("compliance_rad_per_nm", 0.0, COMPLIANCE_BOUNDS[1], 1e-4, "twist per torque; 0 is rigid", off=0.0),
-        Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness", replayed=False),
+        Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness"),
     ),
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
     hooks=(
