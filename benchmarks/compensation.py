@@ -4,7 +4,7 @@
     python benchmarks/compensation.py hand  --profile runs/benchmark/profile.yaml [--setting paper]
     python benchmarks/compensation.py track --profile runs/benchmark/profile.yaml [--speed 10deg/s]
     python benchmarks/compensation.py viscosity --profile runs/benchmark/profile.yaml   # the best B_c of mol, by trial
-    python benchmarks/compensation.py rounding --profile runs/benchmark/profile.yaml    # torque steps a tenth as large
+    python benchmarks/compensation.py rounding --profile runs/benchmark/profile.yaml    # other steps of torque
 
 All through the product's own command line, on the simulated bus, with the drives' torque steps, encoder counts and two
 cycles of delay. No law ever sees a parameter of the simulated joints.
@@ -123,21 +123,22 @@ def viscosity(options: argparse.Namespace) -> None:
 
 
 def rounding(options: argparse.Namespace) -> None:
-    """By hand with torque commands in steps of 1 per mille, and of a tenth of that, on the same joints.
+    """By hand with torque commands in steps of 1 per mille, of a tenth of that, and of ten times as much.
 
     A drive that calls a tenth as much 1000 per mille has steps a tenth as large; its noise stays what it was.
     """
     print(f"# hand 0.5 Hz +-20 deg, setting {options.setting}, seed {options.seed}, robot {options.robot}")
-    print("| joint | step [N m] | inertia removed | step [N m] | inertia removed | difference |")
-    print("|---|---|---|---|---|---|")
+    print("| joint | step [N m] | inertia removed | a tenth of it | ten times as much |")
+    print("|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
-        found, steps_nm = [], []
-        for finer in (1, 10):
+        found: list[float] = []
+        steps_nm: list[float] = []
+        for finer in (1, 10, 0.1):
             with tempfile.TemporaryDirectory() as folder:
                 values = load_robot(options.robot).values()
                 drive = values["joints"][joint]
                 rated_nm, gear = drive["rated_torque_nm"], drive["gear_ratio"]
-                if finer > 1:
+                if finer != 1:
                     # Drives know their rated torque in whole mN m of the motor.
                     drive["rated_torque_nm"] = max(1, round(1000.0 * rated_nm / gear / finer)) * gear / 1000.0
                 share = rated_nm / drive["rated_torque_nm"]
@@ -150,8 +151,8 @@ def rounding(options: argparse.Namespace) -> None:
             found.append(result["modes"]["mop"]["reduction_inertia_removed_percent"])
             steps_nm.append(drive["rated_torque_nm"] / 1000.0)
         print(
-            f"| {joint} | {steps_nm[0]:.4f} | {found[0]:.3f} % | {steps_nm[1]:.4f} | {found[1]:.3f} % "
-            f"| {found[1] - found[0]:+.3f} |",
+            f"| {joint} | {steps_nm[0]:.4f} | {found[0]:.3f} % "
+            f"| {found[1] - found[0]:+.3f} | {found[2] - found[0]:+.3f} |",
             flush=True,
         )
 
