@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,13 +17,13 @@ from frictid_hil.errors import FrictidError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.bus_logs import is_log, logs_of
 from frictid_hil.jobs.decoded_log import Account, samples_in
+from frictid_hil.jobs.executors import answers, executor
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import given_procedure
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.run_folder import load_manifest
 
-_SERIAL_UP_TO = 3
 _READABLE = (".mcap", ".csv", ".csv.gz", ".mat")
 
 
@@ -92,8 +90,9 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
     logs = recordings(options.logs)
     tasks = [_task(log, options) for log in logs]
     results: list[_Identified] = []
-    with _executor(options.executor, len(tasks)) as run:
-        for task, result in zip(tasks, run(_identified, tasks), strict=True):
+    with executor(options.executor, len(tasks)) as pool:
+        for task, answer in zip(tasks, answers(pool, _identified, tasks), strict=True):
+            result = _Identified({}, {}, answer) if isinstance(answer, FrictidError) else answer
             results.append(result)
             if len(tasks) > 1:
                 said = str(result.error) if result.error else f"{len(result.joints)} joints"
@@ -258,33 +257,3 @@ def _write(task: _Task, result: _Identified, out: Path | None, *, alone: bool) -
 
 def _files(log: Path) -> list[Path]:
     return sorted(log.glob("samples*.mcap")) if log.is_dir() else [log]
-
-
-_Map = Callable[[Callable[[_Task], _Identified], list[_Task]], Iterator[_Identified]]
-
-
-@contextlib.contextmanager
-def _executor(named: str | None, tasks: int) -> Iterator[_Map]:
-    """A ``map`` that runs here, over processes, or over a cluster; results in order of the tasks."""
-    if named is None and tasks <= _SERIAL_UP_TO:
-        yield lambda function, items: map(function, items)
-        return
-    with _pool(named) as pool:
-        yield lambda function, items: pool.map(function, items)
-
-
-def _pool(named: str | None) -> Executor:
-    kind, _, rest = (named or "processes:").partition(":")
-    if kind == "processes" and (not rest or (rest.isdigit() and int(rest) > 0)):
-        return ProcessPoolExecutor(int(rest) if rest else None)
-    if kind == "dask" and rest.startswith("//"):
-        try:
-            from distributed import Client
-        except ImportError:
-            raise UsageError(
-                "dask:// needs the package distributed", next_step="pip install 'frictid-hil[cluster]'"
-            ) from None
-        client = Client(f"tcp:{rest}", timeout="10s")
-        executor: Executor = client.get_executor()
-        return executor
-    raise UsageError(f"no executor {named!r}", next_step="processes:4, or dask://host:port")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from frictid_hil.config.profile import load_profile
-from frictid_hil.errors import UsageError
+from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.executors import answers, executor
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 
 P = Procedure(0.35, 2.0, 4)
@@ -35,19 +40,59 @@ def options(*logs: Path, **changes: object) -> IdentifyOptions:
     return IdentifyOptions(logs, amplitude_rad=0.35, velocity_rad_s=2.0, cycles=4, **changes)  # type: ignore[arg-type]
 
 
-def test_over_processes_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """A real scheduler and two worker processes on this machine."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.ERROR
+    ) as running:
+        yield "dask:" + running.scheduler_address.removeprefix("tcp:")
+
+
+def check_as_alone(logs: Path, executor: str, out: Path) -> None:
+    """Every file as serially, the bad one told by name, progress for each."""
     told: list[str] = []
-    result = identify(options(logs, executor="processes:2", out=tmp_path / "many"), told.append)
+    result = identify(options(logs, executor=executor, out=out / "many"), told.append)
     entries = {Path(entry["log"]).name: entry for entry in result["recordings"]}
-    assert len(entries) == 5 and len(told) == 5
+    assert len(entries) == 5 and [line.split()[0] for line in told] == [f"{k}/5" for k in range(1, 6)]
     assert entries["zz_broken.csv"]["error"] and "zz_broken.csv" in result["error"]["what"]
     assert result["outcome"] == "gate_failed"
     for k in range(4):
-        alone = identify(options(logs / f"log{k}.csv", out=tmp_path / f"alone{k}"))
+        alone = identify(options(logs / f"log{k}.csv", out=out / f"alone{k}"))
         entry = entries[f"log{k}.csv"]
         assert entry["error"] is None
         assert entry["joints"] == alone["joints"]
         assert load_profile(Path(entry["profile"])).joints == load_profile(Path(alone["profile"])).joints
+
+
+def test_over_processes_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, tmp_path: Path) -> None:
+    check_as_alone(logs, "processes:2", tmp_path)
+
+
+def test_over_a_cluster_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, cluster: str, tmp_path: Path) -> None:
+    check_as_alone(logs, cluster, tmp_path)
+
+
+def die_at_two(task: int) -> int:
+    """A task whose worker is killed, as by the system when memory runs out."""
+    if task == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 10 * task
+
+
+def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> None:
+    with executor(cluster, 4) as pool:
+        got = list(answers(pool, die_at_two, range(4)))
+    assert [got[0], got[1], got[3]] == [0, 10, 30]
+    assert isinstance(got[2], FrictidError) and "no answer" in got[2].what
+
+
+def test_no_cluster_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("frictid_hil.jobs.executors.CONNECT_TIMEOUT", "0.3s")
+    with pytest.raises(HardwareError, match="no cluster answers"), executor("dask://127.0.0.1:9", 4):
+        pass
 
 
 @pytest.mark.parametrize("named", ["threads:4", "processes:0", "dask:host"])

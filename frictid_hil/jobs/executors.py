@@ -1,0 +1,94 @@
+"""Where many independent tasks run: here, over processes, or over a dask.distributed cluster, behind one ``Executor``.
+
+Results come in the order of the tasks. A task whose worker died, or whose answer could not be carried back, is told by
+an error of its own, so that it spoils no other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from typing import TypeVar
+
+from frictid_hil.errors import FrictidError, HardwareError, UsageError
+
+SERIAL_UP_TO = 3
+"""Unless told, so few tasks are not worth a process."""
+
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+
+
+@contextlib.contextmanager
+def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
+    """Where to run; None is here.
+
+    Args:
+        named: ``processes:N``, ``dask://host:port``, or None to choose.
+        tasks: how many there are.
+
+    Raises:
+        UsageError: no such executor, or its package is missing.
+        HardwareError: no cluster answers there.
+    """
+    if named is None and tasks <= SERIAL_UP_TO:
+        yield None
+        return
+    kind, _, rest = (named or "processes:").partition(":")
+    if kind == "processes" and (not rest or (rest.isdigit() and int(rest) > 0)):
+        with ProcessPoolExecutor(int(rest) if rest else None) as pool:
+            yield pool
+    elif kind == "dask" and rest.startswith("//"):
+        with _cluster(rest) as pool:
+            yield pool
+    else:
+        raise UsageError(f"no executor {named!r}", next_step="processes:4, or dask://host:port")
+
+
+def answers(
+    pool: Executor | None, function: Callable[[Task], Answer], tasks: Sequence[Task]
+) -> Iterator[Answer | FrictidError]:
+    """The function's answer to every task, in order, as they come; an error where a worker was lost."""
+    if pool is None:
+        yield from map(function, tasks)
+        return
+    futures: list[Future[Answer]] = [pool.submit(function, task) for task in tasks]
+    for future in futures:
+        try:
+            answer = future.result()
+        except Exception as lost:  # whatever the cluster raises: a killed worker, a broken pipe, a missing package
+            yield _lost(lost)
+        else:
+            yield answer
+
+
+def _lost(cause: Exception) -> FrictidError:
+    return FrictidError(
+        f"the worker gave no answer: {type(cause).__name__}: {cause}",
+        cause="the worker was killed (memory?), or runs another version",
+        next_step="identify this recording alone, without --executor",
+    )
+
+
+CONNECT_TIMEOUT = "10s"
+
+
+@contextlib.contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UsageError(
+            "dask:// needs the package distributed", next_step="pip install 'frictid-hil[cluster]'"
+        ) from None
+    try:
+        client = Client(f"tcp:{address}", timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call, unused-ignore]
+    except (OSError, ValueError) as unreachable:
+        raise HardwareError(
+            f"no cluster answers: {unreachable}",
+            where=f"dask:{address}",
+            next_step="start `dask scheduler` and `dask worker`, or use --executor processes:4",
+        ) from None
+    with client, client.get_executor(pure=False) as pool:  # type: ignore[no-untyped-call, unused-ignore]
+        yield pool
