@@ -3,6 +3,10 @@
 The windows of (7) are replaced by stretches in which the commanded (or else the measured) speed does not change; equal
 speeds are gathered, both ways, and (7f)-(7i) are applied to each. At constant speed the inertia term is zero by itself;
 gravity cancels between the two directions when they cover the same travel.
+
+The intervals come from how much alike torques disagree: halves of plateaus at other places of the travel (friction and
+gravity that depend on the place) and the same place passed again (noise, friction that changes with time). Both are
+pooled over all speeds, for a speed that is held at one place only says nothing of the others.
 """
 
 from __future__ import annotations
@@ -10,10 +14,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from frictid_hil.errors import IdentificationError
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian, uniform
 from frictid_hil.friction.identify import IdentifiedPairs
+from frictid_hil.friction.intervals import coulomb_half_width_nm
+from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array
 
 _CONSTANT_PER_S = 0.4
@@ -26,11 +35,34 @@ _SETTLE_S = 0.1
 """Dropped at both ends of a plateau: the axis is still settling, or the next corner is smoothed in."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlateauEstimate:
+    """What plateaus say of one joint.
+
+    Attributes:
+        pairs: of every speed held both ways, slowest first.
+        curve: phi of (8) through them.
+        half_width_nm: half of the 95 % interval of each F_n, shape (N,).
+        coulomb_nm: F_0 with its interval.
+    """
+
+    pairs: IdentifiedPairs
+    curve: FrictionCurve
+    half_width_nm: Array
+    coulomb_nm: Measured
+
+
 @dataclass(frozen=True, slots=True)
 class _Plateau:
     start: int
     stop: int
     speed: float  # signed
+
+    @property
+    def halves(self) -> tuple[slice, slice]:
+        """The first and the second half of its samples."""
+        middle = (self.start + self.stop) // 2
+        return slice(self.start, middle), slice(middle, self.stop)
 
 
 def plateaus(
@@ -41,8 +73,8 @@ def plateaus(
     command_rad: Array | None = None,
     torque_delay_s: float = 0.0,
     where: str = "",
-) -> IdentifiedPairs:
-    """Pairs of every speed that the recording holds in both directions, slowest first.
+) -> PlateauEstimate:
+    """Pairs of every speed that the recording holds in both directions, slowest first, and their intervals.
 
     Args:
         time_s: strictly increasing, shape (n,).
@@ -67,7 +99,8 @@ def plateaus(
         raise IdentificationError("no stretch of constant speed was found", where=where)
     fine = Gaussian(step_s, 2 * step_s)
     velocity, force = fine.rate(position), fine.smooth(torque, torque_delay_s)
-    rows = [_row(velocity, force, group, where) for group in _groups(found)]
+    groups = _groups(found)
+    rows = [_row(velocity, force, group, where) for group in groups]
     if len(rows) < 2:
         raise IdentificationError(
             f"only one speed ({rows[0][0]:.4g}) is held; a curve needs at least 2",
@@ -75,7 +108,7 @@ def plateaus(
             next_step="record plateaus of several speeds, both ways",
         )
     v_plus, v_minus, f_plus, f_minus, n_plus, n_minus = (np.array(column) for column in zip(*rows, strict=True))
-    return IdentifiedPairs(
+    pairs = IdentifiedPairs(
         velocity_rad_s=v_plus,
         torque_nm=(f_plus - f_minus) / 2,
         velocity_minus_rad_s=v_minus,
@@ -84,6 +117,10 @@ def plateaus(
         samples_plus=n_plus,
         samples_minus=n_minus,
     )
+    half = _half_widths(position, force, groups)
+    curve = pairs.curve(where=where)
+    half = half[np.argsort(v_plus, kind="stable")]
+    return PlateauEstimate(pairs, curve, half, Measured(curve.coulomb_nm, coulomb_half_width_nm(curve, half)))
 
 
 def _find(path: Array, step_s: float) -> list[_Plateau]:
@@ -133,3 +170,42 @@ def _row(
         int(forward.sum()),
         int(backward.sum()),
     )
+
+
+def _half_widths(position: Array, force: Array, groups: list[list[_Plateau]]) -> Array:
+    """Half of the 95 % interval of each F_n; infinite where nothing was seen twice."""
+    between: list[float] = []  # squared deviations of places from the mean of their speed and direction
+    within: list[float] = []  # of passes from the mean of their place
+    free_between = free_within = 0
+    counts = np.empty((len(groups), 2))
+    for n, group in enumerate(groups):
+        for side, direction in enumerate((1, -1)):
+            halves = [half for plateau in group if plateau.speed * direction > 0 for half in plateau.halves]
+            levels = np.array([force[half].mean() for half in halves])
+            place = _places(position, halves)
+            means = np.array([levels[place == k].mean() for k in range(place.max() + 1)])
+            between.extend((means - means.mean()) ** 2)
+            within.extend((levels - means[place]) ** 2)
+            free_between += means.size - 1
+            free_within += levels.size - means.size
+            counts[n, side] = means.size
+    if free_between < 1:
+        return np.full(len(groups), np.inf)
+    place_power = sum(between) / free_between
+    # The truth may be the friction at any time of the recording: what changed from pass to pass counts whole.
+    pass_power = sum(within) / free_within if free_within else 0.0
+    # Both directions pass the same places, and a place that resists more resists both ways.
+    deviation = np.sqrt(place_power * (1 / counts).mean(axis=1) + pass_power / 2)
+    half: Array = student.ppf(0.975, min(free_between, 30)) * deviation
+    return half
+
+
+def _places(position: Array, halves: list[slice]) -> NDArray[np.int64]:
+    """Which of the halves lie at the same place: their middles are nearer than half of what they cover."""
+    middles = np.array([position[half].mean() for half in halves])
+    reach = np.median([abs(position[half.stop - 1] - position[half.start]) for half in halves]) / 2
+    order = np.argsort(middles)
+    new = np.diff(middles[order], prepend=middles[order[0]]) > reach
+    place = np.empty(len(halves), dtype=np.int64)
+    place[order] = np.cumsum(new)
+    return place

@@ -23,7 +23,7 @@ from frictid_hil.friction.plateaus import plateaus
 from frictid_hil.friction.presliding import presliding
 from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
 from frictid_hil.friction.rigid_body import Measured
-from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.recording.samples import Mark, Samples
 
 _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
@@ -109,7 +109,6 @@ def _from_cycles(
     gates = quality.gates(recording, result)
     body = result.rigid_body
     curve = result.curve
-    half = result.half_width_nm
     temperature = samples.temperature_c
     stiffness, level = _presliding(samples, recording)
     return JointProfile(
@@ -117,9 +116,7 @@ def _from_cycles(
         prismatic=samples.prismatic,
         velocity_rad_s=curve.velocity_rad_s,
         torque_nm=curve.torque_nm,
-        torque_interval_nm=tuple(
-            (float(f - h), float(f + h)) for f, h in zip(curve.torque_nm, half.tolist(), strict=True)
-        ),
+        torque_interval_nm=_interval(curve.torque_nm, result.half_width_nm),
         coulomb_nm=_figure(result.coulomb_nm),
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
@@ -159,7 +156,7 @@ def _from_cycles(
 def _from_plateaus(samples: Samples) -> JointProfile:
     assert samples.torque_nm is not None  # by the caller
     skew = _skew(samples)
-    pairs = plateaus(
+    found = plateaus(
         samples.time_s,
         samples.position_rad,
         samples.torque_nm,
@@ -167,19 +164,28 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         torque_delay_s=skew.torque_delay_s - skew.position_delay_s,
         where=f"joint {samples.joint}",
     )
-    curve = pairs.curve(where=f"joint {samples.joint}")
+    pairs, curve, half = found.pairs, found.curve, found.half_width_nm
+    notes = ["no sine cycles: windows are stretches of constant speed, both ways"]
+    known = bool(np.all(np.isfinite(half)))
+    if not known:
+        notes.append("no interval could be formed: every speed was held at one place only, and once")
     return JointProfile(
         method="plateaus",
         prismatic=samples.prismatic,
         velocity_rad_s=curve.velocity_rad_s,
         torque_nm=curve.torque_nm,
-        coulomb_nm=Figure(value=curve.coulomb_nm),
+        torque_interval_nm=_interval(curve.torque_nm, half) if known else None,
+        coulomb_nm=_figure(found.coulomb_nm),
         forward=_pair_list(pairs.velocity_plus_rad_s, pairs.torque_plus_nm),
         backward=_pair_list(-pairs.velocity_minus_rad_s, pairs.torque_minus_nm),
         torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=skew.torque_delay_s - skew.position_delay_s,
-        quality={"notes": ["no sine cycles: windows are stretches of constant speed, both ways"]},
+        quality={"notes": notes},
     )
+
+
+def _interval(torque_nm: tuple[float, ...], half_width_nm: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((f - h, f + h) for f, h in zip(torque_nm, half_width_nm.tolist(), strict=True))
 
 
 def _recording(
