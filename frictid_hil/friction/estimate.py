@@ -14,13 +14,14 @@ The published result always stands beside the chosen one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.least_squares import RippleTable
 from frictid_hil.friction.link import Link, soft_link, without
@@ -103,6 +104,10 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     if link is not None:
         motion = without(motion, link)
         windows = intervals.aligned_pairs(recording, motion)
+    seen = _seen_delay(recording, motion, level, notes)
+    if seen is not None:
+        open_s = seen.open_s(recording.skew.uncertainty_s)
+        recording = replace(recording, skew=replace(recording.skew, uncertainty_s=open_s))
     drift = intervals.repeated(recording, motion, windows)
     solved: Fit | None = None
     doubtful = None if link is None else link.columns
@@ -149,7 +154,7 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         drift=drift,
         terms=terms,
         notes=tuple(notes),
-        figures={} if solved is None else {"residual_rms_nm": solved.residual_rms_nm},
+        figures=_figures(solved, seen),
     )
 
 
@@ -196,6 +201,21 @@ def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[s
             "position and taken off"
         )
     return link
+
+
+def _seen_delay(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> SeenDelay | None:
+    try:
+        return seen_delay(recording, motion, level)
+    except IdentificationError as problem:
+        notes.append(f"the declared timing could not be tested: {problem.what}")
+        return None
+
+
+def _figures(solved: Fit | None, seen: SeenDelay | None) -> dict[str, float]:
+    figures = {} if solved is None else {"residual_rms_nm": solved.residual_rms_nm}
+    if seen is not None:
+        figures.update(seen_delay_s=seen.delay_s, seen_delay_deviation_s=seen.deviation_s)
+    return figures
 
 
 def _ripple(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> RippleTable | None:

@@ -2,7 +2,8 @@
 
 * **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise, ripple
   and friction that depends on the place show as their disagreement;
-* **skew**: one standard deviation of undeclared delay between torque and position, through the very same windows;
+* **skew**: what the data leave open of the declared uncertainty of the delay between torque and position (``delay``),
+  through the very same windows;
 * **model**: the distance between windows and global least squares, two estimators that fail differently;
 * **drift**: friction changed between the first and the second run of the repeated cycle;
 * **link**: the swinging of a soft joint's link, taken off the torque, is known only so well.

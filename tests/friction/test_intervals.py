@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.estimate import estimate
-from frictid_hil.friction.intervals import coulomb_half_width_nm, curve_half_width_nm
-from frictid_hil.friction.recording import Skew
+from frictid_hil.friction.intervals import aligned_pairs, coulomb_half_width_nm, curve_half_width_nm, window_terms
+from frictid_hil.friction.recording import Skew, synchronised
 
 UNKNOWN = {
     "ripple": {"ripple": 0.1},
@@ -52,15 +53,34 @@ def test_a_drifting_joint_gets_wide_intervals(plants):
     assert np.mean(width) > 0.03
 
 
-def test_declared_skew_uncertainty_widens_the_fast_knots_only(plants):
+def test_skew_that_is_left_open_widens_the_fast_knots_only(plants):
     recording = plants.record(plants.arm[1], plants.procedure(20))
-    narrow = estimate(replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=0.0)))
-    wide = estimate(replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=1e-3)))
-    added = wide.half_width_nm - narrow.half_width_nm
-    assert added[0] < 0.01 * added[-1]
-    predicted = 1.96 * 0.93 * 1.9 * recording.procedure.velocity_rad_s * 1e-3
+    recording = replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=1e-3))
+    motion = synchronised(recording)
+    terms = window_terms(recording, motion, aligned_pairs(recording, motion), None, None, None)
+    assert terms.skew[0] < 0.01 * terms.skew[-1]
+    predicted = 0.93 * 1.9 * recording.procedure.velocity_rad_s * 1e-3
     predicted *= recording.procedure.angular_frequencies_rad_s[-1] ** 2
-    assert wide.terms.skew[-1] * 1.96 == pytest.approx(predicted, rel=0.15)
+    assert terms.skew[-1] == pytest.approx(predicted, rel=0.15)
+
+
+@pytest.mark.parametrize(("wrong_s", "left_open_s"), [(0.0, (0.0, 2e-4)), (5e-4, (3e-4, 8e-4)), (4e-3, (1e-3, 1e-3))])
+def test_data_narrow_what_the_declaration_leaves_open_but_never_widen_it(plants, wrong_s, left_open_s):
+    recording = plants.record(plants.arm[1], plants.procedure(10))
+    recording = replace(recording, skew=Skew(torque_delay_s=5e-4 + wrong_s, uncertainty_s=1e-3))
+    motion = synchronised(recording)
+    low, high = left_open_s
+    assert low <= seen_delay(recording, motion, 25.0).open_s(recording.skew.uncertainty_s) <= high
+
+
+def test_the_seen_delay_widens_an_interval_and_moves_no_curve(plants, monkeypatch):
+    recording = plants.record(plants.arm[1], plants.procedure(10))
+    recording = replace(recording, skew=Skew(torque_delay_s=1e-3, uncertainty_s=1e-3))
+    with_it = estimate(recording)
+    monkeypatch.setattr("frictid_hil.friction.estimate.seen_delay", lambda *_: SeenDelay(1.0, 1.0))
+    without = estimate(recording)
+    assert with_it.curve == without.curve
+    assert np.all(with_it.half_width_nm <= without.half_width_nm)
 
 
 def test_coulomb_interval_is_that_of_a_line_through_two_uncertain_pairs():
