@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from typing import TypeVar
 
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
@@ -54,13 +54,18 @@ def answers(
         yield from map(function, tasks)
         return
     futures: list[Future[Answer]] = [pool.submit(function, task) for task in tasks]
-    for future in futures:
+    for task, future in zip(tasks, futures, strict=True):
         try:
             answer = future.result()
-        except Exception as lost:  # whatever the cluster raises: a killed worker, a broken pipe, a missing package
-            yield _lost(lost)
-        else:
-            yield answer
+        except Exception:  # whatever the cluster raises: a killed worker, a broken pipe, a missing package
+            # A dying worker takes its neighbours with it, so each has a second try with nobody beside it.
+            wait(futures)
+            try:
+                answer = pool.submit(function, task).result()
+            except Exception as lost:
+                yield _lost(lost)
+                continue
+        yield answer
 
 
 def _lost(cause: Exception) -> FrictidError:
