@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from frictid_hil.gap.base_model import base_model, has_known_mass, without_own_torque
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
 from frictid_hil.gap.evidence import Evidence, Group
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -23,8 +24,6 @@ LEAST_IMPROVEMENT = 0.05
 """Fall of the held-out RMS below which an effect has no practical meaning."""
 WORST_LOG = 1.03
 """RMS of any judged log over its RMS before, above which an effect has lost across logs."""
-TOLERANCE_FACTOR = 8.0
-"""A joint without a controller is rarely a calibrated one: its tolerances count this many times wider."""
 SURE_IMPROVEMENT = 0.3
 """Improvement, both ways, without which a cause found without a replay stays below ``UNSURE``."""
 UNSURE = 0.85
@@ -70,9 +69,20 @@ def diagnose_without_replay(
     if not judged_apart:
         reasons["gap"] = "no validation log: judged on held-out blocks of the same logs, so causes stay tentative"
     kinematic = fit_kinematics(logs, experiments.nominal.encoder_resolution_rad, experiments.nominal.velocity_filter_s)
-    evidence = Evidence(usable, kinematic.step_rad, allowed, None, tolerance_factor=TOLERANCE_FACTOR)
+    base = base_model(experiments, hints)
+    reasons |= base.reasons
+    if not has_known_mass(experiments):
+        usable = without_own_torque(usable)
+
+    def evidence_of(recordings: Sequence[Recording]) -> Evidence:
+        factor, offset_nm = base.tolerance_factor, base.offset_nm
+        return Evidence(recordings, kinematic.step_rad, allowed, None, tolerance_factor=factor, offset_nm=offset_nm)
+
+    evidence = evidence_of(usable)
+    swapped = [replace(r, experiment=replace(r.experiment, validation=not r.experiment.validation)) for r in usable]
+    other = evidence_of(swapped) if judged_apart else None
     trials = _trials(evidence)
-    chosen = _chosen(evidence, trials)
+    chosen = _chosen(evidence, other, trials)
     nominal_nm = _judged_nm(evidence, ())
     after_nm = _judged_nm(evidence, chosen)
     family = best_family(evidence, chosen)
@@ -80,11 +90,9 @@ def diagnose_without_replay(
         1.0, 0.5 * evidence.misfit_ratio(chosen) * (evidence.fitted.rows if evidence.fitted else 1.0)
     )
     causes, confusable = _causes(evidence, chosen, trials, judged_apart, "motion" in reasons)
-    if any(c.confidence > UNSURE for c in causes):
-        swapped = [replace(r, experiment=replace(r.experiment, validation=not r.experiment.validation)) for r in usable]
-        other = Evidence(swapped, kinematic.step_rad, allowed, None, tolerance_factor=TOLERANCE_FACTOR)
-        if not (_judged(evidence, (), chosen).improvement >= SURE_IMPROVEMENT and _same_way(evidence, other, chosen)):
-            causes = tuple(replace(c, confidence=min(c.confidence, UNSURE)) for c in causes)
+    sure = _judged(evidence, (), chosen).improvement >= SURE_IMPROVEMENT and _same_way(evidence, other, chosen)
+    if not sure:
+        causes = tuple(replace(c, confidence=min(c.confidence, UNSURE)) for c in causes)
     verdict = "explained" if causes else "none"
     if family_share > 0.35 and _family_wins(evidence, chosen, family[1]):
         verdict = "unknown"
@@ -115,8 +123,10 @@ def diagnose_without_replay(
     )
 
 
-def _same_way(evidence: Evidence, other: Evidence, chosen: tuple[Group, ...]) -> bool:
+def _same_way(evidence: Evidence, other: Evidence | None, chosen: tuple[Group, ...]) -> bool:
     """Whether the effects help as much with the logs' roles exchanged, and point the same way."""
+    if other is None:
+        return False
     trial = _judged(other, (), chosen)
     count = sum(len(evidence.groups[g]) for g in chosen)
     agree = np.sign(evidence.coefficients(chosen)[-count:]) == np.sign(other.coefficients(chosen)[-count:])
@@ -149,14 +159,21 @@ def _judged(evidence: Evidence, before: tuple[Group, ...], after: tuple[Group, .
     return _Trial(after, 1.0 - math.sqrt(max(total_new, 1e-12) / max(total_old, 1e-12)), max(ratios.values()))
 
 
-def _chosen(evidence: Evidence, trials: Sequence[_Trial]) -> tuple[Group, ...]:
-    """The best effect that pays on unseen logs, and a second one that still pays beside it."""
+def _chosen(evidence: Evidence, other: Evidence | None, trials: Sequence[_Trial]) -> tuple[Group, ...]:
+    """The best effect that pays on unseen logs, and a second one that still pays beside it, both ways.
+
+    Args:
+        evidence: fitted on the identification logs.
+        other: the same with the logs' roles exchanged; None where all logs have one role.
+        trials: every effect alone.
+    """
     rows = evidence.fitted.rows if evidence.fitted is not None else 1.0
     bare = evidence.score(())
     passing = [
         t
         for t in trials
-        if t.improvement >= LEAST_IMPROVEMENT
+        if _possible(evidence, t.groups)
+        and t.improvement >= LEAST_IMPROVEMENT
         and t.worst <= WORST_LOG
         and evidence.score(t.groups) - bare > 12.0 * max(1.0, -2.0 * evidence.score(t.groups) / rows)
     ]
@@ -169,9 +186,23 @@ def _chosen(evidence: Evidence, trials: Sequence[_Trial]) -> tuple[Group, ...]:
             continue
         _, group = evidence.best_shape(trial.groups[0][0], first)
         pair = _judged(evidence, first, (*first, group))
+        if not _possible(evidence, (*first, group)):
+            continue
+        if other is not None and _judged(other, first, (*first, group)).improvement < LEAST_IMPROVEMENT:
+            continue
         if pair.improvement >= 2.0 * LEAST_IMPROVEMENT and pair.worst <= WORST_LOG:
             best = pair if best is None or pair.improvement > best.improvement else best
     return first if best is None else best.groups
+
+
+def _possible(evidence: Evidence, groups: tuple[Group, ...]) -> bool:
+    """Whether the fitted parameters lie within what the effects allow; a share of 300 % is no effect but a misfit."""
+    return all(
+        p.lower <= values[p.name] <= p.upper
+        for effect, values in evidence.parameters(groups).items()
+        for p in all_effects()[effect].parameters
+        if p.name in values
+    )
 
 
 def _causes(
