@@ -54,7 +54,8 @@ def measure(robot: Path, joint: str, out: Path) -> bool:
     entry = result.get("joints", {}).get(joint, {})
     _, compared = tool("compare", str(out), "--truth", str(robot))
     percent = compared.get("joints", {}).get(joint, {}).get("e_percent_measured_range")
-    said = "; ".join([*entry.get("remarks", []), *told.split("\n")[:1]]) or (result.get("error") or {}).get("what", "")
+    error = (result.get("error") or {}).get("what", "")
+    said = "; ".join([text for text in (error, *entry.get("remarks", []), told.partition("\n")[0]) if text])
     shown = "-" if percent is None else f"{percent:.2f} %"
     print(
         f"joint {joint}: exit {code}, {shown}, {entry.get('duration_s') or 0:.1f} s, "

@@ -295,7 +295,13 @@ FrameSink = Callable[[int, int, bytes, bool], None]
 
 
 class Clock(Protocol):
-    """Run time: integer nanoseconds since ``start_cycling``. Wall clock or lock-step, the loop cannot tell."""
+    """Run time: integer nanoseconds since ``start_cycling``. Wall clock or lock-step, the loop cannot tell.
+
+    Attributes:
+        lock_step: time is virtual. Where it is not, the loop gets a process of its own.
+    """
+
+    lock_step: bool
 
     def now_ns(self) -> int:
         """Run time now."""
@@ -308,6 +314,8 @@ class Clock(Protocol):
 
 class WallClock:
     """Run time on the machine's monotonic clock, by absolute deadlines."""
+
+    lock_step = False
 
     def __init__(self) -> None:
         self._origin_ns = time.monotonic_ns()

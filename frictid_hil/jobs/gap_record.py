@@ -17,7 +17,7 @@ import yaml
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import Driver, JointIdentity, JointSetup, RobotSetup, WallClock, load_driver
+from frictid_hil.driver import Driver, JointIdentity, JointSetup, RobotSetup, load_driver
 from frictid_hil.errors import FrictidError, GateFailed, InputFileError, PlanRefused, UsageError
 from frictid_hil.gap.experiments import (
     FULL,
@@ -357,7 +357,7 @@ class _Run:
             mount(self._joint, self._loaded[self._session])
 
     def _in_lock_step(self) -> bool:
-        return not isinstance(_new_driver(self._driver_name, self._setup).clock, WallClock)
+        return _new_driver(self._driver_name, self._setup).clock.lock_step
 
 
 def _new_driver(name: str, setup: RobotSetup) -> Driver:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Protocol
 
-from frictid_hil.driver import Driver, RobotSetup, WallClock, load_driver
+from frictid_hil.driver import Driver, RobotSetup, load_driver
 from frictid_hil.plan import Plan
 from frictid_hil.runner.cycle import QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight
@@ -90,7 +90,7 @@ def run_plan(
     """
     care = care or Care()
     driver: Driver = load_driver(driver_name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
-    own_process = isinstance(driver.clock, WallClock)
+    own_process = not driver.clock.lock_step
     samples, frames = sample_ring(shared=own_process), frame_ring(shared=own_process)
     recorder = Recorder(samples, frames)
 

@@ -245,6 +245,8 @@ class WireBus(can.BusABC):
 class HandClock:
     """Run time that a test turns by hand; drives' heartbeats come with it."""
 
+    lock_step = True
+
     def __init__(self, bus, heartbeat_ns=100_000_000):
         self.bus = bus
         self.time_ns = 0

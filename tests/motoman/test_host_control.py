@@ -30,8 +30,6 @@ from frictid_hil.errors import HardwareError
 class ScriptedPort:
     """Answers what is written with what a transcript says, in virtual time."""
 
-    lock_step = True
-
     def __init__(self, *exchanges: tuple[str, str], late: tuple[float, str] | None = None) -> None:
         self.script = [(bytes.fromhex(sent), bytes.fromhex(reply)) for sent, reply in exchanges]
         self.late = late

@@ -95,6 +95,12 @@ def test_the_bus_must_be_a_serial_port() -> None:
 # -- layers ----------------------------------------------------------------------------------------------------------
 
 
+def test_on_a_real_port_time_is_not_virtual_so_that_the_loop_gets_a_process_of_its_own() -> None:
+    bench = make_bench()
+    assert bench.driver().clock.lock_step
+    assert not MotomanDriver(bench.setup).clock.lock_step
+
+
 def test_the_best_layer_is_found_and_says_what_it_can() -> None:
     driver = make_bench(axes=6).driver()
     driver.open()

@@ -56,8 +56,8 @@ class Cia402Driver:
     Args:
         setup: the robot; ``settings`` lists the options it may carry.
         bus_factory: opens the bus instead of python-can (a simulated one); it is then not locked.
-        clock: run time; a clock that is no ``WallClock`` makes this lock-step: answers are there when ``send`` returns,
-            and time passes only in ``clock.wait_until``.
+        clock: run time; a lock-step clock promises that answers are there when ``send`` returns, and that time passes
+            only in its ``wait_until``.
 
     Raises:
         InvalidFields: an option or node id of the robot file is wrong.
@@ -66,7 +66,7 @@ class Cia402Driver:
     def __init__(self, setup: RobotSetup, *, bus_factory: BusFactory | None = None, clock: Clock | None = None) -> None:
         self.setup = setup
         self.clock: Clock = clock if clock is not None else WallClock()
-        self._lock_step = not isinstance(self.clock, WallClock)
+        self._lock_step = self.clock.lock_step
         self._settings, self._joint_settings = read_settings(setup)
         self._bus_factory = bus_factory
         self._torque_limits_nm = {joint.name: joint.max_torque_nm for joint in setup.joints}

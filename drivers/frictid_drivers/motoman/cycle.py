@@ -26,9 +26,13 @@ class TickClock:
     """Run time by the controller's ticks; see the module's first page. Zero while nothing streams.
 
     Between jobs of a batch there are no ticks to go by: it is then the time on this side since ``start``.
+
+    Args:
+        lock_step: the controller is an emulator in this process, on virtual time.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, lock_step: bool = False) -> None:
+        self.lock_step = lock_step
         self._session: StreamSession | None = None
         self._now_s = 0.0
         self._first_tick = 0

@@ -53,7 +53,7 @@ class MotomanDriver:
 
     Args:
         setup: the robot; every joint needs ``options.pulses_per_degree``.
-        port_factory: opens the port; an emulator in the same process brings its own.
+        port_factory: opens the port; an emulator in the same process brings its own, on virtual time.
 
     Raises:
         InvalidFields: an option is unknown or impossible, or pulses per degree are missing.
@@ -84,7 +84,7 @@ class MotomanDriver:
             joint.name: (joint.position_min_rad, joint.position_max_rad, joint.max_torque_nm) for joint in setup.joints
         }
         self._batching = False
-        self.clock = TickClock()
+        self.clock = TickClock(lock_step=port_factory is not None)
         self.batch_columns: dict[str, Any] = {}
 
     # -- reaching it -------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ class MotomanDriver:
                 modes=frozenset({Mode.POSITION}),
                 torque_offset=reach.welcome is not None and reach.welcome.feed_forward,
                 drive_watchdog=True,
-                lock_step=self._open_line().port.lock_step,
+                lock_step=self.clock.lock_step,
                 cycle_quantum_s=self.cycle_quantum_s(),
                 table_download=table,
                 command_delay_s=self._command_delay_s(),
@@ -138,7 +138,7 @@ class MotomanDriver:
                 modes=frozenset({Mode.POSITION}),
                 drive_watchdog=True,
                 batch_only=True,
-                lock_step=self._open_line().port.lock_step,
+                lock_step=self.clock.lock_step,
                 cycle_quantum_s=self.cycle_quantum_s(),
                 table_download=table,
                 command_delay_s=self._command_delay_s(),

@@ -17,13 +17,7 @@ from frictid_hil.errors import HardwareBusy, HardwareError
 
 
 class BytePort(Protocol):
-    """Bytes both ways, and the clock they run on.
-
-    Attributes:
-        lock_step: time is virtual and stands still except in ``read``.
-    """
-
-    lock_step: bool
+    """Bytes both ways, and the clock they run on."""
 
     def now_s(self) -> float:
         """Time now, from any origin."""
@@ -58,8 +52,6 @@ class SerialPort:
         HardwareBusy: another process holds it.
         HardwareError: it does not exist, may not be opened, or does not accept the parity.
     """
-
-    lock_step = False
 
     def __init__(self, path: str, baud: int, parity: str) -> None:
         self._path = path

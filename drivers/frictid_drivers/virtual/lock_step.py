@@ -104,6 +104,8 @@ class LockStepBus(VirtualBus):
 class LockStepClock:
     """Run time of the drives on a lock-step bus; see ``frictid_hil.driver.Clock``."""
 
+    lock_step = True
+
     def __init__(self, rack: Drives) -> None:
         self._rack = rack
         self._origin_ns = rack.now_ns

@@ -15,8 +15,6 @@ class LoopbackPort:
         parity: the host's parity.
     """
 
-    lock_step = True
-
     def __init__(self, emulator: Emulator, baud: int, parity: str) -> None:
         self.emulator = emulator
         self._line = (baud, parity)
