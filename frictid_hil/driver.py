@@ -15,8 +15,9 @@ raw units (encoder counts, pulses, per mille of rated torque) and keeps the conv
 
 from __future__ import annotations
 
+import difflib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from importlib.metadata import entry_points
@@ -488,6 +489,26 @@ def load_driver(name: str) -> type[Driver]:
     raise InvalidFields(
         [FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")]
     )
+
+
+def unknown_options(
+    given: Mapping[str, Any], known: Collection[str], path: tuple[str | int, ...], driver: str
+) -> list[FieldProblem]:
+    """A problem for every option that the driver does not take, with the option that was probably meant.
+
+    Args:
+        given: the options of the robot file, or those of one joint.
+        known: what the driver takes there.
+        path: of ``given`` in the robot file.
+        driver: its name, as the robot file has it.
+    """
+    problems = []
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(sorted(known)) or 'none'}"
+            problems.append(FieldProblem((*path, name), f"is no option of the {driver} driver; {hint}"))
+    return problems
 
 
 def planned_quantum_s(name: str, setup: RobotSetup) -> float:

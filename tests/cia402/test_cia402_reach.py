@@ -31,12 +31,23 @@ def test_is_a_driver():
             ("joints", "0", "options", "external_torque_nm_per_unit"),
         ),
         ({"joint_options": {"timing": {"torque_delay": 1}}}, ("joints", "0", "options", "timing")),
+        ({"joint_options": {"rated_torque_side": "gear"}}, ("joints", "0", "options", "rated_torque_side")),
+        ({"joint_options": {"velocity_unit_rad_s": 0}}, ("joints", "0", "options", "velocity_unit_rad_s")),
+        ({"joint_options": {"digital_inputs": "yes"}}, ("joints", "0", "options", "digital_inputs")),
+        ({"options": {"allow_torque_without_watchdog": "false"}}, ("options", "allow_torque_without_watchdog")),
+        ({"options": {"watchdog_s": 0.1}}, ("options", "watchdog_s")),
+        ({"joint_options": {"torque_sourse": "current"}}, ("joints", "0", "options", "torque_sourse")),
     ],
 )
 def test_wrong_options_are_named(options, path):
     with pytest.raises(InvalidFields) as caught:
         bench(1, **options)
     assert path in [problem.path for problem in caught.value.problems]
+
+
+def test_the_option_that_was_meant_is_told():
+    with pytest.raises(InvalidFields, match="did you mean watchdog_ms"):
+        bench(1, options={"watchdog": 100})
 
 
 @pytest.mark.parametrize("nodes", [(1, 1), (0,), (128,), (127,)])

@@ -103,6 +103,20 @@ def test_errors_keep_file_line_and_column(tmp_path: Path) -> None:
     assert "gear_ratio" in result.stderr, "the nearest known key is suggested"
 
 
+@pytest.mark.parametrize(
+    ("driver", "option", "meant"), [("virtual", "fault", "faults"), ("cia402", "watchdog", "watchdog_ms")]
+)
+def test_a_misspelt_option_is_told_with_its_place(tmp_path: Path, driver: str, option: str, meant: str) -> None:
+    site = tmp_path / "site.yaml"
+    site.write_text(
+        f"schema: frictid.robot/1\nextends: hp3j.yaml\nname: mine\ndriver: {driver}\noptions:\n  {option}: 1\n"
+    )
+    result = run("check", "--robot", str(site))
+    assert result.returncode == 2
+    assert "site.yaml:6:" in result.stderr
+    assert f"did you mean {meant}?" in result.stderr
+
+
 def test_what_a_driver_misses_is_told_with_its_place() -> None:
     result = run("check", "--robot", "hp3j.yaml", "--bus", "serial:/dev/nowhere")
     assert result.returncode == 2

@@ -27,7 +27,7 @@ from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
 BusFactory = Callable[[], can.BusABC]
 
 DEFAULT_BITRATE = 1_000_000
-_FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host")
+FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host")
 """Robot-file options that are handed to python-can as they are, when given."""
 
 
@@ -58,7 +58,7 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
         HardwareError: interface unknown, channel absent, or no permission.
     """
     interface, channel = split_bus(bus)
-    settings = {key: options[key] for key in _FORWARDED if key in options}
+    settings = {key: options[key] for key in FORWARDED if key in options}
     if interface not in ("socketcan", "virtual"):
         # A SocketCAN link carries its bitrate already; everybody else must be told.
         settings.setdefault("bitrate", DEFAULT_BITRATE)

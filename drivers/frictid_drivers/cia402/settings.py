@@ -12,6 +12,7 @@ reply_window                            0.7       share of the cycle in which re
 allow_torque_without_watchdog           false     torque modes on drives without 1016
 quick_stop_option                       6         605A: 5, 6 or 7 (stop and hold)
 abort_option                            3         6007: 2 (disable voltage) or 3 (quick stop)
+tty_baudrate, port, host, ...           -         handed to the python-can interface as they are (``network.FORWARDED``)
 ======================================  ========  =====================================================================
 
 ======================================  ========  =====================================================================
@@ -42,9 +43,42 @@ from dataclasses import dataclass
 from typing import Any
 
 from frictid_drivers.cia402.frame_map import Entry
-from frictid_drivers.cia402.network import DEFAULT_BITRATE
-from frictid_hil.driver import JointSetup, RobotSetup, Timing
+from frictid_drivers.cia402.network import DEFAULT_BITRATE, FORWARDED
+from frictid_hil.driver import JointSetup, RobotSetup, Timing, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
+
+BUS_OPTIONS = frozenset(
+    {
+        "bitrate",
+        "sdo_timeout_s",
+        "watchdog_ms",
+        "drive_heartbeat_ms",
+        "host_node",
+        "reply_window",
+        "allow_torque_without_watchdog",
+        "quick_stop_option",
+        "abort_option",
+        *FORWARDED,
+    }
+)
+JOINT_OPTIONS = frozenset(
+    {
+        "following_window_rad",
+        "locked_window_rad",
+        "following_timeout_ms",
+        "standstill_rad_s",
+        "external_torque_object",
+        "external_torque_nm_per_unit",
+        "temperature_object",
+        "temperature_c_per_unit",
+        "digital_inputs",
+        "position_units_per_revolution",
+        "velocity_unit_rad_s",
+        "rated_torque_side",
+        "torque_source",
+        "timing",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +144,7 @@ class _Reader:
 
     def bus(self, options: Mapping[str, Any]) -> BusSettings:
         at: tuple[str, ...] = ("options",)
+        self.problems += unknown_options(options, BUS_OPTIONS, at, "cia402")
         return BusSettings(
             bitrate=self._whole(at, options, "bitrate", DEFAULT_BITRATE, 10_000, 1_000_000),
             sdo_timeout_s=self._number(at, options, "sdo_timeout_s", 0.5, 0.01, 60.0),
@@ -117,7 +152,7 @@ class _Reader:
             drive_heartbeat_ms=self._whole(at, options, "drive_heartbeat_ms", 100, 10, 1000),
             host_node=self._whole(at, options, "host_node", 127, 1, 127),
             reply_window=self._number(at, options, "reply_window", 0.7, 0.1, 0.95),
-            allow_torque_without_watchdog=bool(options.get("allow_torque_without_watchdog", False)),
+            allow_torque_without_watchdog=self._flag(at, options, "allow_torque_without_watchdog"),
             quick_stop_option=self._whole(at, options, "quick_stop_option", 6, 5, 7),
             abort_option=self._whole(at, options, "abort_option", 3, 2, 3),
         )
@@ -125,6 +160,8 @@ class _Reader:
     def joint(self, joint: JointSetup) -> JointSettings:
         options = joint.options
         at = ("joints", joint.name, "options")
+        self.problems += unknown_options(options, JOINT_OPTIONS, at, "cia402")
+        self._overrides(at, options)
         external, external_unit = self._object(at, options, "external_torque", "nm_per_unit")
         temperature, temperature_unit = self._object(at, options, "temperature", "c_per_unit")
         return JointSettings(
@@ -136,7 +173,7 @@ class _Reader:
             external_torque_nm_per_unit=external_unit,
             temperature=temperature,
             temperature_c_per_unit=temperature_unit,
-            digital_inputs=bool(options.get("digital_inputs", False)),
+            digital_inputs=self._flag(at, options, "digital_inputs"),
             torque_source=str(options.get("torque_source", "6077 actual torque")),
             timing=self._timing(at, options),
         )
@@ -151,6 +188,15 @@ class _Reader:
                     ("joints", joint.name, "node"), f"node {joint.address} is already used by {seen[joint.address]}"
                 )
             seen.setdefault(joint.address, f"joint {joint.name}")
+
+    def _overrides(self, at: tuple[str, ...], options: Mapping[str, Any]) -> None:
+        """What ``facts.scale_of`` takes instead of the drive's own word."""
+        for key in ("position_units_per_revolution", "velocity_unit_rad_s"):
+            if key in options:
+                self._number(at, options, key, None, 1e-12, 1e15)
+        side = options.get("rated_torque_side", "motor")
+        if side not in ("motor", "joint"):
+            self._problem((*at, "rated_torque_side"), f"expected motor or joint, found {side!r}")
 
     def _timing(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Timing | None:
         given = options.get("timing")
@@ -195,6 +241,13 @@ class _Reader:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             self._problem((*at, key), f"expected a whole number {low}..{high}, found {value!r}")
             return default
+        return value
+
+    def _flag(self, at: tuple[str, ...], options: Mapping[str, Any], key: str) -> bool:
+        value = options.get(key, False)
+        if not isinstance(value, bool):
+            self._problem((*at, key), f"expected true or false, found {value!r}")
+            return False
         return value
 
     def _problem(self, path: tuple[str | int, ...], message: str) -> None:

@@ -8,9 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
-from frictid_hil.driver import JointSetup
+from frictid_hil.driver import JointSetup, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
+
+JOINT_OPTIONS: Final = frozenset({"pulses_per_degree", "digital_inputs"})
+"""``digital_inputs`` is asked of every driver by unattended jobs; this one reports none, and the runner says so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +66,12 @@ def axis_units(joints: Sequence[JointSetup]) -> dict[str, AxisUnits]:
     """Conversions of every joint by name.
 
     Raises:
-        InvalidFields: ``options.pulses_per_degree`` missing, not a positive number, or two joints on one axis.
+        InvalidFields: an unknown option, ``options.pulses_per_degree`` missing or not positive, two joints on one axis.
     """
     problems: list[FieldProblem] = []
     made: dict[str, AxisUnits] = {}
     for joint in joints:
+        problems += unknown_options(joint.options, JOINT_OPTIONS, ("joints", joint.name, "options"), "motoman")
         path = ("joints", joint.name, "options", "pulses_per_degree")
         value = joint.options.get("pulses_per_degree")
         if value is None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from frictid_drivers.motoman.bsc import BscTiming
 from frictid_drivers.motoman.host_control import PROFILES
-from frictid_hil.driver import Timing
+from frictid_hil.driver import Timing, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
 
 _PSEUDO_TERMINALS = "/dev/pts/"
@@ -100,11 +100,11 @@ def serial_options(mapping: Mapping[str, Any]) -> SerialOptions:
     Raises:
         InvalidFields: an unknown option, or a value that is not possible.
     """
-    problems: list[FieldProblem] = []
     types = {entry.name: entry.type for entry in fields(SerialOptions)}
+    problems = unknown_options(mapping, {*types, *_OTHERS}, ("options",), "motoman")
     values: dict[str, Any] = {}
     for name, value in mapping.items():
-        if name in _OTHERS:
+        if name not in types:
             continue
         if name == "timing":
             values[name] = _timing(value, problems)
@@ -134,8 +134,6 @@ def _timing(value: Any, problems: list[FieldProblem]) -> Timing:
 
 
 def _problem(name: str, value: Any, types: Mapping[str, Any]) -> str:
-    if name not in types:
-        return f"is no option of the serial driver; there are {', '.join(sorted(types))}"
     if name in _CHOICES:
         return "" if value in _CHOICES[name] else f"must be one of {', '.join(_CHOICES[name])}, found {value!r}"
     return _out_of_bounds(value, *_BOUNDS[name], whole=types[name] == "int")

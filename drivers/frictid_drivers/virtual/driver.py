@@ -31,8 +31,9 @@ from frictid_hil.driver import (
     RobotSetup,
     SetPoint,
     WallClock,
+    unknown_options,
 )
-from frictid_hil.errors import UsageError
+from frictid_hil.errors import InvalidFields, UsageError
 from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
@@ -192,6 +193,11 @@ class VirtualDriver:
 
 def _told_to_host(setup: RobotSetup) -> RobotSetup:
     """The robot as the host driver shall see it: no faults, and where our drives keep what other drives have not."""
+    from frictid_drivers.cia402.settings import BUS_OPTIONS  # late, as above
+
+    problems = unknown_options(setup.options, {*BUS_OPTIONS, "faults"}, ("options",), "virtual")
+    if problems:
+        raise InvalidFields(problems)
     options = {name: value for name, value in setup.options.items() if name != "faults"}
     joints = tuple(replace(joint, options={**_objects(joint), **joint.options}) for joint in setup.joints)
     return replace(setup, options=options, joints=joints)
