@@ -95,5 +95,10 @@ def _cluster(address: str) -> Iterator[Executor]:
             where=f"dask:{address}",
             next_step="start `dask scheduler` and `dask worker`, or use --executor processes:4",
         ) from None
-    with client, client.get_executor(pure=False) as pool:  # type: ignore[no-untyped-call, unused-ignore]
-        yield pool
+    with client:
+        pool = client.get_executor(pure=False)  # type: ignore[no-untyped-call, unused-ignore]
+        try:
+            yield pool
+        finally:
+            # Whoever wanted an answer has it; waiting for the rest may last for ever where a worker was killed.
+            pool.shutdown(wait=False)
