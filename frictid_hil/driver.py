@@ -71,6 +71,7 @@ class JointSetup:
         locked_position_rad: where it is held while another joint moves.
         options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
         simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
+        dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
     """
 
     name: str
@@ -86,6 +87,7 @@ class JointSetup:
     locked_position_rad: float
     options: Mapping[str, Any] = field(default_factory=dict)
     simulated: Mapping[str, Any] = field(default_factory=dict)
+    dh: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,7 @@ class RobotSetup:
         options: driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
         realtime: run on the wall clock even where lock-step is possible.
         seed: seed of every simulated noise; ignored by real hardware.
+        simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
     """
 
     name: str
@@ -109,6 +112,7 @@ class RobotSetup:
     options: Mapping[str, Any] = field(default_factory=dict)
     realtime: bool = False
     seed: int = 0
+    simulated_arm: Mapping[str, Any] = field(default_factory=dict)
 
     def joint(self, name: str) -> JointSetup:
         """The joint of that name.

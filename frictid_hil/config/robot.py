@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from frictid_hil.config.policy import Policy
-from frictid_hil.config.schema import Pair, Strict, schema_version, validated
+from frictid_hil.config.schema import Pair, Strict, Triple, schema_version, validated
 from frictid_hil.config.search import find
 from frictid_hil.config.yaml import Document, merge, read
 from frictid_hil.driver import JointSetup, RobotSetup
@@ -71,6 +71,22 @@ class ExpectedFile(Strict):
     link_inertia_kg_m2: float | None = Field(default=None, ge=0)
 
 
+class DhFile(Strict):
+    """Where the next joint is: the joint's Denavit-Hartenberg row, as the robot's manual prints it.
+
+    Attributes:
+        d_m: along this joint's axis.
+        a_m: along the common normal.
+        alpha_rad: twist to the next joint's axis.
+        theta_rad: angle at joint position 0.
+    """
+
+    d_m: float = 0.0
+    a_m: float = 0.0
+    alpha_rad: float = 0.0
+    theta_rad: float = 0.0
+
+
 class JointFile(Strict):
     """One joint; torque and position on the joint side of the gear."""
 
@@ -89,14 +105,25 @@ class JointFile(Strict):
     procedure: JointProcedureFile = JointProcedureFile()
     options: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
+    dh: DhFile | None = None
 
 
 class WorkspaceFile(Strict):
-    """A box in the robot's base frame that no link may leave when several joints move together."""
+    """A box in the robot's base frame that the arm may not leave in a calibration; needs ``dh`` of every joint.
+
+    Attributes:
+        x_m: from and to.
+        y_m: from and to.
+        z_m: from and to.
+        clearance_m: kept from every face: as much as the links are thicker than lines from joint to joint.
+        tool_m: tool point in the last joint's frame.
+    """
 
     x_m: Pair
     y_m: Pair
     z_m: Pair
+    clearance_m: float = Field(default=0.0, ge=0)
+    tool_m: Triple = (0.0, 0.0, 0.0)
 
     @field_validator("x_m", "y_m", "z_m")
     @classmethod
@@ -119,6 +146,7 @@ class RobotFile(Strict):
     procedure: ProcedureFile = ProcedureFile()
     policy: Policy = Policy()
     workspace: WorkspaceFile | None = None
+    simulated_arm: dict[str, Any] = Field(default_factory=dict)
     joints: dict[str, JointFile] = Field(min_length=1)
 
     @field_validator("bus")
@@ -269,6 +297,7 @@ class Robot:
             options=self.file.options,
             realtime=realtime,
             seed=seed,
+            simulated_arm=self.file.simulated_arm,
         )
 
 
@@ -367,5 +396,6 @@ def _address(joint: JointFile, driver: str) -> int | None:
 
 
 def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
-    values = joint.model_dump(exclude={"node", "axis", "procedure", "expected", "options", "simulated"})
-    return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, **values)
+    values = joint.model_dump(exclude={"node", "axis", "procedure", "expected", "options", "simulated", "dh"})
+    row = joint.dh.model_dump() if joint.dh else {}
+    return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, dh=row, **values)

@@ -44,10 +44,11 @@ class Estimate:
         half_width_nm: half of the 95 % interval at each knot of the curve, shape (K,).
         coulomb_nm: F_0 with its interval.
         asymmetry_nm: half the difference of forward and backward friction at each knot, its constant part left to
-            the bias, shape (K,). phi + asymmetry forwards, phi - asymmetry backwards.
+            the bias, shape (K,). phi + asymmetry forwards, phi - asymmetry backwards. Zero where other joints moved
+            too: the velocity products of the arm look the same.
         pairs: window averages: of the drive's columns for ``function-a``, else of the synchronised ones.
         published: Function A as published; None where its windows are empty or there is no drive velocity.
-        rigid_body: inertia, gravity, bias; None where they could not be separated.
+        rigid_body: inertia, gravity, bias; None where they could not be separated, or are not of this joint alone.
         ripple: over one motor revolution; None where it is unknown or lost in its uncertainty.
         link_resonance_hz: of a soft joint; None where the joint looks rigid.
         drift: the repeated cycle against its first run; None without one.
@@ -140,15 +141,22 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         half = half[np.argsort(pairs.velocity_rad_s, kind="stable")]
 
     speeds = np.asarray(curve.velocity_rad_s)
+    even = asymmetry(pairs, speeds) if solved is None else solved.even_nm(speeds)
+    body = None if solved is None else rigid_body(recording, solved)
+    if recording.coupled:
+        even, body = np.zeros_like(even), None
+        notes.append(
+            "other joints moved with this one: inertia, gravity, asymmetry and a soft link cannot be told from theirs"
+        )
     return Estimate(
         method=method,
         curve=curve,
         half_width_nm=half,
         coulomb_nm=Measured(curve.coulomb_nm, intervals.coulomb_half_width_nm(curve, half)),
-        asymmetry_nm=asymmetry(pairs, speeds) if solved is None else solved.even_nm(speeds),
+        asymmetry_nm=even,
         pairs=pairs,
         published=published,
-        rigid_body=None if solved is None else rigid_body(recording, solved),
+        rigid_body=body,
         ripple=_ripple(recording, motion, level, notes),
         link_resonance_hz=None if link is None else link.resonance_hz,
         drift=drift,
@@ -190,6 +198,8 @@ def _published(recording: CycleRecording, notes: list[str], *, required: bool) -
 
 
 def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> Link | None:
+    if recording.coupled:
+        return None
     try:
         link = soft_link(recording, motion, level)
     except IdentificationError as problem:

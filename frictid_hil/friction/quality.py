@@ -60,9 +60,10 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
         _roughness(recording, result),
         _samples(result),
         _lateness(recording),
-        _asymmetry(result),
         _kinks(recording, result),
     ]
+    if not recording.coupled:
+        asked.append(_asymmetry(result))
     if math.isfinite(recording.torque_limit_nm):
         asked.append(_saturation(recording))
     if result.drift is not None:

@@ -64,6 +64,8 @@ class CycleRecording:
         torque_quantum_nm: one step of the reported torque.
         repeat: the repeated cycle, where there is one.
         late_cycles: control cycles that were late or missed while recording.
+        coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
+            combined motion. They are the same both ways and leave the curve alone.
         where: what to name in errors (``joint 1``).
     """
 
@@ -80,6 +82,7 @@ class CycleRecording:
     torque_quantum_nm: float = 0.0
     repeat: Repeat | None = None
     late_cycles: int = 0
+    coupled: bool = False
     where: str = ""
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -104,13 +105,14 @@ def _from_cycles(
     late_cycles: int,
     together: tuple[str, ...] = (),
 ) -> JointProfile:
-    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    recording = replace(_recording(samples, procedure, start_s, joint, late_cycles), coupled=len(together) > 1)
     result = estimate(recording, method)
     gates = quality.gates(recording, result)
     body = result.rigid_body
     curve = result.curve
     temperature = samples.temperature_c
     stiffness, level = _presliding(samples, recording)
+    apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
     return JointProfile(
         method=result.method,
         prismatic=samples.prismatic,
@@ -120,10 +122,10 @@ def _from_cycles(
         coulomb_nm=_figure(result.coulomb_nm),
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
-        inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, "inertia and gravity could not be separated"),
-        gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, "inertia and gravity could not be separated"),
-        gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, "inertia and gravity could not be separated"),
-        bias_nm=_figure(body.bias_nm if body else None, "inertia and gravity could not be separated"),
+        inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, apart),
+        gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, apart),
+        gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, apart),
+        bias_nm=_figure(body.bias_nm if body else None, apart),
         forward=_pair_list(result.pairs.velocity_plus_rad_s, result.pairs.torque_plus_nm),
         backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
         published=_published(result.published),

@@ -50,6 +50,7 @@ class Kernel:
     """The compiled functions of ``plant.py``, effects included; see there for their arguments."""
 
     run: Callable[..., None]
+    run_coupled: Callable[..., None]
     steady: Callable[..., None]
     place: Callable[..., float]
     holding_torque: Callable[..., float]
@@ -73,7 +74,7 @@ def layout() -> Layout:
 def kernel() -> Kernel:
     """The compiled kernel with every effect there is; the first call on a machine compiles for some seconds."""
     module = _load(kernel_source())
-    return Kernel(module.run, module.steady, module.place, module.holding_torque)
+    return Kernel(module.run, module.run_coupled, module.steady, module.place, module.holding_torque)
 
 
 def kernel_source() -> str:

@@ -9,6 +9,9 @@ and the rate-dependent remainder (17). The spring is far stiffer than anything e
 sub-step solves it by the implicit midpoint rule, whose slip condition has a closed form; everything soft is explicit
 at the midpoint, extrapolated with the last acceleration. Second order, and stable whatever the stiffness.
 
+``run`` moves one joint alone; ``run_coupled`` moves the joints of an arm, where what one link accelerates the others
+feel. Both are made of the same pieces: ``begin``, ``control``, ``prepare``, ``solve``, ``move``, ``report``.
+
 Everything is on the joint side of the gear.
 """
 
@@ -44,7 +47,8 @@ POWERED = 22
 BRAKED = 23
 CURVE_AT = 24
 CURVE_KNOTS = 25
-CORE_PARAMETERS = 26
+ARM_TORQUE = 26
+CORE_PARAMETERS = 27
 
 # Slots of the state vector; effects' states follow.
 TIME = 0
@@ -60,7 +64,31 @@ MEASURED = 9
 CONTROL_VELOCITY = 10
 REPORT_VELOCITY = 11
 FRICTION = 12
-CORE_STATES = 13
+# ... of the control period under way ...
+DEMAND = 13
+SATURATED = 14
+CURRENT_SUM = 15
+EXTERNAL = 16
+MOTOR_INERTIA = 17
+LINK_INERTIA = 18
+HALF_MOBILITY = 19
+TURN_PER_RAD_S = 20
+COUPLING = 21
+COUPLING_DAMPING = 22
+PLAY = 23
+# ... and of the sub-step under way.
+LEVEL = 24
+REMAINDER = 25
+DRIVE = 26
+EFFECTIVE = 27
+LINK_FREE = 28
+LINK_GAIN = 29
+DRIVE_PER_OUTER = 30
+FREE_PER_OUTER = 31
+MEAN = 32
+SLIP_MID = 33
+LINK_MEAN = 34
+CORE_STATES = 35
 
 # Columns of what a call is told for every control period ...
 POSITION_COMMAND = 0
@@ -84,6 +112,11 @@ READINGS = 9
 POSITION_MODE = 8
 VELOCITY_MODE = 9
 TORQUE_MODE = 10
+
+COUPLING_RAD_S = 1e-12
+"""Joints of an arm are solved in turn until no mean velocity changes by more ..."""
+COUPLING_ROUNDS = 200
+"""... or for so many rounds."""
 
 Vector = Any
 """A flat float64 array; typed loosely because the compiled kernel replaces this module's functions."""
@@ -144,6 +177,8 @@ def steady(
 def gravity_torque(parameters: Vector, position_rad: float) -> float:
     """Torque that holds the link and its payload at rest."""
     gravity_nm = parameters[GRAVITY_COS] * math.cos(position_rad) + parameters[GRAVITY_SIN] * math.sin(position_rad)
+    # What the links beyond this one ask of it in an arm; a lone joint has none.
+    gravity_nm += parameters[ARM_TORQUE]
     # effects at gravity transform gravity_nm
     gravity_nm += parameters[PAYLOAD_GRAVITY_COS] * math.cos(position_rad)
     return float(gravity_nm)
@@ -230,6 +265,199 @@ def encoder_position(parameters: Vector, state: Vector) -> float:
     return float(state[MOTOR_POSITION] if parameters[ENCODER_ON_MOTOR] != 0.0 else state[LINK_POSITION])
 
 
+def begin(parameters: Vector, state: Vector, step_s: float) -> None:
+    """Take over what stays the same for a while: inertias, transmission, step."""
+    inertia_kg_m2 = parameters[INERTIA]
+    motor_kg_m2 = parameters[MOTOR_SHARE] * inertia_kg_m2
+    link_kg_m2 = inertia_kg_m2 - motor_kg_m2
+    # effects at inertia transform link_kg_m2
+    link_kg_m2 += parameters[PAYLOAD_INERTIA]
+    state[MOTOR_INERTIA] = motor_kg_m2
+    state[LINK_INERTIA] = link_kg_m2
+
+    coupling_nm_per_rad, coupling_nm_s_per_rad, play_rad = transmission(parameters)
+    state[COUPLING] = coupling_nm_per_rad
+    state[COUPLING_DAMPING] = coupling_nm_s_per_rad
+    state[PLAY] = play_rad
+    half_s = 0.5 * step_s
+    rigid = coupling_nm_per_rad <= 0.0
+    state[HALF_MOBILITY] = half_s / (motor_kg_m2 + link_kg_m2 if rigid else motor_kg_m2)
+    coulomb_nm = parameters[COULOMB]
+    state[TURN_PER_RAD_S] = (parameters[STIFFNESS] / coulomb_nm if coulomb_nm > 0.0 else 0.0) * half_s
+
+
+def control(parameters: Vector, state: Vector, commands: Vector, tick: int, mode: int, period_s: float) -> None:
+    """The torque that the drive's loops demand for the coming control period."""
+    limit_nm = parameters[TORQUE_LIMIT]
+    velocity_measured = state[CONTROL_VELOCITY]
+    error_rad = commands[tick, POSITION_COMMAND] - state[MEASURED]
+    state[SATURATED] = 0.0
+    if mode == TORQUE_MODE:
+        demand_nm = commands[tick, TORQUE_COMMAND]
+        integral_step_nm = 0.0
+    elif mode == VELOCITY_MODE:
+        error_rad_s = commands[tick, VELOCITY_COMMAND] - velocity_measured
+        demand_nm = state[INTEGRAL] + parameters[KD] * error_rad_s
+        integral_step_nm = parameters[KP] * error_rad_s * period_s
+    else:
+        demand_nm = parameters[KP] * error_rad + state[INTEGRAL]
+        demand_nm += parameters[KD] * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
+        integral_step_nm = parameters[KI] * error_rad * period_s
+    demand_nm += commands[tick, TORQUE_OFFSET]
+    if abs(demand_nm) > limit_nm:
+        demand_nm = math.copysign(limit_nm, demand_nm)
+        state[SATURATED] = 1.0
+    else:
+        # Frozen while the limit is active, so that it cannot wind up.
+        state[INTEGRAL] += integral_step_nm
+    state[DEMAND] = demand_nm if parameters[POWERED] != 0.0 else 0.0
+    state[CURRENT_SUM] = 0.0
+    state[EXTERNAL] = 0.0
+
+
+def motor_torque(parameters: Vector, state: Vector, step_s: float) -> float:
+    """What the power stage makes of the demand during one sub-step."""
+    limit_nm = parameters[TORQUE_LIMIT]  # noqa: F841 - for effects
+    current_nm = state[DEMAND]
+    # effects at current transform current_nm
+    state[CURRENT_SUM] += current_nm
+    return float(current_nm)
+
+
+def prepare(parameters: Vector, state: Vector, outer_nm: float, step_s: float) -> None:
+    """Everything soft at the middle of one sub-step; what is stiff is left to ``solve``.
+
+    ``outer_nm`` is what other links' accelerations did to this link last; load-dependent friction feels it.
+    """
+    current_nm = motor_torque(parameters, state, step_s)
+    half_s = 0.5 * step_s
+    velocity_rad_s = state[MOTOR_VELOCITY] + half_s * state[MOTOR_ACCELERATION]
+    position_rad = state[MOTOR_POSITION] + half_s * state[MOTOR_VELOCITY]
+    link_velocity = state[LINK_VELOCITY] + half_s * state[LINK_ACCELERATION]
+    link_rad = state[LINK_POSITION] + half_s * state[LINK_VELOCITY]
+    link_kg_m2 = state[LINK_INERTIA]
+
+    torque_nm = shaft_torque(parameters, current_nm, position_rad, parameters[GEAR_RATIO])
+    gravity_nm = gravity_torque(parameters, link_rad)
+    external_nm = 0.0
+    if parameters[HAND_STIFFNESS] > 0.0 or parameters[HAND_DAMPING] > 0.0:
+        rate = 2.0 * math.pi * parameters[HAND_FREQUENCY]
+        phase = rate * (state[TIME] + half_s)
+        hand_rad = parameters[HAND_CENTRE] + parameters[HAND_AMPLITUDE] * math.sin(phase)
+        hand_rad_s = parameters[HAND_AMPLITUDE] * rate * math.cos(phase)
+        external_nm = parameters[HAND_STIFFNESS] * (hand_rad - link_rad)
+        external_nm += parameters[HAND_DAMPING] * (hand_rad_s - link_velocity)
+    load_nm = gravity_nm - external_nm - outer_nm + link_kg_m2 * state[LINK_ACCELERATION]
+    level_nm, rate_nm, other_nm = friction(parameters, state, velocity_rad_s, position_rad, state[SLIP], load_nm)
+
+    # Motor side: body * dv/step = drive - level * sat(slip + ...); the link, if any, is eliminated first.
+    drive_nm = torque_nm - rate_nm - other_nm
+    half_mobility = state[HALF_MOBILITY]
+    if state[COUPLING] <= 0.0:
+        drive_nm += external_nm - gravity_nm
+        state[EFFECTIVE] = 1.0
+        state[DRIVE_PER_OUTER] = 1.0
+    else:
+        spring_nm = 0.0
+        pull = 0.0
+        stretch_rad = state[MOTOR_POSITION] - state[LINK_POSITION]
+        if abs(stretch_rad) > 0.5 * state[PLAY]:
+            spring_nm = state[COUPLING] * (stretch_rad - math.copysign(0.5 * state[PLAY], stretch_rad))
+            pull = state[COUPLING] * half_s + state[COUPLING_DAMPING]
+        half_link = half_s / link_kg_m2
+        link_gain = half_link * pull / (1.0 + half_link * pull)
+        link_free = state[LINK_VELOCITY] + half_link * (spring_nm + external_nm - gravity_nm)
+        link_free /= 1.0 + half_link * pull
+        drive_nm -= spring_nm - pull * link_free
+        state[EFFECTIVE] = 1.0 + half_mobility * pull * (1.0 - link_gain)
+        state[LINK_GAIN] = link_gain
+        state[LINK_FREE] = link_free
+        state[FREE_PER_OUTER] = half_link / (1.0 + half_link * pull)
+        state[DRIVE_PER_OUTER] = pull * state[FREE_PER_OUTER]
+    state[DRIVE] = drive_nm
+    state[LEVEL] = level_nm
+    state[REMAINDER] = rate_nm + other_nm
+    state[EXTERNAL] = external_nm
+
+
+def solve(state: Vector, outer_nm: float) -> float:
+    """Mean velocity of the link in this sub-step under a torque ``outer_nm`` upon the link, slip solved with it."""
+    half_mobility, turn = state[HALF_MOBILITY], state[TURN_PER_RAD_S]
+    level_nm, slip, effective = state[LEVEL], state[SLIP], state[EFFECTIVE]
+    start = state[MOTOR_VELOCITY] + half_mobility * (state[DRIVE] + state[DRIVE_PER_OUTER] * outer_nm)
+    mean = (start - half_mobility * level_nm * slip) / (effective + half_mobility * level_nm * turn)
+    slip_mid = slip + turn * mean
+    if abs(slip_mid) > 1.0:
+        slip_mid = math.copysign(1.0, slip_mid)
+        mean = (start - half_mobility * level_nm * slip_mid) / effective
+    state[MEAN] = mean
+    state[SLIP_MID] = slip_mid
+    link_mean = mean
+    if state[COUPLING] > 0.0:
+        link_mean = state[LINK_FREE] + state[FREE_PER_OUTER] * outer_nm + state[LINK_GAIN] * mean
+    state[LINK_MEAN] = link_mean
+    return float(link_mean)
+
+
+def move(parameters: Vector, state: Vector, step_s: float) -> None:
+    """Carry the joint over the sub-step that ``solve`` has solved."""
+    half_s = 0.5 * step_s
+    mean = state[MEAN]
+    slip = state[SLIP] + 2.0 * state[TURN_PER_RAD_S] * mean
+    state[SLIP] = min(1.0, max(-1.0, slip))
+    friction_nm = state[LEVEL] * state[SLIP_MID] + state[REMAINDER]
+    state[FRICTION] = friction_nm
+
+    state[MOTOR_POSITION] += step_s * mean
+    state[MOTOR_ACCELERATION] = (mean - state[MOTOR_VELOCITY]) / half_s
+    state[MOTOR_VELOCITY] = 2.0 * mean - state[MOTOR_VELOCITY]
+    if state[COUPLING] <= 0.0:
+        state[LINK_POSITION] = state[MOTOR_POSITION]
+        state[LINK_VELOCITY] = state[MOTOR_VELOCITY]
+        state[LINK_ACCELERATION] = state[MOTOR_ACCELERATION]
+    else:
+        link_mean = state[LINK_MEAN]
+        state[LINK_POSITION] += step_s * link_mean
+        state[LINK_ACCELERATION] = (link_mean - state[LINK_VELOCITY]) / half_s
+        state[LINK_VELOCITY] = 2.0 * link_mean - state[LINK_VELOCITY]
+    remember(parameters, state, mean, friction_nm, step_s)
+
+
+def stand(parameters: Vector, state: Vector, step_s: float) -> None:
+    """One sub-step under the brake."""
+    motor_torque(parameters, state, step_s)
+    remember(parameters, state, 0.0, 0.0, step_s)
+    state[MOTOR_VELOCITY] = 0.0
+    state[MOTOR_ACCELERATION] = 0.0
+    state[LINK_VELOCITY] = 0.0
+    state[LINK_ACCELERATION] = 0.0
+
+
+def report(parameters: Vector, state: Vector, readings: Vector, tick: int, substeps: int, period_s: float) -> None:
+    """What encoder and drive say at the end of a control period."""
+    measured = measure(parameters, encoder_position(parameters, state))
+    difference = (measured - state[MEASURED]) / period_s
+    state[MEASURED] = measured
+    control_share = _filter_share(period_s, parameters[CONTROL_FILTER_S])
+    report_share = _filter_share(period_s, parameters[REPORT_FILTER_S])
+    state[CONTROL_VELOCITY] += control_share * (difference - state[CONTROL_VELOCITY])
+    state[REPORT_VELOCITY] += report_share * (difference - state[REPORT_VELOCITY])
+    reported_rad_s = state[REPORT_VELOCITY]
+    # effects at report_velocity transform reported_rad_s
+    temperature_c = 25.0
+    # effects at temperature transform temperature_c
+
+    readings[tick, READ_POSITION] = measured
+    readings[tick, READ_VELOCITY] = reported_rad_s
+    readings[tick, READ_TORQUE] = state[CURRENT_SUM] / substeps
+    readings[tick, READ_TRUE_POSITION] = state[LINK_POSITION]
+    readings[tick, READ_TRUE_VELOCITY] = state[LINK_VELOCITY]
+    readings[tick, READ_EXTERNAL] = state[EXTERNAL]
+    readings[tick, READ_SATURATED] = state[SATURATED]
+    readings[tick, READ_TEMPERATURE] = temperature_c
+    readings[tick, READ_FRICTION] = state[FRICTION]
+
+
 def run(
     parameters: Vector,
     state: Vector,
@@ -241,154 +469,74 @@ def run(
 ) -> None:
     """Advance through ``len(commands)`` control periods of ``substeps`` steps each; reads after each period."""
     period_s = substeps * step_s
-    control_share = _filter_share(period_s, parameters[CONTROL_FILTER_S])
-    report_share = _filter_share(period_s, parameters[REPORT_FILTER_S])
-    limit_nm = parameters[TORQUE_LIMIT]
-    coulomb_nm = parameters[COULOMB]
-    powered = parameters[POWERED] != 0.0
-    braked = parameters[BRAKED] != 0.0
-
-    inertia_kg_m2 = parameters[INERTIA]
-    motor_kg_m2 = parameters[MOTOR_SHARE] * inertia_kg_m2
-    link_kg_m2 = inertia_kg_m2 - motor_kg_m2
-    # effects at inertia transform link_kg_m2
-    link_kg_m2 += parameters[PAYLOAD_INERTIA]
-
-    coupling_nm_per_rad, coupling_nm_s_per_rad, play_rad = transmission(parameters)
-    rigid = coupling_nm_per_rad <= 0.0
-    body_kg_m2 = motor_kg_m2 + link_kg_m2 if rigid else motor_kg_m2
-
-    slip_per_rad = parameters[STIFFNESS] / coulomb_nm if coulomb_nm > 0.0 else 0.0
-
+    begin(parameters, state, step_s)
     for tick in range(commands.shape[0]):
-        velocity_measured = state[CONTROL_VELOCITY]
-        error_rad = commands[tick, POSITION_COMMAND] - state[MEASURED]
-        saturated = False
-        if mode == TORQUE_MODE:
-            demand_nm = commands[tick, TORQUE_COMMAND]
-            integral_step_nm = 0.0
-        elif mode == VELOCITY_MODE:
-            error_rad_s = commands[tick, VELOCITY_COMMAND] - velocity_measured
-            demand_nm = state[INTEGRAL] + parameters[KD] * error_rad_s
-            integral_step_nm = parameters[KP] * error_rad_s * period_s
-        else:
-            demand_nm = parameters[KP] * error_rad + state[INTEGRAL]
-            demand_nm += parameters[KD] * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
-            integral_step_nm = parameters[KI] * error_rad * period_s
-        demand_nm += commands[tick, TORQUE_OFFSET]
-        if abs(demand_nm) > limit_nm:
-            demand_nm = math.copysign(limit_nm, demand_nm)
-            saturated = True
-        else:
-            # Frozen while the limit is active, so that it cannot wind up.
-            state[INTEGRAL] += integral_step_nm
-        if not powered:
-            demand_nm = 0.0
-
-        current_sum_nm = 0.0
-        external_nm = 0.0
-        friction_nm = state[FRICTION]
-        load_nm = 0.0
+        control(parameters, state, commands, tick, mode, period_s)
         for _ in range(substeps):
-            current_nm = demand_nm
-            # effects at current transform current_nm
-            current_sum_nm += current_nm
-            if braked:
-                remember(parameters, state, 0.0, 0.0, step_s)
+            if parameters[BRAKED] != 0.0:
+                stand(parameters, state, step_s)
+            else:
+                prepare(parameters, state, 0.0, step_s)
+                solve(state, 0.0)
+                move(parameters, state, step_s)
+        report(parameters, state, readings, tick, substeps, period_s)
+
+
+def run_coupled(
+    parameters: Vector,
+    states: Vector,
+    commands: Vector,
+    readings: Vector,
+    modes: Vector,
+    coupling_kg_m2: Vector,
+    substeps: int,
+    step_s: float,
+) -> None:
+    """Advance the n joints of an arm through one control period; one row per joint in everything.
+
+    ``coupling_kg_m2`` (n, n) is the links' inertia matrix; its diagonal stands in the joints' own parameters already.
+    In every sub-step the joints are solved in turn, each under the accelerations that the others have by now, until
+    nothing changes: the inertia matrix with the motors' part is positive definite and friction opposes motion, so that
+    the rounds converge.
+    """
+    joints = parameters.shape[0]
+    period_s = substeps * step_s
+    half_s = 0.5 * step_s
+    for k in range(joints):
+        begin(parameters[k], states[k], step_s)
+        control(parameters[k], states[k], commands, k, modes[k], period_s)
+    for _ in range(substeps):
+        for k in range(joints):
+            state = states[k]
+            if parameters[k, BRAKED] != 0.0:
+                stand(parameters[k], state, step_s)
                 continue
-
-            # Midpoint estimates for everything soft.
-            half_s = 0.5 * step_s
-            velocity_rad_s = state[MOTOR_VELOCITY] + half_s * state[MOTOR_ACCELERATION]
-            position_rad = state[MOTOR_POSITION] + half_s * state[MOTOR_VELOCITY]
-            link_velocity = state[LINK_VELOCITY] + half_s * state[LINK_ACCELERATION]
-            link_rad = state[LINK_POSITION] + half_s * state[LINK_VELOCITY]
-
-            torque_nm = shaft_torque(parameters, current_nm, position_rad, parameters[GEAR_RATIO])
-            gravity_nm = gravity_torque(parameters, link_rad)
-            if parameters[HAND_STIFFNESS] > 0.0 or parameters[HAND_DAMPING] > 0.0:
-                rate = 2.0 * math.pi * parameters[HAND_FREQUENCY]
-                phase = rate * (state[TIME] + half_s)
-                hand_rad = parameters[HAND_CENTRE] + parameters[HAND_AMPLITUDE] * math.sin(phase)
-                hand_rad_s = parameters[HAND_AMPLITUDE] * rate * math.cos(phase)
-                external_nm = parameters[HAND_STIFFNESS] * (hand_rad - link_rad)
-                external_nm += parameters[HAND_DAMPING] * (hand_rad_s - link_velocity)
-            load_nm = gravity_nm - external_nm + link_kg_m2 * state[LINK_ACCELERATION]
-
-            slip = state[SLIP]
-            level_nm, rate_nm, other_nm = friction(parameters, state, velocity_rad_s, position_rad, slip, load_nm)
-
-            # Motor side: body * dv/step = drive - level * sat(slip + ...); the link, if any, is eliminated first.
-            drive_nm = torque_nm - rate_nm - other_nm
-            half_mobility = half_s / body_kg_m2
-            spring_nm = 0.0
-            link_gain = 0.0
-            link_free = 0.0
-            pull = 0.0
-            if rigid:
-                drive_nm += external_nm - gravity_nm
-            else:
-                stretch_rad = state[MOTOR_POSITION] - state[LINK_POSITION]
-                if abs(stretch_rad) > 0.5 * play_rad:
-                    spring_nm = coupling_nm_per_rad * (stretch_rad - math.copysign(0.5 * play_rad, stretch_rad))
-                    pull = coupling_nm_per_rad * half_s + coupling_nm_s_per_rad
-                half_link = half_s / link_kg_m2
-                link_gain = half_link * pull / (1.0 + half_link * pull)
-                link_free = state[LINK_VELOCITY] + half_link * (spring_nm + external_nm - gravity_nm)
-                link_free /= 1.0 + half_link * pull
-                drive_nm -= spring_nm - pull * link_free
-            effective = 1.0 + half_mobility * pull * (1.0 - link_gain)
-
-            turn = slip_per_rad * half_s
-            start = state[MOTOR_VELOCITY] + half_mobility * drive_nm
-            mean = (start - half_mobility * level_nm * slip) / (effective + half_mobility * level_nm * turn)
-            slip_mid = slip + turn * mean
-            if abs(slip_mid) > 1.0:
-                slip_mid = math.copysign(1.0, slip_mid)
-                mean = (start - half_mobility * level_nm * slip_mid) / effective
-            slip += 2.0 * turn * mean
-            state[SLIP] = min(1.0, max(-1.0, slip))
-            friction_nm = level_nm * slip_mid + rate_nm + other_nm
-
-            state[MOTOR_POSITION] += step_s * mean
-            state[MOTOR_ACCELERATION] = (mean - state[MOTOR_VELOCITY]) / half_s
-            state[MOTOR_VELOCITY] = 2.0 * mean - state[MOTOR_VELOCITY]
-            if rigid:
-                state[LINK_POSITION] = state[MOTOR_POSITION]
-                state[LINK_VELOCITY] = state[MOTOR_VELOCITY]
-                state[LINK_ACCELERATION] = state[MOTOR_ACCELERATION]
-            else:
-                link_mean = link_free + link_gain * mean
-                state[LINK_POSITION] += step_s * link_mean
-                state[LINK_ACCELERATION] = (link_mean - state[LINK_VELOCITY]) / half_s
-                state[LINK_VELOCITY] = 2.0 * link_mean - state[LINK_VELOCITY]
-            remember(parameters, state, mean, friction_nm, step_s)
-
-        state[FRICTION] = friction_nm
-        if braked:
-            state[MOTOR_VELOCITY] = 0.0
-            state[MOTOR_ACCELERATION] = 0.0
-            state[LINK_VELOCITY] = 0.0
-            state[LINK_ACCELERATION] = 0.0
-        measured = measure(parameters, encoder_position(parameters, state))
-        difference = (measured - state[MEASURED]) / period_s
-        state[MEASURED] = measured
-        state[CONTROL_VELOCITY] += control_share * (difference - state[CONTROL_VELOCITY])
-        state[REPORT_VELOCITY] += report_share * (difference - state[REPORT_VELOCITY])
-        reported_rad_s = state[REPORT_VELOCITY]
-        # effects at report_velocity transform reported_rad_s
-        temperature_c = 25.0
-        # effects at temperature transform temperature_c
-
-        readings[tick, READ_POSITION] = measured
-        readings[tick, READ_VELOCITY] = reported_rad_s
-        readings[tick, READ_TORQUE] = current_sum_nm / substeps
-        readings[tick, READ_TRUE_POSITION] = state[LINK_POSITION]
-        readings[tick, READ_TRUE_VELOCITY] = state[LINK_VELOCITY]
-        readings[tick, READ_EXTERNAL] = external_nm
-        readings[tick, READ_SATURATED] = 1.0 if saturated else 0.0
-        readings[tick, READ_TEMPERATURE] = temperature_c
-        readings[tick, READ_FRICTION] = friction_nm
+            outer_nm = 0.0
+            for other in range(joints):
+                if other != k:
+                    outer_nm -= coupling_kg_m2[k, other] * states[other, LINK_ACCELERATION]
+            prepare(parameters[k], state, outer_nm, step_s)
+            # As good a first guess as there is.
+            state[LINK_MEAN] = state[LINK_VELOCITY] + half_s * state[LINK_ACCELERATION]
+        for _ in range(COUPLING_ROUNDS):
+            change = 0.0
+            for k in range(joints):
+                if parameters[k, BRAKED] != 0.0:
+                    continue
+                outer_nm = 0.0
+                for other in range(joints):
+                    if other != k and parameters[other, BRAKED] == 0.0:
+                        acceleration = (states[other, LINK_MEAN] - states[other, LINK_VELOCITY]) / half_s
+                        outer_nm -= coupling_kg_m2[k, other] * acceleration
+                before = states[k, LINK_MEAN]
+                change = max(change, abs(solve(states[k], outer_nm) - before))
+            if change < COUPLING_RAD_S:
+                break
+        for k in range(joints):
+            if parameters[k, BRAKED] == 0.0:
+                move(parameters[k], states[k], step_s)
+    for k in range(joints):
+        report(parameters[k], states[k], readings, k, substeps, period_s)
 
 
 def _filter_share(period_s: float, time_constant_s: float) -> float:

@@ -7,6 +7,7 @@ the end of every ``advance``; the torque is the mean of what was applied during 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,6 +30,13 @@ class ServoLoop:
         period_s: of the drive's control loop.
         seed: of the noise on the reported torque.
         position_rad: where the joint stands at first, as its encoder reads it; unpowered, brake engaged.
+
+    Attributes:
+        model: the joint.
+        commands: what the coming control periods are told, shape (periods, ``plant.COMMANDS``).
+        readings: what they read, shape (periods, ``plant.READINGS``).
+        substeps: of one control period.
+        step_s: of one sub-step.
     """
 
     def __init__(self, model: JointModel, *, period_s: float = 0.001, seed: int = 0, position_rad: float = 0.0) -> None:
@@ -48,8 +56,9 @@ class ServoLoop:
         self._kernel.place(self._parameters, self._state, float(position_rad))
         self._parameters[plant.POWERED] = 0.0
         self._parameters[plant.BRAKED] = 1.0
-        self._commands = np.zeros((0, plant.COMMANDS))
-        self._readings = np.zeros((0, plant.READINGS))
+        self.substeps, self.step_s = 1, period_s
+        self.commands = np.zeros((0, plant.COMMANDS))
+        self.readings = np.zeros((0, plant.READINGS))
         self._row: list[float] = [
             self._state[plant.MEASURED],
             0.0,
@@ -141,13 +150,28 @@ class ServoLoop:
             torque_nm: torque mode: target.
             torque_offset_nm: added in every mode.
         """
+        if duration_s <= 0.0:
+            return
+        self.command(duration_s, position_rad, velocity_rad_s, torque_nm, torque_offset_nm)
+        self._kernel.run(
+            self._parameters, self._state, self.commands, self.readings, self._mode, self.substeps, self.step_s
+        )
+        self.read()
+
+    def command(
+        self,
+        duration_s: float,
+        position_rad: float | None,
+        velocity_rad_s: float,
+        torque_nm: float,
+        torque_offset_nm: float,
+    ) -> None:
+        """The first part of ``advance``: what every control period is told (``commands``)."""
         if not abs(duration_s - self._duration_s) <= 1e-12:
-            if duration_s <= 0.0:
-                return
             self._prepare(duration_s)
         if position_rad is None:
             position_rad = self._target_rad
-        commands = self._commands
+        commands = self.commands
         if self._mode == plant.POSITION_MODE:
             velocity_rad_s = (position_rad - self._target_rad) / duration_s
             self._target_rad = position_rad
@@ -162,15 +186,40 @@ class ServoLoop:
             row[1] = velocity_rad_s
             row[2] = torque_nm
             row[3] = torque_offset_nm
-        self._kernel.run(
-            self._parameters, self._state, commands, self._readings, self._mode, self._substeps, self._step_s
-        )
-        self._row = self._readings[-1].tolist()
-        if len(commands) > 1:
-            self._row[plant.READ_TORQUE] = float(self._readings[:, plant.READ_TORQUE].mean())
+
+    def read(self) -> None:
+        """The last part of ``advance``: latch what the control periods have read (``readings``)."""
+        self._row = self.readings[-1].tolist()
+        if len(self.readings) > 1:
+            self._row[plant.READ_TORQUE] = float(self.readings[:, plant.READ_TORQUE].mean())
         if not self._noise:
             self._noise = (self._random.standard_normal(_NOISE_BLOCK) * self._noise_nm).tolist()
         self._torque_noise_nm = self._noise.pop()
+
+    @property
+    def mode(self) -> int:
+        """As set."""
+        return self._mode
+
+    @property
+    def periods(self) -> int:
+        """Control periods of the last ``command``."""
+        return len(self.commands)
+
+    @staticmethod
+    def shared_rows(joints: Sequence[ServoLoop]) -> tuple[packing.Vector, packing.Vector]:
+        """Let the joints' parameters and states live in the rows of two matrices, shapes (n, ...), for an arm."""
+        parameters = np.zeros((len(joints), max(joint._parameters.size for joint in joints)))
+        states = np.zeros((len(joints), joints[0]._state.size))
+        for joint, row, state in zip(joints, parameters, states, strict=True):
+            row[: joint._parameters.size] = joint._parameters
+            state[:] = joint._state
+            joint._parameters, joint._state = row, state
+        return parameters, states
+
+    def place_again(self) -> None:
+        """Relax where the encoder stands, with the parameters of now."""
+        self._kernel.place(self._parameters, self._state, float(self._row[plant.READ_POSITION]))
 
     @property
     def position_counts(self) -> int:
@@ -230,9 +279,9 @@ class ServoLoop:
     def _prepare(self, duration_s: float) -> None:
         """Sizes of one call of the kernel for this duration."""
         periods = max(1, round(duration_s / self._period_s))
-        self._substeps = max(1, math.ceil(duration_s / periods / SUBSTEP_S - 1e-6))
-        self._step_s = duration_s / periods / self._substeps
+        self.substeps = max(1, math.ceil(duration_s / periods / SUBSTEP_S - 1e-6))
+        self.step_s = duration_s / periods / self.substeps
         self._ramp = np.arange(1, periods + 1) / periods
-        self._commands = np.zeros((periods, plant.COMMANDS))
-        self._readings = np.zeros((periods, plant.READINGS))
+        self.commands = np.zeros((periods, plant.COMMANDS))
+        self.readings = np.zeros((periods, plant.READINGS))
         self._duration_s = duration_s

@@ -88,6 +88,14 @@ class Plant(Protocol):
         ...
 
 
+class Company(Protocol):
+    """Axes whose joints can only move on together: those of an arm."""
+
+    def advance(self, now_ns: int) -> None:
+        """Bring all of them to ``now_ns``, or as far towards it as their commands go on unbroken."""
+        ...
+
+
 class Axis:
     """One motor.
 
@@ -109,6 +117,7 @@ class Axis:
         following_error: outside the window right now (statusword bit 13).
         max_torque_per_mille: 6072h as taken over last.
         encoder_stuck: report the last position for ever (a fault to play).
+        company: axes that move on with this one; None where it is alone.
     """
 
     def __init__(
@@ -132,6 +141,7 @@ class Axis:
         self.internal_limit = False
         self.following_error = False
         self.encoder_stuck = False
+        self.company: Company | None = None
         self.powered = False
         self.mode = 0
         self._stopped = False  # by a ramp: the host's set-points do not count until ``resume``
@@ -307,56 +317,67 @@ class Axis:
             self._plant.set_mode(CSP)
         self._demand_rad_s = self._demand_rad_s2 = self._velocity_rad_s = 0.0
 
-    def _run_ramp(self, ramp: _Ramp, now_ns: int) -> None:
-        while self.now_ns < now_ns:
-            end_ns = min(now_ns, self.now_ns + _RAMP_STEP_NS)
-            if ramp.rate_rad_s2 == math.inf:
-                self._velocity_rad_s = 0.0
-            else:
-                position_rad, velocity_rad_s = ramp.at(end_ns)
-                self._position_rad, self._demand_rad_s = position_rad, velocity_rad_s
-            self._advance(end_ns)
-            at_rest = abs(self._plant.velocity_rad_s) < _STANDSTILL_RAD_S
-            ramp.done = ramp.done or (end_ns >= ramp.end_ns and (at_rest or end_ns >= ramp.end_ns + _SETTLE_NS))
-
     # -- time ----------------------------------------------------------------------------------------------------------
 
     def catch_up(self, now_ns: int) -> None:
         """Run the plant to ``now_ns`` and supervise it."""
         if now_ns <= self.now_ns:
             return
+        while self.now_ns < now_ns:
+            if self.company is not None:
+                self.company.advance(now_ns)
+                continue
+            end_ns = self.unbroken_until_ns(now_ns)
+            position_rad, velocity_rad_s, torque_nm, offset_nm = self.command_until(end_ns)
+            self._plant.advance(
+                (end_ns - self.now_ns) * _NS,
+                position_rad=position_rad,
+                velocity_rad_s=velocity_rad_s,
+                torque_nm=torque_nm,
+                torque_offset_nm=offset_nm,
+            )
+            self.arrive(end_ns)
+        self.supervise()
+
+    def unbroken_until_ns(self, now_ns: int) -> int:
+        """How far towards ``now_ns`` the command goes on as it does: a straight line, or standing still."""
+        if self._ramp is not None:
+            return min(now_ns, self.now_ns + _RAMP_STEP_NS)
+        return min(now_ns, self._to_ns) if self._on_the_way else now_ns
+
+    @property
+    def _on_the_way(self) -> bool:
+        """Between two set-points of position."""
+        return self.now_ns < self._to_ns and self.mode == CSP and self.powered and not self._stopped
+
+    def command_until(self, end_ns: int) -> tuple[float, float, float, float]:
+        """What the plant is told for the time up to ``end_ns``: position, velocity, torque, torque offset."""
         ramp = self._ramp
         if ramp is not None:
-            self._run_ramp(ramp, now_ns)
-        elif self.now_ns < self._to_ns and self.mode == CSP and self.powered and not self._stopped:
-            end_ns = self._to_ns
-            if now_ns < end_ns:
-                share = (now_ns - self._from_ns) / (end_ns - self._from_ns)
+            if ramp.rate_rad_s2 == math.inf:
+                self._velocity_rad_s = 0.0
+            else:
+                self._position_rad, self._demand_rad_s = ramp.at(end_ns)
+        elif self._on_the_way:
+            if end_ns < self._to_ns:
+                share = (end_ns - self._from_ns) / (self._to_ns - self._from_ns)
                 self._position_rad = self._from_rad + share * (self._to_rad - self._from_rad)
-                self._advance(now_ns)
             else:
                 self._position_rad = self._to_rad
-                self._advance(end_ns)
-                if now_ns > end_ns:
-                    self._demand_rad_s = self._demand_rad_s2 = 0.0
-                    self._advance(now_ns)
-        else:
-            self._advance(now_ns)
-        if self.powered:
-            self._supervise()
-
-    def _advance(self, end_ns: int) -> None:
-        velocity_rad_s, torque_nm, offset_nm = self._velocity_rad_s, self._torque_nm, self._offset_nm
+        elif self.mode == CSP and not self._stopped:
+            self._demand_rad_s = self._demand_rad_s2 = 0.0
         if self._own_anything:
-            velocity_rad_s, torque_nm, offset_nm = self._helped(velocity_rad_s, torque_nm, offset_nm)
-        self._plant.advance(
-            (end_ns - self.now_ns) * _NS,
-            position_rad=self._position_rad,
-            velocity_rad_s=velocity_rad_s,
-            torque_nm=torque_nm,
-            torque_offset_nm=offset_nm,
-        )
+            velocity_rad_s, torque_nm, offset_nm = self._helped(self._velocity_rad_s, self._torque_nm, self._offset_nm)
+            return self._position_rad, velocity_rad_s, torque_nm, offset_nm
+        return self._position_rad, self._velocity_rad_s, self._torque_nm, self._offset_nm
+
+    def arrive(self, end_ns: int) -> None:
+        """The plant has run to ``end_ns``."""
         self.now_ns = end_ns
+        ramp = self._ramp
+        if ramp is not None:
+            at_rest = abs(self._plant.velocity_rad_s) < _STANDSTILL_RAD_S
+            ramp.done = ramp.done or (end_ns >= ramp.end_ns and (at_rest or end_ns >= ramp.end_ns + _SETTLE_NS))
 
     def _helped(self, velocity_rad_s: float, torque_nm: float, offset_nm: float) -> tuple[float, float, float]:
         """Set-points with the drive's own friction compensation and feed-forward (2020h, 2021h)."""
@@ -369,7 +390,10 @@ class Axis:
             return velocity_rad_s, torque_nm + own_nm, offset_nm
         return velocity_rad_s, torque_nm, offset_nm + own_nm
 
-    def _supervise(self) -> None:
+    def supervise(self) -> None:
+        """Look for overspeed, following error and limits while there is power; ``alarm`` tells."""
+        if not self.powered:
+            return
         plant, values = self._plant, self._values
         if abs(plant.velocity_rad_s) > self._speed_limit_rad_s * 1.1:
             self.alarm = self.alarm or emergency.OVERSPEED

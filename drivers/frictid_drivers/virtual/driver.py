@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import can
 
 from frictid_drivers.virtual import channel, side_channel
+from frictid_drivers.virtual.arm import arm_of
 from frictid_drivers.virtual.faults import faults_of, missing_objects
 from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
@@ -68,6 +69,7 @@ class VirtualDriver:
             if self._setup.realtime:
                 for joint in self._setup.joints:
                     JointModel.of(joint, joint.name)  # a mistake is better told here than by another process
+                arm_of(self._setup)
                 self._process = start_rack(self._setup)
             else:
                 self._rack.install(self._setup, missing=missing_objects(self._faults))

@@ -27,22 +27,40 @@ _FOLLOWING_WINDOW_RAD = 0.05
 _U16, _U32 = (1 << 16) - 1, (1 << 32) - 1
 
 
+def plant_for(robot: RobotSetup, joint: JointSetup) -> ServoLoop:
+    """The simulated joint under its drive's inner loops, where the robot file locks it.
+
+    Raises:
+        InvalidFields: the joint's ``simulated`` mapping is wrong.
+    """
+    return ServoLoop(
+        JointModel.of(joint, joint.name),
+        period_s=CONTROL_PERIOD_S,
+        seed=zlib.crc32(f"{robot.seed}/{robot.name}/{joint.name}".encode()),
+        position_rad=joint.locked_position_rad,
+    )
+
+
 def servo_for(
-    robot: RobotSetup, joint: JointSetup, send: Send, *, missing: Iterable[int] = (), sync_gap_tenths: int = 20
+    robot: RobotSetup,
+    joint: JointSetup,
+    plant: ServoLoop,
+    send: Send,
+    *,
+    missing: Iterable[int] = (),
+    sync_gap_tenths: int = 20,
 ) -> Servo:
     """The drive of one joint, unpowered, its brake engaged, standing at the start position.
 
     Args:
         robot: whose joint it is; gives seed and serial number.
         joint: the joint.
+        plant: behind the drive, see ``plant_for``.
         send: puts a frame on the bus.
         missing: indices of objects that this drive does not have.
         sync_gap_tenths: longest tolerated gap between SYNCs, in tenths of the period (2010h:01).
-
-    Raises:
-        InvalidFields: the joint's ``simulated`` mapping is wrong.
     """
-    model = JointModel.of(joint, joint.name)
+    model = plant.model
     gear = Fraction(joint.gear_ratio).limit_denominator(1000)
     counts = Fraction(model.encoder.counts_per_revolution).limit_denominator(1)
     if counts <= 0:
@@ -75,12 +93,6 @@ def servo_for(
                 f"{float(ratio):g} increments do not fit a drive's 32 bits",
                 where=f"joint {joint.name}: simulated.encoder",
             )
-    plant = ServoLoop(
-        model,
-        period_s=CONTROL_PERIOD_S,
-        seed=zlib.crc32(f"{robot.seed}/{robot.name}/{joint.name}".encode()),
-        position_rad=joint.locked_position_rad,
-    )
 
     def hold_hand(held: bool, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
         plant.hold_hand(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from frictid_drivers.virtual.joint_drive import servo_for
+from frictid_drivers.virtual.arm import arm_of, couple
+from frictid_drivers.virtual.joint_drive import plant_for, servo_for
 from frictid_drivers.virtual.pdo import NEVER_NS
 from frictid_drivers.virtual.servo import Servo
 from frictid_hil.driver import RobotSetup
@@ -55,11 +56,17 @@ class Rack:
             sync_gap_tenths: longest gap between SYNCs that drives tolerate, in tenths of the period.
 
         Raises:
-            InvalidFields: some joint's ``simulated`` mapping is wrong.
+            InvalidFields: some joint's ``simulated`` mapping, or ``simulated_arm``, is wrong.
+            ConfigError: the library that a simulated arm needs is not installed.
         """
-        for joint in setup.joints:
+        arm = arm_of(setup)
+        plants = [plant_for(setup, joint) for joint in setup.joints]
+        for joint, plant in zip(setup.joints, plants, strict=True):
             absent = (missing or {}).get(joint.name, frozenset())
-            self.add(joint.name, servo_for(setup, joint, self.send, missing=absent, sync_gap_tenths=sync_gap_tenths))
+            servo = servo_for(setup, joint, plant, self.send, missing=absent, sync_gap_tenths=sync_gap_tenths)
+            self.add(joint.name, servo)
+        if arm is not None:
+            couple(arm, plants, [servo.axis for servo in self.servos.values()])
 
     def add(self, name: str, servo: Servo) -> None:
         """Connect a drive."""

@@ -1,0 +1,77 @@
+"""All joints at once, on simulated drives whose joints share one arm."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from frictid_hil.config.profile import load_profile
+from frictid_hil.errors import PlanRefused, UsageError
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
+from frictid_hil.jobs.compare import compare
+from frictid_hil.jobs.identify import IdentifyOptions, identify
+from frictid_hil.jobs.watch import Silent
+
+pytest.importorskip("mujoco")
+
+JOINTS = ("1", "2", "4")
+"""Those with parallel axes: they feel each other most."""
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    out = tmp_path_factory.mktemp("together") / "run"
+    options = CalibrateOptions("hp3j-arm.yaml", bus="virtual:test-together", out=out, joints=JOINTS, together=True)
+    return out, calibrate(options, Silent())
+
+
+def test_three_joints_take_the_time_of_one(together: tuple[Path, dict[str, object]]) -> None:
+    _, result = together
+    assert result["outcome"] == "ok", result
+    durations = {entry["duration_s"] for entry in result["joints"].values()}  # type: ignore[attr-defined]
+    assert len(durations) == 1
+    alone_s = [plan_calibration(CalibrateOptions("hp3j-arm.yaml", joints=(name,))).plan.duration_s for name in JOINTS]
+    # Every stretch lasts as for the joint that needs longest; powering up and down comes on top.
+    assert durations.pop() < max(alone_s) + 2.0 < 0.5 * sum(alone_s)
+
+
+def test_the_curves_are_those_of_the_joints_not_of_the_arm(together: tuple[Path, dict[str, object]]) -> None:
+    out, _ = together
+    for name, distance in compare(out, None, "hp3j-arm.yaml")["joints"].items():
+        assert distance["e_percent_measured_range"] <= 1.0, name
+
+
+def test_what_is_of_the_whole_arm_is_not_said_of_a_joint(together: tuple[Path, dict[str, object]]) -> None:
+    out, _ = together
+    profile = load_profile(out / "profile.yaml")
+    assert profile.provenance.settings["together"] is True
+    for name in JOINTS:
+        joint = profile.joint(name)
+        assert joint.procedure is not None and joint.procedure.together == JOINTS
+        assert joint.inertia_kg_m2.value is None
+        assert "together" in joint.inertia_kg_m2.reason
+
+
+def test_the_recording_identifies_to_the_same_profile(together: tuple[Path, dict[str, object]]) -> None:
+    out, _ = together
+    again = identify(IdentifyOptions((out,), robot="hp3j-arm.yaml", out=out.parent / "again"))
+    assert again["outcome"] == "ok"
+    first, second = load_profile(out / "profile.yaml"), load_profile(out.parent / "again" / "profile.yaml")
+    assert first.joints == second.joints
+
+
+def test_different_timing_is_refused(tmp_path: Path) -> None:
+    site = tmp_path / "site.yaml"
+    site.write_text(
+        "schema: frictid.robot/1\nextends: hp3j-arm.yaml\njoints:\n  '4':\n    procedure: {amplitude_rad: 0.5}\n"
+    )
+    with pytest.raises(UsageError, match=r"joint 4: its 10 cycles take .* joints that move together need identical"):
+        plan_calibration(CalibrateOptions(str(site), together=True))
+
+
+def test_the_combined_torque_is_refused_where_each_alone_is_not() -> None:
+    fast = {"velocity_rad_s": 2.3}
+    plan_calibration(CalibrateOptions("hp3j-arm.yaml", **fast))
+    with pytest.raises(PlanRefused, match=r"joint 0: predicted torque .* the most that the other joints can add"):
+        plan_calibration(CalibrateOptions("hp3j-arm.yaml", together=True, **fast))
