@@ -20,7 +20,7 @@ from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
-from frictid_hil.gap.where import where
+from frictid_hil.gap.where import lives, where
 from frictid_hil.gap.which import Model, Ranking, best_family, rank, replacements
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
@@ -347,7 +347,8 @@ def _conclude(
         )
     if not any(r.experiment.validation for r in logs):
         reasons["gap"] = "the set has no validation log; figures are of the logs that were fitted"
-    places = where(judged, encoder)
+    gain = nominal_gain.kd_nm_s_per_rad if (nominal_gain := experiments.nominal.controller) is not None else None
+    places = where(logs, math.hypot(noise_nm, encoder), velocity_gain_nm_s_per_rad=gain)
     return Diagnosis(
         name=experiments.name,
         verdict=verdict,
@@ -407,15 +408,14 @@ def _per_log(bare: Mapping[str, Replayed], after: Mapping[str, Replayed]) -> dic
 def _summary(
     name: str, verdict: str, causes: Sequence[Cause], places: Sequence[Where], closed: float, place: str
 ) -> str:
-    first = places[0] if places else None
-    lives = f"{100 * first.share_of_gap:.0f} % of the gap sits {first.description}" if first is not None else ""
+    there = lives(places)
     if verdict == "none":
         return f"{name}: no gap beyond noise and the nominal model's tolerances."
     if verdict == "unknown":
-        return f"{name}: {lives}; no known effect explains it ({place})."
+        return f"{name}: {there}; no known effect explains it ({place})."
     effects = " and ".join(f"{c.effect} ({c.confidence:.2f})" for c in causes)
     if verdict == "ambiguous":
-        return f"{name}: {lives}; these recordings cannot decide between {effects}."
+        return f"{name}: {there}; these recordings cannot decide between {effects}."
     return (
-        f"{name}: {lives}; {effects} explains it; adding it closes {closed:.0f} % on recordings not used for fitting."
+        f"{name}: {there}; {effects} explains it; adding it closes {closed:.0f} % on recordings not used for fitting."
     )

@@ -112,7 +112,7 @@ def diagnose_without_replay(
         name=experiments.name,
         verdict=verdict,
         causes=causes if verdict != "none" else (),
-        where=where([r for r in usable if r.experiment.validation] or usable, 0.0),
+        where=where(usable, noise),
         before=Figures(nominal_nm),
         after=Figures(after_nm if applied else nominal_nm),
         noise_floor=Figures(noise),

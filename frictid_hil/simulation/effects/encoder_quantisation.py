@@ -78,7 +78,7 @@ EFFECT = Effect(
     parameters=(
         Parameter("step_rad", 0.0, 5e-3, 1e-4, "true step of the position, joint side", off=0.0, replayed=False),
     ),
-    signature=Signature((Channel.KINEMATIC, Channel.PLANT), (Region.KINEMATICS, Region.STANDSTILL)),
+    signature=Signature((Channel.KINEMATIC, Channel.PLANT), (Region.KINEMATICS, Region.STANDSTILL, Region.FREQUENCY)),
     hooks=(Hook("resolution", resolution),),
     illustrate=illustrate,
     kinematic=KinematicForm("step_rad", read, position_step=True),

@@ -1,0 +1,85 @@
+"""Where the gap lies: shares that add up, each effect in the regions that its own file names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gap_sets
+import numpy as np
+import pytest
+from test_gap_diagnose import SINGLES
+
+from frictid_hil.gap.residuals import LowPass, recordings
+from frictid_hil.gap.where import by_region, where
+from frictid_hil.simulation.effect import Region
+from frictid_hil.simulation.effects import all_effects
+
+EFFECTS = {**SINGLES, "backlash": {"gap_rad": 2e-3}}
+
+
+def places(effects: dict[str, dict[str, float]]):  # type: ignore[no-untyped-def]
+    noise_nm = gap_sets.NOISE_NM * LowPass.at(1.0 / gap_sets.STEP_S).white_gain
+    logs = recordings(gap_sets.make(effects, seed=4))
+    return where(logs, noise_nm, velocity_gain_nm_s_per_rad=18.0)
+
+
+@pytest.fixture(scope="module")
+def shares() -> dict[str, dict[Region, float]]:
+    """Shares by region, by effect."""
+    assert set(EFFECTS) == set(all_effects())
+    found = {}
+    for name, parameters in EFFECTS.items():
+        told = places({name: parameters})
+        assert sum(place.share_of_gap for place in told) == pytest.approx(1.0), name
+        assert all(place.share_of_gap > 0.0 for place in told)
+        found[name] = by_region(told)
+    return found
+
+
+def test_every_effect_is_largest_or_second_where_its_own_file_says(shares: dict[str, dict[Region, float]]) -> None:
+    for name, found in shares.items():
+        assert set(list(found)[:2]) & set(all_effects()[name].signature.regions), (name, found)
+
+
+def test_most_effects_are_largest_where_their_own_file_says(shares: dict[str, dict[Region, float]]) -> None:
+    elsewhere = [n for n, found in shares.items() if next(iter(found)) not in all_effects()[n].signature.regions]
+    assert len(elsewhere) <= 1, elsewhere
+
+
+@pytest.mark.parametrize(
+    ("effect", "region", "least"),
+    [
+        ("torque_delay", Region.ACTUATION, 0.9),
+        ("velocity_lag", Region.KINEMATICS, 0.9),
+        ("torque_ripple", Region.POSITION, 0.6),
+        ("inertia_error", Region.ACCELERATION, 0.6),
+        ("viscous_nonlinearity", Region.VELOCITY_BAND, 0.6),
+        ("stiction_breakaway", Region.STANDSTILL, 0.6),
+        ("load_dependent_friction", Region.LOAD, 0.3),
+    ],
+)
+def test_what_has_one_clear_place_is_found_there(
+    shares: dict[str, dict[Region, float]], effect: str, region: Region, least: float
+) -> None:
+    assert shares[effect].get(region, 0.0) >= least
+
+
+def test_friction_that_falls_with_a_measured_temperature_is_told_as_such() -> None:
+    made = gap_sets.make()
+    hot = []
+    for k, e in enumerate(made.experiments):
+        assert e.torque_nm is not None
+        # Logs are warm and cold by turns, so that time alone does not tell it.
+        celsius = np.full(e.time_s.size, 20.0 + 20.0 * (k % 2))
+        slower = 0.3 * (celsius - 30.0) / 10.0 * np.sign(np.gradient(e.position_rad))
+        hot.append(replace(e, torque_nm=e.torque_nm - slower, temperature_c=celsius))
+    told = where(recordings(replace(made, experiments=tuple(hot))), 0.01, velocity_gain_nm_s_per_rad=18.0)
+    assert by_region(told)[Region.TEMPERATURE] > 0.4
+
+
+def test_shares_do_not_depend_on_the_unit_of_the_gap() -> None:
+    """Ten times the residual without noise: the same picture."""
+    once = by_region(places({"direction_asymmetry": {"coulomb_share": 0.2}}))
+    twice = by_region(places({"direction_asymmetry": {"coulomb_share": 0.4}}))
+    for region in (Region.VELOCITY_BAND, Region.POSITION):
+        assert once[region] == pytest.approx(twice[region], abs=0.05)
