@@ -25,12 +25,12 @@ from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, refuse_beyond_limits
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.rehearsals import Rehearsals
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RunFolder
-from frictid_hil.runner.scheduler import Care
 from frictid_hil.units import format_velocity
 
 VERB = "calibrate"

@@ -27,10 +27,10 @@ from frictid_hil.plan import refuse_beyond_limits
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.run_folder import RowKeeper, RunFolder
-from frictid_hil.runner.scheduler import Care
 
 VERB = "compensate"
 

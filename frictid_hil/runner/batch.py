@@ -17,26 +17,21 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
-
-import numpy as np
+from typing import Any, Protocol
 
 from frictid_hil.driver import Batched, Driver, Feedback, JointState, Mode, RobotSetup, SetPoint
 from frictid_hil.errors import Interrupted, SafetyAbort
 from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move
 from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import StopRequest
 from frictid_hil.runner.events import Event, JobProgress, JointRun, Marked, PhaseStarted, Warned
+from frictid_hil.runner.motions import AT_RAD, REHEARSAL_TORQUE, from_here
 from frictid_hil.runner.reference import verify_reference
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.sign_watch import SignWatch
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
-if TYPE_CHECKING:
-    from frictid_hil.runner.scheduler import Care
-
-_REHEARSAL_TORQUE = 0.5
-_AT_RAD = 1e-4
 _LOOKS_AT_STANDSTILL = 20
 _COLUMNS = ("position_rad", "velocity_rad_s", "torque_nm", "position_command_rad")
 
@@ -105,8 +100,9 @@ class BatchRunner:
         at_rad = self._see_standstill()
         for index, name in enumerate(self._names):
             target_rad = plan.locked.get(name)
-            if index != moving and target_rad is not None and abs(target_rad - at_rad[index]) > _AT_RAD:
-                self._job(index, [self._approach(at_rad[index], target_rad)], at_rad)
+            if index != moving and target_rad is not None and abs(target_rad - at_rad[index]) > AT_RAD:
+                approach = Move.within(at_rad[index], target_rad, self._care.approach_rad_s, name="approach")
+                self._job(index, [approach], at_rad)
                 at_rad[index] = target_rad
         marks: list[Mark] = []
         self._count = 0
@@ -134,10 +130,7 @@ class BatchRunner:
 
         What is measured stays in one job: no transfer, and no standing still, comes in between.
         """
-        every = list(motions)
-        first_rad = float(every[0].position_rad(np.zeros(1))[0])
-        if abs(first_rad - here_rad) > _AT_RAD:
-            every.insert(0, self._approach(here_rad, first_rad))
+        every = from_here(here_rad, motions, self._care.approach_rad_s)
         cut = max((k + 1 for k, motion in enumerate(every) if motion.name == REHEARSAL), default=0)
         return [job for job in (every[:cut], every[cut:]) if job]
 
@@ -147,7 +140,7 @@ class BatchRunner:
             raise Interrupted("stopped on request before the motion began")
         driver, joint, normal = self._driver, self._joints[index], self._limits[index]
         rehearsing = motions[-1].name == REHEARSAL
-        share = _REHEARSAL_TORQUE if rehearsing else 1.0
+        share = REHEARSAL_TORQUE if rehearsing else 1.0
         driver.set_limits(
             joint.name,
             torque_nm=share * joint.max_torque_nm,
@@ -227,9 +220,6 @@ class BatchRunner:
         self._supervisor.check([SetPoint() for _ in reports], reports)
 
     # -- before the first job -----------------------------------------------------------------------------------
-
-    def _approach(self, from_rad: float, to_rad: float) -> Move:
-        return Move.within(from_rad, to_rad, self._care.approach_rad_s, name="approach")
 
     def _see_power(self) -> None:
         for name, report in zip(self._names, self._driver.standing(), strict=True):

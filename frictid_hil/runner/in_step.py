@@ -15,10 +15,9 @@ from frictid_hil.driver import JointSetup
 from frictid_hil.plan import Motion, Move
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, Stream
+from frictid_hil.runner.motions import AT_RAD, REHEARSAL_TORQUE
 from frictid_hil.runner.sign_watch import SignWatch
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
-
-_AT_RAD = 1e-4
 
 
 class InStep:
@@ -42,7 +41,7 @@ class InStep:
         approach = {
             index: Move.within(here_rad[index], first_rad[index], approach_rad_s, name="approach") for index in motions
         }
-        if any(abs(move.to_rad - move.from_rad) > _AT_RAD for move in approach.values()):
+        if any(abs(move.to_rad - move.from_rad) > AT_RAD for move in approach.values()):
             longest_s = max(move.duration_s for move in approach.values())
             yield {index: replace(move, duration_s=longest_s) for index, move in approach.items()}
         for stretch in zip(*motions.values(), strict=True):
@@ -69,7 +68,9 @@ class InStep:
             Interrupted: asked to stop.
         """
         for index, normal in limits.items():
-            self._supervisor.set_limits(index, replace(normal, torque_nm=0.5 * self._joints[index].max_torque_nm))
+            self._supervisor.set_limits(
+                index, replace(normal, torque_nm=REHEARSAL_TORQUE * self._joints[index].max_torque_nm)
+            )
         watches = {
             index: SignWatch(Stream(points), self._joints[index].name)
             for index, points in self._points(motions).items()

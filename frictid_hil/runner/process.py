@@ -31,10 +31,11 @@ from typing import TYPE_CHECKING
 from frictid_hil.driver import RobotSetup, load_driver
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, SafetyAbort
 from frictid_hil.plan import Plan
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import DECELERATE, QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight, Warned
 from frictid_hil.runner.ring import frame_ring, sample_ring
-from frictid_hil.runner.scheduler import Care, Recorder, Scheduler
+from frictid_hil.runner.scheduler import Recorder, Scheduler
 
 if TYPE_CHECKING:
     from multiprocessing.sharedctypes import Synchronized

@@ -14,11 +14,12 @@ from typing import Protocol
 
 from frictid_hil.driver import Driver, RobotSetup, load_driver
 from frictid_hil.plan import Plan
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.process import run_in_own_process
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
-from frictid_hil.runner.scheduler import Care, Recorder, Scheduler
+from frictid_hil.runner.scheduler import Recorder, Scheduler
 
 
 class Keeper(Protocol):

@@ -20,9 +20,10 @@ from frictid_hil.friction.estimate import Estimate, estimate
 from frictid_hil.friction.recording import CycleRecording, Skew
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan import Cycles, Hold, JointPlan, Move
+from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun
 from frictid_hil.runner.ring import frame_ring, sample_ring
-from frictid_hil.runner.scheduler import Care, Recorder, Scheduler
+from frictid_hil.runner.scheduler import Recorder, Scheduler
 from frictid_hil.simulation.joint import JointModel
 
 pytestmark = pytest.mark.slow

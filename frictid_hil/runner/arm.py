@@ -1,0 +1,159 @@
+"""The whole arm around the joints that move: seen where it should be, powered, locked, and brought to rest again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+
+from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode
+from frictid_hil.errors import FrictidError, SafetyAbort
+from frictid_hil.plan import Move
+from frictid_hil.runner.care import Care
+from frictid_hil.runner.cycle import CyclicLoop
+from frictid_hil.runner.motions import AT_RAD, stream
+from frictid_hil.runner.reference import verify_reference
+from frictid_hil.runner.supervisor import Supervisor
+
+_POWER_TIMEOUT_S = 3.0
+_STANDSTILL_S = 0.2
+
+
+class Arm:
+    """All joints of one stretch of cyclic traffic.
+
+    Args:
+        driver: cycling.
+        joints: order of set-points and reports.
+        loop: of the stretch.
+        supervisor: of the loop.
+        care: tolerances.
+    """
+
+    def __init__(
+        self, driver: Driver, joints: Sequence[JointSetup], loop: CyclicLoop, supervisor: Supervisor, care: Care
+    ) -> None:
+        self._driver = driver
+        self._joints = joints
+        self._loop = loop
+        self._supervisor = supervisor
+        self._care = care
+
+    def verify(self, planned_rad: Mapping[str, float]) -> None:
+        """Before anything gets power: every joint reports and stands where it should, and the interlock is closed.
+
+        Raises:
+            SafetyAbort: naming the joint.
+        """
+        loop = self._loop
+        loop.wait_for(lambda feedback: all(report.valid for report in feedback), 1.0, "a first report of every joint")
+        verify_reference(self._joints, loop.feedback, planned_rad, self._care.reference_tolerance_rad)
+        self._aim_where_it_stands()
+        self._verify_interlock()
+
+    def enable(self) -> None:
+        """Power on every joint, each held where it stands.
+
+        Raises:
+            SafetyAbort: a joint does not take it.
+        """
+        for joint in self._joints:
+            self._driver.enable(joint.name, Mode.POSITION)
+        self._loop.wait_for(
+            lambda feedback: all(report.state is JointState.ENABLED or report.error_code for report in feedback),
+            _POWER_TIMEOUT_S,
+            "power on every joint",
+        )
+        for joint, report in zip(self._joints, self._loop.feedback, strict=True):
+            if report.error_code or report.state is not JointState.ENABLED:
+                raise SafetyAbort(
+                    f"could not be enabled: state {report.state.value}, error {report.error_code:#06x}",
+                    where=f"joint {joint.name}",
+                    next_step="clear the drive's fault, then start again",
+                )
+        # The bumpless set-point is where the drive stood when it was enabled.
+        self._aim_where_it_stands()
+
+    def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
+        """Every other joint at its planned place, locked there; and all of them seen to stand.
+
+        Raises:
+            SafetyAbort: one does not come to rest.
+        """
+        # Joints that are near, but not at, their planned locked position are brought there one by one.
+        for index, joint in enumerate(self._joints):
+            target_rad = planned_rad.get(joint.name)
+            here_rad = self._loop.set_points[index].position_rad
+            if index not in moving and target_rad is not None and abs(target_rad - here_rad) > AT_RAD:
+                self._lock([index])
+                approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
+                stream(self._loop, index, approach)
+        self._lock(moving)
+        self._see_standstill()
+
+    def power_off(self) -> None:
+        """Power off on every joint, and seen to be."""
+        for joint in self._joints:
+            self._driver.unlock(joint.name)
+            self._driver.disable(joint.name)
+        self._loop.wait_for(
+            lambda feedback: all(report.state is JointState.DISABLED for report in feedback),
+            _POWER_TIMEOUT_S,
+            "power off on every joint",
+        )
+
+    def stop(self) -> None:
+        """Quick stop, a moment of cycles so that it is seen, power off. Never hides the error that led here."""
+        loop = self._loop
+        self._driver.quick_stop()
+        try:
+            loop.settle(round(0.3 / loop.period_s))
+            for joint in self._joints:
+                self._driver.disable(joint.name)
+            loop.settle(round(0.1 / loop.period_s))
+        except FrictidError:
+            # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
+            self._driver.quick_stop()
+
+    # -- inside -------------------------------------------------------------------------------------------------
+
+    def _aim_where_it_stands(self) -> None:
+        for set_point, report in zip(self._loop.set_points, self._loop.feedback, strict=True):
+            set_point.position_rad = report.position_rad
+
+    def _verify_interlock(self) -> None:
+        """Closed before anything gets power, watched in every cycle from here on."""
+        interlock = self._care.interlock
+        if interlock is None:
+            return
+        index = next(index for index, joint in enumerate(self._joints) if joint.name == interlock.joint)
+        self._loop.wait_for(
+            lambda feedback: feedback[index].digital_inputs is not None, 1.0, f"the inputs of joint {interlock.joint}"
+        )
+        self._supervisor.arm_interlock(self._loop.feedback)
+
+    def _lock(self, moving: Collection[int]) -> None:
+        locked_at: dict[int, float] = {}
+        for index, joint in enumerate(self._joints):
+            if index in moving:
+                self._driver.unlock(joint.name)
+            else:
+                self._driver.lock(joint.name)
+                locked_at[index] = self._loop.set_points[index].position_rad
+        self._supervisor.watch(list(moving), Mode.POSITION, locked_at)
+
+    def _see_standstill(self) -> None:
+        loop, care = self._loop, self._care
+        need = max(2, round(_STANDSTILL_S / loop.period_s))
+        still = 0
+
+        def standing(feedback: Sequence[Feedback]) -> bool:
+            nonlocal still
+            quiet = all(
+                abs(report.position_rad - set_point.position_rad) <= care.still_rad
+                and abs(report.velocity_rad_s if math.isfinite(report.velocity_rad_s) else 0.0) <= care.still_rad_s
+                for report, set_point in zip(feedback, loop.set_points, strict=True)
+            )
+            still = still + 1 if quiet else 0
+            return still >= need
+
+        loop.wait_for(standing, 2.0 + _STANDSTILL_S, "standstill of every locked joint")

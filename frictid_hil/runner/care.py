@@ -1,0 +1,72 @@
+"""How careful a run is: tolerances, and the limits of every joint that follow from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from frictid_hil.driver import JointSetup
+from frictid_hil.plan import JointPlan
+from frictid_hil.runner.interlock import Interlock
+from frictid_hil.runner.supervisor import JointLimits
+
+_OVER_MAXIMUM = 1.05
+"""A joint's own maxima may be exceeded by so much in what it reports: noise, and the servo's overshoot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Care:
+    """How careful the scheduler is; the defaults suit an arm of a few kilograms.
+
+    Attributes:
+        reference_tolerance_rad: a joint further than this from its planned locked position means that the position
+            reference is wrong, or that somebody moved the arm: refused.
+        approach_rad_s: speed of moves to locked and start positions.
+        still_rad: how far a joint may be from where it was locked.
+        still_rad_s: speed below which a joint stands.
+        following_error_rad: bound on the following error, beyond what the driver's own delay makes at full speed.
+        velocity_margin: measured speed may exceed the planned peak by this factor ...
+        velocity_slack_rad_s: ... plus this.
+        travel_slack_rad: measured position may leave the planned travel by this.
+        silence_s: how long the moving joint may go without a report; never less than three cycles.
+        interlock: must be closed before and during motion; None where a person watches.
+        tolerated: topics of the driver's findings that the caller judges by itself when asked to proceed.
+    """
+
+    reference_tolerance_rad: float = math.radians(10.0)
+    approach_rad_s: float = math.radians(20.0)
+    still_rad: float = math.radians(0.25)
+    still_rad_s: float = math.radians(0.5)
+    following_error_rad: float = math.radians(5.0)
+    velocity_margin: float = 1.25
+    velocity_slack_rad_s: float = math.radians(10.0)
+    travel_slack_rad: float = math.radians(2.0)
+    silence_s: float = 0.02
+    interlock: Interlock | None = None
+    tolerated: frozenset[str] = frozenset()
+
+    def limits(self, joint: JointSetup, plan: JointPlan, cycle_hz: float, command_delay_s: float) -> JointLimits:
+        """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
+
+        Args:
+            joint: of the robot.
+            plan: that runs.
+            cycle_hz: rate of the reports.
+            command_delay_s: from set-point to motion, normal for this driver.
+        """
+        low, high = joint.position_min_rad, joint.position_max_rad
+        velocity = joint.max_velocity_rad_s
+        if joint.name == plan.joint:
+            planned_rad_s = plan.peak_velocity_rad_s * self.velocity_margin + self.velocity_slack_rad_s
+            velocity = min(velocity * _OVER_MAXIMUM, planned_rad_s)
+            low = max(low, min(plan.travel_rad[0], joint.locked_position_rad) - self.travel_slack_rad)
+            high = min(high, max(plan.travel_rad[1], joint.locked_position_rad) + self.travel_slack_rad)
+        return JointLimits(
+            position_min_rad=low,
+            position_max_rad=high,
+            velocity_rad_s=velocity,
+            torque_nm=joint.max_torque_nm * _OVER_MAXIMUM,
+            following_error_rad=self.following_error_rad + plan.peak_velocity_rad_s * command_delay_s,
+            still_rad=self.still_rad,
+            max_age_cycles=max(3, math.ceil(self.silence_s * cycle_hz)),
+        )
