@@ -155,17 +155,21 @@ def _print_diagnosis(output: Output, result: Result) -> None:
         )
     if result["causes"]:
         output.out.print(causes)
-    where = Table("where", "share of gap", "")
+    where = Table("where", "share of gap", "", "")
     for region in result["where"]:
-        where.add_row(region["region"], f"{100 * region['share_of_gap']:.0f} %", region["description"])
+        share = region["share_of_gap"]
+        if share >= 0.005:
+            where.add_row(region["region"], f"{100 * share:.0f} %", "█" * round(30 * share), region["description"])
     output.out.print(where)
     gap = Table("on validation logs", "before", "after", "noise floor")
     for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
         row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
         gap.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row))
     output.out.print(gap)
-    if result.get("next_experiment"):
-        output.out.print(f"record next: {result['next_experiment'].get('description', '')}")
+    if asked := result.get("next_experiment"):
+        output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}", markup=False)
+    for subject, why in result["reasons"].items():
+        output.out.print(f"{subject}: {why}", markup=False)
     for key in ("model", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)

@@ -60,7 +60,7 @@ class _Log:
 def where(
     recordings: Sequence[Recording], noise_nm: float, *, velocity_gain_nm_s_per_rad: float | None = None
 ) -> tuple[Where, ...]:
-    """Shares of the squared gap by region, largest first; empty without a residual to share out.
+    """Shares of the squared gap, the largest region first; empty without a residual to share out.
 
     Args:
         recordings: all logs of the set; nothing is fitted to form their residuals.
@@ -95,7 +95,8 @@ def where(
     if total <= 0.0:
         return ()
     found = [Where(region.value, value / total, words) for (region, words), value in sums.items() if value > 0.0]
-    return tuple(sorted(found, key=lambda w: -w.share_of_gap))
+    whole = by_region(found)
+    return tuple(sorted(found, key=lambda w: (-whole[Region(w.region)], w.region, -w.share_of_gap)))
 
 
 def by_region(places: Sequence[Where]) -> dict[Region, float]:

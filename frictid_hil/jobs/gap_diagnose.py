@@ -12,6 +12,7 @@ from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
+from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.improved_robot import improved_robot
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
@@ -51,7 +52,7 @@ def diagnose(
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"cannot be created: {error.strerror}", where=str(out)) from error
-        page = gap_page(found, _side_by_side(experiments, found))
+        page = gap_page(found, _side_by_side(experiments, found), missing_torque(experiments))
         result["report"] = str(write_page(page, out / "gap.html").resolve())
     return result
 

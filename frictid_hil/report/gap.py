@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures
-from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, bars, line
+from frictid_hil.gap.profiles import Profile
+from frictid_hil.gap.where import by_region
+from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, band, bars, line
 from frictid_hil.report.pages import Page, Section, Table
+from frictid_hil.simulation.effect import Region
 from frictid_hil.units import degrees
 
 
@@ -37,10 +41,17 @@ class SideBySide:
     improved_position_error_rad: Array | None
 
 
-def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = ()) -> Page:
-    """The page of one diagnosis."""
+def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profiles: tuple[Profile, ...] = ()) -> Page:
+    """The page of one diagnosis.
+
+    Args:
+        found: the diagnosis.
+        side_by_side: measured, nominal and improved, by validation log.
+        profiles: the missing torque over what it may depend on.
+    """
+    pictures = (_where_figure(found), *(_profile(p) for p in profiles)) if found.where else ()
     sections = [
-        Section("Where the gap lies", tables=(_where_table(found),), figures=(_where_figure(found),)),
+        Section("Where the gap lies", tables=(_where_table(found),), figures=pictures),
         Section(
             "Which effect causes it",
             words=() if found.causes else ("No effect of the library is named.",),
@@ -73,13 +84,24 @@ def _where_table(found: Diagnosis) -> Table:
 
 
 def _where_figure(found: Diagnosis) -> Figure:
-    regions = [w.region for w in found.where]
+    """Every region with its share, those without one too: what is not there is an answer as well."""
+    shares = {region: 0.0 for region in Region} | by_region(found.where)
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
     return Figure(
         "Where the gap lies",
-        (bars("share", regions, [100 * w.share_of_gap for w in found.where], IDENTIFIED),),
-        "region of the motion",
+        (bars("share", [region.value for region, _ in ranked], [100 * share for _, share in ranked], IDENTIFIED),),
+        "region of the recordings",
         "share of the squared gap [%]",
     )
+
+
+def _profile(profile: Profile) -> Figure:
+    traces: list[Mapping[str, Any]] = []
+    for curve, color in zip(profile.curves, (IDENTIFIED, PUBLISHED), strict=False):
+        if curve.low is not None and curve.high is not None:
+            traces.append(band(f"{curve.name}: middle half", curve.x, curve.low, curve.high))
+        traces.append(line(curve.name, curve.x, curve.y, color))
+    return Figure(profile.title, tuple(traces), profile.x_title, profile.y_title, profile.caption)
 
 
 def _causes(causes: tuple[Cause, ...]) -> Table:
