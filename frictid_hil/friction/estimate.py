@@ -118,9 +118,9 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         if method == "least-squares":
             raise
         notes.append(f"inertia, gravity and bias are not known: {problem.what}")
-    if solved is not None and solved.unobserved.size:
+    if method == "least-squares" and solved is not None and solved.unobserved.size:
         slow = ", ".join(f"{speed:.3g}" for speed in solved.unobserved)
-        notes.append(f"least squares saw too few samples at {slow} rad/s")
+        notes.append(f"too few samples at {slow} rad/s: the curve is extended to there from faster ones")
 
     pairs = windows
     if method == "least-squares":

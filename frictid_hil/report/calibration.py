@@ -59,23 +59,15 @@ def _summary(joints: Mapping[str, JointProfile], previous: FrictionProfile | Non
             (
                 name,
                 f"failed: {', '.join(failed)}" if failed else "passed",
-                _figure_text(joint.coulomb_nm),
-                f"{joint.torque_nm[-1]:.4g} at {_speed(joint, joint.velocity_rad_s[-1])}",
-                _figure_text(joint.inertia_kg_m2),
-                _figure_text(joint.presliding_stiffness_nm_per_rad),
+                _figure_text(joint.coulomb_nm, "N" if joint.prismatic else "N m"),
+                _highest(joint),
+                _figure_text(joint.inertia_kg_m2, "kg" if joint.prismatic else "kg m2"),
+                _figure_text(joint.presliding_stiffness_nm_per_rad, "N/m" if joint.prismatic else "N m/rad"),
                 _change(name, joint, previous),
             )
         )
     return Table(
-        (
-            "joint",
-            "gates",
-            "F_0 [N m or N]",
-            "highest measured",
-            "inertia [kg m2 or kg]",
-            "presliding [N m/rad or N/m]",
-            "change",
-        ),
+        ("joint", "gates", "F_0", "highest measured", "inertia", "presliding", "change"),
         tuple(rows),
         caption="Figures with their 95 % interval. F_0 is an extrapolated Coulomb level, not the break-away torque.",
     )
@@ -177,12 +169,17 @@ def _change(name: str, joint: JointProfile, previous: FrictionProfile | None) ->
     return f"{distance.e_percent:.1f} % from the active profile"
 
 
-def _figure_text(figure: Estimate) -> str:
+def _figure_text(figure: Estimate, unit: str) -> str:
     if figure.value is None:
         return f"none: {figure.reason}"
     if figure.low is None or figure.high is None:
-        return f"{figure.value:.4g}"
-    return f"{figure.value:.4g} ({figure.low:.4g} .. {figure.high:.4g})"
+        return f"{figure.value:.4g} {unit}"
+    return f"{figure.value:.4g} {unit} ({figure.low:.4g} .. {figure.high:.4g})"
+
+
+def _highest(joint: JointProfile) -> str:
+    unit = "N" if joint.prismatic else "N m"
+    return f"{joint.torque_nm[-1]:.4g} {unit} at {_speed(joint, joint.velocity_rad_s[-1])}"
 
 
 def _speed(joint: JointProfile, velocity: float) -> str:
