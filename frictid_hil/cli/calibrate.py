@@ -15,6 +15,8 @@ from frictid_hil.cli.options import (
     CyclesOption,
     JointOption,
     JsonOption,
+    LiveAtOption,
+    LiveOption,
     NotifyOption,
     OutOption,
     ProfileArgument,
@@ -115,6 +117,8 @@ def calibrate(
         Path | None,
         typer.Option("--resume", metavar="RUN", help="Continue this run folder with the joints it still lacks."),
     ] = None,
+    live: LiveOption = False,
+    live_at: LiveAtOption = None,
     out: OutOption = None,
     notify: NotifyOption = None,
     yes: YesOption = False,
@@ -122,7 +126,7 @@ def calibrate(
     quiet: QuietOption = False,
 ) -> None:
     """Identify the friction of every joint, one at a time or all --together, and write a friction profile."""
-    from frictid_hil.cli.progress import TerminalWatcher, print_plan
+    from frictid_hil.cli.progress import print_plan, watching
     from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
     from frictid_hil.jobs.calibrate import calibrate as job
     from frictid_hil.plan import described
@@ -154,13 +158,9 @@ def calibrate(
 
         output.run("calibrate", plan_only)
 
-    watcher = TerminalWatcher(output, yes=yes)
-
     def run() -> Result:
-        try:
+        with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
             return job(options, watcher)
-        finally:
-            watcher.close()
 
     output.run("calibrate", run, lambda result: print_joints(output, result))
 

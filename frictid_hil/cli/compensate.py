@@ -11,6 +11,8 @@ from rich.table import Table
 from frictid_hil.cli.options import (
     BusOption,
     JsonOption,
+    LiveAtOption,
+    LiveOption,
     OneJointOption,
     OutOption,
     QuietOption,
@@ -109,18 +111,19 @@ def compensate(
     bus: BusOption = None,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
+    live: LiveOption = False,
+    live_at: LiveAtOption = None,
     out: OutOption = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
-    from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.cli.progress import watching
     from frictid_hil.jobs.compensate import CompensateOptions
     from frictid_hil.jobs.compensate import compensate as job
 
     output = Output(as_json, quiet)
-    watcher = TerminalWatcher(output, yes=yes)
 
     def run() -> Result:
         if drive_mode not in _DRIVE_MODES:
@@ -145,10 +148,8 @@ def compensate(
             seed=seed,
             out=out,
         )
-        try:
+        with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
             return job(options, watcher, live=watcher.note)
-        finally:
-            watcher.close()
 
     output.run("compensate", run, lambda result: _show(output, result))
 

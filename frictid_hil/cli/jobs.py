@@ -11,6 +11,8 @@ from rich.table import Table
 from frictid_hil.cli.options import (
     BusOption,
     JsonOption,
+    LiveAtOption,
+    LiveOption,
     NotifyOption,
     OutOption,
     QuietOption,
@@ -35,25 +37,24 @@ def recalibrate(
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
     notify: NotifyOption = None,
+    live: LiveOption = False,
+    live_at: LiveAtOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Calibrate with nobody watching; promote or refuse by the robot file's policy. Never asks."""
-    from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.cli.progress import watching
     from frictid_hil.jobs.recalibrate import RecalibrateOptions
     from frictid_hil.jobs.recalibrate import recalibrate as job
 
     output = Output(as_json, quiet, notify)
-    # The policy in the robot file has said yes, or the job refuses.
-    watcher = TerminalWatcher(output, yes=True)
     options = RecalibrateOptions(robot, bus=bus, store=store, realtime=realtime, seed=seed, out=out)
 
     def run() -> Result:
-        try:
+        # The policy in the robot file has said yes, or the job refuses.
+        with watching(output, yes=True, live=live, live_at=live_at) as watcher:
             return job(options, watcher)
-        finally:
-            watcher.close()
 
     output.run("recalibrate", run, lambda result: _print_night(output, result))
 

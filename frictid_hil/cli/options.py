@@ -102,6 +102,13 @@ METHODS = one_of("function-a", "aligned", "least-squares")
 """Completion of ``--method``."""
 
 ProfileArgument = Annotated[Path, typer.Argument(metavar="PROFILE", help="Profile, or a run folder that holds one.")]
+LiveOption = Annotated[
+    bool, typer.Option("--live", help="Stream samples over Foxglove WebSocket to this computer (127.0.0.1:8765).")
+]
+LiveAtOption = Annotated[
+    str | None,
+    typer.Option("--live-at", metavar="HOST:PORT", help="As --live, on this address; 0.0.0.0:8765 for everybody."),
+]
 StoreOption = Annotated[
     Path | None,
     typer.Option("--store", metavar="FOLDER", help="Folder of the profile store; default: the user's data folder."),

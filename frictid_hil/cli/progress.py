@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import sys
-import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from frictid_hil.cli.joint_view import JointView
 from frictid_hil.cli.output import Output
 from frictid_hil.driver import RobotSetup, Severity
 from frictid_hil.errors import UsageError
+from frictid_hil.jobs.live import DEFAULT_ADDRESS
+from frictid_hil.jobs.live import live as live_watcher
+from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan, stretch_name
 from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.ring import Rows
 from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity
 
 
@@ -56,13 +60,14 @@ class TerminalWatcher:
         self._console = output.err
         self._silent = output.as_json or output.quiet
         self._yes = yes
-        self._progress: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
+        self._view: JointView | None = None
+        self._make_view: Callable[[], JointView] | None = None
         self._planned: dict[str, float] = {}
         self._done_s: dict[str, float] = {}
+        self._phase = ""
         self._phase_s = 0.0
         self._joint = ""
-        self._phase_began = time.monotonic()
+        self._stretch_began_s: float | None = None
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
         """Print it, remember the durations; refuse at once where nobody could be asked."""
@@ -71,9 +76,11 @@ class TerminalWatcher:
                 "motion needs a yes, and there is no terminal to ask on",
                 next_step="add --yes once the plan is right (see --dry-run)",
             )
+        members = {stretch_name(stretch): [entry.joint for entry in stretch] for stretch in plan.stretches}
         self._planned = {
             stretch_name(stretch): max(entry.duration_s for entry in stretch) for stretch in plan.stretches
         }
+        self._make_view = lambda: JointView(self._console, setup, self._planned, members)
         if not self._silent:
             print_plan(self._console, plan, setup)
 
@@ -99,11 +106,16 @@ class TerminalWatcher:
         elif isinstance(event, Warned):
             self.note(f"warning: {event.message}")
 
-    def at(self, run_time_s: float) -> None:
-        """Advance the bar of the current phase."""
-        if self._progress is not None and self._joint in self._tasks:
-            done = self._done_s.get(self._joint, 0.0)
-            self._progress.update(self._tasks[self._joint], completed=min(run_time_s, done + self._phase_s))
+    def rows(self, rows: Rows) -> None:
+        """Move the bar of the current joint, and tell its figures."""
+        if self._view is None:
+            return
+        now_s = float(rows["t_ns"][-1]) * 1e-9
+        if self._stretch_began_s is None:
+            self._stretch_began_s = float(rows["t_ns"][0]) * 1e-9
+        # Run time goes on from joint to joint; a planned phase is never shown further than its end.
+        done_s = self._done_s.get(self._joint, 0.0)
+        self._view.rows(rows, min(now_s - self._stretch_began_s, done_s + self._phase_s))
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
         """A line per finished joint."""
@@ -112,13 +124,13 @@ class TerminalWatcher:
     def note(self, message: str) -> None:
         """A line above the bars."""
         if not self._silent:
-            (self._progress.console if self._progress else self._console).print(message, markup=False)
+            (self._view.console if self._view else self._console).print(message, markup=False)
 
     def close(self) -> None:
         """End the bars."""
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = None
+        if self._view is not None:
+            self._view.close()
+            self._view = None
 
     def _start_phase(self, event: PhaseStarted) -> None:
         if self._silent:
@@ -126,48 +138,49 @@ class TerminalWatcher:
         if event.joint != self._joint:
             self._joint = event.joint
             self._done_s[event.joint] = 0.0
+            self._stretch_began_s = None
         else:
             self._done_s[event.joint] = self._done_s.get(event.joint, 0.0) + self._phase_s
         self._phase_s = event.duration_s
+        self._phase = event.phase
         if not self._console.is_terminal:
             if event.duration_s >= 1.0 or event.phase == "configure":
                 self._console.print(f"joint {event.joint}: {event.phase} {format_duration(event.duration_s)}")
             return
-        if self._progress is None:
-            self._progress = Progress(
-                TextColumn("joint {task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[phase]:<10}"),
-                TimeRemainingColumn(),
-                console=self._console,
-            )
-            self._progress.start()
-            for joint, planned_s in self._planned.items():
-                self._tasks[joint] = self._progress.add_task(
-                    joint, total=planned_s if math.isfinite(planned_s) else None, phase="waiting"
-                )
-        task = self._tasks.get(event.joint)
-        if task is not None:
-            self._progress.update(task, completed=self._done_s[event.joint], phase=event.phase)
+        if self._view is None and self._make_view is not None:
+            self._view = self._make_view()
+        if self._view is not None:
+            self._view.phase(event.joint, event.phase, self._done_s[event.joint])
 
     def _show_job(self, event: JobProgress) -> None:
         """A job moves the bar; the transfer of its recording shows its own share."""
         if self._silent:
             return
-        if self._progress is not None and event.joint in self._tasks:
-            done_s = self._done_s[event.joint] + event.share * self._phase_s
+        if self._view is not None:
+            done_s = self._done_s[event.joint]
             if event.stage == "motion":
-                self._progress.update(self._tasks[event.joint], completed=done_s)
+                self._view.phase(event.joint, self._phase, done_s + event.share * self._phase_s)
             else:
-                self._progress.update(self._tasks[event.joint], phase=f"{event.stage} {event.share:.0%}")
+                self._view.phase(event.joint, f"{event.stage} {event.share:.0%}", done_s)
         elif event.stage == "transfer" and event.share >= 1.0:
             self._console.print(f"joint {event.joint}: recording fetched")
 
     def _finish(self, event: JointRun) -> None:
         # Joints that moved together have one bar: the current one.
         name = event.joint if event.joint in self._planned else self._joint
-        if self._progress is not None and name in self._tasks:
-            self._progress.update(self._tasks[name], completed=self._planned[name], phase="done")
+        if self._view is not None:
+            self._view.done(name, event.late_cycles + event.missed_cycles)
 
 
-__all__ = ["TerminalWatcher", "format_angle", "print_plan"]
+@contextmanager
+def watching(output: Output, *, yes: bool, live: bool, live_at: str | None) -> Iterator[Watcher]:
+    """The terminal's watcher while a job lasts, which streams as well where ``--live`` or ``--live-at`` asks for it."""
+    watcher = TerminalWatcher(output, yes=yes)
+    try:
+        with live_watcher(watcher, live_at or (DEFAULT_ADDRESS if live else None)) as streamed:
+            yield streamed
+    finally:
+        watcher.close()
+
+
+__all__ = ["TerminalWatcher", "format_angle", "print_plan", "watching"]

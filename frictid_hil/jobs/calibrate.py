@@ -203,7 +203,7 @@ def _run(planned: Planned, folder: RunFolder, options: CalibrateOptions, watcher
         if isinstance(event, JointRun):
             _identify(event, folder, planned, watcher, progress)
 
-    with folder.keeping(setup, watcher.at) as keeper:
+    with folder.keeping(setup, watcher.rows) as keeper:
         try:
             with planned.robot.document.locating():
                 return run_plan(

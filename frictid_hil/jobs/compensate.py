@@ -189,7 +189,7 @@ def _run(
             progress.run = event
             _measure(folder.samples(event), planned, wanted, progress)
 
-    with folder.keeping(setup, watcher.at) as keeper:
+    with folder.keeping(setup, watcher.rows) as keeper:
         figures_live = LiveFigures(keeper, setup, joint, wanted, live)
         try:
             run_plan(

@@ -312,7 +312,7 @@ class _Run:
 
     def _one(self, plan: Plan) -> None:
         self._watcher.plan(plan, self._setup)
-        with self._folder.keeping(self._setup, self._watcher.at) as keeper:
+        with self._folder.keeping(self._setup, self._watcher.rows) as keeper:
             try:
                 lost = run_plan(
                     self._driver_name,

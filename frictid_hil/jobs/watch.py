@@ -7,6 +7,7 @@ from typing import Protocol
 from frictid_hil.driver import RobotSetup
 from frictid_hil.plan import Plan
 from frictid_hil.runner.events import Event, Preflight
+from frictid_hil.runner.ring import Rows
 
 
 class Watcher(Protocol):
@@ -24,8 +25,8 @@ class Watcher(Protocol):
         """Something happened on the hardware."""
         ...
 
-    def at(self, run_time_s: float) -> None:
-        """Run time of the newest sample; advances the progress of the current phase."""
+    def rows(self, rows: Rows) -> None:
+        """What was measured since the last call, rows of ``ring.SAMPLE_ROW``; as it is written to disk."""
         ...
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
@@ -50,7 +51,7 @@ class Silent:
     def event(self, event: Event) -> None:
         """Ignore."""
 
-    def at(self, run_time_s: float) -> None:
+    def rows(self, rows: Rows) -> None:
         """Ignore."""
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:

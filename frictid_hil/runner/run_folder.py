@@ -50,16 +50,16 @@ class RowKeeper:
         samples: file of samples.
         frames: file of frames.
         joints: names, order of the driver.
-        at: told the run time of the newest sample.
+        seen: given the rows, once they are kept.
     """
 
     def __init__(
-        self, samples: SampleWriter, frames: BusLogWriter, joints: list[str], at: Callable[[float], None]
+        self, samples: SampleWriter, frames: BusLogWriter, joints: list[str], seen: Callable[[Rows], None]
     ) -> None:
         self._samples = samples
         self._frames = frames
         self._joints = joints
-        self._at = at
+        self._seen = seen
         self._kept: list[Rows] = []
         self._flushed_at = time.monotonic()
         self.rows = 0
@@ -70,7 +70,7 @@ class RowKeeper:
         self._kept.append(rows)
         for index in np.unique(rows["joint"]):
             self._samples.append(self._joints[int(index)], rows[rows["joint"] == index])
-        self._at(float(rows["t_ns"][-1]) * 1e-9)
+        self._seen(rows)
         self._flush()
 
     def frames(self, rows: Rows) -> None:
@@ -176,7 +176,7 @@ class RunFolder:
         return RunFolder(path, robot, manifest)
 
     @contextmanager
-    def keeping(self, setup: RobotSetup, at: Callable[[float], None]) -> Iterator[RowKeeper]:
+    def keeping(self, setup: RobotSetup, seen: Callable[[Rows], None]) -> Iterator[RowKeeper]:
         """The files of a run, closed whatever happens."""
         self._joints = [joint.name for joint in setup.joints]
         part = len(self.manifest["sessions"])
@@ -187,7 +187,7 @@ class RunFolder:
             SampleWriter(self.path / f"samples{suffix}.mcap", self._joints, meta),
             BusLogWriter(self.path / self._bus_log),
             self._joints,
-            at,
+            seen,
         )
         self._keeper = keeper
         try:

@@ -1,0 +1,144 @@
+"""``--live``: samples of a running job over Foxglove WebSocket, to the tools that robotics people already have open.
+
+One channel per joint, ``/joint/<name>``, JSON with a schema, units in every name. Rows come from the ring that the
+cyclic loop fills, in the process that writes files: the loop itself knows nothing of this, and a viewer that is slow or
+gone costs it nothing. Loopback unless told otherwise: whoever can reach the port can watch, nobody can command.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.driver import RobotSetup
+from frictid_hil.errors import UsageError
+from frictid_hil.jobs.watch import Watcher
+from frictid_hil.plan import Plan
+from frictid_hil.runner.events import Event, Preflight
+from frictid_hil.runner.ring import Rows
+
+DEFAULT_ADDRESS = "127.0.0.1:8765"
+LIVE_HZ = 100.0
+"""Messages a joint and second of run time; the recording has every sample."""
+
+_COLUMNS = (
+    "position_rad",
+    "velocity_rad_s",
+    "torque_nm",
+    "position_command_rad",
+    "torque_command_nm",
+    "external_torque_nm",
+    "temperature_c",
+)
+_SCHEMA = {
+    "title": "frictid.sample",
+    "type": "object",
+    "properties": {name: {"type": "number"} for name in ("time_s", *_COLUMNS, "tracking_error_rad")},
+}
+
+
+class LiveWatcher:
+    """Passes everything on to another watcher, and every joint's samples to whoever is connected.
+
+    Args:
+        watcher: follows the job as well.
+        server: of the Foxglove SDK, started.
+        context: that its channels belong to.
+    """
+
+    def __init__(self, watcher: Watcher, server: Any, context: Any) -> None:
+        self._watcher = watcher
+        self._server = server
+        self._context = context
+        self._channels: list[Any] = []
+        self._due_ns: list[int] = []
+        self._epoch_ns = time.time_ns()
+
+    def plan(self, plan: Plan, setup: RobotSetup) -> None:
+        """Announce a channel per joint."""
+        from foxglove import Channel
+
+        self._channels = [
+            Channel(f"/joint/{joint.name}", schema=_SCHEMA, message_encoding="json", context=self._context)
+            for joint in setup.joints
+        ]
+        self._due_ns = [0] * len(self._channels)
+        self._watcher.plan(plan, setup)
+
+    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+        """The other watcher's answer."""
+        return self._watcher.confirm(plan, preflight)
+
+    def event(self, event: Event) -> None:
+        """Pass on."""
+        self._watcher.event(event)
+
+    def rows(self, rows: Rows) -> None:
+        """Send each joint's rows, thinned to ``LIVE_HZ``."""
+        for row in rows:
+            index, t_ns = int(row["joint"]), int(row["t_ns"])
+            if t_ns < self._due_ns[index]:
+                continue
+            self._due_ns[index] = t_ns + round(1e9 / LIVE_HZ)
+            # Of a log time the viewers expect a date; run time goes along as it is.
+            self._channels[index].log(_message(row), log_time=self._epoch_ns + t_ns)
+        self._watcher.rows(rows)
+
+    def joint(self, joint: str, summary: str, ok: bool) -> None:
+        """Pass on."""
+        self._watcher.joint(joint, summary, ok)
+
+    def note(self, message: str) -> None:
+        """Pass on."""
+        self._watcher.note(message)
+
+
+@contextmanager
+def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
+    """The watcher itself, or with ``address`` one that streams as well while the job lasts.
+
+    Raises:
+        UsageError: not ``host:port``, the port is taken, or the Foxglove SDK is not installed.
+    """
+    if address is None:
+        yield watcher
+        return
+    host, port = _host_and_port(address)
+    try:
+        import foxglove
+    except ImportError:
+        raise UsageError(
+            "--live needs the Foxglove SDK", next_step="install it with: pip install 'frictid-hil[live]'"
+        ) from None
+    context = foxglove.Context()
+    try:
+        server = foxglove.start_server(name="frictid-hil", host=host, port=port, context=context)
+    except Exception as error:  # the SDK raises RuntimeError and its own, by version
+        raise UsageError(
+            f"cannot listen: {error}", where=address, next_step="choose another port with --live-at HOST:PORT"
+        ) from None
+    try:
+        watcher.note(f"live: open ws://{host}:{server.port} in Foxglove (Open connection, Foxglove WebSocket)")
+        yield LiveWatcher(watcher, server, context)
+    finally:
+        server.stop()
+
+
+def _message(row: Any) -> dict[str, float]:
+    """One row, what is not known left out: JSON has no NaN."""
+    message = {"time_s": int(row["t_ns"]) * 1e-9}
+    message |= {name: float(row[name]) for name in _COLUMNS if np.isfinite(row[name])}
+    if "position_command_rad" in message and "position_rad" in message:
+        message["tracking_error_rad"] = message["position_command_rad"] - message["position_rad"]
+    return message
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"{address!r} is not HOST:PORT", next_step=f"e.g. --live-at {DEFAULT_ADDRESS}")
+    return host.strip("[]"), int(port)
