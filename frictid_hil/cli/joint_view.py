@@ -36,14 +36,13 @@ class Figures:
 
 def figures_of(rows: Rows, max_torque_nm: float) -> Figures:
     """Figures of some rows of one joint (``ring.SAMPLE_ROW``)."""
-    error = np.abs(rows["position_command_rad"] - rows["position_rad"])
-    torque = np.abs(rows["torque_nm"])
-    temperature = float(rows["temperature_c"][-1])
-    largest, peak_nm = (float(np.nanmax(one)) if np.isfinite(one).any() else math.nan for one in (error, torque))
+    error_rad = _largest(rows["position_command_rad"] - rows["position_rad"])
+    torque_nm = _largest(rows["torque_nm"])
+    temperature_c = float(rows["temperature_c"][-1])
     return Figures(
-        f"{degrees(largest):.3f} deg" if math.isfinite(largest) else "",
-        torque_bar(peak_nm, max_torque_nm) if math.isfinite(peak_nm) else "",
-        f"{temperature:.1f} C" if math.isfinite(temperature) else "",
+        f"{degrees(error_rad):.3f} deg" if math.isfinite(error_rad) else "",
+        torque_bar(torque_nm, max_torque_nm) if math.isfinite(torque_nm) else "",
+        f"{temperature_c:.1f} C" if math.isfinite(temperature_c) else "",
     )
 
 
@@ -53,41 +52,73 @@ def torque_bar(torque_nm: float, max_torque_nm: float) -> str:
     return f"{'█' * cells}{'·' * (_BAR_CELLS - cells)} {torque_nm:5.1f} N m"
 
 
+class Lateness:
+    """Counts late cycles from the rows alone, while the loop's own count is still in its process.
+
+    Args:
+        period_s: of a cycle.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._most_ns = 1.5e9 * period_s
+        self._newest_ns: int | None = None
+        self.late = 0
+
+    def take(self, t_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> int:
+        """Late cycles so far: rows more than a period and a half after the one before.
+
+        Args:
+            t_ns: times of one joint's rows since the last call, shape ``(n,)``.
+        """
+        if self._newest_ns is not None:
+            t_ns = np.concatenate([[self._newest_ns], t_ns])
+        self.late += int(np.count_nonzero(np.diff(t_ns) > self._most_ns))
+        self._newest_ns = int(t_ns[-1])
+        return self.late
+
+    def pause(self) -> None:
+        """Cycles end here, and go on after a while."""
+        self._newest_ns = None
+
+
 class JointView:
     """The rows of one run.
 
     Args:
         console: a terminal.
         setup: names, torque limits.
+        period_s: of a cycle; infinite where the controller cycles by itself and sends its recording afterwards.
         planned: how long each stretch of the plan takes, s, by its name (a joint's, or of several that move together).
         members: the joints of each stretch.
     """
 
     def __init__(
-        self, console: Console, setup: RobotSetup, planned: Mapping[str, float], members: Mapping[str, Sequence[str]]
+        self,
+        console: Console,
+        setup: RobotSetup,
+        period_s: float,
+        planned: Mapping[str, float],
+        members: Mapping[str, Sequence[str]],
     ) -> None:
         self._setup = setup
-        self._names = [joint.name for joint in setup.joints]
+        self._lateness = {joint.name: Lateness(period_s) for joint in setup.joints}
+        self._index = {joint.name: index for index, joint in enumerate(setup.joints)}
         self._planned = planned
         self._members = members
         self._stretch = ""
-        self._drawn_at = 0.0
+        self._drawn_at = -math.inf
         fields = ("phase:<11", "error:>10", "torque:<20", "temperature:>7", "late:>9")
         texts = [TextColumn(f"{{task.fields[{name}]:{form}}}") for name, form in (one.split(":") for one in fields)]
         self._progress = Progress(
-            TextColumn("joint {task.description}"),
-            BarColumn(20),
-            *texts,
-            TimeRemainingColumn(),
-            console=console,
+            TextColumn("joint {task.description}"), BarColumn(20), *texts, TimeRemainingColumn(), console=console
         )
-        self._tasks: dict[str, TaskID] = {
-            name: self._progress.add_task(
-                name, total=total_s if math.isfinite(total_s) else None, phase="waiting", error="", torque="",
-                temperature="", late="", start=False,
-            )
-            for name, total_s in planned.items()
-        }  # fmt: skip
+        self._tasks: dict[str, TaskID] = {}
+        for stretch, joints in members.items():
+            for name in joints:
+                total = planned[stretch] if math.isfinite(planned[stretch]) else None
+                self._tasks[name] = self._progress.add_task(
+                    name, total=total, start=False, phase="waiting", error="", torque="", temperature="", late=""
+                )
         self._progress.start()
 
     @property
@@ -97,37 +128,49 @@ class JointView:
 
     def phase(self, stretch: str, phase: str, completed_s: float) -> None:
         """A stretch of the plan goes into another phase."""
+        if phase == "configure" or stretch != self._stretch:
+            for lateness in self._lateness.values():
+                lateness.pause()  # no cycles in between
         self._stretch = stretch
-        if stretch in self._tasks:
-            self._progress.start_task(self._tasks[stretch])
-            self._progress.update(self._tasks[stretch], completed=completed_s, phase=phase)
+        for name in self._members.get(stretch, ()):
+            self._progress.start_task(self._tasks[name])
+            self._progress.update(self._tasks[name], completed=completed_s, phase=phase)
 
     def rows(self, rows: Rows, completed_s: float) -> None:
-        """New rows of all joints; drawn a few times a second."""
+        """New rows of all joints; every one is counted, a few times a second they are drawn."""
         now = time.monotonic()
-        if self._stretch not in self._tasks or now - self._drawn_at < _REDRAW_S:
-            return
-        self._drawn_at = now
-        self._progress.update(self._tasks[self._stretch], completed=completed_s)
-        for name in self._members[self._stretch]:
-            mine = rows[rows["joint"] == self._names.index(name)]
-            if mine.size:
+        drawn = now - self._drawn_at >= _REDRAW_S
+        for name in self._members.get(self._stretch, ()):
+            mine = rows[rows["joint"] == self._index[name]]
+            if not mine.size:
+                continue
+            late = self._lateness[name].take(mine["t_ns"])
+            if drawn:
                 figures = figures_of(mine, self._setup.joint(name).max_torque_nm)
-                # Joints that move together share a row: it tells of the last of them.
                 self._progress.update(
-                    self._tasks[self._stretch],
+                    self._tasks[name],
+                    completed=completed_s,
                     error=figures.error,
                     torque=figures.torque,
                     temperature=figures.temperature,
+                    late=f"{late} late",
                 )
+        if drawn:
+            self._drawn_at = now
 
-    def done(self, stretch: str, late_cycles: int) -> None:
-        """A stretch is over."""
-        if stretch in self._tasks:
-            total = self._planned[stretch]
+    def done(self, joint: str, late_cycles: int) -> None:
+        """A joint's motions are over; ``late_cycles`` as the loop itself counted them."""
+        if joint in self._tasks:
+            (total,) = (self._planned[stretch] for stretch, names in self._members.items() if joint in names)
             late = f"{late_cycles} late"
-            self._progress.update(self._tasks[stretch], completed=total, phase="done", error="", torque="", late=late)
+            self._progress.update(self._tasks[joint], completed=total, phase="done", error="", torque="", late=late)
 
     def close(self) -> None:
         """Leave the rows as they are."""
         self._progress.stop()
+
+
+def _largest(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    """Largest magnitude of the finite values; NaN where there is none."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(finite.max()) if finite.size else math.nan

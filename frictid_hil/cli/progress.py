@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -61,8 +62,8 @@ class TerminalWatcher:
         self._silent = output.as_json or output.quiet
         self._yes = yes
         self._view: JointView | None = None
+        self._period_s = math.inf
         self._make_view: Callable[[], JointView] | None = None
-        self._planned: dict[str, float] = {}
         self._done_s: dict[str, float] = {}
         self._phase = ""
         self._phase_s = 0.0
@@ -76,16 +77,17 @@ class TerminalWatcher:
                 "motion needs a yes, and there is no terminal to ask on",
                 next_step="add --yes once the plan is right (see --dry-run)",
             )
+        self._period_s = 1.0 / plan.cycle_hz
         members = {stretch_name(stretch): [entry.joint for entry in stretch] for stretch in plan.stretches}
-        self._planned = {
-            stretch_name(stretch): max(entry.duration_s for entry in stretch) for stretch in plan.stretches
-        }
-        self._make_view = lambda: JointView(self._console, setup, self._planned, members)
+        planned = {stretch_name(stretch): max(entry.duration_s for entry in stretch) for stretch in plan.stretches}
+        self._make_view = lambda: JointView(self._console, setup, self._period_s, planned, members)
         if not self._silent:
             print_plan(self._console, plan, setup)
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
         """Ask, unless the person said yes beforehand."""
+        if preflight.capabilities.batch_only:
+            self._period_s = math.inf  # its cycles are the controller's own
         for finding in preflight.findings:
             if finding.severity is not Severity.OK:
                 self.note(f"{finding.severity.value}: {finding.subject}: {finding.message}")
@@ -166,10 +168,8 @@ class TerminalWatcher:
             self._console.print(f"joint {event.joint}: recording fetched")
 
     def _finish(self, event: JointRun) -> None:
-        # Joints that moved together have one bar: the current one.
-        name = event.joint if event.joint in self._planned else self._joint
         if self._view is not None:
-            self._view.done(name, event.late_cycles + event.missed_cycles)
+            self._view.done(event.joint, event.late_cycles + event.missed_cycles)
 
 
 @contextmanager

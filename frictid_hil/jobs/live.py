@@ -7,6 +7,7 @@ gone costs it nothing. Loopback unless told otherwise: whoever can reach the por
 
 from __future__ import annotations
 
+import ipaddress
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -122,6 +123,10 @@ def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
             f"cannot listen: {error}", where=address, next_step="choose another port with --live-at HOST:PORT"
         ) from None
     try:
+        if not _is_loopback(host):
+            watcher.note(
+                f"warning: --live-at {address} is open to the network: everybody who reaches it can watch, unencrypted"
+            )
         watcher.note(f"live: open ws://{host}:{server.port} in Foxglove (Open connection, Foxglove WebSocket)")
         yield LiveWatcher(watcher, server, context)
     finally:
@@ -135,6 +140,15 @@ def _message(row: Any) -> dict[str, float]:
     if "position_command_rad" in message and "position_rad" in message:
         message["tracking_error_rad"] = message["position_command_rad"] - message["position_rad"]
     return message
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name: where it leads is for its resolver to say
 
 
 def _host_and_port(address: str) -> tuple[str, int]:

@@ -104,6 +104,25 @@ def test_nobody_connected_and_no_address_change_nothing() -> None:
         assert same is watcher
 
 
+class Notes(Silent):
+    """Keeps what a person would see."""
+
+    def __init__(self) -> None:
+        self.kept: list[str] = []
+
+    def note(self, message: str) -> None:
+        self.kept.append(message)
+
+
+@pytest.mark.parametrize(("host", "warned"), [("127.0.0.1", False), ("localhost", False), ("0.0.0.0", True)])
+def test_whoever_opens_it_to_the_network_is_warned(host: str, warned: bool) -> None:
+    notes = Notes()
+    with live(notes, f"{host}:{free_port()}"):
+        pass
+    assert any("warning" in note and "network" in note for note in notes.kept) == warned
+    assert any(f"ws://{host}:" in note for note in notes.kept)
+
+
 @pytest.mark.parametrize("address", ["8765", "localhost:", "localhost:http", "1.2.3.4:99999"])
 def test_an_address_that_is_none_is_told(address: str) -> None:
     with pytest.raises(UsageError, match="HOST:PORT"), live(Silent(), address):
