@@ -17,100 +17,24 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import filelock
 
-from frictid_hil.config.drift import joint_drift
 from frictid_hil.config.journal import append_line, append_lines, journal_lines
-from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.promotions import Promotion, active_stack, baseline_of, promotions_in
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.search import user_data_dir
+from frictid_hil.config.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
 
 _LOCK_TIMEOUT_S = 30.0
 _ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}")
-
-
-@dataclass(frozen=True, slots=True)
-class JointSummary:
-    """One joint of one profile, as far as history shows it.
-
-    Attributes:
-        coulomb_nm: F_0, None where it could not be formed.
-        coulomb_low_nm: its interval.
-        coulomb_high_nm: its interval.
-        temperature_c: during the cycles, None where not measured.
-        gates_failed: names of failed quality gates.
-        distance_percent: (15) from the baseline's curve, in percent of its mean; None where it has none.
-    """
-
-    coulomb_nm: float | None
-    coulomb_low_nm: float | None
-    coulomb_high_nm: float | None
-    temperature_c: float | None
-    gates_failed: Sequence[str]
-    distance_percent: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class Stored:
-    """A profile in the store.
-
-    Attributes:
-        id: ``<UTC>-<first 12 digits of sha256>``; sorts by time.
-        robot: name.
-        created_utc: from its provenance.
-        baseline: id of the profile that the distances are from, None before the first promotion.
-        joints: summaries by name.
-    """
-
-    id: str
-    robot: str
-    created_utc: str
-    baseline: str | None
-    joints: Mapping[str, JointSummary]
-
-
-@dataclass(frozen=True, slots=True)
-class Promotion:
-    """A line of the journal.
-
-    Attributes:
-        action: ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from).
-        id: the profile that is active, or the baseline, from here on.
-        sha256: of its file.
-        utc: when.
-        by: person or job.
-        reason: in words.
-    """
-
-    action: str
-    id: str
-    sha256: str
-    utc: str
-    by: str = ""
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class TrendPoint:
-    """One joint at one time.
-
-    Attributes:
-        id: of the profile.
-        created_utc: when.
-        joint: its figures; ``distance_percent`` is from the baseline of today.
-    """
-
-    id: str
-    created_utc: str
-    joint: JointSummary
 
 
 class ProfileStore:
@@ -148,7 +72,7 @@ class ProfileStore:
             write_whole(path, text)
             path.chmod(0o444)
             # A crash just here costs nothing: `history` finds the profile and writes its line.
-            append_line(folder / "index.jsonl", _line(_summary(identity, profile, self._reference(profile.robot))))
+            append_line(folder / "index.jsonl", line_of(summary(identity, profile, self._reference(profile.robot))))
         return identity
 
     def path(self, robot: str, identity: str) -> Path:
@@ -193,7 +117,7 @@ class ProfileStore:
 
     def active(self, robot: str) -> Promotion | None:
         """What is active, and since when; None where nothing was ever promoted."""
-        stack = _active_stack(self.promotions(robot))
+        stack = active_stack(self.promotions(robot))
         return stack[-1] if stack else None
 
     def active_profile(self, robot: str) -> FrictionProfile | None:
@@ -203,9 +127,7 @@ class ProfileStore:
 
     def baseline(self, robot: str) -> str | None:
         """Id of the profile that drift is measured from: the pinned one, else the first ever promoted."""
-        journal = self.promotions(robot)
-        pinned = [line.id for line in journal if line.action == "baseline"]
-        return pinned[-1] if pinned else journal[0].id if journal else None
+        return baseline_of(self.promotions(robot))
 
     def promote(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
         """Make a stored profile the active one; promoting the active one again changes nothing.
@@ -239,7 +161,7 @@ class ProfileStore:
             UsageError: there is none before.
         """
         with self._locked(robot) as folder:
-            stack = _active_stack(self.promotions(robot))
+            stack = active_stack(self.promotions(robot))
             if len(stack) < 2:
                 raise UsageError(
                     f"no profile of {robot} was active before the present one",
@@ -253,8 +175,7 @@ class ProfileStore:
 
     def promotions(self, robot: str) -> list[Promotion]:
         """The journal, oldest first."""
-        lines = journal_lines(self._folder(robot) / "promotions.jsonl")
-        return [Promotion(**line) for line in lines if line.keys() == Promotion.__dataclass_fields__.keys()]
+        return promotions_in(self._folder(robot) / "promotions.jsonl")
 
     def history(self, robot: str) -> list[Stored]:
         """Every profile of a robot, oldest first; those that the index lost are read anew, and noted for next time.
@@ -267,7 +188,7 @@ class ProfileStore:
         index = _index(folder, robot, present)
         if len(index) < len(present):
             reference = self._reference(robot)
-            found = [_summary(lost, self.load(robot, lost), reference) for lost in sorted(present - index.keys())]
+            found = [summary(lost, self.load(robot, lost), reference) for lost in sorted(present - index.keys())]
             index |= {stored.id: stored for stored in found}
             self._note(robot, found)
         return [index[identity] for identity in sorted(index)]
@@ -281,9 +202,9 @@ class ProfileStore:
         with self._locked(robot) as folder:
             reference = self._reference(robot)
             every = [
-                _summary(identity, self.load(robot, identity), reference) for identity in sorted(_profile_ids(folder))
+                summary(identity, self.load(robot, identity), reference) for identity in sorted(_profile_ids(folder))
             ]
-            write_whole(folder / "index.jsonl", "".join(json.dumps(_line(stored)) + "\n" for stored in every))
+            write_whole(folder / "index.jsonl", "".join(json.dumps(line_of(stored)) + "\n" for stored in every))
 
     def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
@@ -292,7 +213,7 @@ class ProfileStore:
         measured_anew = []
         for stored in self.history(robot):
             if stored.baseline != reference.id:
-                stored = _summary(stored.id, self.load(robot, stored.id), reference)
+                stored = summary(stored.id, self.load(robot, stored.id), reference)
                 measured_anew.append(stored)
             for name, joint in stored.joints.items():
                 trends.setdefault(name, []).append(TrendPoint(stored.id, stored.created_utc, joint))
@@ -317,14 +238,14 @@ class ProfileStore:
             append_line(folder / "promotions.jsonl", asdict(line))
         return line
 
-    def _reference(self, robot: str) -> _Reference:
+    def _reference(self, robot: str) -> Reference:
         baseline = self.baseline(robot)
-        return _Reference(baseline, None if baseline is None else self.load(robot, baseline))
+        return Reference(baseline, None if baseline is None else self.load(robot, baseline))
 
     def _note(self, robot: str, found: Sequence[Stored]) -> None:
         """Add lines to the index; it only saves time, so a store that may not be written stays as it is."""
         with suppress(FrictidError), self._locked(robot) as folder:
-            append_lines(folder / "index.jsonl", [_line(stored) for stored in found])
+            append_lines(folder / "index.jsonl", [line_of(stored) for stored in found])
 
     @contextmanager
     def _locked(self, robot: str) -> Iterator[Path]:
@@ -344,50 +265,14 @@ class ProfileStore:
             raise could_not_write(folder, error) from error
 
 
-@dataclass(frozen=True, slots=True)
-class _Reference:
-    """The baseline and its profile, read once."""
-
-    id: str | None
-    profile: FrictionProfile | None
-
-
 def _index(folder: Path, robot: str, present: Set[str]) -> dict[str, Stored]:
     """The summaries whose profiles are there, by id."""
     index = {}
     for line in journal_lines(folder / "index.jsonl"):
-        stored = _stored(line, robot)
+        stored = stored_of(line, robot)
         if stored is not None and stored.id in present:
             index[stored.id] = stored
     return index
-
-
-def _summary(identity: str, profile: FrictionProfile, reference: _Reference) -> Stored:
-    joints = {name: _joint_summary(name, joint, reference) for name, joint in profile.joints.items()}
-    return Stored(identity, profile.robot, profile.provenance.created_utc, reference.id, joints)
-
-
-def _joint_summary(name: str, joint: JointProfile, reference: _Reference) -> JointSummary:
-    known = None if reference.profile is None else reference.profile.joints.get(name)
-    return JointSummary(
-        coulomb_nm=joint.coulomb_nm.value,
-        coulomb_low_nm=joint.coulomb_nm.low,
-        coulomb_high_nm=joint.coulomb_nm.high,
-        temperature_c=joint.temperature_c,
-        gates_failed=[gate.name for gate in joint.gates if not gate.passed],
-        distance_percent=None if known is None else joint_drift(known, joint).distance_percent,
-    )
-
-
-def _active_stack(journal: list[Promotion]) -> list[Promotion]:
-    """Those active one after the other, as far as they were not rolled back; the last is active."""
-    stack: list[Promotion] = []
-    for line in journal:
-        if line.action == "promote":
-            stack.append(line)
-        elif line.action == "rollback" and stack:
-            stack.pop()
-    return stack
 
 
 def _profile_path(folder: Path, identity: str) -> Path:
@@ -409,21 +294,3 @@ def _tidy(folder: Path) -> None:
     """Remove what killed writers had staged; only under the lock."""
     for staged in [*folder.glob(".*.part"), *(folder / "profiles").glob(".*.part")]:
         staged.unlink(missing_ok=True)
-
-
-def _line(stored: Stored) -> dict[str, Any]:
-    """A line of the index; a joint is a list of its figures, because a store may have 60,000 of them."""
-    joints = {
-        name: [getattr(joint, field) for field in JointSummary.__slots__] for name, joint in stored.joints.items()
-    }
-    return {"index": 1, "id": stored.id, "utc": stored.created_utc, "baseline": stored.baseline, "joints": joints}
-
-
-def _stored(line: dict[str, Any], robot: str) -> Stored | None:
-    try:
-        if line["index"] != 1:
-            return None  # written by another version: the profile itself is read instead
-        joints = {name: JointSummary(*figures) for name, figures in line["joints"].items()}
-        return Stored(line["id"], robot, line["utc"], line["baseline"], joints)
-    except (KeyError, TypeError, AttributeError):
-        return None

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from frictid_hil.config.attempts import Attempt
-from frictid_hil.config.store import Promotion, TrendPoint
+from frictid_hil.config.promotions import Promotion
+from frictid_hil.config.summary import TrendPoint
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 
