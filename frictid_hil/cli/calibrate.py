@@ -9,7 +9,6 @@ import typer
 from rich.table import Table
 
 from frictid_hil.cli.options import (
-    METHODS,
     AmplitudeOption,
     BusOption,
     CyclesOption,
@@ -17,6 +16,7 @@ from frictid_hil.cli.options import (
     JsonOption,
     LiveAtOption,
     LiveOption,
+    MethodOption,
     NotifyOption,
     OutOption,
     ProfileArgument,
@@ -32,16 +32,6 @@ from frictid_hil.cli.options import (
 )
 from frictid_hil.cli.output import Output, Result
 from frictid_hil.units import degrees, format_duration
-
-MethodOption = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        metavar="METHOD",
-        autocompletion=METHODS,
-        help="function-a (as published), aligned (default), least-squares.",
-    ),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -83,15 +73,7 @@ def calibrate(
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method",
-            metavar="METHOD",
-            autocompletion=METHODS,
-            help="function-a (as published), aligned, least-squares. Default: the programme's.",
-        ),
-    ] = None,
+    method: MethodOption = None,
     program: Annotated[
         str,
         typer.Option(
@@ -206,7 +188,7 @@ def identify(
         velocity_rad_s=velocity,
         cycles=cycles,
         ratio=ratio,
-        method=method,
+        method=method or "aligned",
         columns=columns,
         executor=executor,
         out=out,

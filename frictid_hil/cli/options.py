@@ -98,8 +98,15 @@ CyclesOption = Annotated[int | None, typer.Option("--cycles", "-N", metavar="N",
 RatioOption = Annotated[
     float | None, typer.Option("--ratio", "-c", metavar="C", min=0.0, max=0.999, help="Window ratio c.")
 ]
-METHODS = one_of("function-a", "aligned", "least-squares")
-"""Completion of ``--method``."""
+MethodOption = Annotated[
+    str | None,
+    typer.Option(
+        "--method",
+        metavar="METHOD",
+        autocompletion=one_of("function-a", "aligned", "least-squares"),
+        help="function-a (as published), aligned or least-squares; else that of the programme or of the profile.",
+    ),
+]
 
 ProfileArgument = Annotated[Path, typer.Argument(metavar="PROFILE", help="Profile, or a run folder that holds one.")]
 LiveOption = Annotated[

@@ -9,11 +9,11 @@ import typer
 from rich.table import Table
 
 from frictid_hil.cli.options import (
-    METHODS,
     AmplitudeOption,
     CyclesOption,
     JointOption,
     JsonOption,
+    MethodOption,
     OutOption,
     QuietOption,
     RatioOption,
@@ -50,12 +50,7 @@ def replay(
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method", metavar="METHOD", autocompletion=METHODS, help="Estimator; default: that of the profile."
-        ),
-    ] = None,
+    method: MethodOption = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
     echo: Annotated[
         str | None,
