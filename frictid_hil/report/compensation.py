@@ -83,8 +83,12 @@ def compensation_page(
         figures = (*_over_time(runs), _moving(runs), *_hand_bars(names, modes))
     else:
         figures = (*_following(runs), _tracking_bars(names, modes))
+    unknown = hand and all(run.external_torque_nm is None for run in runs.values())
     section = Section(
-        "Moved by hand" if hand else "Tracking a triangle", tables=(_table(names, modes, hand=hand),), figures=figures
+        "Moved by hand" if hand else "Tracking a triangle",
+        words=("No force sensor: the torque of the hand is not known.",) if unknown else (),
+        tables=(_table(names, modes, hand=hand),),
+        figures=tuple(figure for figure in figures if figure.traces),
     )
     return Page(f"Friction compensation of {robot}, joint {joint}", headline, [section], dict(facts))
 
@@ -157,7 +161,6 @@ def _over_time(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
             tuple(torques),
             "time [s]",
             "hand torque [N m]",
-            caption="" if torques else "No force sensor: the torque of the hand is not known.",
         ),
     )
 
@@ -172,21 +175,25 @@ def _moving(runs: Mapping[str, Run]) -> Figure:
         tuple(traces),
         "velocity [deg/s]",
         "hand torque [N m]",
-        caption="Friction opens the loop along the vertical axis at zero speed; inertia alone makes a flat ellipse."
-        if traces
-        else "No force sensor: the torque of the hand is not known.",
+        caption="Friction opens the loop along the vertical axis at zero speed; inertia alone makes a flat ellipse.",
     )
 
 
 def _hand_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, Figure]:
     velocity = [degrees(float(modes[name]["velocity_rms_rad_s"])) for name in names]
-    torque = [modes[name]["torque_rms_nm"] for name in names]
-    removed = [modes[name]["torque_rms_inertia_removed_nm"] for name in names]
+    torques = [
+        bars(told, names, [modes[name][key] for name in names], color)
+        for told, key, color in (
+            ("as measured", "torque_rms_nm", IDENTIFIED),
+            ("inertia removed", "torque_rms_inertia_removed_nm", REFERENCE),
+        )
+        if any(modes[name][key] is not None for name in names)
+    ]
     return (
         Figure("Magnitude of velocity V_s (Fig. 12)", (bars("V_s", names, velocity, MEASURED),), "mode", "V_s [deg/s]"),
         Figure(
             "Magnitude of hand torque F_s (Fig. 12)",
-            (bars("as measured", names, torque, IDENTIFIED), bars("inertia removed", names, removed, REFERENCE)),
+            tuple(torques),
             "mode",
             "F_s [N m]",
         ),

@@ -6,8 +6,9 @@ import html
 import re
 import shutil
 import subprocess
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,14 @@ from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointPro
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.store import ProfileStore
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Value, Where
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.judgement import judge
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.calibration import calibration_page
+from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import Page, write_page
@@ -92,6 +95,9 @@ def pages(store: ProfileStore) -> dict[str, Page]:
         "recalibration": recalibration_page(result, Policy(), new, old, old, store.trends("arm")),
         "index": index,
         "gap": a_gap_page(),
+        "compensation by hand": compensated("hand"),
+        "compensation by hand without a force sensor": compensated("hand", force_sensor=False),
+        "compensation on a path": compensated("track"),
     }
 
 
@@ -124,6 +130,41 @@ def a_gap_page() -> Page:
     return gap_page(found, (beside,), profiles)
 
 
+@dataclass(frozen=True)
+class ModeRun:
+    """One mode of compensation, as a page needs it."""
+
+    time_s: Array
+    position_rad: Array
+    velocity_rad_s: Array
+    reference_rad: Array
+    external_torque_nm: Array | None
+
+
+def compensated(task: str, *, force_sensor: bool = True) -> Page:
+    time_s = np.arange(0.0, 4.0, 0.01)
+    wave = 0.2 * np.sin(2 * np.pi * time_s / 4)
+    runs = {
+        mode: ModeRun(time_s, scale * wave, scale * np.gradient(wave, time_s), wave, 8 * wave if force_sensor else None)
+        for mode, scale in (("nc", 0.7), ("mop", 0.98))
+    }
+    modes: dict[str, dict[str, Any]] = {
+        mode: {
+            "velocity_rms_rad_s": 0.2,
+            "torque_rms_nm": torque if force_sensor else None,
+            "torque_rms_inertia_removed_nm": torque if force_sensor else None,
+            "reduction_percent": reduction,
+            "reduction_inertia_removed_percent": reduction,
+            "tracking_rms_rad": 0.01 * torque,
+        }
+        for mode, torque, reduction in (("nc", 5.0, None), ("mop", 1.0, 80.0))
+    }
+    return compensation_page("arm", "1", task, runs, modes, facts={"run": "runs/x"}, outcome="ok")
+
+
+PAGES = ("calibration", "recalibration", "index", "gap", "compensation by hand", "compensation on a path")
+
+
 def in_browser(page: Path, profile_folder: Path) -> tuple[str, list[str]]:
     """The page's DOM once its scripts have run, and what it wrote to the console."""
     assert CHROMIUM is not None
@@ -138,7 +179,7 @@ def in_browser(page: Path, profile_folder: Path) -> tuple[str, list[str]]:
 
 
 @needs_browser
-@pytest.mark.parametrize("name", ["calibration", "recalibration", "index", "gap"])
+@pytest.mark.parametrize("name", [*PAGES, "compensation by hand without a force sensor"])
 def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: Path) -> None:
     page = pages(history)[name]
     figures = [figure for section in page.sections for figure in section.figures]
@@ -153,6 +194,8 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
             assert html.unescape(re.sub(r"<[^>]+>", "", shown)) == title
             of_names = kind == "xtitle" and figure.traces[0]["type"] == "bar"
             assert of_names or re.search(r"\[.+\]$|\[.+\] *", title), "an axis without its unit"
+        assert figure.traces and all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure.traces)
+        assert all(any(y is not None for y in trace["y"]) for trace in figure.traces), "a trace without data"
         assert len(re.findall(r'class="[^"]*(?:js-line|js-fill|point)"', svg)) >= len(figure.traces)
 
 
