@@ -298,6 +298,11 @@ class FrictionProfile(Strict):
         write_whole(path, self.to_yaml())
 
 
+def profile_file(given: Path) -> Path:
+    """The profile itself, or that of a run folder."""
+    return given / "profile.yaml" if given.is_dir() else given
+
+
 def load_profile(path: str | Path) -> FrictionProfile:
     """Read and check a profile.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile, profile_file
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.curve import FrictionCurve
@@ -34,15 +34,15 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
             "compare needs one reference: a second profile, or --truth with a robot file",
             next_step="frictid-hil compare profile.yaml --truth hp3j.yaml",
         )
-    profile = load_profile(_profile_in(profile_path))
+    profile = load_profile(profile_file(profile_path))
     if truth is not None:
         references = _true_curves(load_robot(truth), profile)
         named = f"truth of {truth}"
     else:
         assert other_path is not None  # by the check above
-        other = load_profile(_profile_in(other_path))
+        other = load_profile(profile_file(other_path))
         references = {name: joint.curve() for name, joint in other.joints.items()}
-        named = str(_profile_in(other_path).resolve())
+        named = str(profile_file(other_path).resolve())
     common = [name for name in profile.joints if name in references]
     if not common:
         raise ProfileMismatch(
@@ -61,7 +61,7 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
         }
     return {
         "outcome": "ok",
-        "profile": str(_profile_in(profile_path).resolve()),
+        "profile": str(profile_file(profile_path).resolve()),
         "reference": named,
         "joints": joints,
         "not_compared": [name for name in profile.joints if name not in common],
@@ -94,7 +94,3 @@ def _upper_velocity(joint: JointProfile) -> float:
     """V of the procedure, or the highest identified velocity."""
     velocity = joint.procedure.velocity_rad_s if joint.procedure else joint.velocity_rad_s[-1]
     return velocity if math.isfinite(velocity) else joint.velocity_rad_s[-1]
-
-
-def _profile_in(path: Path) -> Path:
-    return path / "profile.yaml" if path.is_dir() else path

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile, profile_file
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.control import Compensated
 from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Mode, RobotSetup
@@ -105,7 +105,7 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
     robot.check_joints([options.joint])
     driver_name = robot.driver(options.bus)
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
-    profile = load_profile(_profile_path(options.profile))
+    profile = load_profile(profile_file(options.profile))
     wanted = _wanted(options, simulated=driver_name == "virtual")
     doubts = doubts_of_file(profile, setup.joint(options.joint), robot.name, robot.policy)
     if not options.force:
@@ -272,7 +272,7 @@ def _finish(
         "late_cycles": progress.run.late_cycles if progress.run else None,
         "missed_cycles": progress.run.missed_cycles if progress.run else None,
         "warnings": list(planned.plan.notes[1:]),
-        "profile": str(_profile_path(options.profile).resolve()),
+        "profile": str(profile_file(options.profile).resolve()),
         "run": str(folder.path.resolve()),
         "modes": modes,
     }
@@ -351,10 +351,6 @@ def _facts(result: dict[str, Any]) -> dict[str, str]:
     names = ("setting", "compensation_ratio", "stiffness_nm_per_rad", "inertia_kg_m2", "inertia_source", "seed")
     facts = {name: str(result[name]) for name in (*names, "rate_hz", "profile", "run")}
     return {**facts, "warnings": "; ".join(result["warnings"])}
-
-
-def _profile_path(given: Path) -> Path:
-    return given / "profile.yaml" if given.is_dir() else given
 
 
 def _refuse_without_hand(setup: RobotSetup, driver: str, options: CompensateOptions) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from frictid_hil.config.drift import drift
-from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, load_profile, profile_file
 from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import GateFailed, ProfileMismatch
 
@@ -121,11 +121,6 @@ def rollback(robot: str, *, store: Path | None = None, reason: str = "") -> dict
         "id": line.id,
         "before": before.id if before else None,
     }
-
-
-def profile_file(path: Path) -> Path:
-    """The profile itself, or that of a run folder."""
-    return path / "profile.yaml" if path.is_dir() else path
 
 
 def _named(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, str]:

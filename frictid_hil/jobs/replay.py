@@ -16,7 +16,7 @@ from typing import Any
 import can
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile, profile_file
 from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.driver import RobotSetup
@@ -153,8 +153,7 @@ class _echo:  # noqa: N801 - a context manager that reads as a function
 
 def _reference(options: ReplayOptions) -> FrictionProfile | None:
     if options.profile is not None:
-        path = options.profile / "profile.yaml" if options.profile.is_dir() else options.profile
-        return load_profile(path)
+        return load_profile(profile_file(options.profile))
     folder = options.source if options.source.is_dir() else options.source.parent
     own = folder / "profile.yaml"
     return load_profile(own) if (folder / "manifest.json").exists() and own.exists() else None
