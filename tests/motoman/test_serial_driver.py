@@ -309,6 +309,35 @@ def test_a_stream_on_which_nothing_is_enabled_stays_alive() -> None:
     driver.close()
 
 
+def test_a_session_is_fed_until_it_is_stopped_also_once_no_joint_is_enabled() -> None:
+    bench = make_bench()
+    driver, set_points = cycling(bench)
+    driver.disable("0")
+    turn(driver, set_points, 30)
+    driver.stop_cycling()
+    # A controller that runs dry takes the host for dead, and leaves a command hold behind.
+    assert "command" not in bench.emulator.panel.holds
+    driver.close()
+
+
+def test_a_queue_is_dry_when_little_time_is_left_not_when_few_targets_are() -> None:
+    bench = make_bench(lead_ticks=20)
+    driver = bench.driver()
+    driver.open()
+    driver.configure(250.0, ["0"])
+    driver.start_cycling()
+    set_points = [SetPoint(position_rad=START_RAD)]
+    driver.exchange(set_points)
+    driver.enable("0", Mode.POSITION)
+    turn(driver, set_points, 2)
+    stream = bench.emulator.stream
+    assert stream is not None and stream.moving
+    assert not stream.running_dry
+    bench.emulator.advance(bench.emulator.now_s + 19 * 0.004)
+    assert stream.running_dry
+    driver.close()
+
+
 def test_a_controller_whose_host_died_comes_back_to_host_control() -> None:
     bench = make_bench()
     cycling(bench)

@@ -118,6 +118,8 @@ class StreamCycle:
         self._units = [units[joint.name] for joint in joints]
         self._feedback = [Feedback() for _ in joints]
         self._wanted: set[int] = set()
+        # Once armed, a session must be fed until it is stopped, or the controller takes us for dead.
+        self._following = False
         self._locked: set[int] = set()
         self._last_tick = -1
         self._alive_until_tick = first.tick + _KEEP_ALIVE_TICKS
@@ -167,7 +169,8 @@ class StreamCycle:
         session = self.session
         report = session.wait_for_tick(0)
         session.raise_if_stopped()
-        if self._wanted and not session.halted:
+        self._following = self._following or bool(self._wanted)
+        if self._following and not session.halted:
             self._aim(set_points, ticks=max(1, report.tick - self._last_tick) if self._last_tick >= 0 else 1)
             feed_forward = self._may_feed_forward and any(self._torques)
             due_tick = session.send(self._targets, self._torques if feed_forward else ())

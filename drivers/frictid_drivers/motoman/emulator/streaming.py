@@ -89,8 +89,8 @@ class StreamApplication:
 
     @property
     def running_dry(self) -> bool:
-        """Targets are being followed, and hardly any are left."""
-        return self._armed and not self._latched and len(self._queue) <= _NEARLY_DRY
+        """Targets are being followed, and hardly any time is left to the last of them."""
+        return self._armed and not self._latched and self._last_due - self.tick_number <= _NEARLY_DRY
 
     # -- the wire ----------------------------------------------------------------------------------------------
 

@@ -1,0 +1,426 @@
+"""Every fault of the serial emulator at every phase of a whole ``calibrate``, streamed and in batch.
+
+    python benchmarks/serial_faults.py [--places 2] [--docs PAGE]   virtual time (about 12 minutes of processor time)
+    python benchmarks/serial_faults.py --pty [--docs PAGE]          20 of them through the command line, on a pseudo
+                                                                    terminal and the wall clock (about 10 minutes)
+
+One light joint, the quick programme. A healthy run first tells which acknowledgement, block, frame or tick belongs to
+which phase; then every kind of fault strikes at some of them. Every run must end - at most 150 s of the controller's
+time later than a healthy one - with an outcome and no traceback; the joint must stand afterwards; an error must name a
+cause that this fault can have; a run that succeeds must be within 2.5 % of the truth; what moved must be recorded; and
+every recorded position must be the one that the joint had at that tick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_drivers.motoman import MotomanDriver
+from frictid_drivers.motoman.emulator.build import build
+from frictid_drivers.motoman.emulator.faults import OCCASIONS, Fault, FaultPlan
+from frictid_drivers.motoman.emulator.jobs import Job
+from frictid_drivers.motoman.emulator.loopback import LoopbackPort
+from frictid_drivers.motoman.emulator.machine import Emulator
+from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import RobotSetup
+from frictid_hil.errors import FrictidError
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.compare import compare
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.recording.mcap_reader import read_mcap
+from frictid_hil.runner import run as run_module
+from frictid_hil.runner.events import Event, JobProgress, Marked, PhaseStarted
+
+JOINT, LIMIT_PERCENT, LATER_S, TICK_NS = "5", 2.5, 150.0, 4_000_000
+ROBOT = """\
+schema: frictid.robot/1
+extends: hp3j-serial.yaml
+name: hp3j-faults
+bus: serial:loopback
+options:
+  layer: {layer}
+"""
+KINDS = (
+    *("lost_ack", "wrong_ack", "nak", "nak x3", "nak x5", "bad_bcc", "bad_bcc x6", "lost_block", "garble"),
+    *("silence :4", "silence :25", "enq", "enq :1", "split", "merge :0.02", "close"),
+    *("bad_crc", "bad_crc x7", "lost_frame x2", "lost_frame x90", "deaf", "deaf x90", "noise x2", "noise x90"),
+    *("late :0.02", "late :0.5", "alarm :4107", "hold", "drop :30", "unplug"),
+)
+LINK = (
+    "no answer|rejected|unreadable|silent|no reply|ended|never acknowledged|no HELLO|in the middle|instead of|asked for"
+)
+LOST = "watchdog|no HELLO|no feedback"
+CAUSES = {
+    "close": "port is gone|port failed",
+    "unplug": "port is gone|port failed|no feedback",
+    "alarm": "alarm 4107",
+    "hold": "pendant hold|pressed hold",
+    "late": LOST,
+    "bad_crc": LOST,
+    "lost_frame": LOST,
+    "deaf": LOST,
+    "noise": LOST,
+    "silence": f"{LINK}|{LOST}|heard nothing",
+    "enq": f"bid for the line|{LINK}",
+}
+ON_TERMINALS = {
+    "stream": (
+        *(
+            "lost_ack@3",
+            "wrong_ack@9",
+            "nak@2",
+            "nak@4x5",
+            "bad_bcc@5",
+            "garble@11",
+            "silence@14:4",
+            "enq@1:1",
+            "split@0",
+        ),
+        *(
+            "merge@0:0.01",
+            "bad_crc@400",
+            "deaf@1800x90",
+            "late@700:0.02",
+            "alarm@2000:4107",
+            "hold@3000",
+            "unplug@1900",
+        ),
+    ),
+    "batch": ("bad_bcc@70x2", "lost_block@80", "hold@900", "close@250"),
+}
+
+
+@dataclass
+class Watched:
+    """One run: the controller behind it, and what its joint really did."""
+
+    emulator: Emulator
+    driver: MotomanDriver
+    truth_pulses: dict[int, int] = field(default_factory=dict)
+    jobs: list[Job] = field(default_factory=list)
+
+    @staticmethod
+    def of(setup: RobotSetup, faults: Sequence[str]) -> Watched:
+        """Driver and controller on one virtual wire."""
+        emulator = build(setup, FaultPlan(Fault.parse(text) for text in faults))
+        driver = MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
+        watched = Watched(emulator, driver)
+        axis = emulator.axes[setup.joint(JOINT).address]
+        run, start = axis.run, emulator.batch._commands["FRUN"]
+
+        def remember(duration_s: float) -> None:
+            if emulator.stream is not None:
+                watched.truth_pulses[emulator.stream.tick_number] = axis.pulses
+            run(duration_s)
+
+        def remember_job(text: str, operands: list[str]) -> Any:
+            job = emulator.batch._job
+            if job is not None and job not in watched.jobs:
+                watched.jobs.append(job)
+            return start(text, operands)
+
+        axis.run = remember  # type: ignore[method-assign]
+        emulator.batch._commands["FRUN"] = remember_job
+        return watched
+
+    def true_pulses(self, times_ns: np.ndarray[Any, Any]) -> list[int | None]:
+        """Where the joint was at these times of the recording."""
+        if not self.jobs:
+            first = -self.driver.clock.tick_ns(0) // TICK_NS
+            return [self.truth_pulses.get(first + int(time_ns) // TICK_NS) for time_ns in times_ns]
+        cuts = np.flatnonzero(np.diff(times_ns) != TICK_NS) + 1
+        true: list[int | None] = []
+        for part, job in zip(np.split(times_ns, cuts), self.jobs, strict=False):
+            true += [sample[0] for sample in job.samples[: len(part)]]
+        return true
+
+    def still_moving(self) -> bool:
+        """Six seconds later (a job's own watchdog takes five), for one second."""
+        emulator = self.emulator
+        emulator.advance(emulator.now_s + 6.0)
+        before = [axis.issued for axis in emulator.axes]
+        emulator.advance(emulator.now_s + 1.0)
+        return emulator.panel.operating or before != [axis.issued for axis in emulator.axes]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one run ended; ``wrong`` says what must not be."""
+
+    exit_code: int
+    told: str
+    wrong: tuple[str, ...]
+    seconds: float
+
+    @property
+    def cell(self) -> str:
+        """As the table shows it."""
+        return "recovers" if self.exit_code == 0 else f"stops ({self.exit_code})"
+
+
+def inject(layer: str, faults: Sequence[str], *, phase: str, limit_s: float, told: Callable[[Event], None]) -> Outcome:
+    """One whole calibration with these faults."""
+    runs: list[Watched] = []
+
+    def driver(setup: RobotSetup) -> MotomanDriver:
+        runs.append(Watched.of(setup, faults))
+        return runs[-1].driver
+
+    class Watch(Silent):
+        def event(self, event: Event) -> None:
+            told(event)
+
+    run_module.load_driver = lambda name: driver  # type: ignore[assignment,return-value]
+    wrong: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        robot, out = Path(folder) / "robot.yaml", Path(folder) / "run"
+        robot.write_text(ROBOT.format(layer=layer))
+        INJECTED.append(runs)
+        options = CalibrateOptions(str(robot), out=out, program="quick", joints=(JOINT,))
+        try:
+            result = calibrate(options, Watch())
+        except FrictidError as refused:
+            result = {"exit_code": refused.exit_code, "error": {"what": str(refused), "cause": refused.cause}}
+        except Exception:
+            return Outcome(-1, "", ("traceback: " + traceback.format_exc().splitlines()[-1],), 0.0)
+        (watched,) = runs
+        ended_s = watched.emulator.now_s
+        if ended_s > limit_s:
+            wrong.append(f"took {ended_s:.0f} s")
+        error = result.get("error") or {}
+        text = f"{error.get('what', '')} | {error.get('cause', '')}"
+        wrong += judge_outcome(result, faults, text, lambda: compare(out, None, str(robot)))
+        if watched.still_moving():
+            wrong.append("still moving")
+        wrong += judge_recording(watched, out, recorded=phase not in BEFORE_RECORDING[layer])
+    return Outcome(int(result["exit_code"]), text, tuple(wrong), ended_s)
+
+
+INJECTED: list[list[Watched]] = []
+"""The runs so far; the healthy one is looked at while it goes on."""
+BEFORE_RECORDING = {"stream": ("open", "power on"), "batch": ("open", "power on", "rehearsal", "its transfer")}
+
+
+def judge_outcome(
+    result: Mapping[str, Any], faults: Sequence[str], text: str, distance: Callable[[], Mapping[str, Any]]
+) -> Iterator[str]:
+    """An outcome, a cause, and no wrong friction."""
+    code = result["exit_code"]
+    if code not in (0, 3, 4, 5):
+        yield f"exit code {code}"
+    if code in (3, 4):
+        causes = "|".join(CAUSES.get(fault.partition("@")[0], LINK) for fault in faults)
+        if not re.search(causes, text):
+            yield f"cause: {text}"
+    if code == 0:
+        percent = distance()["joints"][JOINT]["e_percent_measured_range"]
+        if percent > LIMIT_PERCENT:
+            yield f"{percent:.1f} % from the truth"
+
+
+def judge_recording(watched: Watched, out: Path, *, recorded: bool) -> Iterator[str]:
+    """What moved is there, and is what happened."""
+    path = out / "samples.mcap"
+    kept = read_mcap(path, JOINT)[0] if path.exists() and path.stat().st_size else None
+    if kept is None or len(kept.time_ns) == 0:
+        if recorded:
+            yield "nothing was recorded"
+        return
+    axis = next(axis for axis, joint in zip(watched.emulator.axes, range(6), strict=True) if str(joint) == JOINT)
+    measured = np.rint(kept.position_rad * axis.plate.pulses_per_rad)
+    true = watched.true_pulses(kept.time_ns)
+    wrong = sum(a != b for a, b in zip(measured, true, strict=True)) if len(true) == len(measured) else len(measured)
+    if wrong:
+        yield f"{wrong} of {len(measured)} samples are not what happened"
+
+
+# -- phases ------------------------------------------------------------------------------------------------------------
+
+
+def phases_of(layer: str) -> tuple[dict[str, tuple[Counter[str], Counter[str]]], float]:
+    """Every phase of a healthy run, with the counts of all occasions at its begin and end; and how long it takes."""
+    bounds: list[tuple[str, Counter[str]]] = [("open", Counter())]
+
+    def told(event: Event) -> None:
+        name = None
+        if isinstance(event, PhaseStarted) and event.phase not in ("reference", "enable", "hold", "drift"):
+            name = "power on" if event.phase == "configure" else event.phase
+        elif isinstance(event, JobProgress) and event.share >= 1.0:
+            name = "its transfer" if event.stage == "motion" else "power off"
+        elif isinstance(event, Marked) and layer == "stream":
+            name = "power off"
+        if name is None:
+            return
+        if layer == "batch":
+            # Job by job: the rehearsal, everything else, each with its transfer.
+            name = {"reversal": "cycles"}.get(name, name)
+        counted = Counter(INJECTED[-1][-1].emulator.faults.counted)
+        if bounds[-1][0] == "power off":
+            bounds.pop()
+        bounds.append((name, counted))
+
+    healthy = inject(layer, (), phase="power off", limit_s=1e9, told=told)
+    if healthy.exit_code or healthy.wrong:
+        raise SystemExit(f"{layer}: the healthy run fails: {healthy}")
+    last = Counter(INJECTED[-1][-1].emulator.faults.counted)
+    phases: dict[str, tuple[Counter[str], Counter[str]]] = {}
+    for (name, begin), (_, end) in zip(bounds, [*bounds[1:], ("", last)], strict=True):
+        name = f"{name} of the cycles" if name == "its transfer" and name in phases else name
+        phases[name] = (phases[name][0] if name in phases else begin, end)
+    return phases, healthy.seconds
+
+
+def places(kind: str, begin: Counter[str], end: Counter[str], count: int) -> list[int]:
+    """Where in a phase this kind of fault can strike."""
+    occasion = OCCASIONS[kind.partition(" ")[0]]
+    low, high = begin[occasion], end[occasion]
+    count = min(count, high - low)
+    return sorted({low + (high - low) * (2 * k + 1) // (2 * count) for k in range(count)})
+
+
+def in_virtual_time(count: int) -> tuple[str, int, int]:
+    """The whole table, how many runs it took, and how many of them were wrong."""
+    lines, runs, bad = [], 0, 0
+    for layer in ("stream", "batch"):
+        phases, healthy_s = phases_of(layer)
+        lines += [f"| {layer} | " + " | ".join(phases) + " |", "|---|" + "---|" * len(phases)]
+        for kind in KINDS:
+            name, _, how = kind.partition(" ")
+            cells = []
+            for phase, (begin, end) in phases.items():
+                outcomes = []
+                for at in places(kind, begin, end, count):
+                    fault = f"{name}@{at}{how}"
+                    outcome = inject(layer, [fault], phase=phase, limit_s=healthy_s + LATER_S, told=lambda event: None)
+                    outcomes.append(outcome.cell)
+                    runs += 1
+                    if outcome.wrong:
+                        bad += 1
+                        outcomes[-1] = "**WRONG**"
+                        print(f"{layer} {phase} {fault}: {'; '.join(outcome.wrong)}", file=sys.stderr, flush=True)
+                    INJECTED.clear()
+                cells.append(", ".join(dict.fromkeys(outcomes)) or "-")
+            if any(cell != "-" for cell in cells):
+                lines.append(f"| `{kind}` | " + " | ".join(cells) + " |")
+                print(lines[-1], flush=True)
+        lines.append("")
+    lines.insert(0, f"{runs} runs, {bad} of them wrong.\n")
+    return "\n".join(lines), runs, bad
+
+
+# -- the same on a pseudo terminal -------------------------------------------------------------------------------------
+
+
+def on_terminals() -> tuple[str, int, int]:
+    """Twenty of them, each ``frictid-hil emulate`` and ``frictid-hil calibrate`` as a person would start them."""
+    lines = ["| layer | fault | exit code | told | samples kept | wall s |", "|---|---|---|---|---|---|"]
+    bad = 0
+    for layer, faults in ON_TERMINALS.items():
+        for fault in faults:
+            with tempfile.TemporaryDirectory() as folder:
+                cells, wrong = _on_terminal(layer, fault, Path(folder))
+            bad += bool(wrong)
+            lines.append(f"| {layer} | `{fault}` | " + " | ".join([*cells, *(f"**{text}**" for text in wrong)]) + " |")
+            print(lines[-1], flush=True)
+    runs = len(lines) - 2
+    return "\n".join([f"{runs} runs, {bad} of them wrong.\n", *lines, ""]), runs, bad
+
+
+def _on_terminal(layer: str, fault: str, folder: Path) -> tuple[list[str], list[str]]:
+    robot, out = folder / "robot.yaml", folder / "run"
+    robot.write_text(ROBOT.format(layer=layer))
+    emulator = subprocess.Popen(
+        ["frictid-hil", "emulate", "motoman", "--pty", "--robot", str(robot), "--fault", fault],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert emulator.stdout is not None
+    try:
+        port = emulator.stdout.readline().split()[-1]
+        begun_s = time.monotonic()
+        command = ["frictid-hil", "calibrate", "--robot", str(robot), "--bus", f"serial:{port}", "--joint", JOINT]
+        done = subprocess.run(
+            [*command, "--program", "quick", "--yes", "--json", "--out", str(out)],
+            capture_output=True,
+            text=True,
+            timeout=400,
+            check=False,
+        )
+        took_s = time.monotonic() - begun_s
+        standing = _stands(f"serial:{port}", robot) if emulator.poll() is None else True
+    finally:
+        emulator.terminate()
+        emulator.communicate(timeout=10)
+    try:
+        result = json.loads(done.stdout)
+    except ValueError:
+        return [str(done.returncode), "", "", f"{took_s:.0f}"], [f"no JSON: {done.stderr[-200:]}"]
+    error = result.get("error") or {}
+    text = f"{error.get('what', '')} | {error.get('cause', '')}" if error else ""
+    truth = load_robot(str(robot))
+    result["exit_code"] = done.returncode
+    wrong = list(judge_outcome(result, [fault], text, lambda: compare(out, None, str(truth.path))))
+    if "Traceback" in done.stderr or "Traceback" in text:
+        wrong.append("traceback")
+    if not standing:
+        wrong.append("does not stand")
+    path = out / "samples.mcap"
+    kept = len(read_mcap(path, JOINT)[0].time_ns) if path.exists() and path.stat().st_size else 0
+    return [str(done.returncode), text.partition(" |")[0], str(kept), f"{took_s:.0f}"], wrong
+
+
+def _stands(bus: str, robot: Path) -> bool:
+    """Two looks through stock host control."""
+    driver = MotomanDriver(load_robot(str(robot)).to_setup(bus))
+    try:
+        driver.open()
+        before = [report.position_rad for report in driver.standing()]
+        time.sleep(0.2)
+        return bool(np.allclose(before, [report.position_rad for report in driver.standing()], atol=1e-4))
+    except FrictidError:
+        return True  # the port has gone with the fault; the emulated controller behind it is judged in virtual time
+    finally:
+        driver.close()
+
+
+def write(page: Path, name: str, text: str) -> None:
+    """Replace what stands between this benchmark's two comments on the page."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    command = "python benchmarks/serial_faults.py" + (" --pty" if name == "faults-pty" else "")
+    before, _, rest = page.read_text().partition(begin)
+    _, _, after = rest.partition(end)
+    page.write_text(f"{before}{begin}\n`{command}` at commit {commit.strip()}: {text}{end}{after}")
+
+
+def main() -> int:
+    """0 when nothing was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--places", type=int, default=2, help="how many places per phase and kind")
+    parser.add_argument("--pty", action="store_true")
+    parser.add_argument("--docs", type=Path, help="the page to write the table to")
+    asked = parser.parse_args()
+    text, runs, bad = on_terminals() if asked.pty else in_virtual_time(asked.places)
+    print(f"{runs} runs, {bad} wrong")
+    if asked.docs:
+        write(asked.docs, "faults-pty" if asked.pty else "faults", text)
+    return 0 if bad == 0 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
