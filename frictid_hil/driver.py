@@ -24,6 +24,7 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.workspace import Workspace
 
 if TYPE_CHECKING:
     from frictid_hil.plan import JointPlan, Plan
@@ -103,6 +104,7 @@ class RobotSetup:
         realtime: run on the wall clock even where lock-step is possible.
         seed: seed of every simulated noise; ignored by real hardware.
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
+        workspace: the box that the arm may not leave; None where the robot file names none.
     """
 
     name: str
@@ -113,6 +115,7 @@ class RobotSetup:
     realtime: bool = False
     seed: int = 0
     simulated_arm: Mapping[str, Any] = field(default_factory=dict)
+    workspace: Workspace | None = None
 
     def joint(self, name: str) -> JointSetup:
         """The joint of that name.

@@ -14,8 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from frictid_hil.driver import JointSetup, RobotSetup
-from frictid_hil.errors import PlanRefused
+from frictid_hil.driver import JointSetup
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 
@@ -404,48 +403,3 @@ def _peaks(motions: Sequence[Motion]) -> tuple[tuple[float, float], float, float
         if not isinstance(getattr(motion, "path", motion), Corners):
             peak_rad_s2 = max(peak_rad_s2, float(np.abs(np.diff(speeds)).max(initial=0.0)) / step_s)
     return (travel[0], travel[1]), peak_rad_s, peak_rad_s2
-
-
-_TOGETHER_STEP = (
-    "; what other joints add is bounded by `expected: link_inertia_kg_m2` (the inertia behind the gear); without "
-    "--together it is nothing"
-)
-
-
-def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, Expected]) -> None:
-    """Check the whole plan against the joints' limits, before anything is opened.
-
-    Raises:
-        PlanRefused: naming every joint whose planned position, speed or predicted torque exceeds a limit.
-    """
-    problems: list[str] = []
-    for entry in plan.joints:
-        joint = setup.joint(entry.joint)
-        low, high = entry.travel_rad
-        if low < joint.position_min_rad or high > joint.position_max_rad:
-            problems.append(
-                f"joint {joint.name}: planned travel {math.degrees(low):.1f}..{math.degrees(high):.1f} deg leaves its "
-                f"limits {math.degrees(joint.position_min_rad):.1f}..{math.degrees(joint.position_max_rad):.1f} deg"
-            )
-        if entry.peak_velocity_rad_s > joint.max_velocity_rad_s:
-            problems.append(
-                f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its "
-                f"limit {math.degrees(joint.max_velocity_rad_s):.1f} deg/s"
-            )
-        if entry.predicted_torque_nm > joint.max_torque_nm:
-            source = expected[joint.name].source if joint.name in expected else "robot file"
-            problems.append(
-                f"joint {joint.name}: predicted torque {entry.predicted_torque_nm:.1f} N m above the limit "
-                f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source}"
-                f"{', and the most that the other joints can add' if plan.together else ''})"
-            )
-        for name, locked_rad in entry.locked.items():
-            other = setup.joint(name)
-            if not other.position_min_rad <= locked_rad <= other.position_max_rad:
-                problems.append(f"joint {name}: locked position {math.degrees(locked_rad):.1f} deg outside its limits")
-    if problems:
-        raise PlanRefused(
-            "; ".join(dict.fromkeys(problems)),
-            next_step="raise the amplitude (peak torque grows as V^2/A), lower the velocity, or shift the start"
-            + _TOGETHER_STEP * plan.together,
-        )

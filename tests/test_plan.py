@@ -16,8 +16,8 @@ from frictid_hil.plan import (
     Sine,
     coupling_bound_nm,
     joint_plan,
-    refuse_beyond_limits,
 )
+from frictid_hil.plan_limits import refuse_beyond_limits
 
 DEG = math.pi / 180
 

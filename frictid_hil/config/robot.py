@@ -29,6 +29,8 @@ from frictid_hil.config.yaml import Document, merge, read
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.kinematics import DhRow
+from frictid_hil.workspace import Workspace
 
 KIND = "frictid.robot"
 NEWEST = 1
@@ -109,7 +111,7 @@ class JointFile(Strict):
 
 
 class WorkspaceFile(Strict):
-    """A box in the robot's base frame that the arm may not leave in a calibration; needs ``dh`` of every joint.
+    """A box in the robot's base frame that the arm may not leave; needs ``dh`` of every joint.
 
     Attributes:
         x_m: from and to.
@@ -298,6 +300,7 @@ class Robot:
             realtime=realtime,
             seed=seed,
             simulated_arm=self.file.simulated_arm,
+            workspace=_workspace(self.file),
         )
 
 
@@ -377,11 +380,35 @@ def _contradictions(file: RobotFile) -> list[FieldProblem]:
             first = taken.setdefault((kind, address), name)
             if first != name:
                 problems.append(FieldProblem((*at, kind), f"{kind} {address} is already that of joint {first}"))
+    if file.workspace is not None:
+        problems += _workspace_problems(file, file.workspace)
     interlock = file.policy.unattended.interlock_input if file.policy.unattended else None
     if interlock and interlock.joint not in file.joints:
         at_joint = ("policy", "unattended", "interlock_input", "joint")
         problems.append(FieldProblem(at_joint, f"no such joint; this robot has {', '.join(file.joints)}"))
     return problems
+
+
+def _workspace_problems(file: RobotFile, box: WorkspaceFile) -> list[FieldProblem]:
+    problems = [
+        FieldProblem(("joints", name), "has no `dh`, without which `workspace` cannot be checked")
+        for name, joint in file.joints.items()
+        if joint.dh is None
+    ]
+    for axis in ("x_m", "y_m", "z_m"):
+        low, high = getattr(box, axis)
+        if high - low <= 2 * box.clearance_m:
+            at = ("workspace", axis)
+            problems.append(FieldProblem(at, f"leaves no room between faces of {box.clearance_m:g} m clearance"))
+    return problems
+
+
+def _workspace(file: RobotFile) -> Workspace | None:
+    box = file.workspace
+    if box is None:
+        return None
+    rows = tuple(DhRow(**joint.dh.model_dump()) for joint in file.joints.values() if joint.dh)
+    return Workspace(rows, (box.x_m, box.y_m, box.z_m), box.clearance_m, box.tool_m)
 
 
 def _address(joint: JointFile, driver: str) -> int | None:

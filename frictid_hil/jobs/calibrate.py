@@ -24,7 +24,8 @@ from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import Plan, refuse_beyond_limits
+from frictid_hil.plan import Plan
+from frictid_hil.plan_limits import refuse_beyond_limits
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
@@ -404,7 +405,7 @@ def _unseen(
 
 _TOGETHER_NOTE = (
     "all joints at once is experimental: where links drive each other, inertia and gravity come out as those of the "
-    "combined motion, curves differ by up to 0.7 % from one by one, and no workspace box is checked"
+    "combined motion, and curves differ by up to 0.7 % from one by one"
 )
 
 

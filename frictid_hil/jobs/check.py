@@ -8,7 +8,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.driver import Driver, Finding, Severity, load_driver
 from frictid_hil.errors import PlanRefused
 from frictid_hil.jobs.plans import calibration_plan, expected_of
-from frictid_hil.plan import refuse_beyond_limits
+from frictid_hil.plan_limits import refuse_beyond_limits
 
 
 def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.profile_fit import doubts_of_drive, doubts_of_file, refuse
 from frictid_hil.jobs.tracking_floor import tracking_floor_rad
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import refuse_beyond_limits
+from frictid_hil.plan_limits import refuse_beyond_limits
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page

@@ -43,8 +43,8 @@ from frictid_hil.plan import (
     Plan,
     Sine,
     joint_plan,
-    refuse_beyond_limits,
 )
+from frictid_hil.plan_limits import refuse_beyond_limits
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.rehearsals import Rehearsals

@@ -33,6 +33,7 @@ from frictid_hil.runner.in_step import InStep
 from frictid_hil.runner.motions import Motions
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.runner.workspace_watch import WorkspaceWatch
 
 _LOCKED_REPORT_S = 0.010
 """Locked joints report at least this often, whatever the layout of the bus."""
@@ -160,7 +161,9 @@ class Scheduler:
                 position_max_rad=joint.position_max_rad,
             )
         limits = [self._limits(joint, moving.get(at, plans[0])) for at, joint in enumerate(self._setup.joints)]
-        supervisor = Supervisor(self._names, limits, self._care.interlock)
+        box = self._setup.workspace
+        watch = None if box is None else WorkspaceWatch(box, self._names, self._plan.cycle_hz)
+        supervisor = Supervisor(self._names, limits, self._care.interlock, watch)
         for index in range(len(self._names)):
             if index not in moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))

@@ -14,6 +14,7 @@ from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.runaway import RunawayWatch
+from frictid_hil.runner.workspace_watch import WorkspaceWatch
 from frictid_hil.units import degrees, format_angle, format_torque, format_velocity
 
 
@@ -51,9 +52,16 @@ class Supervisor:
         names: joint names, order of the feedback.
         limits: one per joint, same order.
         interlock: must be closed from ``arm_interlock`` on.
+        workspace: the box that the arm may not leave while a joint moves.
     """
 
-    def __init__(self, names: Sequence[str], limits: Sequence[JointLimits], interlock: Interlock | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        limits: Sequence[JointLimits],
+        interlock: Interlock | None = None,
+        workspace: WorkspaceWatch | None = None,
+    ) -> None:
         self._names = list(names)
         self._limits = list(limits)
         self._moving: tuple[int, ...] = ()
@@ -64,6 +72,7 @@ class Supervisor:
         self._runaway: RunawayWatch | None = None
         self._interlock = interlock
         self._interlock_armed = False
+        self._workspace = workspace
 
     def watch(self, moving: int | Sequence[int] | None, mode: Mode, locked_at: dict[int, float]) -> None:
         """Say what is allowed from now on.
@@ -121,6 +130,8 @@ class Supervisor:
         self.check_interlock(feedback)
         for moving in self._moving:
             self._check_moving(moving, set_points[moving], feedback[moving])
+        if self._workspace is not None and self._moving:
+            self._workspace.check(feedback)
         for index, held_rad in self._locked_at.items():
             report = feedback[index]
             if report.age_cycles:

@@ -1,0 +1,54 @@
+"""The workspace box while the arm moves: where the joints are is looked at every few cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from frictid_hil.driver import Feedback
+from frictid_hil.errors import SafetyAbort
+from frictid_hil.workspace import Workspace
+
+INTERVAL_S = 0.02
+"""At 1 m/s the arm moves 2 cm in between."""
+SLACK_M = 0.01
+"""How far beyond the box a joint that lags or overshoots its command may carry the arm."""
+
+
+class WorkspaceWatch:
+    """See the module's first page.
+
+    Args:
+        workspace: the box and the chain.
+        names: of the joints.
+        cycle_hz: rate of ``check``.
+    """
+
+    def __init__(self, workspace: Workspace, names: Sequence[str], cycle_hz: float) -> None:
+        faces = tuple((low - SLACK_M, high + SLACK_M) for low, high in workspace.box_m)
+        self._workspace = replace(workspace, box_m=(faces[0], faces[1], faces[2]))
+        self._names = tuple(names)
+        self._every = max(1, round(INTERVAL_S * cycle_hz))
+        self._cycle = 0
+
+    def check(self, feedback: Sequence[Feedback]) -> None:
+        """Pass one cycle's reports.
+
+        Raises:
+            SafetyAbort: some joint, or the tool, is outside.
+        """
+        self._cycle += 1
+        if self._cycle % self._every:
+            return
+        posture = np.array([[report.position_rad for report in feedback]])
+        if not np.all(np.isfinite(posture)):
+            return  # a joint that does not report is another check's to judge
+        found = self._workspace.outside(posture)
+        if found is not None:
+            raise SafetyAbort(
+                found.described(self._names),
+                cause="the arm is not where the plan has it, or it overshoots",
+                next_step="bring the arm back inside by hand; widen `workspace`, or shift the start positions",
+            )

@@ -1,0 +1,99 @@
+"""The box that an arm may not leave: checked point by point along the chain of its joints.
+
+Links are taken as lines from joint to joint. A box is convex, so that a line is inside where its ends are; what a link
+is thicker than a line is the box's clearance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.kinematics import Array, DhRow, chain_points_m
+
+Range = tuple[float, float]
+
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True)
+class Outside:
+    """The point that is furthest beyond a face of the box.
+
+    Attributes:
+        moment: index of the posture.
+        positions_rad: of all joints then, in the order of the chain.
+        link: index of the joint that carries the point; the number of joints for the tool.
+        point_m: in the base frame.
+        axis: of the face, 0..2.
+        bound_m: the face, clearance taken off.
+    """
+
+    moment: int
+    positions_rad: tuple[float, ...]
+    link: int
+    point_m: tuple[float, float, float]
+    axis: int
+    bound_m: float
+
+    def described(self, names: Sequence[str]) -> str:
+        """In words: which point, how far beyond which side, at which joint angles.
+
+        Args:
+            names: of the joints, in the order of the chain.
+        """
+        part = f"the far end of joint {names[self.link]}'s link" if self.link < len(names) else "the tool point"
+        at = self.point_m[self.axis]
+        side = "above" if at > self.bound_m else "below"
+        point = ", ".join(f"{value:.3f}" for value in self.point_m)
+        angles = ", ".join(
+            f"{name} at {math.degrees(angle):.1f} deg" for name, angle in zip(names, self.positions_rad, strict=True)
+        )
+        return (
+            f"{part} at ({point}) m leaves the workspace box: {_AXES[self.axis]} = {at:.3f} m is "
+            f"{1e3 * abs(at - self.bound_m):.0f} mm {side} its bound of {self.bound_m:.3f} m, with joints {angles}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Workspace:
+    """A box in the base frame, and the chain that must stay inside.
+
+    Attributes:
+        rows: where the joints are.
+        box_m: from and to along x, y, z.
+        clearance_m: kept from every face.
+        tool_m: tool point in the last joint's frame.
+    """
+
+    rows: tuple[DhRow, ...]
+    box_m: tuple[Range, Range, Range]
+    clearance_m: float = 0.0
+    tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def outside(self, positions_rad: Array) -> Outside | None:
+        """Where the arm is furthest outside, None where it stays inside.
+
+        Args:
+            positions_rad: postures, shape (k, n). One that is not a number is outside.
+        """
+        points = chain_points_m(self.rows, positions_rad, self.tool_m)
+        low = np.array([side[0] for side in self.box_m]) + self.clearance_m
+        high = np.array([side[1] for side in self.box_m]) - self.clearance_m
+        beyond = np.maximum(points - high, low - points)
+        if np.all(beyond <= 0.0):
+            return None
+        moment, link, axis = map(int, np.unravel_index(int(np.argmax(beyond)), beyond.shape))
+        point = points[moment, link]
+        bound = high[axis] if point[axis] - high[axis] >= low[axis] - point[axis] else low[axis]
+        return Outside(
+            moment,
+            tuple(map(float, positions_rad[moment])),
+            link,
+            (float(point[0]), float(point[1]), float(point[2])),
+            axis,
+            float(bound),
+        )
