@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import warnings
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -332,43 +333,79 @@ def read_log(path: Path) -> dict[str, Array]:
     where = str(path)
     opener = gzip.open if path.suffix == ".gz" else open
     try:
+        with opener(path, "rb") as binary:
+            rows = sum(block.count(b"\n") for block in iter(lambda: binary.read(1 << 20), b""))
+        if rows > MAX_ROWS + 1:
+            raise InputFileError(
+                f"{rows - 1} rows; at most {MAX_ROWS} are read",
+                where=where,
+                next_step="cut the recording or thin it to 500 Hz",
+            )
         with opener(path, "rt", encoding="utf-8", newline="") as file:
             header = [name.strip() for name in file.readline().lstrip("\ufeff").split(",")]
             with warnings.catch_warnings():
                 # An empty table is reported below, in our own words.
                 warnings.simplefilter("ignore", UserWarning)
-                table = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MAX_ROWS + 1)
+                table = np.loadtxt(file, delimiter=",", ndmin=2)
     except FileNotFoundError as error:
         raise InputFileError("no such log", where=where, next_step="correct `file` in nominal.yaml") from error
-    except (OSError, EOFError, UnicodeDecodeError, ValueError) as error:
-        raise InputFileError(f"cannot be read as a table of numbers: {error}", where=where) from error
-    if table.shape[0] > MAX_ROWS:
-        raise InputFileError(
-            f"more than {MAX_ROWS} rows", where=where, next_step="cut the recording or thin it to 500 Hz"
-        )
-    if table.shape[0] < 2:
-        raise InputFileError(f"{table.shape[0]} rows of samples; at least 2 are needed", where=where)
-    if table.shape[1] != len(header):
-        raise InputFileError(f"{len(header)} names in the header, {table.shape[1]} columns", where=where)
-    columns: dict[str, Array] = {
-        name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(header) if name in COLUMNS
-    }
+    except (OSError, EOFError, UnicodeDecodeError, zlib.error) as error:
+        raise InputFileError(f"cannot be read: {error}", where=where) from error
+    except ValueError as error:
+        raise (_first_bad_cell(path) or InputFileError(f"cannot be read: {error}", where=where)) from error
+    columns = {name: np.ascontiguousarray(table[:, k]) for k, name in enumerate(header[: table.shape[1]])}
+    _check_columns(columns, header, table.shape, where)
+    return {name: column for name, column in columns.items() if name in COLUMNS}
+
+
+def _first_bad_cell(path: Path) -> InputFileError | None:
+    """What is wrong with the first cell that is no number, or the first row of another length."""
+    opener = gzip.open if path.suffix == ".gz" else open
+    with opener(path, "rt", encoding="utf-8", newline="") as file:
+        header = file.readline().split(",")
+        for line, text in enumerate(file, 2):
+            cells = text.split("#")[0].strip().split(",")
+            if cells == [""]:
+                continue
+            if len(cells) != len(header):
+                return InputFileError(
+                    f"{len(cells)} cells; {len(header)} are expected, as in the header", where=f"{path}:{line}"
+                )
+            for column, (name, cell) in enumerate(zip(header, cells, strict=True), 1):
+                try:
+                    float(cell)
+                except ValueError:
+                    return InputFileError(
+                        f"{cell.strip()!r} in column {name.strip()}; a number is expected",
+                        where=f"{path}:{line}:{column}",
+                    )
+    return None
+
+
+def _check_columns(columns: Mapping[str, Array], header: list[str], shape: tuple[int, ...], where: str) -> None:
+    if shape[0] < 2:
+        raise InputFileError(f"{shape[0]} rows of samples; at least 2 are needed", where=where)
+    if shape[1] != len(header):
+        raise InputFileError(f"{len(header)} names in the header, {shape[1]} columns", where=f"{where}:1")
     for name in ("time_s", "position_rad"):
         if name not in columns:
-            raise InputFileError(f"no column {name}", where=where, cause=f"found {', '.join(header)}")
+            raise InputFileError(f"no column {name}", where=f"{where}:1", cause=f"found {', '.join(header)}")
     if "torque_nm" not in columns and "position_command_rad" not in columns:
-        raise InputFileError("neither torque_nm nor position_command_rad", where=where)
-    for name, column in columns.items():
-        bad = np.flatnonzero(~np.isfinite(column))
-        if bad.size and name not in ("external_torque_nm", "temperature_c"):
+        raise InputFileError(
+            "neither torque_nm nor position_command_rad", where=f"{where}:1", cause=f"found {', '.join(header)}"
+        )
+    for place, name in enumerate(header, 1):
+        bad = np.flatnonzero(~np.isfinite(columns[name]))
+        if bad.size and name in COLUMNS and name not in ("external_torque_nm", "temperature_c"):
             raise InputFileError(
-                f"column {name} has {bad.size} values that are not finite, the first at row {int(bad[0])}", where=where
+                f"column {name} has {bad.size} values that are not finite; a number is expected in every row",
+                where=f"{where}:{int(bad[0]) + 2}:{place}",
+                next_step="cut the recording there, or fill the gap from its neighbours",
             )
     backwards = np.flatnonzero(np.diff(columns["time_s"]) <= 0)
     if backwards.size:
         raise InputFileError(
-            f"time does not increase at row {int(backwards[0]) + 1} ({backwards.size} such rows)",
-            where=where,
+            f"time does not increase ({backwards.size} such rows)",
+            where=f"{where}:{int(backwards[0]) + 3}:{header.index('time_s') + 1}",
             cause="rows reordered, or two recordings joined",
         )
-    return columns

@@ -11,11 +11,23 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.residuals import LowPass, friction_scales, slip_state, uniform
+from frictid_hil.gap.residuals import LowPass, controller_demand, friction_scales, rms, slip_state, uniform
 
 LARGEST_POSITION_RAD = 60.0
 """Beyond this, a joint position is more likely in degrees."""
+LARGEST_SPEED_RAD_S = 40.0
+"""Beyond this, the speed of a geared joint is more likely in degrees per second, or its time in another unit."""
 LEAST_ROWS = 200
+SLOWEST_STEP_S = 0.2
+"""Sampling steps longer than this are more likely in milliseconds."""
+OTHER_UNIT = 20.0
+"""Factor between what a nominal joint or its controller asks for and what was measured that no joint explains."""
+LONGEST_HALT = 0.25
+"""Part of a log in which a position may repeat itself while its command travels."""
+
+_COLUMNS = (
+    "time_s", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad", "rigid_body_torque_nm",
+)  # fmt: skip
 
 
 def checked(experiments: ExperimentSet) -> ExperimentSet:
@@ -34,6 +46,7 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
             cause="the sign of torque or position is swapped",
             next_step="turn the sign of one of the columns",
         )
+    _check_scale(experiments)
     return experiments
 
 
@@ -41,33 +54,128 @@ def _check(e: Experiment) -> None:
     where = e.name
     if e.time_s.size < LEAST_ROWS:
         raise InputFileError(f"{e.time_s.size} rows; a diagnosis needs at least {LEAST_ROWS}", where=where)
-    for name, column in (("position_rad", e.position_rad), ("torque_nm", e.torque_nm)):
-        if column is not None and not np.all(np.isfinite(column)):
-            raise InputFileError(f"column {name} holds values that are not finite", where=where)
-        if column is not None and float(np.ptp(column)) == 0.0:
+    for name in _COLUMNS:
+        column = getattr(e, name)
+        if column is None:
+            continue
+        if not np.all(np.isfinite(column)):
+            row = int(np.flatnonzero(~np.isfinite(column))[0])
+            raise InputFileError(f"column {name} is not finite, first in row {row}", where=where)
+        if float(np.ptp(column)) == 0.0 and name != "rigid_body_torque_nm":
             raise InputFileError(f"column {name} never changes", where=where, cause="a sensor or a mapping is dead")
-    if np.any(np.diff(e.time_s) <= 0.0):
-        raise InputFileError("time does not increase", where=where)
-    if float(np.max(np.abs(e.position_rad))) > LARGEST_POSITION_RAD:
+    _check_time(e)
+    _check_position(e)
+    if e.velocity_rad_s is not None:
+        _check_velocity(e, e.velocity_rad_s)
+    if e.position_command_rad is not None:
+        _check_command(e, e.position_command_rad)
+
+
+def _check_time(e: Experiment) -> None:
+    steps = np.diff(e.time_s)
+    if np.any(steps <= 0.0):
+        row = int(np.flatnonzero(steps <= 0.0)[0]) + 1
+        raise InputFileError(f"time does not increase at row {row}", where=e.name)
+    step_s = float(np.median(steps))
+    if step_s > SLOWEST_STEP_S:
         raise InputFileError(
-            f"positions up to {np.max(np.abs(e.position_rad)):.3g} rad",
-            where=where,
+            f"samples are {step_s:.3g} s apart; friction needs at least {1 / SLOWEST_STEP_S:g} a second",
+            where=e.name,
+            cause="the time is probably in milliseconds",
+            next_step="state its unit in a column map, or convert it to s",
+        )
+
+
+def _check_position(e: Experiment) -> None:
+    step_s = float(np.median(np.diff(e.time_s)))
+    speed = np.abs(np.gradient(LowPass.at(1.0 / step_s)(e.position_rad), e.time_s))
+    farthest, fastest = float(np.max(np.abs(e.position_rad))), float(np.quantile(speed, 0.99))
+    if farthest > LARGEST_POSITION_RAD or fastest > LARGEST_SPEED_RAD_S:
+        raise InputFileError(
+            f"positions up to {farthest:.3g} rad at speeds up to {fastest:.3g} rad/s",
+            where=e.name,
             cause="the position is probably in degrees",
             next_step="convert to rad, or read the file through a column map that states its unit",
         )
-    command = e.position_command_rad
-    if command is not None and float(np.ptp(command)) > 0.0:
-        ratio = float(np.ptp(e.position_rad)) / float(np.ptp(command))
-        if ratio > 20.0 or ratio < 0.02:
-            raise InputFileError(
-                f"the position travels {ratio:.3g} times as far as its command",
-                where=where,
-                cause="one of the two is probably in degrees or in counts",
-            )
-        if float(np.corrcoef(command, e.position_rad)[0, 1]) < -0.5:
-            raise InputFileError(
-                "position and command move in opposite directions", where=where, cause="a swapped sign"
-            )
+
+
+def _check_velocity(e: Experiment, velocity_rad_s: Array) -> None:
+    """The reported velocity must be the position's derivative but for a lag, noise and a few percent."""
+    step_s = float(np.median(np.diff(e.time_s)))
+    low_pass = LowPass.at(1.0 / step_s)
+    true = np.gradient(low_pass(e.position_rad), e.time_s)
+    slope = float(true @ low_pass(velocity_rad_s) / max(float(true @ true), 1e-300))
+    if 0.4 < slope < 2.5:
+        return
+    cause = "its sign is swapped" if slope < 0.0 else "it is probably in degrees per second or of the motor"
+    raise InputFileError(
+        f"column velocity_rad_s is {slope:.3g} times the derivative of position_rad; 1 is expected",
+        where=e.name,
+        cause=cause,
+        next_step="correct the column, or leave it out: the position alone will do",
+    )
+
+
+def _check_command(e: Experiment, command: Array) -> None:
+    ratio = float(np.ptp(e.position_rad)) / float(np.ptp(command))
+    if ratio > OTHER_UNIT or ratio < 1.0 / OTHER_UNIT:
+        raise InputFileError(
+            f"the position travels {ratio:.3g} times as far as its command",
+            where=e.name,
+            cause="one of the two is probably in degrees or in counts",
+        )
+    if float(np.corrcoef(command, e.position_rad)[0, 1]) < -0.5:
+        raise InputFileError("position and command move in opposite directions", where=e.name, cause="a swapped sign")
+    start, rows = _longest_halt(e.position_rad)
+    if rows > LONGEST_HALT * command.size and float(np.ptp(command[start : start + rows])) > 0.2 * float(
+        np.ptp(command)
+    ):
+        raise InputFileError(
+            f"the position repeats itself for {rows} rows from row {start} while its command travels",
+            where=e.name,
+            cause="the sensor stopped, or the recording went on without it",
+        )
+
+
+def _longest_halt(position_rad: Array) -> tuple[int, int]:
+    """(first row, rows) of the longest stretch of one and the same value."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(position_rad) != 0.0) + 1, [position_rad.size]])
+    lengths = np.diff(edges)
+    at = int(np.argmax(lengths))
+    return int(edges[at]), int(lengths[at])
+
+
+def _check_scale(experiments: ExperimentSet) -> None:
+    """Torque, position and nominal joint must be of one system of units: they agree within a factor of twenty."""
+    nominal = experiments.nominal
+    asked, measured = [], []
+    for e in experiments.experiments:
+        if e.torque_nm is None:
+            continue
+        log, step_s, _ = uniform(e)
+        assert log.torque_nm is not None
+        low_pass = LowPass.at(1.0 / step_s)
+        if nominal.controller is not None and log.position_command_rad is not None:
+            boundless = replace(nominal.controller, torque_limit_nm=math.inf)
+            free = controller_demand(boundless, log.position_rad, log.position_command_rad, step_s)
+            asked.append(low_pass(free - np.median(free)))
+        elif nominal.inertia_kg_m2 is not None and nominal.curve is not None and log.rigid_body_torque_nm is None:
+            speed = np.gradient(log.position_rad, step_s)
+            rigid = nominal.inertia_kg_m2 * np.gradient(speed, step_s) + nominal.curve.torque(speed)
+            asked.append(low_pass(rigid))
+        else:
+            continue
+        measured.append(low_pass(log.torque_nm - np.median(log.torque_nm)))
+    if not asked:
+        return
+    ratio = rms(np.concatenate(asked)) / max(rms(np.concatenate(measured)), 1e-300)
+    if not 1.0 / OTHER_UNIT < ratio < OTHER_UNIT:
+        raise InputFileError(
+            f"nominal.yaml asks for {ratio:.3g} times the torque that was measured",
+            where=experiments.name,
+            cause="position in degrees, or torque in per mille, in amperes or on the motor's side of the gear",
+            next_step="bring both to rad and N m on the joint's side",
+        )
 
 
 def _torque_sign(e: Experiment) -> float | None:

@@ -1,0 +1,164 @@
+"""Sets that cannot be right: a clear error that names file, line, column and what was expected; never a verdict."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gap_sets
+import numpy as np
+import pytest
+import yaml
+
+from frictid_hil.errors import InputFileError
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.experiment_set import MAX_ROWS, Experiment, ExperimentSet
+
+DEGREES = 180.0 / np.pi
+HEADER = "time_s,position_rad,torque_nm,position_command_rad"
+
+
+@pytest.fixture(scope="module")
+def asymmetric() -> ExperimentSet:
+    """A set with a cause to be sure of, were it not for what is done to it."""
+    names = ("sines_large", "triangle_slow", "sines_repeat")
+    return gap_sets.make({"direction_asymmetry": {"coulomb_share": 0.1, "viscous_share": 0.15}}, only=names)
+
+
+def _with(**factors: float) -> Callable[[Experiment], Experiment]:
+    return lambda e: replace(e, **{name: factor * getattr(e, name) for name, factor in factors.items()})
+
+
+def _not_a_number(name: str) -> Callable[[Experiment], Experiment]:
+    def change(e: Experiment) -> Experiment:
+        column = getattr(e, name).copy()
+        column[700] = np.nan
+        return replace(e, **{name: column})
+
+    return change
+
+
+def _level(name: str) -> Callable[[Experiment], Experiment]:
+    return lambda e: replace(e, **{name: np.full_like(getattr(e, name), 0.5)})
+
+
+def _halted(e: Experiment) -> Experiment:
+    position = e.position_rad.copy()
+    position[position.size // 2 :] = position[position.size // 2]
+    return replace(e, position_rad=position)
+
+
+def _swapped_rows(e: Experiment) -> Experiment:
+    time = e.time_s.copy()
+    time[[300, 301]] = time[[301, 300]]
+    return replace(e, time_s=time)
+
+
+WRONG: dict[str, tuple[Callable[[Experiment], Experiment], str]] = {
+    "all in degrees": (
+        _with(position_rad=DEGREES, velocity_rad_s=DEGREES, position_command_rad=DEGREES),
+        "positions up to",
+    ),
+    "position in degrees": (_with(position_rad=DEGREES), "positions up to"),
+    "velocity in degrees": (_with(velocity_rad_s=DEGREES), "57.3 times the derivative"),
+    "command in degrees": (_with(position_command_rad=DEGREES), "as far as its command"),
+    "torque in per mille": (_with(torque_nm=1000.0 / 12.0), "times the torque that was measured"),
+    "torque of the motor": (_with(torque_nm=0.01), "times the torque that was measured"),
+    "time in milliseconds": (_with(time_s=1000.0), "apart"),
+    "torque's sign": (_with(torque_nm=-1.0), "opposite signs"),
+    "velocity's sign": (_with(velocity_rad_s=-1.0), "-1 times the derivative"),
+    "command's sign": (_with(position_command_rad=-1.0), "opposite directions"),
+    "motion's sign": (_with(position_rad=-1.0, velocity_rad_s=-1.0, position_command_rad=-1.0), "opposite signs"),
+    "constant position": (_level("position_rad"), "position_rad never changes"),
+    "constant torque": (_level("torque_nm"), "torque_nm never changes"),
+    "constant velocity": (_level("velocity_rad_s"), "velocity_rad_s never changes"),
+    "constant command": (_level("position_command_rad"), "position_command_rad never changes"),
+    "position stops": (_halted, "repeats itself"),
+    "time goes back": (_swapped_rows, "time does not increase at row 301"),
+    "one NaN in time": (_not_a_number("time_s"), "row 700"),
+    "one NaN in position": (_not_a_number("position_rad"), "row 700"),
+    "one NaN in torque": (_not_a_number("torque_nm"), "row 700"),
+    "one NaN in velocity": (_not_a_number("velocity_rad_s"), "row 700"),
+    "one NaN in command": (_not_a_number("position_command_rad"), "row 700"),
+}
+
+
+@pytest.mark.parametrize("loop", [True, False], ids=["closed loop", "no controller"])
+@pytest.mark.parametrize("wrong", list(WRONG))
+def test_what_cannot_be_right_is_refused_with_its_reason(asymmetric: ExperimentSet, wrong: str, loop: bool) -> None:
+    change, said = WRONG[wrong]
+    nominal = asymmetric.nominal if loop else replace(asymmetric.nominal, controller=None)
+    broken = ExperimentSet("broken", nominal, tuple(change(e) for e in asymmetric.experiments))
+    with pytest.raises(InputFileError, match=said) as told:
+        diagnose(broken)
+    assert told.value.where
+
+
+def test_slow_motion_in_degrees_is_noticed_by_what_the_nominal_joint_asks_for() -> None:
+    """Speeds that degrees do not give away: the torque does."""
+    made = gap_sets.make(only=("triangle_slow", "breakaway"))
+    change = WRONG["all in degrees"][0]
+    with pytest.raises(InputFileError, match="times the torque that was measured"):
+        diagnose(replace(made, experiments=tuple(change(e) for e in made.experiments)))
+
+
+def _set(folder: Path, text: str | bytes) -> Path:
+    document = {"joint": {}, "experiments": [{"name": "a", "role": "identification"}]}
+    (folder / "nominal.yaml").write_text(yaml.safe_dump(document))
+    (folder / "a.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+    return folder
+
+
+def _rows(*broken: tuple[int, str]) -> str:
+    """Ten rows under the header; broken ones by file line."""
+    lines = [HEADER, *(f"{0.01 * k},{0.1 * k},{k % 3},{0.1 * k}" for k in range(10))]
+    for line, text in broken:
+        lines[line - 1] = text
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "said"),
+    [
+        (_rows((5, "0.03,x,1,0.3")), "a.csv:5:2", "'x' in column position_rad; a number is expected"),
+        (_rows((5, "0.03,,1,0.3")), "a.csv:5:2", "a number is expected"),
+        (_rows((7, "0.05,0.5,1")), "a.csv:7", "3 cells; 4 are expected"),
+        (_rows((4, "0.02,0.2,nan,0.2")), "a.csv:4:3", "torque_nm has 1 values that are not finite"),
+        (_rows((6, "0.01,0.4,1,0.4")), "a.csv:6:1", "time does not increase"),
+        (_rows((1, "time_s,angle,torque_nm,position_command_rad")), "a.csv:1", "no column position_rad"),
+        (_rows((1, "time_s,position_rad,current,speed")), "a.csv:1", "neither torque_nm nor position_command_rad"),
+        (HEADER + "\n", "a.csv", "0 rows"),
+        ("", "a.csv", "0 rows"),
+        (b"\x00\xff\xfe binary", "a.csv", "cannot be read"),
+    ],
+    ids=[
+        "text",
+        "empty cell",
+        "short row",
+        "NaN",
+        "time",
+        "no position",
+        "no torque",
+        "header only",
+        "empty",
+        "binary",
+    ],
+)
+def test_a_broken_file_is_told_with_its_line_and_column(
+    text: str | bytes, where: str, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputFileError, match=said) as told:
+        ExperimentSet.load(_set(tmp_path, text))
+    assert told.value.where == str(tmp_path / where)
+
+
+def test_ten_million_rows_are_a_stated_limit_not_a_lost_machine(tmp_path: Path) -> None:
+    _set(tmp_path, "")
+    (tmp_path / "a.csv").unlink()
+    with gzip.open(tmp_path / "a.csv.gz", "wb", compresslevel=1) as file:
+        file.write(b"time_s,position_rad,torque_nm\n" + b"1,2,3\n" * 10**7)
+    with pytest.raises(InputFileError, match=f"10000000 rows; at most {MAX_ROWS}") as told:
+        ExperimentSet.load(tmp_path)
+    assert told.value.next_step
