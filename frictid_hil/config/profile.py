@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
@@ -150,6 +150,7 @@ class JointProfile(Strict):
         coulomb_nm: F_0.
         presliding_stiffness_nm_per_rad: from a slow small reversal.
         presliding_level_nm: friction of creeping motion, from the same: where presliding yields.
+        presliding_yields: how, from the same; ``at once`` also where it was not plain to see.
         inertia_kg_m2: of the whole joint.
         gravity_cos_nm: of ``gravity_cos * cos(q) + gravity_sin * sin(q)``.
         gravity_sin_nm: see there.
@@ -177,6 +178,7 @@ class JointProfile(Strict):
     coulomb_nm: Estimate
     presliding_stiffness_nm_per_rad: Estimate = Field(default_factory=_not_identified)
     presliding_level_nm: Estimate = Field(default_factory=_not_identified)
+    presliding_yields: Literal["at once", "gradually"] = "at once"
     inertia_kg_m2: Estimate = Field(default_factory=_not_identified)
     gravity_cos_nm: Estimate = Field(default_factory=_not_identified)
     gravity_sin_nm: Estimate = Field(default_factory=_not_identified)
@@ -234,6 +236,8 @@ class JointProfile(Strict):
                     del values["procedure"][name]
         if self.presliding_level_nm.value is None:
             del values["presliding_level_nm"]  # the stiffness beside it says why
+        if self.presliding_yields == "at once":
+            del values["presliding_yields"]
         for value in values.values():
             if isinstance(value, dict) and "value" in value:
                 _drop_nothings(value)

@@ -10,6 +10,11 @@ rather than by v * dt: a coarse or late velocity costs nothing there (20).
 ``mop``     R (K e + phi_0(v))                              (24)
 ==========  ===================================================
 
+The paper's spring yields at once: K e rises with the slope K until it slips at F_0. Gears with many small contacts
+yield gradually: after a turning point friction turns over twice as steeply at first, and ever less (Dahl 1968, LuGre).
+Where a slow reversal shows that, the spring of our setting does the same, d(K e)/dx = K (1 -/+ K e / F_0); its slope at
+rest is K as before.
+
 Two limits keep it stable. R < 1: a free joint that is given all of its friction back runs away on the first touch.
 R K < presliding stiffness: below break-away the joint is held by its own presliding spring alone; a compensation
 stiffer than that is a negative spring, and the joint hunts.
@@ -19,6 +24,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
+from math import exp
 
 import numpy as np
 
@@ -71,6 +77,7 @@ class CompensationSettings:
         speed_rad_s: knots of phi_0, first 0, increasing, shape (k,); extended with the last slope.
         forward_nm: phi_0 at the knots for positive motion, first 0, shape (k,).
         backward_nm: its magnitude for negative motion, shape (k,).
+        gradual: the spring yields gradually, not at once.
     """
 
     form: str
@@ -80,6 +87,7 @@ class CompensationSettings:
     speed_rad_s: tuple[float, ...] = (0.0, 1.0)
     forward_nm: tuple[float, ...] = (0.0, 0.0)
     backward_nm: tuple[float, ...] = (0.0, 0.0)
+    gradual: bool = False
 
     @staticmethod
     def of(
@@ -90,6 +98,7 @@ class CompensationSettings:
         ratio: float,
         asymmetry_nm: tuple[float, ...] | None = None,
         viscous_nm_s_per_rad: float | None = None,
+        gradual: bool = False,
     ) -> CompensationSettings:
         """From an identified curve.
 
@@ -100,13 +109,14 @@ class CompensationSettings:
             ratio: R.
             asymmetry_nm: half the difference of forward and backward friction at the curve's pairs, 0 at rest.
             viscous_nm_s_per_rad: B_c for ``mol``; least squares on phi - F_0 unless given.
+            gradual: the joint's presliding yields gradually.
 
         Raises:
             UsageError: no such form.
         """
         if form not in FORMS:
             raise UsageError(f"no compensation {form!r}; there are {', '.join(FORMS)}")
-        base = CompensationSettings(form, curve.coulomb_nm, stiffness_nm_per_rad, ratio)
+        base = CompensationSettings(form, curve.coulomb_nm, stiffness_nm_per_rad, ratio, gradual=gradual)
         if form == "mol":
             slope = least_squares_viscosity(curve) if viscous_nm_s_per_rad is None else viscous_nm_s_per_rad
             return replace(base, forward_nm=(0.0, slope), backward_nm=(0.0, slope))
@@ -160,7 +170,18 @@ class Compensation:
         period_s: between two steps; used only where a reference velocity drives the spring.
     """
 
-    __slots__ = ("_backward", "_forward", "_knots", "_last", "_limit", "_period", "_ratio", "_spring", "_stiffness")
+    __slots__ = (
+        "_backward",
+        "_forward",
+        "_gradual",
+        "_knots",
+        "_last",
+        "_limit",
+        "_period",
+        "_ratio",
+        "_spring",
+        "_stiffness",
+    )
 
     def __init__(self, settings: CompensationSettings, period_s: float) -> None:
         self._knots = settings.speed_rad_s
@@ -170,6 +191,7 @@ class Compensation:
         self._limit = settings.coulomb_nm
         self._stiffness = settings.stiffness_nm_per_rad
         self._ratio = settings.ratio
+        self._gradual = settings.gradual
         self._period = period_s
         self._spring = 0.0
 
@@ -188,11 +210,17 @@ class Compensation:
             velocity_rad_s = reference_velocity_rad_s
             position_increment_rad = reference_velocity_rad_s * self._period
         limit = self._limit
-        spring = self._spring + self._stiffness * position_increment_rad
-        if spring > limit:
-            spring = limit
-        elif spring < -limit:
-            spring = -limit
+        spring = self._spring
+        if self._gradual:
+            # The whole of the increment in closed form: it cannot pass the limit, however large.
+            ahead = limit if position_increment_rad >= 0.0 else -limit
+            spring = ahead - (ahead - spring) * exp(-self._stiffness * position_increment_rad / ahead)
+        else:
+            spring += self._stiffness * position_increment_rad
+            if spring > limit:
+                spring = limit
+            elif spring < -limit:
+                spring = -limit
         self._spring = spring
         last = self._last
         if velocity_rad_s >= 0.0:

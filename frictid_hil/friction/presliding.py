@@ -6,10 +6,11 @@ yields. Two shapes of that passage are fitted, x being the travel since the turn
     yields at once       f(x) = f_r -/+ min(sigma x, D)
     yields gradually     f(x) = f_r -/+ D (1 - exp(-2 sigma x / D))        (Dahl, LuGre)
 
-and the one that leaves less decides. sigma is the slope midway, where friction passes zero: the stiffness of a joint
-at rest. Right after the turning point a gradual joint is twice as stiff, but only until it has moved; a compensation
-spring as stiff as that would give back more than the joint takes. D / 2 is the friction of a joint that creeps, static
-friction included: the level at which the spring of a joint at rest yields.
+and the one that leaves less decides; a joint is only called gradual where that is plain. sigma is the slope midway,
+where friction passes zero: the stiffness of a joint at rest. Right after the turning point a gradual joint is twice as
+stiff, but only until it has moved; a compensation spring that stays as stiff as that would give back more than the
+joint takes. D / 2 is the friction of a joint that creeps, static friction included: the level at which the spring of a
+joint at rest yields.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ _SMOOTHING_S = 0.02
 _TURN_SHARE = 0.3
 """A turning point is followed by at least this share of the whole travel in the other direction."""
 _LEAST_ROWS = 20
+_PLAINLY = 0.5
+"""A joint yields gradually where that shape leaves less than this share of what the other leaves (mean squares)."""
 _LEAST_CLARITY = 4.0
 """The passage is larger than what the fitted shape leaves by at least this factor."""
 
@@ -42,10 +45,12 @@ class Presliding:
     Attributes:
         stiffness_nm_per_rad: sigma.
         level_nm: friction of creeping motion, half of D.
+        gradual: it yields gradually, not at once.
     """
 
     stiffness_nm_per_rad: Measured
     level_nm: Measured
+    gradual: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +83,8 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
         _passage(smooth, np.asarray(torque_nm, dtype=np.float64), start, stop) for start, stop in pairwise(bounds)
     ]
     passages = [passage for passage in passages if passage.travel.size >= _LEAST_ROWS]
-    shapes = [fitted for shape in (_at_once, _gradually) if (fitted := _fit_all(shape, passages)) is not None]
+    at_once, gradually = (_fit_all(shape, passages) for shape in (_at_once, _gradually))
+    shapes = [fitted for fitted in (at_once, gradually) if fitted is not None]
     if not shapes:
         raise IdentificationError(
             "torque does not pass from one sliding level to the other at the reversals",
@@ -86,7 +92,8 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
             cause="the reversal is shorter than the presliding travel, or torque is too noisy",
         )
     found, _ = min(shapes, key=lambda fitted: fitted[1])
-    return Presliding(_mean(found[:, 0]), _mean(0.5 * found[:, 1]))
+    gradual = at_once is not None and gradually is not None and gradually[1] < _PLAINLY * at_once[1]
+    return Presliding(_mean(found[:, 0]), _mean(0.5 * found[:, 1]), gradual)
 
 
 def _mean(values: Array) -> Measured:

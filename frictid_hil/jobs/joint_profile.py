@@ -111,7 +111,7 @@ def _from_cycles(
     body = result.rigid_body
     curve = result.curve
     temperature = samples.temperature_c
-    stiffness, level = _presliding(samples, recording)
+    stiffness, level, gradual = _presliding(samples, recording)
     apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
     return JointProfile(
         method=result.method,
@@ -122,6 +122,7 @@ def _from_cycles(
         coulomb_nm=_figure(result.coulomb_nm),
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
+        presliding_yields="gradually" if gradual else "at once",
         inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, apart),
         gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, apart),
         gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, apart),
@@ -254,18 +255,20 @@ def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
     )
 
 
-def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Figure]:
-    """Stiffness and level."""
+def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Figure, bool]:
+    """Stiffness, level, and whether it yields gradually."""
     reversals = samples.marked("reversal")
     if not reversals:
-        return (Figure.none("the recording has no slow reversal"),) * 2
+        nothing = Figure.none("the recording has no slow reversal")
+        return nothing, nothing, False
     part = samples.during(reversals[0])
     assert part.torque_nm is not None  # by the caller
     try:
         found = presliding(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
     except IdentificationError as problem:
-        return (Figure.none(problem.what),) * 2
-    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm)
+        nothing = Figure.none(problem.what)
+        return nothing, nothing, False
+    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm), found.gradual
 
 
 def _figure(measured: Measured | None, reason: str = "") -> Figure:

@@ -82,6 +82,30 @@ def test_a_reference_velocity_decides_before_the_joint_moves() -> None:
     assert torque == pytest.approx(R * 6.4)
 
 
+def gradually(ratio: float = R) -> Compensation:
+    return Compensation(CompensationSettings.of(CURVE, "mo", stiffness_nm_per_rad=K, ratio=ratio, gradual=True), DT)
+
+
+@given(st.lists(st.floats(-0.01, 0.01), min_size=1, max_size=30))
+def test_a_spring_that_yields_gradually_depends_on_the_path_alone(increments: list[float]) -> None:
+    f0 = CURVE.coulomb_nm
+    whole, parts = gradually(), gradually()
+    for increment in increments:
+        torque = whole.step(increment, 0.0)
+        for _ in range(4):
+            in_parts = parts.step(increment / 4, 0.0)
+        assert torque == pytest.approx(in_parts, abs=1e-9)
+        assert abs(torque) <= R * f0 * (1 + 1e-12)
+
+
+def test_a_spring_that_yields_gradually_is_k_stiff_at_rest_and_twice_that_where_the_motion_turns() -> None:
+    spring, small = gradually(), 1e-9
+    assert spring.step(small, 0.0) / small == pytest.approx(R * K, rel=1e-5)
+    sliding = spring.step(1.0, 0.0)
+    assert sliding == pytest.approx(R * CURVE.coulomb_nm)
+    assert (sliding - spring.step(-small, 0.0)) / small == pytest.approx(2 * R * K, rel=1e-4)
+
+
 def test_two_compensations_share_no_state() -> None:
     one, other = Compensation(settings(), DT), Compensation(settings(), DT)
     one.step(1.0, 0.5)

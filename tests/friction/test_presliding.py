@@ -45,6 +45,13 @@ def test_stiffness_at_rest_is_found_through_noise_steps_and_gravity(model, stiff
     assert found.stiffness_nm_per_rad.value == pytest.approx(stiffness, rel=0.05)
     assert found.stiffness_nm_per_rad.half_width < 0.15 * stiffness
     assert found.level_nm.value == pytest.approx(level, rel=0.04)
+    assert found.gradual == (model is dahl)
+
+
+def test_a_joint_between_the_two_shapes_is_not_called_gradual():
+    time, path = triangles()
+    torque = 0.5 * (slip(path, 6_000.0, 5.0) + dahl(path, 6_000.0, 5.0))
+    assert not presliding(time, path, torque).gradual
 
 
 @pytest.mark.parametrize("index", range(6))
