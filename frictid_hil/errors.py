@@ -68,7 +68,7 @@ class InputFileError(UsageError):
 
 
 class PlanRefused(UsageError):
-    """The plan breaks a limit of position, velocity, torque or bus load; nothing moved."""
+    """The plan breaks a limit of position, velocity, torque or bus load, or must not run so; nothing moved."""
 
 
 class ProfileMismatch(UsageError):

@@ -12,6 +12,7 @@ from frictid_hil.cli.options import (
     AmplitudeOption,
     BusOption,
     CyclesOption,
+    DryRunOption,
     JointOption,
     JsonOption,
     LiveAtOption,
@@ -92,7 +93,7 @@ def calibrate(
         typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
     ] = None,
     bus: BusOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")] = False,
+    dry_run: DryRunOption = False,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
     resume: Annotated[

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from frictid_hil.cli.options import (
     BusOption,
+    DryRunOption,
     JsonOption,
     LiveAtOption,
     LiveOption,
@@ -108,6 +109,7 @@ def compensate(
         ),
     ] = "torque",
     force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
+    dry_run: DryRunOption = False,
     bus: BusOption = None,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
@@ -119,16 +121,17 @@ def compensate(
     quiet: QuietOption = False,
 ) -> None:
     """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
-    from frictid_hil.cli.progress import watching
-    from frictid_hil.jobs.compensate import CompensateOptions
+    from frictid_hil.cli.progress import print_plan, watching
+    from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
     from frictid_hil.jobs.compensate import compensate as job
+    from frictid_hil.plan import described
 
     output = Output(as_json, quiet)
 
-    def run() -> Result:
+    def options() -> CompensateOptions:
         if drive_mode not in _DRIVE_MODES:
             raise UsageError(f"no drive mode {drive_mode!r}; there are {', '.join(_DRIVE_MODES)}")
-        options = CompensateOptions(
+        return CompensateOptions(
             robot=robot,
             profile=profile,
             joint=joint,
@@ -148,8 +151,19 @@ def compensate(
             seed=seed,
             out=out,
         )
+
+    if dry_run:
+
+        def plan_only() -> Result:
+            asked = plan_compensation(options())
+            print_plan(output.out, asked.plan, asked.setup)
+            return {"outcome": "ok", "dry_run": True, "plan": described(asked.plan)}
+
+        output.run("compensate", plan_only)
+
+    def run() -> Result:
         with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
-            return job(options, watcher, live=watcher.note)
+            return job(options(), watcher, live=watcher.note)
 
     output.run("compensate", run, lambda result: _show(output, result))
 

@@ -20,7 +20,7 @@ from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, Us
 from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
 from frictid_hil.jobs.joint_profile import identify_joint, joint_result
-from frictid_hil.jobs.plans import calibration_plan, expected_of
+from frictid_hil.jobs.plans import calibration_plan, expected_of, rehearsal_note
 from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
@@ -412,9 +412,7 @@ _TOGETHER_NOTE = (
 def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
     notes = []
     if rehearse:
-        notes.append(
-            f"first run of this travel on this robot: joints {', '.join(rehearse)} rehearse it slowly, torque watched"
-        )
+        notes.append(rehearsal_note(rehearse))
     unknown = [name for name in procedures if name not in expected]
     if unknown:
         notes.append(f"peak torque of joints {', '.join(unknown)} is not predicted (no `expected` in the robot file)")

@@ -32,8 +32,9 @@ from frictid_hil.friction.compensation import (
     CompensationSettings,
     stiffness_with_margin,
 )
-from frictid_hil.jobs.plans import APPROACH_RAD_S
-from frictid_hil.plan import Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
+from frictid_hil.jobs.plans import APPROACH_RAD_S, rehearsal_note
+from frictid_hil.plan import REHEARSAL, Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
+from frictid_hil.runner.rehearsals import Rehearsals
 
 TASKS = ("hand", "track")
 MODES = ("nc", "mo", "mol", "mop", "mop-reference")
@@ -125,7 +126,7 @@ class CompensationPlan:
         plan: frozen.
         centre_rad: middle of the travel.
         laws: by mode.
-        warnings: stability limits that the published setting breaks.
+        warnings: what speaks against it and is done all the same.
     """
 
     plan: Plan
@@ -135,9 +136,15 @@ class CompensationPlan:
 
 
 def compensation_plan(
-    robot: str, setup: RobotSetup, name: str, entry: JointProfile, policy: Policy, wanted: Wanted
+    robot: str,
+    setup: RobotSetup,
+    name: str,
+    entry: JointProfile,
+    policy: Policy,
+    wanted: Wanted,
+    rehearsals: Rehearsals,
 ) -> CompensationPlan:
-    """The plan of one joint.
+    """The plan of one joint; a travel that was never seen on this robot is rehearsed first.
 
     Raises:
         UsageError: options that contradict each other, or an unstable R or K.
@@ -151,7 +158,9 @@ def compensation_plan(
         centre_rad = joint.start_position_rad + travel_rad / 2
     warnings: list[str] = []
     laws = {mode: law_of(entry, joint, mode, wanted, warnings) for mode in wanted.modes}
-    motions = _motions(joint, entry, policy, wanted, centre_rad, laws, hunts=bool(warnings))
+    reach_rad = wanted.amplitude_rad
+    rehearse = not rehearsals.covers(name, centre_rad - reach_rad, centre_rad + reach_rad)
+    motions = _motions(joint, entry, policy, wanted, centre_rad, laws, hunts=bool(warnings), rehearse=rehearse)
     others = {other.name: other.locked_position_rad for other in setup.joints if other.name != name}
     moved: JointPlan = joint_plan(joint, motions, others, None)
     gravity = next(iter(laws.values())).gravity
@@ -159,8 +168,11 @@ def compensation_plan(
     peak_nm = gravity.largest_nm + float(entry.curve().magnitude(np.array(moved.peak_velocity_rad_s)))
     peak_nm += inertia * wanted.peak_rad_s * 2 * math.pi / wanted.period_s
     moved = replace(moved, predicted_torque_nm=peak_nm)
-    notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}", *warnings]
-    return CompensationPlan(Plan(robot, setup.cycle_hz, (moved,), tuple(notes)), centre_rad, laws, tuple(warnings))
+    notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}"]
+    if rehearse:
+        notes.append(rehearsal_note([name]))
+    plan = Plan(robot, setup.cycle_hz, (moved,), (*notes, *warnings))
+    return CompensationPlan(plan, centre_rad, laws, tuple(warnings))
 
 
 def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, warnings: list[str]) -> ControlLaw:
@@ -231,6 +243,7 @@ def friction_settings(
         ratio=ratio,
         asymmetry_nm=asymmetry if len(asymmetry) == len(curve.velocity_rad_s) else None,
         viscous_nm_s_per_rad=wanted.viscous_nm_s_per_rad,
+        gradual=ours and entry.presliding_yields == "gradually",
     )
     published = not ours and wanted.ratio is None and wanted.stiffness_nm_per_rad is None
     try:
@@ -254,16 +267,17 @@ def _motions(
     laws: dict[str, ControlLaw],
     *,
     hunts: bool,
+    rehearse: bool,
 ) -> list[Motion]:
-    reach = wanted.amplitude_rad
-    low_rad, home_rad = centre_rad - reach, joint.locked_position_rad
+    low_rad, home_rad = centre_rad - wanted.amplitude_rad, joint.locked_position_rad
     gravity = next(iter(laws.values())).gravity
-    speed = min(APPROACH_RAD_S, wanted.peak_rad_s)
+    slowly = Sine(low_rad, 2 * wanted.amplitude_rad, min(APPROACH_RAD_S, wanted.peak_rad_s))
     motions: list[Motion] = [
         Move.within(home_rad, low_rad, APPROACH_RAD_S),
+        *([replace(slowly, name=REHEARSAL)] if rehearse else []),
         Hold(low_rad, _PAUSE_S),
         Probe(
-            Sine(low_rad, 2 * reach, speed),
+            slowly,
             entry.curve(),
             gravity,
             tolerance=policy.refuse_percent / 100.0,

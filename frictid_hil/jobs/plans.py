@@ -64,6 +64,11 @@ def calibration_motions(
     return motions
 
 
+def rehearsal_note(joints: Sequence[str]) -> str:
+    """For the plan of joints whose travel was never seen on this robot."""
+    return f"first run of this travel on this robot: joints {', '.join(joints)} rehearse it slowly, torque watched"
+
+
 def slow_reversal(start_rad: float, *, repeats: int = 2) -> Corners:
     """Slow small triangles that load the gear's presliding one way, then the other."""
     leg_s = _REVERSAL_TRAVEL_RAD / _REVERSAL_SPEED_RAD_S

@@ -16,7 +16,6 @@ from frictid_hil.errors import ProfileMismatch
 
 _EQUAL = 0.01
 """Rated torque and gear ratio agree within this share."""
-_OWN_COMPENSATION = "friction compensation"
 
 
 def doubts_of_file(profile: FrictionProfile, joint: JointSetup, robot: str, policy: Policy) -> list[str]:
@@ -60,12 +59,7 @@ def doubts_of_drive(entry: JointProfile, identity: JointIdentity) -> list[str]:
             doubts.append(f"{name} is {found:.5g}{unit}, the profile was identified with {said:.5g}{unit}")
     for name, found_setting in identity.settings.items():
         said_setting = drive.settings.get(name)
-        if _OWN_COMPENSATION in name and found_setting:
-            doubts.append(
-                f"the drive compensates friction by itself ({name} is {found_setting}, "
-                f"the profile was identified with {said_setting})"
-            )
-        elif said_setting is not None and said_setting != found_setting:
+        if said_setting is not None and said_setting != found_setting:
             doubts.append(f"{name} is {found_setting}, the profile was identified with {said_setting}")
     return doubts
 

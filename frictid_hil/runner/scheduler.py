@@ -20,7 +20,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
-from frictid_hil.driver import Driver, FrameMapped, JointSetup, RobotSetup, Severity
+from frictid_hil.driver import (
+    OWN_FRICTION_COMPENSATION,
+    Driver,
+    FrameMapped,
+    JointSetup,
+    RobotSetup,
+    Severity,
+)
 from frictid_hil.errors import HardwareError, PlanRefused
 from frictid_hil.plan import REHEARSAL, JointPlan, Plan, stretch_name
 from frictid_hil.recording.samples import Mark
@@ -98,7 +105,7 @@ class Scheduler:
 
         Raises:
             HardwareError: hardware unreachable, or not what the robot file says.
-            PlanRefused: the person said no.
+            PlanRefused: the bus cannot carry the plan, drives compensate friction by themselves, or the person said no.
             SafetyAbort: something unexpected; everything was stopped.
             Interrupted: asked to stop; everything was stopped.
         """
@@ -122,8 +129,9 @@ class Scheduler:
         tolerated = self._care.tolerated
         errors = [f for f in findings if f.severity is Severity.ERROR and f.topic not in tolerated]
         if errors:
-            planned_wrong = all(finding.subject == "bus load" for finding in errors)
-            raise (PlanRefused if planned_wrong else HardwareError)(
+            # These drives are as the robot file says, and answer: it is the plan that must not run on them so.
+            refused = all(f.subject == "bus load" or f.topic == OWN_FRICTION_COMPENSATION for f in errors)
+            raise (PlanRefused if refused else HardwareError)(
                 "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
                 next_step=errors[0].next_step or "run `frictid-hil check`",
             )

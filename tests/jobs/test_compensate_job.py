@@ -23,11 +23,14 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profi
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.driver import Mode
-from frictid_hil.errors import FrictidError, HardwareError, ProfileMismatch, UsageError
+from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, ProfileMismatch, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
-from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.compensate import CompensateOptions, compensate, plan_compensation
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan import REHEARSAL, Plan
 from frictid_hil.recording.read import read
+from frictid_hil.runner.events import Event, PhaseStarted
+from frictid_hil.runner.rehearsals import Rehearsals
 
 JOINT = "3"
 
@@ -125,6 +128,19 @@ def test_lock_step_is_bit_identical(robot: Path, profile: Path, tmp_path: Path) 
     assert first["modes"] == second["modes"]
 
 
+def test_a_joint_that_yields_gradually_is_given_such_a_spring_by_our_setting_only(
+    robot: Path, profile: Path, tmp_path: Path
+) -> None:
+    assert load_profile(profile).joints[JOINT].presliding_yields == "at once"
+    other = edited(profile, tmp_path / "gradual.yaml", presliding_yields="gradually")
+    assert load_profile(other).joints[JOINT].presliding_yields == "gradually"
+    for found, setting, expected in ((profile, "ours", False), (other, "ours", True), (other, "paper", False)):
+        laws = plan_compensation(
+            CompensateOptions(str(robot), found, JOINT, "track", ("mop",), setting=setting)
+        ).planned.laws
+        assert laws["mop"].friction is not None and laws["mop"].friction.gradual is expected
+
+
 # -- profiles that do not fit -----------------------------------------------------------------------------------------
 
 
@@ -173,25 +189,29 @@ def drives_that_compensate(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("drives_that_compensate")
-def test_a_drive_that_compensates_by_itself_does_not_fit_the_profile(
+def test_a_drive_that_compensates_by_itself_is_refused_by_both_verbs_in_the_same_words(
     go: Callable[..., dict[str, Any]], tmp_path: Path, robot: Path
 ) -> None:
-    with pytest.raises(ProfileMismatch, match="compensates friction by itself") as refusal:
+    with pytest.raises(PlanRefused, match="compensates friction by itself") as compensating:
         go()
-    assert "--force" in refusal.value.next_step and refusal.value.exit_code == 2
+    with pytest.raises(PlanRefused) as calibrating:
+        calibrate(CalibrateOptions(str(robot), out=tmp_path / "run"), Silent())
+    one, other = compensating.value, calibrating.value
+    assert (one.what, one.where, one.next_step) == (other.what, other.where, other.next_step)
+    assert one.exit_code == 2 and one.outcome == "refused"
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("drives_that_compensate")
+def test_compensation_on_top_of_the_drives_own_that_is_forced_trips(
+    go: Callable[..., dict[str, Any]], tmp_path: Path, robot: Path
+) -> None:
     result = go(modes=("mop",), force=True)
     assert result["outcome"] == "aborted"
     samples = next(one for one in read(tmp_path / "run") if one.joint == JOINT)
     assert samples.velocity_rad_s is not None
     limit = load_robot(robot).to_setup().joint(JOINT).max_velocity_rad_s
     assert float(np.abs(samples.velocity_rad_s).max()) < 0.5 * limit
-
-
-@pytest.mark.usefixtures("drives_that_compensate")
-def test_it_still_cannot_be_identified_through(robot: Path, tmp_path: Path) -> None:
-    with pytest.raises(HardwareError, match="compensates friction by itself"):
-        calibrate(CalibrateOptions(str(robot), out=tmp_path / "calibration"), Silent())
 
 
 def test_what_is_recorded_as_command_is_the_reference(go: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
@@ -280,6 +300,84 @@ def test_wrong_gravity_that_is_forced_trips_at_once(
     assert samples.velocity_rad_s is not None
     assert float(np.abs(samples.velocity_rad_s).max()) < 0.5 * limit
     assert abs(float(samples.velocity_rad_s[-1])) < math.radians(0.5)
+
+
+# -- the rehearsal ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def asked(robot: Path, profile: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CompensateOptions:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return CompensateOptions(str(robot), profile, JOINT, "track", ("mop",), duration_s=3.0, out=tmp_path / "run")
+
+
+@pytest.fixture
+def real(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the simulated drives were real ones: what they rehearse is kept."""
+    as_built = Rehearsals.__init__
+
+    def kept(self: Rehearsals, *arguments: Any) -> None:
+        as_built(self, *arguments)
+        self._simulated = False
+
+    monkeypatch.setattr(Rehearsals, "__init__", kept)
+
+
+def rehearses(plan: Plan) -> bool:
+    return any(motion.name == REHEARSAL for motion in plan.joints[0].motions)
+
+
+def test_on_a_bus_that_never_saw_this_travel_it_is_rehearsed_slowly_and_whole(asked: CompensateOptions) -> None:
+    planned = plan_compensation(replace(asked, bus="socketcan:can0", task="hand"))
+    assert any("rehearse it slowly" in note for note in planned.plan.notes)
+    motions = planned.plan.joints[0].motions
+    names = [motion.name for motion in motions]
+    assert names[:2] == ["move", REHEARSAL] and names.index(REHEARSAL) < names.index("probe")
+    seen = motions[1]
+    travel = seen.position_rad(np.linspace(0.0, seen.duration_s, 1001))
+    assert np.ptp(travel) == pytest.approx(math.radians(40.0), rel=1e-3)
+    assert np.abs(np.gradient(travel, seen.duration_s / 1000)).max() <= math.radians(20.1)
+
+
+@pytest.mark.usefixtures("real")
+def test_what_was_rehearsed_is_not_rehearsed_again_and_a_longer_travel_is(asked: CompensateOptions) -> None:
+    assert rehearses(plan_compensation(asked).plan)
+    result = compensate(asked, Silent())
+    assert result["outcome"] == "ok", result
+    assert [mark.name for mark in next(iter(read(asked.out or Path()))).marks][1:4] == [REHEARSAL, "hold", "probe"]
+    again = plan_compensation(asked).plan
+    assert not rehearses(again) and not any("rehearse" in note for note in again.notes)
+    assert rehearses(plan_compensation(replace(asked, task="hand")).plan)
+    assert rehearses(plan_compensation(replace(asked, bus="socketcan:can0")).plan)
+
+
+@pytest.mark.usefixtures("real")
+@pytest.mark.parametrize(("ending", "kept"), [(Interrupted("stopped on request"), True), (None, False)])
+def test_a_service_that_is_interrupted_has_rehearsed_and_a_run_that_tripped_has_not(
+    asked: CompensateOptions, profile: Path, tmp_path: Path, ending: FrictidError | None, kept: bool
+) -> None:
+    class Ends(Silent):
+        def event(self, event: Event) -> None:
+            if isinstance(event, PhaseStarted) and event.phase == "rest mop" and ending is not None:
+                raise ending
+
+    doubled = scaled(profile, tmp_path / "doubled.yaml", 1.0 if ending else 2.0)
+    by_hand = replace(asked, task="hand", profile=doubled, force=True)
+    result = compensate(by_hand, Ends())
+    assert result["outcome"] == ("interrupted" if ending else "aborted"), result
+    assert rehearses(plan_compensation(by_hand).plan) is not kept
+
+
+def test_a_dry_run_tells_of_the_rehearsal_and_opens_nothing(asked: CompensateOptions, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "frictid_hil.cli.app", "compensate", "--robot", asked.robot, "--task", "track"]
+    command += ["--profile", str(asked.profile), "--joint", JOINT, "--bus", "socketcan:can0", "--dry-run"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "rehearse it slowly" in " ".join(done.stdout.split())
+    as_json = subprocess.run([*command, "--json"], capture_output=True, text=True, cwd=tmp_path, check=False)
+    told = json.loads(as_json.stdout)
+    assert told["dry_run"] and told["outcome"] == "ok" and told["plan"]["joints"][0]["joint"] == JOINT
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- requests that cannot work ----------------------------------------------------------------------------------------

@@ -114,7 +114,7 @@ def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, settings: BusS
                     Severity.ERROR,
                     subject,
                     f"the drive compensates friction by itself ({setting.object} = {value}): "
-                    "it would hide what is to be measured",
+                    "measured through it, friction is too small; compensated on top of it, it is given twice",
                     "switch it off with the vendor's tool",
                     OWN_FRICTION_COMPENSATION,
                 )
