@@ -1,12 +1,17 @@
 """Friction compensated by a downloaded table on the controller's tick, against the same law from the host at 250 Hz.
 
+Once literally, over CAN with the product's own verbs (all joints: ``benchmarks/serial_compensation.py``), and joint by
+joint against the law itself.
+
 A simulated person swings the joint at 0.5 Hz, 20 deg to either side, in both cases; what counts is the torque that the
 person needs. Both laws see the joint once per 4 ms and hold their torque until the next tick.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,3 +117,19 @@ def test_the_table_does_what_the_host_does_within_three_points(joint: str) -> No
     print(f"joint {joint}: " + ", ".join(f"{name} {points:.1f} %" for name, points in reductions.items()))
     assert reductions["host"] > 30
     assert reductions["table"] == pytest.approx(reductions["host"], abs=3.0)
+
+
+def test_the_table_does_what_a_can_run_with_the_same_delay_does_within_three_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    script = Path(__file__).parents[2] / "benchmarks" / "serial_compensation.py"
+    spec = importlib.util.spec_from_file_location(script.stem, script)
+    assert spec is not None and spec.loader is not None
+    benchmark = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(benchmark)
+    profile = benchmark.profile_over_can(["4"], tmp_path)
+    can, (late,) = benchmark.reductions("4", profile, tmp_path, (4.0,))
+    assert can["rate_hz"] == 250.0
+    assert late > 80
+    assert late == pytest.approx(can["modes"]["mop"]["reduction_percent"], abs=3.0)

@@ -7,6 +7,7 @@ standstill; its first point is F_0, beyond its last point it goes on with the la
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 
@@ -41,15 +42,26 @@ class Table:
 
 
 class Compensator:
-    """The slip spring of one axis, and what the table adds to it."""
+    """The slip spring of one axis, and what the table adds to it.
 
-    def __init__(self, table: Table, pulses: int) -> None:
+    Args:
+        table: of the axis.
+        pulses: where the axis is now; the spring is relaxed there.
+        delay_ticks: how much later than the tick that it was computed from a torque acts.
+    """
+
+    def __init__(self, table: Table, pulses: int, delay_ticks: int = 0) -> None:
         self.table = table
+        self._under_way = deque([0.0] * delay_ticks)
         self._pulses = pulses
         self._stretch = 0.0
 
     def torque_micro(self, pulses: int, speed_tenths: float, *, gravity: bool) -> float:
         """Torque to add now, uN m; ``gravity`` adds what holds a floating axis."""
+        self._under_way.append(self._computed(pulses, speed_tenths, gravity=gravity))
+        return self._under_way.popleft()
+
+    def _computed(self, pulses: int, speed_tenths: float, *, gravity: bool) -> float:
         table = self.table
         coulomb = table.points_micro[0]
         longest = coulomb / table.stiffness_micro

@@ -75,6 +75,8 @@ class BatchApplication:
         panel: state of the controller.
         axes: the arm.
         tick_s: interpolation clock.
+        averaging_ms: of the command, as FHELLO tells.
+        table_delay_ticks: between the tick that a table's torque is computed in and the tick that it acts in.
         on_guided: told when an axis is given into a person's hands, and taken back.
 
     Attributes:
@@ -88,12 +90,14 @@ class BatchApplication:
         tick_s: float,
         *,
         averaging_ms: int = 0,
+        table_delay_ticks: int = 0,
         on_guided: Callable[[int, bool], None] | None = None,
     ) -> None:
         self._panel = panel
         self._axes = axes
         self._tick_s = tick_s
         self._averaging_ms = averaging_ms
+        self._table_delay_ticks = table_delay_ticks
         self._on_guided = on_guided
         self._job: Job | None = None
         self._tables: dict[int, tuple[bytes, Table]] = {}
@@ -192,7 +196,9 @@ class BatchApplication:
                 continue
             compensator = self._compensators.get(number)
             if compensator is None:
-                compensator = self._compensators[number] = Compensator(self._tables[number][1], axis.pulses)
+                compensator = self._compensators[number] = Compensator(
+                    self._tables[number][1], axis.pulses, self._table_delay_ticks
+                )
             micro = compensator.torque_micro(axis.pulses, axis.speed_tenths, gravity=axis.floating)
             sign = 1.0 if axis.plate.pulses_per_rad > 0 else -1.0
             axis.feed_forward_nm = sign * micro * 1e-6 * axis.plate.gear_ratio

@@ -37,6 +37,7 @@ class Settings:
         tick_s: interpolation clock.
         averaging_ticks: moving average on the command; 1 is none.
         thinking_s: between a command and the bid to reply.
+        table_delay_ticks: by which the torque of a friction table comes late.
         parameters: of the link.
     """
 
@@ -48,6 +49,7 @@ class Settings:
     tick_s: float = 0.004
     averaging_ticks: int = 1
     thinking_s: float = 0.012
+    table_delay_ticks: int = 0
     parameters: Parameters = field(default_factory=Parameters)
 
 
@@ -83,7 +85,12 @@ class Emulator:
         averaging_ms = round((self.settings.averaging_ticks - 1) * self.settings.tick_s * 1000)
         self._averaging_ms = averaging_ms
         self.batch = BatchApplication(
-            self.panel, self.axes, self.settings.tick_s, averaging_ms=averaging_ms, on_guided=on_guided
+            self.panel,
+            self.axes,
+            self.settings.tick_s,
+            averaging_ms=averaging_ms,
+            table_delay_ticks=self.settings.table_delay_ticks,
+            on_guided=on_guided,
         )
         self.station = Station(self.settings.parameters, self, self._message)
         self.stream: StreamApplication | None = None
