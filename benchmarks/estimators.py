@@ -1,6 +1,6 @@
 """Error to the truth of every estimator on the shipped simulated robot, joint by joint.
 
-    python benchmarks/estimators.py [--amplitudes 20,10,5] [--plants rigid,flexible] [--seed 1]
+    python benchmarks/estimators.py [--amplitudes 20,10,5] [--plants rigid,foreign-ripple,flexible] [--seed 1]
 
 The joint is driven without a bus: the servo loop is advanced cycle by cycle, and torque and position are rounded as the
 drive would report them. Every cell is the error over [0, V] / over the curve's own measured range, in percent of the
@@ -60,6 +60,12 @@ def softened(model: JointModel, resonance_hz: float) -> JointModel:
 def plant(kind: str, model: JointModel) -> JointModel:
     if kind == "flexible":
         return softened(model, 28.0)
+    if kind == "foreign-ripple":
+        # As large as the shipped joint's, but at none of the orders that the estimator looks for.
+        own = model.effects["torque_ripple"]["amplitude_nm"]
+        foreign = {"amplitude_nm": own, "cycles_per_motor_revolution": 3.0, "phase_rad": 0.4}
+        second = {"second_amplitude_nm": 0.6 * own, "second_cycles_per_motor_revolution": 5.3, "second_phase_rad": 1.0}
+        return model.with_effects({**model.effects, "torque_ripple": {**foreign, **second}})
     if kind == "load":
         return model.with_effects({**model.effects, "load_dependent_friction": {"linear_share": 0.05}})
     return model
@@ -105,7 +111,7 @@ def truth(model: JointModel, procedure: Procedure, start_rad: float) -> Friction
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--amplitudes", default="20,10,5")
-    parser.add_argument("--plants", default="rigid,flexible")
+    parser.add_argument("--plants", default="rigid,foreign-ripple,flexible")
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()

@@ -8,8 +8,8 @@
 * **drift**: friction changed between the first and the second run of the repeated cycle;
 * **link**: the swinging of a soft joint's link, taken off the torque, is known only so well.
 
-For least squares, scatter comes from leaving out one quarter cycle after the other (a jackknife over passes, so that
-misfit that lasts a pass is counted once, not per sample), and the model term from the bend that a line cannot follow.
+For least squares, scatter comes from the misfit of every quarter cycle as a whole (``clustered``: misfit that lasts a
+pass is counted once, not per sample), and the model term from the bend that a line cannot follow.
 """
 
 from __future__ import annotations
@@ -68,11 +68,7 @@ def aligned_pairs(recording: CycleRecording, motion: Motion, column: Array | Non
         motion: synchronised columns.
         column: averaged in place of the torque, shape (n,).
     """
-    velocity, torque = motion.velocity_rad_s, motion.torque_nm if column is None else column
-    width_s = STEADY / float(recording.procedure.angular_frequencies_rad_s[-1])
-    if width_s > motion.smoother.step_s:
-        steady = Gaussian(motion.smoother.step_s, width_s)
-        velocity, torque = steady.smooth(velocity), steady.smooth(torque)
+    velocity, torque = _steady(recording, motion, motion.torque_nm if column is None else column)
     fine = np.linspace(motion.time_s[0], motion.time_s[-1], (motion.time_s.size - 1) * FINER + 1)
     velocity, torque = np.interp(fine, motion.time_s, velocity), np.interp(fine, motion.time_s, torque)
     pairs = function_a(fine, velocity, torque, recording.procedure, where=recording.where)
@@ -85,6 +81,15 @@ def aligned_pairs(recording: CycleRecording, motion: Motion, column: Array | Non
         np.round(pairs.samples_plus / FINER).astype(np.int64),
         np.round(pairs.samples_minus / FINER).astype(np.int64),
     )
+
+
+def _steady(recording: CycleRecording, motion: Motion, column: Array) -> tuple[Array, Array]:
+    """Velocity and another column through the windows' kernel."""
+    width_s = STEADY / float(recording.procedure.angular_frequencies_rad_s[-1])
+    if width_s <= motion.smoother.step_s:
+        return motion.velocity_rad_s, column
+    kernel = Gaussian(motion.smoother.step_s, width_s)
+    return kernel.smooth(motion.velocity_rad_s), kernel.smooth(column)
 
 
 def window_terms(
@@ -242,11 +247,12 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
         waves = ripple_waves(recording, motion.position_rad)
         ripple = np.column_stack([waves, np.sign(v) * waves, v * waves]) @ solved.values[blocks.ripple]
         torque = torque - solved.values[blocks.inertia] * motion.acceleration_rad_s2 - ripple
+    velocity, torque = _steady(recording, motion, torque)
     bounds = np.searchsorted(motion.time_s, procedure.cycle_starts_s)
     single = np.zeros(procedure.cycles)
     for n in range(procedure.cycles):
         here = slice(bounds[n], bounds[n + 1])
-        v, f = motion.velocity_rad_s[here], torque[here]
+        v, f = velocity[here], torque[here]
         for sign in (1, -1):
             rows = np.flatnonzero(sign * v >= procedure.ratio * procedure.peak_velocities_rad_s[n])
             early, late = np.array_split(f[rows], 2)

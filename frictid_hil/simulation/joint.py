@@ -68,6 +68,7 @@ class Drive:
         torque_quantum_per_mille: step of the reported torque.
         torque_noise_per_mille: standard deviation of the reported torque.
         velocity_filter_s: first-order smoothing of differenced position, in its own loop and in its report.
+        torque_filter_s: first-order smoothing of the torque that a drive on a bus reports.
     """
 
     rated_torque_nm: float
@@ -75,6 +76,7 @@ class Drive:
     torque_quantum_per_mille: float = 1.0
     torque_noise_per_mille: float = 5.0
     velocity_filter_s: float = 0.001
+    torque_filter_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +250,7 @@ class JointModel:
             "torque_quantum_per_mille": self.drive.torque_quantum_per_mille,
             "torque_noise_per_mille": self.drive.torque_noise_per_mille,
             "velocity_filter_s": self.drive.velocity_filter_s,
+            "torque_filter_s": self.drive.torque_filter_s,
         }
         mapping["servo"] = {
             "kp_nm_per_rad": self.servo.kp_nm_per_rad,
@@ -340,6 +343,7 @@ def _read_drive(fields: Fields, rated_torque_nm: float) -> Drive:
         torque_quantum_per_mille=fields.number("torque_quantum_per_mille", 1.0, low=0.0, high=1000.0),
         torque_noise_per_mille=fields.number("torque_noise_per_mille", 5.0, low=0.0, high=1000.0),
         velocity_filter_s=fields.number("velocity_filter_s", 0.001, low=0.0, high=1.0),
+        torque_filter_s=fields.number("torque_filter_s", 0.0, low=0.0, high=1.0),
     )
     fields.no_others()
     return drive

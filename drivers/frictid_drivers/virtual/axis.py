@@ -423,14 +423,20 @@ class Axis:
             increments = round(increments * self._units_per_increment)
         return (increments + _I32) % (2 * _I32) - _I32
 
+    def _filtered(self, torque_nm: float, time_constants: float) -> float:
+        """Mean of the low-pass's output since the last latch: late by its time constant and half that time."""
+        if time_constants <= 0.0:
+            return self._torque_filtered
+        ahead = self._torque_filtered - torque_nm
+        self._torque_filtered = torque_nm + ahead * math.exp(-time_constants)
+        return torque_nm - ahead * math.expm1(-time_constants) / time_constants
+
     def latch(self) -> None:
         """Put the actual values of this moment into the object dictionary; the caller has caught up."""
         plant, values = self._plant, self._values
         torque_nm = plant.torque_nm
         if self._torque_filter_s > 0.0:
-            share = 1.0 - math.exp(-(self.now_ns - self._latched_ns) * _NS / self._torque_filter_s)
-            self._torque_filtered += share * (torque_nm - self._torque_filtered)
-            torque_nm = self._torque_filtered
+            torque_nm = self._filtered(torque_nm, (self.now_ns - self._latched_ns) * _NS / self._torque_filter_s)
         self._latched_ns = self.now_ns
         if not self.encoder_stuck:
             values[_K6064] = self._position_units()

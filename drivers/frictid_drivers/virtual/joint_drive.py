@@ -76,6 +76,7 @@ def servo_for(
     overrides: dict[Key, Value] = {
         key(0x1018, 4): zlib.crc32(f"{robot.name}/{joint.name}".encode()),
         key(0x2022, 1): round(model.drive.velocity_filter_s * 1e6),
+        key(0x2022, 2): round(model.drive.torque_filter_s * 1e6),
         key(0x6065): round(_FOLLOWING_WINDOW_RAD * counts_per_rad),
         key(0x6072): min(_U16, math.ceil(joint.max_torque_nm / rated_nm * 1000.0)),
         key(0x6076): rated_motor_nmm,
