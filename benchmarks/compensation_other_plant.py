@@ -24,38 +24,46 @@ from frictid_hil.jobs.watch import Silent
 JOINTS = ("0", "1", "2", "3", "4", "5")
 
 
+def calibrated(joint: str, folder: Path, bus: str, seed: int) -> tuple[Path, Path]:
+    """(Robot file, profile) of one joint of the other plant, identified by the product."""
+    joint_drive.ServoLoop = OtherPlant  # type: ignore[assignment,misc]
+    robot = variant(folder / "robot.yaml", joints=[joint])
+    result = calibrate(CalibrateOptions(str(robot), out=folder / "cal", bus=bus, seed=seed), Silent())
+    return robot, Path(result["profile"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--joint", action="append")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bus", default="virtual:other")
     options = parser.parse_args()
-    joint_drive.ServoLoop = OtherPlant  # type: ignore[assignment,misc]
     print(f"# LuGre, two masses, Runge-Kutta; setting ours, seed {options.seed}")
     print(
-        "| joint | K / presliding | raw | ceiling | inertia removed | V_s change | mop-reference | ceiling | outcome |"
+        "| joint | yields | K / presliding | raw | ceiling | inertia removed | V_s change "
+        "| mop-reference | ceiling | outcome |"
     )
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
         with tempfile.TemporaryDirectory() as folder:
-            robot = str(variant(Path(folder) / "robot.yaml", joints=[joint]))
-            common = {"bus": options.bus, "seed": options.seed}
-            calibrated = calibrate(CalibrateOptions(robot, out=Path(folder) / "cal", **common), Silent())
-            profile = Path(calibrated["profile"])
+            path, profile = calibrated(joint, Path(folder), options.bus, options.seed)
+            robot, common = str(path), {"bus": options.bus, "seed": options.seed}
             asked = CompensateOptions(robot, profile, joint, "hand", ("nc", "mop"), out=Path(folder) / "hand", **common)
             hand = compensate(asked, Silent())
             asked = CompensateOptions(
                 robot, profile, joint, "track", ("nc", "mop-reference"), out=Path(folder) / "track", **common
             )
             track = compensate(asked, Silent())
-            presliding = load_profile(profile).joints[joint].presliding_stiffness_nm_per_rad.value or float("nan")
+            entry = load_profile(profile).joints[joint]
+            presliding = entry.presliding_stiffness_nm_per_rad.value or float("nan")
         nc, mop = hand["modes"].get("nc"), hand["modes"].get("mop")
         if not (nc and mop):
-            print(f"| {joint} | | | | | | | | calibrated {calibrated['outcome']}; {hand.get('error')} |", flush=True)
+            print(f"| {joint} | {entry.presliding_yields} | | | | | | | | {hand.get('error')} |", flush=True)
             continue
         reference = track["modes"].get("mop-reference", {})
         print(
-            f"| {joint} | {hand['stiffness_nm_per_rad'] / presliding:.2f} | {mop['reduction_percent']:.1f} % "
+            f"| {joint} | {entry.presliding_yields} | {hand['stiffness_nm_per_rad'] / presliding:.2f} "
+            f"| {mop['reduction_percent']:.1f} % "
             f"| {mop['ceiling_percent']:.1f} % | {mop['reduction_inertia_removed_percent']:.1f} % "
             f"| {100 * (mop['velocity_rms_rad_s'] / nc['velocity_rms_rad_s'] - 1):+.1f} % "
             f"| {reference.get('reduction_percent', float('nan')):.1f} % "

@@ -7,13 +7,15 @@
 With ``--elastic 30`` the links resonate at 30 Hz; the profile is then one identified on such joints (``calibrate
 --robot`` with the file that ``robot --elastic 30 --out FILE`` writes).
 
+With ``--other`` they are joints that this product did not simulate (``other_plant``), each calibrated first.
+
 ``bus``: R + 0.02 and K + 10 %, with 2 and 5 cycles of delay, through driver, bus and drive. ``free``: a person swings
 the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
 it.
 
-``limits``: R and K in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer comes to rest
-within 4 s; without the bus, by the product's own controller on the simulated joint. A joint stands where its true speed
-in the last second is below 0.01 deg/s rms.
+``limits``: R and K upwards from our setting in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer
+comes to rest within 4 s; without the bus, by the product's own controller on the simulated joint. A joint stands where
+its true speed in the last second is below 0.01 deg/s rms.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from compensation_other_plant import calibrated
 from compensation_robots import variant
+from other_plant import OtherPlant
 
 from frictid_drivers.virtual import joint_drive
 from frictid_hil.config.profile import JointProfile, load_profile
@@ -68,21 +72,35 @@ def changed_law(entry: JointProfile, setup: JointSetup, hold: bool, ratio: float
 # -- through the bus ---------------------------------------------------------------------------------------------------
 
 
-class Truth(ServoLoop):
+Plant = type[ServoLoop] | type[OtherPlant]
+built: list[Any] = []
+
+
+def remembering(plant: Plant) -> type[Any]:
     """The simulated joint, remembering how fast it really was."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.speeds: list[float] = []
-        built.append(self)
+    class Truth(plant):  # type: ignore[misc,valid-type]
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self.speeds: list[float] = []
+            built.append(self)
 
-    def advance(self, *arguments: Any, **options: Any) -> None:
-        """As the simulated joint's."""
-        super().advance(*arguments, **options)
-        self.speeds.append(self.true_velocity_rad_s)
+        def advance(self, *arguments: Any, **options: Any) -> None:
+            """As the simulated joint's."""
+            super().advance(*arguments, **options)
+            self.speeds.append(self.true_velocity_rad_s)
+
+    return Truth
 
 
-built: list[Truth] = []
+def of_joint(options: argparse.Namespace, joint: str, folder: Path, delay: int = 2) -> tuple[Path, JointProfile, Plant]:
+    """Robot file, profile and plant of one joint."""
+    robot = variant(folder / "robot.yaml", joints=[joint], elastic_hz=options.elastic, delay_cycles=delay)
+    if not options.other:
+        return robot, load_profile(options.profile).joints[joint], ServoLoop
+    (folder / "calibration").mkdir()
+    _, profile = calibrated(joint, folder / "calibration", options.bus, options.seed)
+    return robot, load_profile(profile).joints[joint], OtherPlant
 
 
 class Forgetful:
@@ -139,18 +157,14 @@ def on_the_bus(robot: Path, bus: str, entry: JointProfile, joint: str, hold: boo
 
 
 def bus(options: argparse.Namespace) -> None:
-    profile = load_profile(options.profile)
-    joint_drive.ServoLoop = Truth  # type: ignore[misc]
-    print(f"# through the bus, R + 0.02, K + 10 %, seed {options.seed}, elastic {options.elastic:g} Hz")
+    print(f"# through the bus, R + 0.02, K + 10 %, {told_of(options)}")
     print("| joint | R | K [N m/rad] | delay [cycles] | free [deg/s rms] | PD hold [deg/s rms] | stands |")
     print("|---|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
-        for delay in (2, 5):
+        for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
-                robot = variant(
-                    Path(folder) / "robot.yaml", joints=[joint], elastic_hz=options.elastic, delay_cycles=delay
-                )
-                entry = profile.joints[joint]
+                robot, entry, plant = of_joint(options, joint, Path(folder), delay)
+                joint_drive.ServoLoop = remembering(plant)  # type: ignore[misc]
                 found = [on_the_bus(robot, options.bus, entry, joint, hold, options.seed) for hold in (False, True)]
                 friction = changed_law(
                     entry, load_robot(str(robot)).to_setup().joint(joint), False, MORE_RATIO, MORE_STIFFNESS
@@ -169,28 +183,30 @@ def bus(options: argparse.Namespace) -> None:
 
 
 def limits(options: argparse.Namespace) -> None:
-    profile = load_profile(options.profile)
-    print(f"# pushed to 20 deg/s and let go, seed {options.seed}, elastic {options.elastic:g} Hz; K over presliding")
+    print(f"# pushed to 20 deg/s and let go, {told_of(options)}; K over presliding")
     print("| joint | delay [cycles] | our K | largest R, free | largest K, free | largest K, PD hold |")
     print("|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
-        entry = profile.joints[joint]
+        with tempfile.TemporaryDirectory() as folder:
+            robot, entry, plant = of_joint(options, joint, Path(folder))
+            setup = load_robot(str(robot)).to_setup().joint(joint)
         presliding = entry.presliding_stiffness_nm_per_rad.value or math.nan
-        for delay in (2, 5):
-            with tempfile.TemporaryDirectory() as folder:
-                robot = variant(Path(folder) / "robot.yaml", joints=[joint], elastic_hz=options.elastic)
-                setup = load_robot(str(robot)).to_setup().joint(joint)
+        for delay in options.delay or (2, 5):
             ours = changed_law(entry, setup, False, 0.0, 1.0).friction
             assert ours is not None
             share = ours.stiffness_nm_per_rad / presliding
 
-            def stands(more_ratio: float, factor: float, hold: bool, entry=entry, setup=setup, delay=delay) -> bool:
+            def stands(
+                more_ratio: float, factor: float, hold: bool, entry=entry, setup=setup, delay=delay, plant=plant
+            ) -> bool:
                 law = changed_law(entry, setup, hold, more_ratio, factor)
-                return all(alone(law, setup, delay, push) < STILL_DEG_S for push in (1.0, -1.0))
+                return all(alone(law, setup, delay, push, plant) < STILL_DEG_S for push in (1.0, -1.0))
 
-            largest_ratio = largest(lambda r, own=ours.ratio: stands(r - own, 1.0, False), 0.9, 1.3)
+            largest_ratio = largest(lambda r, own=ours.ratio: stands(r - own, 1.0, False), ours.ratio, 1.3)
             largest_k = [
-                largest(lambda k, share=share, hold=hold: stands(0.0, k / share, hold), 0.75, 4.0)
+                largest(
+                    lambda k, share=share, hold=hold: stands(0.0, k / share, hold), math.floor(100 * share) / 100, 4
+                )
                 for hold in (False, True)
             ]
             print(
@@ -199,15 +215,26 @@ def limits(options: argparse.Namespace) -> None:
             )
 
 
+def told_of(options: argparse.Namespace) -> str:
+    """Which joints these are."""
+    plant = "other plant" if options.other else f"elastic {options.elastic:g} Hz"
+    return f"seed {options.seed}, {plant}"
+
+
 def largest(good: Callable[[float], bool], low: float, high: float) -> float:
-    """The last step of 0.01 before the first that fails, on the way up; beyond it a joint may stand again by chance."""
+    """The last step of 0.01 before the first that fails, on the way up; beyond it a joint may stand again by chance.
+
+    NaN where not even the first one stands.
+    """
+    if not good(low):
+        return math.nan
     value = low
     while value < high and good(value + 0.01):
         value += 0.01
     return value
 
 
-def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float) -> float:
+def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, plant: Plant) -> float:
     """True speed of the last of five seconds, deg/s rms, of one simulated joint pushed in the direction of ``push``."""
     model = JointModel.from_mapping(
         setup.simulated,
@@ -216,7 +243,7 @@ def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float) ->
         max_torque_nm=setup.max_torque_nm,
     )
     centre = setup.start_position_rad + math.radians(10)
-    loop = ServoLoop(model, period_s=0.001, position_rad=centre)
+    loop = plant(model, period_s=0.001, position_rad=centre)
     loop.brake(False)
     loop.power(True)
     loop.set_mode(Mode.TORQUE.value)
@@ -254,6 +281,8 @@ def main() -> None:
     parser.add_argument("--out", default="elastic.yaml")
     parser.add_argument("--joint", action="append")
     parser.add_argument("--elastic", type=float, default=0.0)
+    parser.add_argument("--other", action="store_true")
+    parser.add_argument("--delay", type=int, action="append")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     VERBS[options.what](options)

@@ -18,11 +18,13 @@ from frictid_hil.friction.curve import FrictionCurve
 CYCLES = 20_000
 
 
-def six_joints() -> list[Compensation]:
+def six_joints(*, gradual: bool) -> list[Compensation]:
     speeds = 0.187 * np.arange(1, 11)
     curve = FrictionCurve.through(speeds, 5.0 + 2.0 * np.tanh(speeds))
     even = tuple((0.05 * speeds).tolist())
-    settings = CompensationSettings.of(curve, "mop", stiffness_nm_per_rad=9e3, ratio=0.95, asymmetry_nm=even)
+    settings = CompensationSettings.of(
+        curve, "mop", stiffness_nm_per_rad=9e3, ratio=0.95, asymmetry_nm=even, gradual=gradual
+    )
     return [Compensation(settings, 0.001) for _ in range(6)]
 
 
@@ -44,9 +46,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000_000)
     arguments = parser.parse_args()
     velocities = [1.5 * math.sin(0.003 * k) for k in range(CYCLES)]
-    joints = six_joints()
-    rounds = [cycle_time_s(joints, velocities) for _ in range(25)]
-    print(f"six joints: best {1e6 * min(rounds):.2f} us, median {1e6 * float(np.median(rounds)):.2f} us per cycle")
+    for gradual in (False, True):
+        joints = six_joints(gradual=gradual)
+        rounds = [cycle_time_s(joints, velocities) for _ in range(25)]
+        print(
+            f"six joints, springs that yield {'gradually' if gradual else 'at once'}: "
+            f"best {1e6 * min(rounds):.2f} us, median {1e6 * float(np.median(rounds)):.2f} us per cycle"
+        )
     step = joints[0].step
     for v in velocities:
         step(0.001 * v, v)

@@ -77,6 +77,11 @@ class OtherPlant:
     # -- what the drive's firmware asks for ----------------------------------------------------------------------------
 
     @property
+    def model(self) -> JointModel:
+        """Numbers of the robot file."""
+        return self._model
+
+    @property
     def position_counts(self) -> int:
         """Encoder counts, zero at joint position 0."""
         return self._counts
@@ -90,6 +95,11 @@ class OtherPlant:
     def velocity_rad_s(self) -> float:
         """The drive's own estimate."""
         return self._velocity
+
+    @property
+    def true_velocity_rad_s(self) -> float:
+        """Of the motor, which no drive sees."""
+        return self._state[1]
 
     @property
     def torque_nm(self) -> float:

@@ -82,6 +82,16 @@ def test_a_value_that_reads_back_otherwise_is_refused(key):
     assert "wrote" in caught.value.what and "read back" in caught.value.what
 
 
+@pytest.mark.parametrize("key", [(0x6072, 0), (0x607D, 1), (0x607D, 2)])
+def test_a_limit_that_reads_back_otherwise_is_refused(key):
+    b = Bench(ScriptedDrive(4, reads_back={key: 5})).open()
+    b.driver.configure(1000.0, ["0"])
+    with pytest.raises(HardwareError, match=r"wrote .*, read back") as caught:
+        b.driver.set_limits("0", torque_nm=60.0, position_min_rad=-1.0, position_max_rad=0.5)
+    assert f"{key[0]:04X}:{key[1]:02X}" in caught.value.where
+    b.driver.close()
+
+
 def test_a_refused_write_is_named():
     b = Bench(ScriptedDrive(1, refuses={(0x6007, 0): 0x06090030})).open()
     with pytest.raises(HardwareError, match=r"refuses abort connection option code = 3.*0609") as caught:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import time
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,7 +24,7 @@ CURVE = FrictionCurve((0.2, 0.8, 2.0), (5.5, 6.4, 7.6))
 K, R, DT = 8000.0, 0.9, 1e-3
 
 
-def settings(form: str = "mop", **changes: float) -> CompensationSettings:
+def settings(form: str = "mop", **changes: float | bool) -> CompensationSettings:
     values = {"stiffness_nm_per_rad": K, "ratio": R} | changes
     return CompensationSettings.of(CURVE, form, **values)  # type: ignore[arg-type]
 
@@ -104,6 +108,39 @@ def test_a_spring_that_yields_gradually_is_k_stiff_at_rest_and_twice_that_where_
     sliding = spring.step(1.0, 0.0)
     assert sliding == pytest.approx(R * CURVE.coulomb_nm)
     assert (sliding - spring.step(-small, 0.0)) / small == pytest.approx(2 * R * K, rel=1e-4)
+
+
+VELOCITIES = [1.5 * math.sin(0.003 * k) for k in range(20_000)]
+
+
+@pytest.mark.parametrize("gradual", [False, True])
+def test_six_joints_cost_less_than_3_us_per_cycle(gradual: bool) -> None:
+    joints = [Compensation(settings(gradual=gradual), DT) for _ in range(6)]
+
+    def cycle_s() -> float:
+        began = time.perf_counter()
+        for velocity in VELOCITIES[:2000]:
+            for joint in joints:
+                joint.step(DT * velocity, velocity)
+        return (time.perf_counter() - began) / 2000
+
+    assert min(cycle_s() for _ in range(40)) <= 3e-6
+
+
+@pytest.mark.parametrize("gradual", [False, True])
+def test_steps_leave_nothing_behind(gradual: bool) -> None:
+    step = Compensation(settings(gradual=gradual), DT).step
+    for velocity in VELOCITIES:
+        step(DT * velocity, velocity)
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        for velocity in VELOCITIES:
+            step(DT * velocity, velocity)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 200  # bytes; one float per step would be 480 000
 
 
 def test_two_compensations_share_no_state() -> None:
