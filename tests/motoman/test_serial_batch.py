@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from serial_bench import START_RAD, make_bench
 
-from frictid_drivers.motoman.batch import BatchClient, JobOrder, _BlockCollector
+from frictid_drivers.motoman.batch import BatchClient
+from frictid_drivers.motoman.batch_messages import BlockCollector, JobOrder
 from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold
 from frictid_drivers.motoman.emulator import jobs
 from frictid_drivers.motoman.emulator.compensation import Compensator, Table
@@ -171,7 +172,7 @@ def test_damaged_blocks_never_become_samples(garbage: bytes, position: int, repl
     clean = bytes(coded)
     coded[position % len(coded)] = replaced
     rows: dict[int, tuple[int, int, int]] = {}
-    collector = _BlockCollector(7, 0, 0, rows)
+    collector = BlockCollector(7, 0, 0, rows)
     collector.take(coded.decode("latin-1") + ",", 0)
     collector.take(base64.b64encode(garbage).decode(), 1)
     collector.finish()

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from frictid_drivers.motoman.batch import BatchClient, JobOrder, Record, record
+from frictid_drivers.motoman.batch import BatchClient
+from frictid_drivers.motoman.batch_messages import JobOrder, Record, record
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from frictid_drivers.motoman import inspection
-from frictid_drivers.motoman.batch import TABLE_POINTS, BatchClient
+from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_run import BatchRun, JobBounds
 from frictid_drivers.motoman.cycle import StreamCycle, TickClock
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
@@ -44,7 +44,6 @@ _SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
 _LOGGED_LENGTHS = (64, 48, 32, 24, 20, 16, 12, *range(8, 0, -1))
 """Lengths that a bus log can hold (those of CAN FD); bytes on the wire are cut into the longest of them."""
 
-_SERVO_LAG_S = 0.02
 _URGENT_S = 0.5
 
 
@@ -118,32 +117,7 @@ class MotomanDriver:
 
     def capabilities(self) -> Capabilities:
         """What the layer that was found can do."""
-        reach = self._reach
-        tick_s = self._tick_us * 1e-6
-        table = reach.batch is not None and reach.batch.table_points >= TABLE_POINTS
-        if reach.layer is Layer.STREAM:
-            return Capabilities(
-                max_cycle_hz=1.0 / tick_s,
-                modes=frozenset({Mode.POSITION}),
-                torque_offset=reach.welcome is not None and reach.welcome.feed_forward,
-                drive_watchdog=True,
-                lock_step=self.clock.lock_step,
-                cycle_quantum_s=self.cycle_quantum_s(),
-                table_download=table,
-                command_delay_s=self._command_delay_s(),
-            )
-        if reach.layer is Layer.BATCH:
-            return Capabilities(
-                max_cycle_hz=1.0 / tick_s,
-                modes=frozenset({Mode.POSITION}),
-                drive_watchdog=True,
-                batch_only=True,
-                lock_step=self.clock.lock_step,
-                cycle_quantum_s=self.cycle_quantum_s(),
-                table_download=table,
-                command_delay_s=self._command_delay_s(),
-            )
-        return Capabilities(max_cycle_hz=0.0, modes=frozenset())
+        return inspection.capabilities(self._reach, self._options, self._tick_us, lock_step=self.clock.lock_step)
 
     def cycle_quantum_s(self) -> float:
         """The interpolation clock that the robot file names; ``check`` compares it with the controller's."""
@@ -407,13 +381,6 @@ class MotomanDriver:
         self._batch.compensate(self._mask(joints))
 
     # -- inside ------------------------------------------------------------------------------------------------
-
-    def _command_delay_s(self) -> float:
-        """Averaging and servo; where the controller does not know its averaging, what the robot file allows."""
-        greeting = self._reach.welcome or self._reach.batch
-        known_ms = greeting.averaging_ms if greeting is not None else None
-        averaging_ms = self._options.command_delay_ms if known_ms is None else known_ms
-        return averaging_ms * 1e-3 + _SERVO_LAG_S
 
     def _mask(self, joints: Iterable[str]) -> int:
         return sum(1 << self._units[name].axis for name in joints)

@@ -1,22 +1,23 @@
-"""What ``identify`` and ``check`` can say of a serial controller without moving anything."""
+"""What can be said of a serial controller without moving anything: identity, capabilities, findings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from frictid_drivers.motoman.batch import BatchHello
+from frictid_drivers.motoman.batch_messages import TABLE_POINTS, BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import HostControl, Status
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.layers import Layer, Reach, busy_share, streamed_mask
 from frictid_drivers.motoman.segments import motion_segments
 from frictid_drivers.motoman.settings import SerialOptions
-from frictid_hil.driver import Finding, JointIdentity, JointSetup, RobotSetup, Severity
+from frictid_hil.driver import Capabilities, Finding, JointIdentity, JointSetup, Mode, RobotSetup, Severity
 from frictid_hil.errors import PlanRefused
 from frictid_hil.plan import Plan
 from frictid_hil.units import degrees
 
 _LONG_AVERAGING_MS = 20
+_SERVO_LAG_S = 0.02
 
 
 def identity(joint: JointSetup, units: AxisUnits, options: SerialOptions, reach: Reach) -> JointIdentity:
@@ -50,6 +51,39 @@ def identity(joint: JointSetup, units: AxisUnits, options: SerialOptions, reach:
         timing=options.timing,
         settings=settings,
     )
+
+
+def capabilities(reach: Reach, options: SerialOptions, tick_us: int, *, lock_step: bool) -> Capabilities:
+    """What the layer that was found can do; without torque, nothing.
+
+    Args:
+        reach: see there.
+        options: of the robot file.
+        tick_us: interpolation clock that the robot file names.
+        lock_step: the controller is emulated on virtual time.
+    """
+    if reach.layer is Layer.HOST:
+        return Capabilities(max_cycle_hz=0.0, modes=frozenset())
+    streaming = reach.layer is Layer.STREAM
+    return Capabilities(
+        max_cycle_hz=1e6 / tick_us,
+        modes=frozenset({Mode.POSITION}),
+        torque_offset=streaming and reach.welcome is not None and reach.welcome.feed_forward,
+        drive_watchdog=True,
+        batch_only=not streaming,
+        lock_step=lock_step,
+        cycle_quantum_s=tick_us * 1e-6,
+        table_download=reach.batch is not None and reach.batch.table_points >= TABLE_POINTS,
+        command_delay_s=_command_delay_s(reach, options),
+    )
+
+
+def _command_delay_s(reach: Reach, options: SerialOptions) -> float:
+    """Averaging and servo; where the controller does not know its averaging, what the robot file allows."""
+    greeting = reach.welcome or reach.batch
+    known_ms = greeting.averaging_ms if greeting is not None else None
+    averaging_ms = options.command_delay_ms if known_ms is None else known_ms
+    return averaging_ms * 1e-3 + _SERVO_LAG_S
 
 
 def findings(

@@ -11,7 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from frictid_drivers.motoman.batch import BatchClient, BatchHello
+from frictid_drivers.motoman.batch import BatchClient
+from frictid_drivers.motoman.batch_messages import BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_drivers.motoman.port import BytePort

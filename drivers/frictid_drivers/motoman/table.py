@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from frictid_drivers.motoman.batch import TABLE_POINTS, FrictionTable
+from frictid_drivers.motoman.batch_messages import TABLE_POINTS, FrictionTable
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_hil.friction.curve import FrictionCurve
 
