@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from frictid_hil.cli.options import JsonOption, ProfileArgument, QuietOption, StoreOption
@@ -37,8 +38,8 @@ def show(
             linear = bool(joint.get("prismatic"))
             force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
             table = Table(title=f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
-            table.add_column(f"V_n [{speed}]", justify="right")
-            table.add_column(f"F_n [{force}]", justify="right")
+            table.add_column(escape(f"V_n [{speed}]"), justify="right")
+            table.add_column(escape(f"F_n [{force}]"), justify="right")
             table.add_column("95 % interval", justify="right")
             intervals = joint.get("torque_interval_nm") or [None] * len(joint["torque_nm"])
             for velocity, torque, interval in zip(joint["velocity_rad_s"], joint["torque_nm"], intervals, strict=True):
