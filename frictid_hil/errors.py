@@ -27,18 +27,19 @@ class FrictidError(Exception):
         what: one sentence saying what went wrong, with the numbers.
         where: the object it happened to (``node 3, object 6041``; ``hp3j.yaml:8:14``; ``joint 1``).
         cause: the likely cause, when one is known.
-        next_step: what the reader should do now.
+        next_step: what the reader should do now; unless told, what its branch of the tree advises.
     """
 
     exit_code: ClassVar[int] = 1
     outcome: ClassVar[str] = "aborted"
+    usual_next_step: ClassVar[str] = ""
 
     def __init__(self, what: str, *, where: str = "", cause: str = "", next_step: str = "") -> None:
         super().__init__(what)
         self.what = what
         self.where = where
         self.cause = cause
-        self.next_step = next_step
+        self.next_step = next_step or self.usual_next_step
 
     def __str__(self) -> str:
         return f"{self.where}: {self.what}" if self.where else self.what
@@ -83,6 +84,7 @@ class HardwareError(FrictidError):
     """Hardware is unreachable, silent, or not what the robot file says."""
 
     exit_code = 3
+    usual_next_step = "see that the robot is on and its cable in place; `frictid-hil check` tells what answers"
 
 
 class HardwareBusy(HardwareError):
@@ -93,6 +95,7 @@ class SafetyAbort(FrictidError):
     """Motion was stopped because a supervised quantity left its bounds."""
 
     exit_code = 4
+    usual_next_step = "look at the joint before anything moves again; `frictid-hil check` reads its drive"
 
 
 class GateFailed(FrictidError):
@@ -100,6 +103,7 @@ class GateFailed(FrictidError):
 
     exit_code = 5
     outcome = "gate_failed"
+    usual_next_step = "look at the joint and at the report; the recording is kept"
 
 
 class Interrupted(FrictidError):
@@ -107,6 +111,18 @@ class Interrupted(FrictidError):
 
     exit_code = 130
     outcome = "interrupted"
+    usual_next_step = "start it again when it suits"
+
+
+class Defect(FrictidError):
+    """The program itself is wrong: something happened that nobody thought of."""
+
+    usual_next_step = "report it with the traceback on standard error; what was measured until then is kept"
+
+    @classmethod
+    def of(cls, error: BaseException) -> Defect:
+        """What happened, as one of our own."""
+        return cls(f"defect of the program: {type(error).__name__}: {error}")
 
 
 @dataclass(frozen=True, slots=True)

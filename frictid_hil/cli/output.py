@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -15,7 +16,7 @@ from typing import Any, NoReturn
 import typer
 from rich.console import Console
 
-from frictid_hil.errors import FrictidError
+from frictid_hil.errors import Defect, FrictidError
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
 
@@ -66,6 +67,9 @@ class Output:
             self._fail(verb, error)
         except BrokenPipeError:
             os._exit(1)
+        except Exception as error:  # a job that nobody watches must end with a line as well
+            traceback.print_exc()
+            self._fail(verb, Defect.of(error))
         except KeyboardInterrupt:
             from frictid_hil.errors import Interrupted
 

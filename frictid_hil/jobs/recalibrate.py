@@ -28,7 +28,7 @@ from frictid_hil.config.profile import FrictionProfile, load_profile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.store import ProfileStore
-from frictid_hil.errors import FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
+from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
 from frictid_hil.jobs.judgement import Verdict, judge
@@ -38,6 +38,8 @@ from frictid_hil.report.recalibration import recalibration_page
 from frictid_hil.runner.interlock import Interlock
 
 VERB = "recalibrate"
+_UNTOLD = "see the run folder and `frictid-hil check`, then start it again with a person present"
+"""What to do next where nothing better is known: whoever reads it in the morning is never left without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,11 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
         with _terminable(), _alone(store, robot):
             result = _night(options, robot, store, watcher)
     except FrictidError as error:
+        error.next_step = error.next_step or _UNTOLD
         _note_failure(store, robot, began_utc, error)
+        raise
+    except Exception as error:
+        _note_failure(store, robot, began_utc, Defect.of(error))
         raise
     note_attempt(store.root, robot.name, _attempt(began_utc, result))
     # The history is on the disk; a page that cannot be written must not turn a good night into a bad one.
@@ -156,9 +162,9 @@ def _concluded(
         "report": measured.get("report"),
     }
     if "error" in measured:
-        result["error"] = measured["error"]
+        result["error"] = {**measured["error"], "next_step": measured["error"]["next_step"] or _UNTOLD}
         result["reason"] = measured["error"]["what"]
-        result["next_step"] = measured["error"]["next_step"] or "see the run folder"
+        result["next_step"] = result["error"]["next_step"]
     if measured["profile"] is not None:
         newer = load_profile(measured["profile"])
         failed = {
