@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share, velocity_lag_s
+from frictid_hil.gap.cautions import ONE_SINUSOID, below_first_pair, one_sinusoid, tied_on_a_sinusoid
 from frictid_hil.gap.confidence import confidence
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
@@ -63,6 +64,8 @@ def diagnose(experiments: ExperimentSet, *, library: Collection[str] | None = No
     experiments, hints = completed(checked(experiments))
     if (open_question := one_sided(experiments)) is not None:
         hints["motion"] = open_question
+    if one_sinusoid(experiments):
+        hints["sinusoid"] = ONE_SINUSOID
     logs = recordings(experiments)
     usable = [r for r in logs if r.plant_nm is not None]
     if reason is not None or not usable or not any(not r.experiment.validation for r in usable):
@@ -323,6 +326,10 @@ def _conclude(
     upcoming = None
     if "motion" in hints:
         causes = [replace(c, confidence=min(c.confidence, 0.45)) for c in causes]
+    if (warning := below_first_pair(causes, experiments.nominal.curve)) is not None:
+        reasons["stribeck"] = warning
+    if channels.actuation is None or not channels.actuation.found:
+        causes = list(tied_on_a_sinusoid(causes, hints))
     if (
         verdict == "explained"
         and causes
@@ -333,7 +340,8 @@ def _conclude(
         rival = causes[0].confusable_with[0] if causes[0].confusable_with else "torque_bias"
         upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
         if len(causes) == 1:
-            causes.append(Cause(rival, round(min(0.5, 1.0 - causes[0].confidence), 3), {}, (causes[0].effect,), None))
+            chance = min(0.5, causes[0].confidence, 1.0 - causes[0].confidence)
+            causes.append(Cause(rival, round(chance, 3), {}, (causes[0].effect,), None))
     applied = verdict == "explained"
     result = Figures(inverse_after, pooled(after, "torque_nm"), pooled(after, "position_rad")) if applied else before
     if verdict == "unknown":

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.gap.base_model import base_model, has_known_mass, without_own_torque
+from frictid_hil.gap.cautions import below_first_pair, curve_rather_than_stribeck, tied_on_a_sinusoid
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
 from frictid_hil.gap.evidence import Evidence, Group
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -93,6 +94,10 @@ def diagnose_without_replay(
     sure = _judged(evidence, (), chosen).improvement >= SURE_IMPROVEMENT and _same_way(evidence, other, chosen)
     if not sure:
         causes = tuple(replace(c, confidence=min(c.confidence, UNSURE)) for c in causes)
+    causes = curve_rather_than_stribeck(tied_on_a_sinusoid(causes, reasons))
+    if (warning := below_first_pair(causes, experiments.nominal.curve)) is not None:
+        reasons["stribeck"] = warning
+    confusable = causes[0].confusable_with if causes else confusable
     verdict = "explained" if causes else "none"
     if family_share > 0.35 and _family_wins(evidence, chosen, family[1]):
         verdict = "unknown"
@@ -104,7 +109,8 @@ def diagnose_without_replay(
         causes = (*causes, Cause(confusable[0], round(min(0.5, causes[0].confidence), 3), {}, (causes[0].effect,)))
     upcoming = None
     if verdict == "ambiguous":
-        rival = causes[1].effect if len(causes) > 1 else "torque_delay"
+        others = (*causes[0].confusable_with, *(c.effect for c in causes[1:]), "torque_delay")
+        rival = others[0]
         upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
     noise = float(np.sqrt(np.mean(np.concatenate(evidence.noise_nm) ** 2)))
     applied = verdict == "explained"

@@ -15,6 +15,7 @@ from numba import njit
 from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.cautions import tied_on_a_sinusoid
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.next_experiment import next_experiment
@@ -91,8 +92,9 @@ def diagnose_tracking(
             if tied:
                 notes["backlash"] = "a free gain predicts these logs as well as a play"
     after = _left(chain, unseen)
-    causes = tuple(_cause(step, chain, bool(judged), fitted) for step in steps)
-    ambiguous = bool(causes) and (not judged or any("torque_constant_error" in c.confusable_with for c in causes))
+    causes = tied_on_a_sinusoid([_cause(step, chain, bool(judged), fitted) for step in steps], notes)
+    undecided = "sinusoid" in notes or any("torque_constant_error" in c.confusable_with for c in causes)
+    ambiguous = bool(causes) and (not judged or undecided)
     verdict = "none" if not causes else ("ambiguous" if ambiguous else "explained")
     if not causes and before > 0.02 * _travel(unseen):
         verdict = "unknown"
@@ -100,7 +102,8 @@ def diagnose_tracking(
     upcoming = None
     if verdict == "ambiguous":
         weakest = causes[-1]
-        upcoming = next_experiment(weakest.effect, weakest.confusable_with[-1], tuple(r.experiment.name for r in logs))
+        rival = weakest.confusable_with[0 if "sinusoid" in notes else -1]
+        upcoming = next_experiment(weakest.effect, rival, tuple(r.experiment.name for r in logs))
     applied = verdict == "explained"
     notes["forward_position_rad"] = "position against the command through the fitted chain, not a replay of the joint"
     return Diagnosis(

@@ -1,0 +1,100 @@
+"""What a set leaves open whatever the evidence says: motion that makes two causes alike, a curve drawn too far."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.diagnosis import Cause
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.residuals import LowPass, uniform
+from frictid_hil.gap.sanity import LEAST_ROWS
+
+ONE_SINUSOID = (
+    "one sinusoid only: what follows travel (presliding hysteresis) and what follows time (a delay) look alike on it"
+)
+"""What a set leaves open whose motion never changes."""
+_ALIKE_ON_A_SINUSOID = {"presliding_hysteresis": "torque_delay", "torque_delay": "presliding_hysteresis"}
+_TIED = 0.45
+"""Confidence, at most, of a cause that the motion cannot tell from another."""
+
+
+def one_sinusoid(experiments: ExperimentSet) -> bool:
+    """Whether every log moves along one and the same sinusoid: one frequency, one travel."""
+    seen = []
+    for e in experiments.experiments:
+        log, step_s, _ = uniform(e)
+        q = log.position_rad
+        speed = np.abs(np.gradient(LowPass.at(1.0 / step_s)(q), step_s))
+        moving = np.flatnonzero(speed > 0.05 * float(np.max(speed)))
+        if moving.size < LEAST_ROWS // 2:
+            return False
+        # Rests before and after are no other motion.
+        q = q[moving[0] : moving[-1] + 1] - float(np.mean(q[moving[0] : moving[-1] + 1]))
+        time_s = step_s * np.arange(q.size)
+        found = _sinusoid(q, time_s)
+        if found is None:
+            return False
+        seen.append(found)
+    return all(abs(a / seen[0][0] - 1.0) < 0.1 and abs(b / seen[0][1] - 1.0) < 0.1 for a, b in seen)
+
+
+def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
+    """(frequency in Hz, amplitude in rad) where one sinusoid leaves less than 1 % of the squares; else None."""
+    spectrum = np.abs(np.fft.rfft(q * np.hanning(q.size), 8 * q.size))
+    coarse = float(np.argmax(spectrum)) / (8 * q.size * float(time_s[1] - time_s[0]))
+    best: tuple[float, float, float] | None = None
+    for hertz in coarse * np.linspace(0.9, 1.1, 41):
+        angle = 2.0 * math.pi * hertz * time_s
+        columns = np.stack([np.cos(angle), np.sin(angle), np.ones_like(angle)], axis=1)
+        weights, *_ = np.linalg.lstsq(columns, q, rcond=None)
+        left = float(np.mean((q - columns @ weights) ** 2))
+        if best is None or left < best[0]:
+            best = left, float(hertz), float(np.hypot(weights[0], weights[1]))
+    if best is None or best[0] > 0.01 * float(np.mean(q**2)):
+        return None
+    return best[1], best[2]
+
+
+def tied_on_a_sinusoid(causes: Sequence[Cause], reasons: Mapping[str, str]) -> tuple[Cause, ...]:
+    """The causes, those lowered that one sinusoid cannot tell from each other, with the other one named."""
+    if "sinusoid" not in reasons:
+        return tuple(causes)
+    lowered = []
+    for cause in causes:
+        partner = _ALIKE_ON_A_SINUSOID.get(cause.effect)
+        if partner is not None:
+            others = tuple(name for name in cause.confusable_with if name != partner)
+            cause = replace(cause, confidence=min(cause.confidence, _TIED), confusable_with=(partner, *others))
+        lowered.append(cause)
+    return tuple(lowered)
+
+
+def below_first_pair(causes: Sequence[Cause], curve: FrictionCurve | None) -> str | None:
+    """The warning that a Stribeck effect deserves whose nominal curve is drawn straight below its first pair."""
+    if curve is None or not any(c.effect == "stribeck" for c in causes):
+        return None
+    first = curve.measured_range_rad_s[0]
+    return (
+        f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
+        "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds before believing it"
+    )
+
+
+def curve_rather_than_stribeck(causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The causes, a Stribeck effect lowered that needs another bend beside it: together they draw a curve."""
+    names = {c.effect for c in causes}
+    if not {"stribeck", "viscous_nonlinearity"} <= names:
+        return tuple(causes)
+    partner = ("viscous_nonlinearity",)
+    return tuple(
+        replace(c, confidence=min(c.confidence, _TIED), confusable_with=(*partner, *c.confusable_with))
+        if c.effect == "stribeck"
+        else c
+        for c in causes
+    )
