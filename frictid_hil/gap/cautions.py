@@ -82,7 +82,7 @@ def below_first_pair(causes: Sequence[Cause], curve: FrictionCurve | None) -> st
     first = curve.measured_range_rad_s[0]
     return (
         f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
-        "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds before believing it"
+        "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds first"
     )
 
 
