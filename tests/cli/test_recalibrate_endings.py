@@ -107,7 +107,7 @@ ENDINGS = {
     "another at work": ({}, held_by_another_recalibration, [], 3, "aborted", "another recalibration", "wait for it"),
     "interlock open": ({"unattended": UNATTENDED, "faults": OPEN}, nullcontext, [], 4, "aborted", "interlock", ""),
     "encoder lost": ({"faults": STUCK}, nullcontext, [], 4, "aborted", "", ""),
-    "changed too much": ({"friction": 1.5}, nullcontext, [], 5, "gate_failed", "changed since", "look at joints 5"),
+    "changed too much": ({"friction": 0.6}, nullcontext, [], 5, "gate_failed", "changed since", "look at joints 5"),
     "drive exchanged": ({}, another_drive_in_force, [], 5, "gate_failed", "drive serial 1234", "--baseline"),
 }
 
