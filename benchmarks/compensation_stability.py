@@ -39,7 +39,8 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.control import Bounds, Compensated, ControlLaw, Swing
 from frictid_hil.driver import Feedback, JointSetup, Mode
 from frictid_hil.errors import FrictidError
-from frictid_hil.jobs.compensation_plan import Wanted, law_of
+from frictid_hil.jobs.compensation_laws import law_of
+from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.plan import Hold, Motion, Move, Plan, joint_plan
 from frictid_hil.runner.compensation import Controller
 from frictid_hil.runner.events import Event, PhaseStarted

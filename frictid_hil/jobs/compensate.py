@@ -19,8 +19,9 @@ from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Mode
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
 from frictid_hil.jobs.compensation_companions import Hand, Live, LiveFigures
 from frictid_hil.jobs.compensation_figures import mode_run
-from frictid_hil.jobs.compensation_plan import MODES, Wanted, compensation_plan
+from frictid_hil.jobs.compensation_plan import compensation_plan
 from frictid_hil.jobs.compensation_result import Asked, Progress, result_of
+from frictid_hil.jobs.compensation_wanted import MODES, Wanted
 from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.profile_fit import doubts_of_drive, doubts_of_file, refuse
 from frictid_hil.jobs.watch import Watcher

@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from frictid_hil.driver import Driver, RobotSetup
-from frictid_hil.jobs.compensation_plan import CompensationPlan, Wanted
+from frictid_hil.jobs.compensation_plan import CompensationPlan
+from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.events import Event, Marked, PhaseStarted

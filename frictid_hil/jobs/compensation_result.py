@@ -13,7 +13,8 @@ from frictid_hil.control import Compensated
 from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError, Interrupted
 from frictid_hil.jobs.compensation_figures import ModeRun, figures
-from frictid_hil.jobs.compensation_plan import CompensationPlan, Wanted
+from frictid_hil.jobs.compensation_plan import CompensationPlan
+from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.jobs.tracking_floor import tracking_floor_rad
 from frictid_hil.plan import Plan
 from frictid_hil.recording.samples import Mark
