@@ -92,6 +92,9 @@ def _tracking(recording: CycleRecording, motion: Motion) -> Gate:
     said = f"cycle {worst + 1} reached {100 * ratio:.1f} % of its commanded peak speed"
     if passed:
         return Gate("tracking", True, ratio, LEAST_TRACKING, f"tracking: {said} at worst")
+    others = [k for k, other in enumerate(ratios) if k != worst and not LEAST_TRACKING <= other <= MOST_TRACKING]
+    if others:
+        said += ", " + ", ".join(f"cycle {k + 1} {100 * ratios[k]:.1f} %" for k in others)
     cause = (
         "the command is averaged or filtered on its way, or torque saturates"
         if ratio < 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -135,5 +136,8 @@ def test_a_moving_average_of_150_ms_fails_the_fast_cycles_and_is_named() -> None
     (tracking,) = [gate for gate in quality.gates(recording, result) if gate.name == "tracking"]
     assert not tracking.passed
     assert "averaged" in tracking.reason
+    # Every cycle that fell short is named, none that did not.
+    short = {int(k) for k in re.findall(r"cycle (\d+)", tracking.reason)}
+    assert short == {k + 1 for k, ratio in enumerate(ratios) if ratio < 0.95}
     # What was reached is still measured rightly.
     assert error_percent(setup, "3", result) < 2.5

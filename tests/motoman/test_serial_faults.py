@@ -203,3 +203,20 @@ def test_a_dead_host_is_noticed_by_the_stream_within_its_watchdog() -> None:
     emulator.advance(emulator.now_s + (4 + 3 + 25 + 1) * 0.004)
     assert not emulator.stream.moving
     assert "command" in emulator.panel.holds
+
+
+@pytest.mark.parametrize("at", [12, 30, 55])
+def test_unplugging_stops_the_arm_within_the_watchdogs_time(at: int) -> None:
+    bench = make_bench(faults=[f"unplug@{at}"])
+    emulator, driver = bench.emulator, bench.driver()
+    driver.open()
+    with pytest.raises(FrictidError, match="port is gone"):
+        stream_motion(driver, ticks=50, travel_rad=0.05)
+    driver.close()
+    assert emulator.stream is not None
+    unplugged_s = emulator.now_s
+    while emulator.stream.moving:
+        emulator.advance(emulator.now_s + 0.004)
+    # Lead 4 ticks, watchdog 3 ticks, deceleration 25 ticks.
+    assert emulator.now_s - unplugged_s <= (4 + 3 + 25 + 1) * 0.004
+    assert "command" in emulator.panel.holds

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -18,6 +18,7 @@ from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.pty import Waits
 from frictid_drivers.motoman.port import SerialPort
 from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError
 from frictid_hil.plan import Hold, JointPlan, Sine
 
@@ -134,6 +135,33 @@ def test_unplugging_is_noticed_at_once() -> None:
         driver.close()
         assert time.monotonic() - stopped_s < 1.0
         assert len(streamed.rows) > 20
+
+
+def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str) -> None:
+    driver = driver_on(port)
+    driver.open()
+    exchange, cycles = driver.exchange, 0
+
+    def until_pulled(set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        nonlocal cycles
+        cycles += 1
+        if cycles == 60:
+            driver._open_line().port.close()
+        return exchange(set_points)
+
+    driver.exchange = until_pulled  # type: ignore[method-assign]
+    with pytest.raises(HardwareError, match="the port is closed"):
+        stream_motion(driver, ticks=400, travel_rad=0.1)
+    driver.close()
+    # What was queued, three missed ticks, a deceleration of 25; then two seconds of silence, and host control again.
+    time.sleep((40 + 3 + 25) * 0.004 + 2.5)
+    after = driver_on(port)
+    after.open()
+    holds = after._open_line().host.status().holds
+    first, second = ([report.position_rad for report in after.standing()] for _ in range(2))
+    after.close()
+    assert holds == ["command hold"]
+    assert first == pytest.approx(second, abs=1e-5)
 
 
 def test_the_emulator_tells_how_long_it_waited_for_a_late_host() -> None:
