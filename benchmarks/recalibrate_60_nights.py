@@ -16,9 +16,11 @@ import shutil
 import sys
 import tempfile
 import time
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -26,7 +28,6 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance
-from frictid_hil.jobs import calibrate as calibration
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
@@ -42,7 +43,7 @@ def main() -> None:
     flagged: dict[str, list[int]] = {}
     passed: int | None = None
     broken: dict[str, Any] = {}
-    failures: list[int] = []
+    failures: dict[int, str] = {}
     began, cpu = time.monotonic(), time.process_time()
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary)
@@ -59,16 +60,16 @@ def main() -> None:
             if passed is None and truth_percent > THRESHOLD_PERCENT:
                 passed = night
             before = active(place)
-            set_date(night)
             run = place / f"run-{night}"
-            result = recalibrate(RecalibrateOptions(robot, store=place / "store", seed=night, out=run), Silent())
+            with dated(night):
+                result = recalibrate(RecalibrateOptions(robot, store=place / "store", seed=night, out=run), Silent())
             shutil.rmtree(run)
             for name in result["drifted"]:
                 flagged.setdefault(name, []).append(night)
             if night == BROKEN_NIGHT:
                 broken = {**result, "kept": result["active"] == before}
             elif not result["promoted"]:
-                failures.append(night)
+                failures[night] = result["reason"]
             distance = result["drift"][DRIFTING]["distance_percent"] or 0.0
             print(
                 f"night {night:2d}: truth {truth_percent:5.1f} %, measured "
@@ -111,10 +112,10 @@ def active(place: Path) -> str | None:
     return str((place / "store" / "nights" / "profiles" / f"{last}.yaml").resolve())
 
 
-def set_date(night: int) -> None:
+def dated(night: int) -> AbstractContextManager[object]:
     """One night per simulated day, where profiles take their date from."""
     day = datetime(2026, 1, 1, 2, 30, tzinfo=UTC) + timedelta(days=night - 1)
-    calibration.utc_now = lambda: day.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return patch("frictid_hil.jobs.calibrate.utc_now", lambda: day.strftime("%Y-%m-%dT%H:%M:%SZ"))
 
 
 if __name__ == "__main__":
