@@ -72,7 +72,7 @@ def readme_lines(path: Path) -> list[str]:
 
 def environment(place: Path) -> dict[str, str]:
     """Of somebody who has just logged in for the first time."""
-    return {"HOME": str(place / "home"), "PATH": os.defpath + ":/usr/local/bin:" + _python_folder(), "TERM": "dumb"}
+    return {"HOME": str(place / "home"), "PATH": f"{_python_folder()}:/usr/local/bin:{os.defpath}", "TERM": "dumb"}
 
 
 def _python_folder() -> str:
