@@ -152,6 +152,33 @@ def test_a_foreign_log_needs_a_frame_map_and_unknown_frames_are_named(run: Path,
     assert result["joints"]["5"]["difference_percent"] < 1.0
 
 
+@pytest.mark.parametrize("name", ["foreign.log", "foreign.asc", "foreign.blf", "foreign.trc"])
+def test_a_log_in_any_format_gives_the_same_curve(name: str, run: Path, robot: str, tmp_path: Path) -> None:
+    """As python-can writes them: candump, ASC, BLF, TRC; with a frame that no map describes."""
+    manifest = json.loads((run / "manifest.json").read_text())
+    (mark,) = [mark for mark in manifest["sessions"][0]["marks"] if mark["name"] == "cycles"]
+    frames = [
+        frame
+        for frame in logged(read_frames(run / "bus.blf"))
+        if mark["start_ns"] - 300_000_000 <= frame[0] < mark["end_ns"]
+    ]
+    with can.Logger(tmp_path / name) as writer:
+        for t_ns, can_id, data in [*frames, (frames[-1][0] + 1, 0x123, b"\1")]:
+            stamp = 1.7e9 + t_ns * 1e-9
+            message = can.Message(timestamp=stamp, arbitration_id=can_id, is_extended_id=False, data=data, channel=1)
+            writer.on_message_received(message)
+    described = tmp_path / "frames.yaml"
+    described.write_text(dump(manifest["frame_maps"]["bus.blf"]))
+    procedure = Procedure(0.2, 1.5, 3, 0.8)
+    options = ReplayOptions(
+        tmp_path / name, robot, frames=described, procedure=procedure, profile=run, simulation=False
+    )
+    result = replay(options)
+    assert result["log"]["frames"] == len(frames) + 1 and result["log"]["unknown"] == {"frame 0x123": 1}
+    assert result["log"]["lost_rows"] == {"5": 0}
+    assert result["joints"]["5"]["difference_percent"] < 1.0
+
+
 def test_a_candump_log_and_an_eds_give_the_same_curve(run: Path, robot: str, tmp_path: Path) -> None:
     """From the shell, as somebody with a logger and a vendor's tool has it: no run folder, no manifest."""
     manifest = json.loads((run / "manifest.json").read_text())
