@@ -18,6 +18,8 @@ from frictid_hil.driver import JointSetup
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 
+COUPLING = "coupling"
+"""Name of the motion that shows how much joints that move together drive each other."""
 REHEARSAL = "rehearsal"
 """Name of the motion that shows a joint's whole travel slowly, with the torque watched."""
 
@@ -148,6 +150,62 @@ class Sine:
             "peak_velocity_rad_s": self.peak_velocity_rad_s,
             "repeats": self.repeats,
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Shake:
+    """A slow cycle from ``start_rad`` to start + A and back, shaking most in the middle of the travel.
+
+    Each of several joints has its own frequency, which tells their accelerations apart. Shaking never reverses the
+    motion nor leaves the travel.
+
+    Attributes:
+        start_rad: where it begins and ends.
+        amplitude_rad: peak-to-peak travel.
+        duration_s: of the cycle.
+        periods: of shaking within the duration.
+        shake_rad: zero-to-peak.
+    """
+
+    start_rad: float
+    amplitude_rad: float
+    duration_s: float
+    periods: int
+    shake_rad: float
+    name: str = COUPLING
+
+    @staticmethod
+    def beside(start_rad: float, procedure: Procedure, place: int) -> Shake:
+        """The shaking of the joint that is ``place``-th of those that move together, 0 the first.
+
+        It asks for at most half of the procedure's highest acceleration, 2 V^2 / A.
+        """
+        a, v = procedure.amplitude_rad, procedure.velocity_rad_s
+        duration_s = max(_SHORTEST_SHAKE_S, 4 * math.pi * a / v)
+        periods = round(_SLOWEST_SHAKE_HZ * duration_s) + 2 * place
+        frequency_rad_s = 2 * math.pi * periods / duration_s
+        # The slow cycle's speed is A/2 times its own frequency: shaking keeps to 0.7 of it.
+        return Shake(start_rad, a, duration_s, periods, min(0.35 * a / periods, v**2 / a / frequency_rad_s**2))
+
+    def position_rad(self, time_s: Array) -> Array:
+        """start + A/2 (1 - cos) + shake sin^2 sin."""
+        phase = 2.0 * math.pi * np.asarray(time_s) / self.duration_s
+        shaking = self.shake_rad * np.sin(phase) ** 2 * np.sin(self.periods * phase)
+        moved: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase)) + shaking
+        return self.start_rad + moved
+
+    def details(self) -> Mapping[str, Any]:
+        """Travel, and what shakes on it."""
+        return {
+            "start_rad": self.start_rad,
+            "amplitude_rad": self.amplitude_rad,
+            "periods": self.periods,
+            "shake_rad": self.shake_rad,
+        }
+
+
+_SHORTEST_SHAKE_S = 2.0
+_SLOWEST_SHAKE_HZ = 4.0
 
 
 @dataclass(frozen=True, slots=True)

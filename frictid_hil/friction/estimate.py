@@ -20,6 +20,7 @@ import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
+from frictid_hil.friction.coupling import Pull, pull
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
@@ -99,19 +100,26 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     notes: list[str] = []
     motion = synchronised(recording)
     published = _published(recording, notes, required=method == "function-a")
+    others = pull(recording, motion)
+    if others is not None:
+        motion = replace(motion, torque_nm=motion.torque_nm - others.torque_nm)
+    elif recording.coupled:
+        notes.append("how much the joints that moved along drove this one is not known; nothing was taken off")
     windows = intervals.aligned_pairs(recording, motion)
     level = float(np.mean(windows.torque_nm))
     link = _link(recording, motion, level, notes)
     if link is not None:
         motion = without(motion, link)
         windows = intervals.aligned_pairs(recording, motion)
-    seen = _seen_delay(recording, motion, level, notes)
+    unknown_pull = recording.coupled and others is None  # what it leaves looks like a delay
+    seen = None if unknown_pull else _seen_delay(recording, motion, level, notes)
     if seen is not None:
         open_s = seen.open_s(recording.skew.uncertainty_s)
         recording = replace(recording, skew=replace(recording.skew, uncertainty_s=open_s))
     drift = intervals.repeated(recording, motion, windows)
     solved: Fit | None = None
-    doubtful = None if link is None else link.columns
+    taken: Link | Pull | None = link or others
+    doubtful = None if taken is None else taken.columns
     try:
         solved = fit(recording, motion, least_squares.curve_knots(recording), level, doubtful=doubtful)
     except IdentificationError as problem:
@@ -127,10 +135,10 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         assert solved is not None
         kept = least_squares.trusted(recording, solved, level)
         curve = least_squares.curve_of(solved, kept, recording.where)
-        terms = intervals.least_squares_terms(recording, motion, solved, kept, drift, link)
+        terms = intervals.least_squares_terms(recording, motion, solved, kept, drift, taken)
         half = terms.half_width_nm
     else:
-        terms = intervals.window_terms(recording, motion, windows, solved, drift, link)
+        terms = intervals.window_terms(recording, motion, windows, solved, drift, taken)
         half = terms.half_width_nm
         if method == "function-a":
             assert published is not None

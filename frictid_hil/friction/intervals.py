@@ -6,7 +6,8 @@
   through the very same windows;
 * **model**: the distance between windows and global least squares, two estimators that fail differently;
 * **drift**: friction changed between the first and the second run of the repeated cycle;
-* **link**: the swinging of a soft joint's link, taken off the torque, is known only so well.
+* **link**: the swinging of a soft joint's link, or the pull of joints that moved along, taken off the torque, is known
+  only so well.
 
 For least squares, scatter comes from the misfit of every quarter cycle as a whole (``clustered``: misfit that lasts a
 pass is counted once, not per sample), and the model term from the bend that a line cannot follow.
@@ -15,6 +16,7 @@ pass is counted once, not per sample), and the model term from the bend that a l
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.stats import t as student
@@ -22,7 +24,6 @@ from scipy.stats import t as student
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
-from frictid_hil.friction.link import Link
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
@@ -34,6 +35,20 @@ STEADY = 0.28
 """Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
 
 
+class TakenOff(Protocol):
+    """What was taken off the torque because it is no friction, and how well it is known."""
+
+    @property
+    def columns(self) -> Array:
+        """By how the torque changes with each of its parameters, shape (n, m)."""
+        ...
+
+    @property
+    def covariance(self) -> Array:
+        """Of these parameters, shape (m, m)."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
     """Standard deviations at each knot of a curve, N m, shape (N,) each.
@@ -43,7 +58,7 @@ class Terms:
         skew: undeclared torque delay.
         model: what the estimator leaves out.
         drift: friction that changed while it was measured.
-        link: torque of the swinging link.
+        link: torque of the swinging link, or of the joints that moved along.
     """
 
     scatter: Array
@@ -98,7 +113,7 @@ def window_terms(
     pairs: IdentifiedPairs,
     solved: Fit | None,
     drift: Drift | None,
-    link: Link | None,
+    link: TakenOff | None,
 ) -> Terms:
     """Terms of the aligned Function A.
 
@@ -125,7 +140,7 @@ def window_terms(
     )
 
 
-def _windowed(recording: CycleRecording, motion: Motion, link: Link) -> Array:
+def _windowed(recording: CycleRecording, motion: Motion, link: TakenOff) -> Array:
     """What each window makes of the link's columns, shape (N, m)."""
     return np.column_stack([aligned_pairs(recording, motion, column).torque_nm for column in link.columns.T])
 
@@ -137,7 +152,7 @@ def _spread(weights: Array, covariance: Array) -> Array:
 
 
 def least_squares_terms(
-    recording: CycleRecording, motion: Motion, solved: Fit, kept: slice, drift: Drift | None, link: Link | None
+    recording: CycleRecording, motion: Motion, solved: Fit, kept: slice, drift: Drift | None, link: TakenOff | None
 ) -> Terms:
     """Terms of the global least squares at its trusted knots."""
     odd, knots = solved.odd_nm, solved.knots

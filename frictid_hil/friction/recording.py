@@ -47,6 +47,27 @@ class Repeat:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Companion:
+    """Another joint that moved at the same time; columns of shape (n,).
+
+    Attributes:
+        name: of the joint.
+        time_s: on the clock of the joint that it went along with.
+        position_rad: measured.
+        position_delay_s: declared, see ``Skew``.
+        inertia_kg_m2: M_ij, torque of the joint per acceleration of this one.
+        deviation_kg_m2: one standard deviation of it.
+    """
+
+    name: str
+    time_s: Array
+    position_rad: Array
+    position_delay_s: float = 0.0
+    inertia_kg_m2: float = 0.0
+    deviation_kg_m2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CycleRecording:
     """One joint's recording of the procedure; every column has shape (n,).
 
@@ -65,7 +86,8 @@ class CycleRecording:
         repeat: the repeated cycle, where there is one.
         late_cycles: control cycles that were late or missed while recording.
         coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
-            combined motion. They are the same both ways and leave the curve alone.
+            combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
+        companions: those joints, as far as it is known how much they take.
         where: what to name in errors (``joint 1``).
     """
 
@@ -83,6 +105,7 @@ class CycleRecording:
     repeat: Repeat | None = None
     late_cycles: int = 0
     coupled: bool = False
+    companions: tuple[Companion, ...] = ()
     where: str = ""
 
 

@@ -26,6 +26,7 @@ from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan
 from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
@@ -265,6 +266,7 @@ def _identify(run: JointRun, folder: RunFolder, planned: Planned, watcher: Watch
             planned.setup.joint(run.joint),
             method=planned.method,
             late_cycles=run.late_cycles + run.missed_cycles,
+            company=_company(run, folder, planned),
         )
     except IdentificationError as error:
         progress.results[run.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
@@ -275,6 +277,15 @@ def _identify(run: JointRun, folder: RunFolder, planned: Planned, watcher: Watch
     folder.keep_joint(run.joint, profile, progress.results[run.joint])
     outcome = progress.results[run.joint]["outcome"]
     watcher.joint(run.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
+
+
+def _company(run: JointRun, folder: RunFolder, planned: Planned) -> list[Samples]:
+    """Samples of the joints that moved together with this one."""
+    if not planned.plan.together:
+        return []
+    return [
+        folder.samples(replace(run, joint=entry.joint)) for entry in planned.plan.joints if entry.joint != run.joint
+    ]
 
 
 _NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}

@@ -158,7 +158,7 @@ def _identified(task: _Task) -> _Identified:
         if len(wanted) > 1 and not task.joints and samples.marks == () and _has_marks(wanted):
             continue  # the joints that stood still in a run of another one
         try:
-            joints[samples.joint] = _joint(samples, task)
+            joints[samples.joint] = _joint(samples, task, every)
         except FrictidError as error:
             failed[samples.joint] = str(error)
             last = error
@@ -171,12 +171,17 @@ def _decoded(task: _Task) -> list[Samples]:
     return list(samples_in(logs_of(task.log, None), task.setup.name if task.setup else "", account).values())
 
 
-def _joint(samples: Samples, task: _Task) -> JointProfile:
+def _joint(samples: Samples, task: _Task, every: Sequence[Samples]) -> JointProfile:
     joint = None
     if task.setup is not None:
         joint = task.setup.joint(samples.joint)
     return identify_joint(
-        samples, joint, method=task.method, procedure=task.procedure, late_cycles=_late_cycles(task.log, samples.joint)
+        samples,
+        joint,
+        method=task.method,
+        procedure=task.procedure,
+        late_cycles=_late_cycles(task.log, samples.joint),
+        company=every,
     )
 
 

@@ -6,7 +6,7 @@ Live runs and recordings come through here alike, so that the same samples give 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +22,11 @@ from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
 from frictid_hil.friction.presliding import presliding
-from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
+from frictid_hil.friction.recording import CycleRecording, Repeat
 from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array, Procedure
+from frictid_hil.jobs.companions import with_companions
+from frictid_hil.jobs.declared import declared_skew
 from frictid_hil.recording.samples import Mark, Samples
 
 _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
@@ -37,6 +39,7 @@ def identify_joint(
     method: str,
     procedure: Procedure | None = None,
     late_cycles: int = 0,
+    company: Sequence[Samples] = (),
 ) -> JointProfile:
     """Identify one joint.
 
@@ -46,6 +49,7 @@ def identify_joint(
         method: estimator.
         procedure: instead of the one that the marks carry; without either, plateaus of constant speed are looked for.
         late_cycles: control cycles that came late or were missed.
+        company: of the joints that moved together with it, where they did, whole runs too; it may be among them.
 
     Raises:
         IdentificationError: no curve can be formed; the reason names cycle or speed.
@@ -63,7 +67,9 @@ def identify_joint(
                 where=f"joint {samples.joint}",
             )
         together = tuple(map(str, marks[0].details.get("together", ())))
-        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles, together)
+        known = {other.joint: other for other in company if other.joint != samples.joint}
+        others = [known[name] for name in together if name in known]
+        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles, together, others)
     if procedure is not None:
         path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
         start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
@@ -104,8 +110,16 @@ def _from_cycles(
     method: str,
     late_cycles: int,
     together: tuple[str, ...] = (),
+    company: Sequence[Samples] = (),
 ) -> JointProfile:
-    recording = replace(_recording(samples, procedure, start_s, joint, late_cycles), coupled=len(together) > 1)
+    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    notes: list[str] = []
+    if len(together) > 1:
+        recording = replace(recording, coupled=True)
+        try:
+            recording = with_companions(recording, samples, company, start_s)
+        except IdentificationError as problem:
+            notes.append(problem.what)
     result = estimate(recording, method)
     gates = quality.gates(recording, result)
     body = result.rigid_body
@@ -150,7 +164,8 @@ def _from_cycles(
             "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
             "drift_percent": 100 * result.drift.change if result.drift else None,
             "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
-            "notes": list(result.notes),
+            "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
+            "notes": [*notes, *result.notes],
         },
         gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
     )
@@ -158,7 +173,7 @@ def _from_cycles(
 
 def _from_plateaus(samples: Samples) -> JointProfile:
     assert samples.torque_nm is not None  # by the caller
-    skew = _skew(samples)
+    skew = declared_skew(samples)
     found = plateaus(
         samples.time_s,
         samples.position_rad,
@@ -205,7 +220,7 @@ def _recording(
         procedure=procedure,
         velocity_rad_s=kept.velocity_rad_s,
         command_rad=kept.position_command_rad,
-        skew=_skew(samples),
+        skew=declared_skew(samples),
         gear_ratio=joint.gear_ratio if joint else math.nan,
         prismatic=samples.prismatic,
         torque_limit_nm=joint.max_torque_nm if joint else math.inf,
@@ -234,14 +249,6 @@ def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np
     time_s = samples.time_s
     inside: np.ndarray[Any, np.dtype[np.bool_]] = (time_s >= first_s) & (time_s < last_s)
     return inside
-
-
-def _skew(samples: Samples) -> Skew:
-    timing = samples.meta.get("timing")
-    if not isinstance(timing, Mapping):
-        return Skew()
-    keys = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
-    return Skew(**{key: float(timing[key]) for key in keys if timing.get(key) is not None})
 
 
 def _drive(meta: Mapping[str, Any]) -> DriveIdentity:

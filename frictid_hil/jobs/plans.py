@@ -23,6 +23,7 @@ from frictid_hil.plan import (
     Motion,
     Move,
     Plan,
+    Shake,
     Sine,
     WarmUp,
     coupling_bound_nm,
@@ -37,9 +38,22 @@ _REVERSAL_SPEED_RAD_S = 4e-3
 
 
 def calibration_motions(
-    joint: JointSetup, procedure: Procedure, *, rehearse: bool, warm_up: policy.WarmUp | None = None
+    joint: JointSetup,
+    procedure: Procedure,
+    *,
+    rehearse: bool,
+    warm_up: policy.WarmUp | None = None,
+    place: int | None = None,
 ) -> list[Motion]:
-    """What one joint does in a calibration, from its locked position and back to it."""
+    """What one joint does in a calibration, from its locked position and back to it.
+
+    Args:
+        joint: which.
+        procedure: its cycles.
+        rehearse: its travel was never seen slowly.
+        warm_up: before it is measured.
+        place: among the joints that move together; None where it moves alone.
+    """
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
     # An early cycle: the later it is run again, the better drift is seen.
@@ -57,6 +71,10 @@ def calibration_motions(
         Cycles(start, procedure),
         Sine(start, amplitude, drift_speed, name="drift"),
         Hold(start, 0.3),
+    ]
+    if place is not None:
+        motions += [Shake.beside(start, procedure, place), Hold(start, 0.2)]
+    motions += [
         slow_reversal(start),
         Move.within(start, home, APPROACH_RAD_S, name="return"),
         Hold(home, 0.2),
@@ -98,8 +116,14 @@ def calibration_plan(
         # One that has not been rehearsed makes all of them rehearse: their travels combined are new.
         rehearse = list(procedures) if rehearse else []
     motions = {
-        name: calibration_motions(setup.joint(name), procedure, rehearse=name in rehearse, warm_up=warm_up)
-        for name, procedure in procedures.items()
+        name: calibration_motions(
+            setup.joint(name),
+            procedure,
+            rehearse=name in rehearse,
+            warm_up=warm_up,
+            place=place if together and len(procedures) > 1 else None,
+        )
+        for place, (name, procedure) in enumerate(procedures.items())
     }
     if together:
         motions = _in_step(motions)

@@ -180,6 +180,7 @@ def _identify(
                 method=method,
                 procedure=procedure,
                 late_cycles=late.get(samples.joint, 0),
+                company=recordings,
             )
         except IdentificationError as error:
             failed[samples.joint] = str(error)
