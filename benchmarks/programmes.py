@@ -1,6 +1,6 @@
 """The accuracy of ``calibrate --program``, through bus, driver and scheduler.
 
-    python benchmarks/programmes.py [--plants rigid,flexible] [--seeds 0,1,2] [--amplitude 20]
+    python benchmarks/programmes.py [--programmes quick] [--plants rigid,flexible] [--seeds 0,1,2] [--amplitude 20]
 
 Every cell is the error to the truth over [0, V] / over the curve's own measured range, in percent of the truth's mean
 there, for the worst seed. The last column is what ``jobs/programmes.py`` tells its users.
@@ -20,6 +20,7 @@ from frictid_hil.jobs.programmes import PROGRAMMES
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--programmes", default=",".join(PROGRAMMES))
     parser.add_argument("--plants", default="rigid,flexible")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--amplitude", type=float, default=20.0)
@@ -28,7 +29,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for kind in arguments.plants.split(","):
             robot = variant(Path(folder), f"programmes-{kind}", plant(kind))
-            for name, programme in PROGRAMMES.items():
+            for name in arguments.programmes.split(","):
+                programme = PROGRAMMES[name]
                 whole: dict[str, list[float]] = {}
                 inner: dict[str, list[float]] = {}
                 seconds = 0.0

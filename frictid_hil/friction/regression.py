@@ -229,7 +229,8 @@ def _choose(recording: CycleRecording, motion: Motion, width_rad: float) -> _Cho
     quarter, travel = _quarters(recording, motion)
     guard = min(np.inf if recording.prismatic else GUARD_RAD, recording.procedure.amplitude_rad / 12)
     spoiled = (quarter < 0) | (travel < guard)
-    kept = ~binary_dilation(spoiled, iterations=int(np.ceil(3 * width)))
+    # What lies beyond the ends of the recording is as unknown as what is guarded.
+    kept = ~binary_dilation(spoiled, iterations=int(np.ceil(3 * width)), border_value=1)
     every = max(1, int(width))  # what the kernel leaves needs no more: it passes 0.7 % of half this rate
     thin = np.zeros_like(kept)
     thin[::every] = True

@@ -192,3 +192,15 @@ def test_the_same_samples_give_the_same_bits(heavy):
         one, two = estimate(recording, method), estimate(recording, method)
         assert one.curve == two.curve
         assert np.array_equal(one.half_width_nm, two.half_width_nm)
+
+
+def test_a_recording_that_ends_with_its_last_cycle_is_not_poisoned_by_its_end(plants, heavy):
+    """The live run stops with the repeated cycle; what the kernel would have to invent beyond is left out."""
+    joint, recording = heavy
+    starts, repeat = recording.procedure.cycle_starts_s, recording.repeat
+    end_s = repeat.start_s + starts[repeat.cycle] - starts[repeat.cycle - 1]
+    until = recording.time_s < end_s
+    columns = {name: getattr(recording, name)[until] for name in ("time_s", "position_rad", "velocity_rad_s")}
+    cut = replace(recording, torque_nm=recording.torque_nm[until], command_rad=None, **columns)
+    with_hold = estimate(recording, "least-squares").figures["residual_rms_nm"]
+    assert estimate(cut, "least-squares").figures["residual_rms_nm"] < 1.1 * with_hold
