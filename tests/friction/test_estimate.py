@@ -196,7 +196,7 @@ def test_the_same_samples_give_the_same_bits(heavy):
 
 def test_a_recording_that_ends_with_its_last_cycle_is_not_poisoned_by_its_end(plants, heavy):
     """The live run stops with the repeated cycle; what the kernel would have to invent beyond is left out."""
-    joint, recording = heavy
+    _, recording = heavy
     starts, repeat = recording.procedure.cycle_starts_s, recording.repeat
     end_s = repeat.start_s + starts[repeat.cycle] - starts[repeat.cycle - 1]
     until = recording.time_s < end_s
