@@ -32,6 +32,14 @@ def diagnose(
     write_model: Annotated[
         Path | None, typer.Option("--write-model", metavar="FILE", help="Write the improved joint as a robot file.")
     ] = None,
+    mujoco: Annotated[
+        Path | None,
+        typer.Option(
+            "--export-mujoco",
+            metavar="FILE.xml",
+            help="Export the improved joint to MuJoCo, and FILE.py with its callback.",
+        ),
+    ] = None,
     apply: Annotated[
         bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
     ] = False,
@@ -45,7 +53,7 @@ def diagnose(
     output = Output(as_json, quiet)
     output.run(
         "gap_diagnose",
-        lambda: job(experiment_set, write_model=write_model, apply=apply, out=out),
+        lambda: job(experiment_set, write_model=write_model, mujoco=mujoco, apply=apply, out=out),
         lambda result: _print_diagnosis(output, result),
     )
 
@@ -170,6 +178,10 @@ def _print_diagnosis(output: Output, result: Result) -> None:
         output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}", markup=False)
     for subject, why in result["reasons"].items():
         output.out.print(f"{subject}: {why}", markup=False)
+    if exported := result.get("mujoco"):
+        output.out.print(f"mujoco: {exported['model']} and {exported['callback_script']}", soft_wrap=True, markup=False)
+        for lost in exported["lost"]:
+            output.out.print(f"  lost: {lost}", markup=False)
     for key in ("model", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)

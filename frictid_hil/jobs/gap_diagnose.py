@@ -13,6 +13,7 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.jobs.export_mujoco import export_mujoco
 from frictid_hil.jobs.improved_robot import improved_robot
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
@@ -20,13 +21,19 @@ from frictid_hil.simulation.joint import JointModel
 
 
 def diagnose(
-    folder: Path, *, write_model: Path | None = None, apply: bool = False, out: Path | None = None
+    folder: Path,
+    *,
+    write_model: Path | None = None,
+    mujoco: Path | None = None,
+    apply: bool = False,
+    out: Path | None = None,
 ) -> dict[str, Any]:
     """Diagnose a set.
 
     Args:
         folder: experiment set (``nominal.yaml`` and one CSV per log).
         write_model: robot file to write the improved joint to.
+        mujoco: MJCF file to export the improved joint to; its callback script is written beside it.
         apply: write it even where the verdict does not recommend it.
         out: folder for the report page; None writes none.
 
@@ -45,6 +52,12 @@ def diagnose(
     if write_model is not None:
         refused = _why_no_model(found, apply)
         result["model"] = None if refused else str(_write_model(write_model, experiments, found, apply).resolve())
+        if refused:
+            result["model_refused"] = refused
+    if mujoco is not None:
+        refused = _why_no_model(found, apply)
+        model = _chosen(found, apply)
+        result["mujoco"] = None if refused or model is None else export_mujoco(mujoco, experiments.name, model)
         if refused:
             result["model_refused"] = refused
     if out is not None:

@@ -17,7 +17,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -47,13 +47,24 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """The compiled functions of ``plant.py``, effects included; see there for their arguments."""
+    """The compiled functions of ``plant.py``, effects included; see there for their arguments.
+
+    The last eight are pieces of ``run``, for another integrator to call.
+    """
 
     run: Callable[..., None]
     run_coupled: Callable[..., None]
     steady: Callable[..., None]
     place: Callable[..., float]
     holding_torque: Callable[..., float]
+    begin: Callable[..., None]
+    motor_torque: Callable[..., float]
+    shaft_torque: Callable[..., float]
+    gravity_torque: Callable[..., float]
+    friction: Callable[..., tuple[float, float, float]]
+    remember: Callable[..., None]
+    encoder_angle: Callable[..., float]
+    measure: Callable[..., float]
 
 
 @functools.cache
@@ -74,7 +85,7 @@ def layout() -> Layout:
 def kernel() -> Kernel:
     """The compiled kernel with every effect there is; the first call on a machine compiles for some seconds."""
     module = _load(kernel_source())
-    return Kernel(module.run, module.run_coupled, module.steady, module.place, module.holding_torque)
+    return Kernel(**{field.name: getattr(module, field.name) for field in fields(Kernel)})
 
 
 def kernel_source() -> str:

@@ -1,0 +1,255 @@
+"""A joint for MuJoCo: what MJCF can say as joint parameters, the rest as a callback, and what neither can say.
+
+``described`` writes the model. Inertia, armature, gravity, compliance, play, the torque limit and the torque constant
+are joint and actuator parameters, with every effect on them included. Friction is ``frictionloss`` and ``damping``
+there: one level and one slope, which is as much as MuJoCo knows. ``MujocoJoint`` installs the callback that puts the
+joint's own friction, drive and sensors in their place, by the very formulas of the simulation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.simulation import packing, plant
+from frictid_hil.simulation.compose import kernel
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.joint import JointModel
+
+STEP_S = 1e-4
+"""Time step of the model; the slip spring asks for it."""
+GRAVITY_M_S2 = 9.81
+
+_IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}
+"""Stages of the simulation whose effects are joint parameters."""
+_SENSED = {"encoder", "resolution", "report_velocity", "temperature"}
+"""Stages that change what is reported, not what moves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """A joint in MuJoCo's words.
+
+    Attributes:
+        xml: the model.
+        native: what is in it, by effect or property.
+        callback: what only the callback does, by effect or property.
+        lost: what is lost, in sentences.
+    """
+
+    xml: str
+    native: Mapping[str, str]
+    callback: Mapping[str, str]
+    lost: tuple[str, ...]
+
+
+def described(model: JointModel, name: str, *, payload: bool = False) -> Exported:
+    """The joint as an MJCF model of one hinge, or of two with a spring between them.
+
+    Args:
+        model: with its effects.
+        name: of the model.
+        payload: the payload is mounted.
+    """
+    parameters, state = packing.parameters(model, payload=payload), packing.state()
+    functions = kernel()
+    functions.begin(parameters, state, STEP_S)
+    motor, link = float(state[plant.MOTOR_INERTIA]), float(state[plant.LINK_INERTIA])
+    stiffness, damping = float(state[plant.COUPLING]), float(state[plant.COUPLING_DAMPING])
+    play = float(state[plant.PLAY])
+    cos_nm = functions.gravity_torque(parameters, 0.0)
+    sin_nm = functions.gravity_torque(parameters, 0.5 * math.pi)
+    nothing = functions.shaft_torque(parameters, 0.0, 0.0, model.gear_ratio)
+    gain = functions.shaft_torque(parameters, 1.0, 0.0, model.gear_ratio) - nothing
+    level, slope = _level_and_slope(model)
+    limit = _largest_torque(model)
+    soft = stiffness > 0.0
+    on_joint = f'armature="{motor:.9g}" frictionloss="{level:.9g}" damping="{slope:.9g}"'
+    body = _body(link, cos_nm, sin_nm)
+    if soft and play > 0.0:
+        # A play is a limit on either side of the gap that yields like a spring: with an impedance near 0 a constraint's
+        # force depends on its depth and speed alone, as stiffness and damping over the inertia that it sees.
+        reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
+        twist = (
+            f'limited="true" range="{-0.5 * play:.9g} {0.5 * play:.9g}" solimplimit="0.001 0.001 0.001" '
+            f'solreflimit="{-stiffness / reduced:.9g} {-max(damping, 1e-9) / reduced:.9g}"'
+        )
+    else:
+        twist = f'stiffness="{stiffness:.9g}" damping="{damping:.9g}"'
+    inner = (
+        f'<body name="link"><joint name="twist" type="hinge" axis="0 -1 0" {twist}/>{body}</body>'
+        f'<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
+        if soft
+        else body
+    )
+    xml = f"""<mujoco model="{name}">
+  <!-- Written by frictid-hil. The angle of "joint" is that of the motor; friction is one level and one slope here. -->
+  <compiler angle="radian" autolimits="false"/>
+  <option timestep="{STEP_S:g}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast"/>
+  <worldbody>
+    <body name="rotor">
+      <joint name="joint" type="hinge" axis="0 -1 0" {on_joint}/>
+      {inner}
+    </body>
+  </worldbody>
+  <actuator>
+    <general name="motor" joint="joint" gaintype="fixed" gainprm="{gain:.9g}" biastype="affine"
+             biasprm="{nothing:.9g} 0 0" {_limits(limit)}/>
+  </actuator>
+  <sensor>
+    <jointpos name="position" joint="joint"/>
+    <jointvel name="velocity" joint="joint"/>
+    <actuatorfrc name="torque" actuator="motor"/>
+  </sensor>
+</mujoco>
+"""
+    return Exported(xml, *_accounts(model, soft))
+
+
+def _largest_torque(model: JointModel) -> float:
+    """What the drive gives in the end when everything is asked of it, whatever effect clips it."""
+    if not math.isfinite(model.drive.torque_limit_nm):
+        return math.inf
+    parameters, state = packing.parameters(model), packing.state()
+    state[plant.DEMAND] = model.drive.torque_limit_nm
+    current = [kernel().motor_torque(parameters, state, 1e-3) for _ in range(2000)]
+    return float(current[-1])
+
+
+def _limits(limit_nm: float) -> str:
+    return f'ctrllimited="true" ctrlrange="{-limit_nm:.9g} {limit_nm:.9g}"' if math.isfinite(limit_nm) else ""
+
+
+def _body(inertia_kg_m2: float, cos_nm: float, sin_nm: float) -> str:
+    """Mass and centre whose gravity torque about -y is ``cos*cos(q) + sin*sin(q)``, with the inertia left over."""
+    torque = math.hypot(cos_nm, sin_nm)
+    radius = 0.5 * inertia_kg_m2 * GRAVITY_M_S2 / torque if torque > 0.0 else 0.0
+    mass = torque / (GRAVITY_M_S2 * radius) if torque > 0.0 else 1e-6
+    angle = math.atan2(-sin_nm, cos_nm)
+    own = inertia_kg_m2 - mass * radius**2
+    return (
+        f'<inertial pos="{radius * math.cos(angle):.9g} 0 {radius * math.sin(angle):.9g}" mass="{mass:.9g}" '
+        f'diaginertia="{own:.9g} {own:.9g} {own:.9g}"/>'
+    )
+
+
+def _level_and_slope(model: JointModel) -> tuple[float, float]:
+    """Coulomb level and viscosity that fit the odd part of steady sliding best, all effects included."""
+    speed = np.linspace(0.02, 2.0, 100)
+    torque = model.true_curve_nm(speed)
+    columns = np.stack([np.ones_like(speed), speed], axis=1)
+    level, slope = np.linalg.lstsq(columns, torque, rcond=None)[0]
+    return max(0.0, float(level)), max(0.0, float(slope))
+
+
+def _accounts(model: JointModel, soft: bool) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:
+    native = {
+        "inertia": "link body and armature",
+        "gravity": "mass and centre of the link body",
+        "friction": "frictionloss and damping: a level and a slope",
+        "torque limit": "ctrlrange",
+    }
+    callback = {"friction curve": "as measured, behind the presliding spring"}
+    lost = [
+        "without the callback: presliding, and friction that is no straight line over speed (MuJoCo's friction loss "
+        "is a soft constraint, so that a joint at rest creeps)"
+    ]
+    for name in model.effects:
+        stages = {hook.stage for hook in all_effects()[name].hooks} - {"settle"}
+        if stages <= _IN_MJCF:
+            native[name] = "joint and body parameters"
+        elif stages <= _SENSED:
+            callback[name] = "in the position that `reading_rad` returns"
+            if "report_velocity" in stages or "temperature" in stages:
+                lost.append(f"{name}: it changes only what a drive reports; MuJoCo's sensors report the true motion")
+        elif name in ("torque_bias", "torque_constant_error", "torque_saturation"):
+            native[name] = "the actuator's biasprm, gainprm and ctrlrange"
+        else:
+            callback[name] = "by the formulas of the simulation; the model alone holds its mean at most"
+            lost.append(f"{name}: without the callback but for its part in level and slope of friction")
+    if soft:
+        lost.append("MuJoCo integrates the transmission explicitly in time: halve the time step for stiffer gears")
+    return native, callback, tuple(lost)
+
+
+class MujocoJoint:
+    """The joint's own drive, friction and sensors in a MuJoCo simulation of its exported model.
+
+    Put the drive's torque demand into ``data.ctrl[0]``; ``install`` makes the model feel what the joint makes of it.
+    One joint at a time: MuJoCo has one control callback per process.
+
+    Args:
+        joint: with its effects.
+        payload: the payload is mounted; export with the same word.
+    """
+
+    def __init__(self, joint: JointModel, *, payload: bool = False) -> None:
+        self._parameters = packing.parameters(joint, payload=payload)
+        self._state = packing.state()
+        self._functions = kernel()
+        self._gear_ratio = joint.gear_ratio
+        self._time_s = -1.0
+        self._soft = False
+        self.torque_nm = 0.0
+        """The torque that the drive gives, as it would report it."""
+
+    def install(self, library: Any, model: Any, data: Any, *, position_rad: float = 0.0) -> float:
+        """Place the joint at rest, switch the model's own friction and actuator off, and hang in the callback.
+
+        Args:
+            library: the ``mujoco`` module.
+            model: made of ``described(...).xml``.
+            data: of that model.
+            position_rad: where the encoder reads at the start.
+
+        Returns:
+            The holding torque, N m: the demand to begin with.
+        """
+        state, step_s = self._state, float(model.opt.timestep)
+        holding = self._functions.place(self._parameters, state, position_rad)
+        self._functions.begin(self._parameters, state, step_s)
+        self._soft = model.nv > 1
+        model.dof_frictionloss[0] = 0.0
+        model.dof_damping[0] = 0.0
+        model.actuator_gainprm[0, 0] = 0.0
+        model.actuator_biasprm[0, 0] = 0.0
+        data.qpos[0] = state[plant.MOTOR_POSITION]
+        if self._soft:
+            data.qpos[1] = state[plant.LINK_POSITION] - state[plant.MOTOR_POSITION]
+        data.ctrl[0] = holding
+        library.set_mjcb_control(self._apply)
+        library.mj_forward(model, data)
+        return float(holding)
+
+    def reading_rad(self, data: Any) -> float:
+        """What the encoder says, its steps and offset included."""
+        on_motor = self._parameters[plant.ENCODER_ON_MOTOR] != 0.0
+        true = data.qpos[0] if on_motor or not self._soft else data.qpos[0] + data.qpos[1]
+        return float(self._functions.measure(self._parameters, true))
+
+    def _apply(self, model: Any, data: Any) -> None:
+        """One step: demand to current to shaft, less friction; memories move on once per step."""
+        parameters, state, functions = self._parameters, self._state, self._functions
+        step_s = float(model.opt.timestep)
+        position, velocity = float(data.qpos[0]), float(data.qvel[0])
+        moved_on = data.time > self._time_s
+        if moved_on:
+            self._time_s = float(data.time)
+            state[plant.DEMAND] = float(data.ctrl[0])
+            self.torque_nm = functions.motor_torque(parameters, state, step_s)
+            coulomb = parameters[plant.COULOMB]
+            turn = parameters[plant.STIFFNESS] / coulomb * step_s * velocity if coulomb > 0.0 else 0.0
+            state[plant.SLIP] = min(1.0, max(-1.0, state[plant.SLIP] + turn))
+        link = position + (float(data.qpos[1]) if self._soft else 0.0)
+        acceleration = float(data.qacc[0] + (data.qacc[1] if self._soft else 0.0))
+        load = functions.gravity_torque(parameters, link) + state[plant.LINK_INERTIA] * acceleration
+        level, rate, other = functions.friction(parameters, state, velocity, position, state[plant.SLIP], load)
+        friction = level * state[plant.SLIP] + rate + other
+        if moved_on:
+            functions.remember(parameters, state, velocity, friction, step_s)
+        shaft = functions.shaft_torque(parameters, self.torque_nm, position, self._gear_ratio)
+        data.qfrc_applied[0] = shaft - friction
