@@ -58,7 +58,7 @@ def walk(place: Path) -> None:
                     print(f"{time.monotonic() - began:6.0f} s  {time.monotonic() - since:5.1f} s  {others[at]}")
                 at, since = at + 1, time.monotonic()
             log.write(said)
-            if "not found" in said or "rror" in said:
+            if "not found" in said or "error:" in said.lower():
                 print(f"          says: {said.strip()}")
         walked.wait()
 

@@ -22,6 +22,8 @@ from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.files import write_whole
 
 _EXAMPLE = 'for example --on-calendar "Mon..Fri 02:30"'
+_WEEK = ("sun", "mon", "tue", "wed", "thu", "fri", "sat")
+"""As cron counts the days, from 0."""
 _STOP_S = 60
 _VERIFY_TIMEOUT_S = 30.0
 
@@ -150,11 +152,12 @@ def verify(units: dict[str, str], *, system: bool) -> bool:
 
 
 def cron_line(options: ScheduleOptions, robot: Robot) -> str:
-    """A line for ``crontab -e``, daily at the hour of the calendar expression, or at 02:30."""
+    """A line for ``crontab -e``: at the weekdays and the hour of the calendar expression, else daily at 02:30."""
     hour, minute = _hour_and_minute(options.on_calendar)
-    command = shlex.join(_command(options, robot)).replace("%", r"\%")
-    log = f"$HOME/.local/state/frictid-hil/{robot.name}.log"
-    return f"{minute} {hour} * * * cd {shlex.quote(str(_work_folder(robot)))} && {command} >> {log} 2>&1"
+    folder = shlex.quote(str(_work_folder()))
+    # cron tells nobody of a folder that is not there: the line makes it.
+    words = f"mkdir -p {folder} && cd {folder} && {shlex.join(_command(options, robot))} >> {robot.name}.log 2>&1"
+    return f"{minute} {hour} * * {_weekdays(options.on_calendar)} " + words.replace("%", r"\%")
 
 
 def _command(options: ScheduleOptions, robot: Robot) -> list[str]:
@@ -259,9 +262,22 @@ def _unit_folder(system: bool) -> Path:
     return (Path(base) if base else Path.home() / ".config") / "systemd" / "user"
 
 
-def _work_folder(robot: Robot) -> Path:
+def _work_folder() -> Path:
     base = os.environ.get("XDG_STATE_HOME", "")
     return (Path(base) if base else Path.home() / ".local" / "state") / "frictid-hil"
+
+
+def _weekdays(on_calendar: str) -> str:
+    """The weekdays of an expression that begins with some (``Mon..Fri``, ``Tue,Sat``) as cron counts them, else all."""
+    word = on_calendar.split()[0].lower()
+    numbers: set[int] = set()
+    for part in word.split(","):
+        first, _, last = part.partition("..")
+        if first not in _WEEK or (last or first) not in _WEEK:
+            return "*"
+        low, high = _WEEK.index(first), _WEEK.index(last or first)
+        numbers |= {at % 7 for at in range(low, high + 1 + 7 * (high < low))}
+    return ",".join(map(str, sorted(numbers)))
 
 
 def _hour_and_minute(on_calendar: str) -> tuple[int, int]:

@@ -21,6 +21,7 @@ from frictid_drivers.virtual import rack
 from frictid_drivers.virtual.servo import Servo
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
+from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
 from frictid_hil.driver import Mode
 from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, ProfileMismatch, UsageError
@@ -126,6 +127,27 @@ def test_lock_step_is_bit_identical(robot: Path, profile: Path, tmp_path: Path) 
     options = CompensateOptions(str(robot), profile, JOINT, "track", ("mop",), duration_s=3.0)
     first, second = (compensate(replace(options, out=tmp_path / name), Silent()) for name in ("a", "b"))
     assert first["modes"] == second["modes"]
+
+
+def test_a_run_keeps_its_profile_when_another_is_promoted(robot: Path, profile: Path, tmp_path: Path) -> None:
+    store, name = ProfileStore(tmp_path / "store"), load_profile(profile).robot
+    first = store.add(load_profile(profile))
+    other = store.add(load_profile(scaled(profile, tmp_path / "other.yaml", 0.9)))
+    store.promote(name, first)
+
+    class Promotes(Silent):
+        def event(self, event: Event) -> None:
+            if isinstance(event, PhaseStarted):
+                store.promote(name, other)
+
+    options = CompensateOptions(str(robot), store.path(name, first), JOINT, "hand", ("mop",), duration_s=2.0)
+    kept = compensate(replace(options, out=tmp_path / "kept"), Promotes())
+    active = store.active(name)
+    assert active is not None and active.id == other
+    alone = compensate(replace(options, out=tmp_path / "alone"), Silent())
+    assert kept["modes"] == alone["modes"] and kept["profile"] == str(store.path(name, first).resolve())
+    after = compensate(replace(options, profile=store.path(name, other), out=tmp_path / "after"), Silent())
+    assert after["modes"] != alone["modes"], "the two profiles can be told apart"
 
 
 def test_a_joint_that_yields_gradually_is_given_such_a_spring_by_our_setting_only(
