@@ -106,6 +106,14 @@ def record(
     profile: Annotated[
         Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
     ] = None,
+    payload: Annotated[
+        bool | None,
+        typer.Option(
+            "--payload/--no-payload",
+            help="Payload steps too; you are asked to mount it. A simulated robot mounts its own.",
+            show_default=False,
+        ),
+    ] = None,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
@@ -127,6 +135,7 @@ def record(
         short=short,
         plan=plan,
         profile=profile,
+        payload=payload,
         realtime=realtime,
         seed=seed,
         out=out,

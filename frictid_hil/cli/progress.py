@@ -97,6 +97,13 @@ class TerminalWatcher:
         how = "ALL AT ONCE" if plan.together else "one at a time, all others locked"
         return typer.confirm(f"{plan.robot}: joints {joints} will move, {how}. Is the cell clear?", err=True)
 
+    def ask(self, question: str) -> bool:
+        """Ask; with ``--yes``, or without a terminal, nobody is there to have done anything."""
+        if self._yes or not sys.stdin.isatty():
+            return False
+        self.close()
+        return typer.confirm(question, err=True)
+
     def event(self, event: Event) -> None:
         """Follow the phases."""
         if isinstance(event, PhaseStarted):

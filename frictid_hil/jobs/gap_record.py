@@ -65,7 +65,8 @@ class GapRecordOptions:
         short: the short set.
         plan: plan file of a diagnosis that could not decide; overrules ``short``.
         profile: friction profile that the simulator believes.
-        payload: the payload is at hand; None: on a simulated robot only.
+        payload: a person is there to mount the payload when asked; None: on a simulated robot only, which mounts its
+            own.
         centre_rad: middle of all travels; None: middle of the joint's procedure.
         travel_rad: of the small sines; None: the joint's procedure's.
         realtime: wall clock for the virtual robot.
@@ -95,22 +96,26 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
         HardwareError: hardware unreachable.
 
     Returns:
-        The JSON of the verb: ``outcome``, ``set`` (None where no experiment was finished), ``experiments``, ``run``,
-        ``robot``, ``joint``, ``duration_s``, ``belief``. A safety abort after motion began is an outcome; experiments
-        finished before it are kept.
+        The JSON of the verb: ``outcome``, ``set`` (None where no experiment was finished), ``experiments``, ``skipped``
+        (with reasons), ``run``, ``robot``, ``joint``, ``duration_s``, ``belief``. A safety abort after motion began is
+        an outcome; experiments finished before it are kept.
     """
     robot = load_robot(options.robot)
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     robot.check_joints([options.joint])
     joint = setup.joint(options.joint)
     driver_name = robot.driver(options.bus)
-    simulated = driver_name == "virtual"
+    simulated = mounts_its_own_payload(driver_name)
     profile = load_profile(options.profile).joint(options.joint) if options.profile else None
     belief = belief_of(
         joint, profile, profile_name=options.profile.name if options.profile else "", simulated_drive=simulated
     )
-    loaded_too = belief.payload and (simulated if options.payload is None else options.payload)
-    experiments = _experiments(options, envelope_of(robot, joint, options), payload=loaded_too)
+    without = _why_no_payload(options, belief, simulated=simulated)
+    asked = _asked(options, envelope_of(robot, joint, options))
+    experiments = asked if without is None else _unloaded(asked)
+    skipped = {e.name: without for e in asked if without is not None and e.name not in {x.name for x in experiments}}
+    if not experiments:
+        raise UsageError(f"all experiments asked for need the payload: {without}", where=options.robot)
     earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
     if earlier is not None and options.plan is None:
         raise UsageError(
@@ -124,15 +129,18 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
         refuse_beyond_limits(plan, setup, expected)
     folder = RunFolder.create(robot, VERB, None)
     loaded = [payload for payload in (False, True) if any(e.payload == payload for e in experiments)]
-    run = _Run(driver_name, rehearsals, setup, joint.name, watcher, folder, loaded)
+    run = _Run(driver_name, rehearsals, setup, joint.name, watcher, folder, loaded, mounts_itself=simulated)
     try:
         run.everything([plan for plan, _ in plans])
     finally:
         if not run.rows:
             folder.discard()
-    if run.ended is not None and not run.rows:
-        raise run.ended
+    if not run.rows:
+        raise run.ended or UsageError(f"{run.unloaded}; nothing has moved", where=options.robot)
     done = [e for payload in loaded for e in experiments if e.payload == payload and e.name in run.logs]
+    skipped |= {e.name: run.unloaded for e in experiments if run.unloaded and e.payload and e.name not in run.logs}
+    for name, why in skipped.items():
+        watcher.note(f"{name} was left out: {why}")
     place: Path | None = None
     if done and run.identity is not None:
         place = options.out or folder.path / "set"
@@ -146,6 +154,7 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
         "run": str(folder.path.resolve()),
         "set": str(place.resolve()) if place else None,
         "experiments": [e.name for e in done],
+        "skipped": [{"experiment": name, "reason": why} for name, why in skipped.items()],
         "duration_s": sum(e.duration_s for e in done),
         "belief": list(belief.sources),
     }
@@ -159,6 +168,11 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
         }
     folder.finish(result)
     return result
+
+
+def mounts_its_own_payload(driver_name: str) -> bool:
+    """Whether the robot is simulated, so that nobody has to mount anything."""
+    return driver_name == "virtual"
 
 
 def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> Envelope:
@@ -177,18 +191,41 @@ def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> E
     )
 
 
-def _experiments(options: GapRecordOptions, envelope: Envelope, *, payload: bool) -> tuple[Experiment, ...]:
-    """Those asked for; without a payload, those that need it are left out or run unloaded."""
+def _asked(options: GapRecordOptions, envelope: Envelope) -> tuple[Experiment, ...]:
+    """The experiments that the options name."""
     if options.plan is not None:
         names = _read_plan(options.plan)
     elif options.short:
         names = SHORT
     else:
         names = (*FULL, *(name for name in ("second_posture",) if name in catalogue(envelope)))
-    experiments = chosen(names, envelope, seed=options.seed)
-    if payload:
-        return experiments
+    return chosen(names, envelope, seed=options.seed)
+
+
+def _unloaded(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+    """Without a payload, those that need it are left out; ordinary work is recorded unloaded."""
     return tuple(dataclasses.replace(e, payload=False) for e in experiments if not e.payload or e.role == "validation")
+
+
+def _why_no_payload(options: GapRecordOptions, belief: Belief, *, simulated: bool) -> str | None:
+    """Why nothing is recorded with the payload; None where it is.
+
+    Raises:
+        UsageError: it was asked for, and its inertia and weight are nowhere told.
+    """
+    if not belief.payload:
+        if options.payload:
+            raise UsageError(
+                f"the payload of joint {options.joint} is not known, so recordings with it would say nothing",
+                where=options.robot,
+                next_step=f"add `payload: {{inertia_kg_m2, gravity_cos_nm}}` to joints.{options.joint}.simulated",
+            )
+        return "the robot file tells no payload of this joint"
+    if options.payload is False:
+        return "asked for without the payload"
+    if options.payload is None and not simulated:
+        return "nobody said that the payload is at hand (--payload)"
+    return None
 
 
 def _read_plan(path: Path) -> tuple[str, ...]:
@@ -280,6 +317,8 @@ class _Run:
         watcher: Watcher,
         folder: RunFolder,
         loaded: list[bool],
+        *,
+        mounts_itself: bool,
     ) -> None:
         self._driver_name = driver_name
         self._rehearsals = rehearsals
@@ -288,27 +327,42 @@ class _Run:
         self._watcher = watcher
         self._folder = folder
         self._loaded = loaded
+        self._mounts_itself = mounts_itself
         self._session = 0
         self._driver: Driver | None = None
         self.identity: JointIdentity | None = None
         self.logs: dict[str, Samples] = {}
         self.rows = 0
         self.ended: FrictidError | None = None
+        self.unloaded = ""
+        """Why no recording with the payload was made although it was planned."""
 
     def everything(self, plans: Sequence[Plan]) -> None:
         """Run all plans; what ends them early is in ``ended``."""
         together = [_joined(plans)] if self._in_lock_step() else list(plans)
         for plan in together:
+            if not self._ready_for(plan):
+                return
             try:
                 self._one(plan)
             except PlanRefused as refused:
                 if not self.logs:
                     raise
-                self._watcher.note(f"{refused.what}; experiments with the payload were left out")
+                self.unloaded = refused.what
                 return
             except FrictidError as error:
                 self.ended = error
                 return
+
+    def _ready_for(self, plan: Plan) -> bool:
+        """Ask for the payload where a person has to mount it; without a yes its experiments are left out."""
+        if self._mounts_itself or not self._loaded[self._session]:
+            return True
+        for note in plan.notes:
+            if not self._watcher.ask(f"{note[:1].upper()}{note[1:]}. Is it mounted?"):
+                self.unloaded = "nobody mounted the payload"
+                return False
+        return True
 
     def _one(self, plan: Plan) -> None:
         self._watcher.plan(plan, self._setup)

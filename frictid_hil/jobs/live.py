@@ -74,6 +74,10 @@ class LiveWatcher:
         """The other watcher's answer."""
         return self._watcher.confirm(plan, preflight)
 
+    def ask(self, question: str) -> bool:
+        """The other watcher's answer."""
+        return self._watcher.ask(question)
+
     def event(self, event: Event) -> None:
         """Pass on."""
         self._watcher.event(event)

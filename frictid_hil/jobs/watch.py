@@ -11,7 +11,7 @@ from frictid_hil.runner.ring import Rows
 
 
 class Watcher(Protocol):
-    """Everything a job says while it works; nothing here decides a result except ``confirm``."""
+    """Everything a job says while it works; nothing here decides a result except ``confirm`` and ``ask``."""
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
         """The plan, before anything is opened."""
@@ -19,6 +19,10 @@ class Watcher(Protocol):
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
         """Ask the person, with the hardware read and the plan shown."""
+        ...
+
+    def ask(self, question: str) -> bool:
+        """Whether a person who is there has done what the question says; no where nobody is asked."""
         ...
 
     def event(self, event: Event) -> None:
@@ -47,6 +51,10 @@ class Silent:
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
         """Yes."""
         return True
+
+    def ask(self, question: str) -> bool:
+        """No: nobody is there."""
+        return False
 
     def event(self, event: Event) -> None:
         """Ignore."""

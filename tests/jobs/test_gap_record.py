@@ -14,6 +14,7 @@ from frictid_hil.config.search import find
 from frictid_hil.errors import UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, full_set, names_of_plan, plan_document
+from frictid_hil.jobs import gap_record
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan import Plan
@@ -102,6 +103,68 @@ def test_without_a_payload_validation_runs_bare_and_the_rest_is_left_out(robot: 
     result = record(GapRecordOptions(robot, "0", plan=plan, payload=False, out=out), Silent())
     assert result["experiments"] == ["moves_payload"]
     assert not ExperimentSet.load(out).experiments[0].payload
+
+
+class Mounting(Silent):
+    """A person who says yes or no when asked for the payload."""
+
+    def __init__(self, mounted: bool) -> None:
+        self.mounted = mounted
+        self.questions: list[str] = []
+        self.notes: list[str] = []
+
+    def ask(self, question: str) -> bool:
+        self.questions.append(question)
+        return self.mounted
+
+    def note(self, message: str) -> None:
+        self.notes.append(message)
+
+
+def test_what_was_left_out_is_told_with_its_reason(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_file(tmp_path, "breakaway", "sines_payload")
+    options = GapRecordOptions(robot, "0", plan=plan, payload=False, out=tmp_path / "a")
+    person = Mounting(True)
+    result = record(options, person)
+    assert result["skipped"] == [{"experiment": "sines_payload", "reason": "asked for without the payload"}]
+    assert person.notes == ["sines_payload was left out: asked for without the payload"] and not person.questions
+    # A machine whose payload nobody announced.
+    monkeypatch.setattr(gap_record, "mounts_its_own_payload", lambda driver: False)
+    unannounced = record(GapRecordOptions(robot, "0", plan=plan, out=tmp_path / "b"), Mounting(True))
+    assert "--payload" in unannounced["skipped"][0]["reason"]
+    assert unannounced["experiments"] == ["breakaway"]
+    with pytest.raises(UsageError, match="all experiments asked for need the payload"):
+        record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "sines_payload"), out=tmp_path / "c"), Silent())
+
+
+@pytest.mark.parametrize("mounted", [True, False])
+def test_a_person_is_asked_to_mount_the_payload_before_it_moves(
+    robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mounted: bool
+) -> None:
+    monkeypatch.setattr(gap_record, "mounts_its_own_payload", lambda driver: False)
+    person = Mounting(mounted)
+    # Nothing but payload steps, so that the question comes before the first motion of a robot in lock-step.
+    options = GapRecordOptions(
+        robot, "0", plan=plan_file(tmp_path, "chirp_payload"), payload=True, out=tmp_path / "set"
+    )
+    if not mounted:
+        with pytest.raises(UsageError, match="nobody mounted the payload; nothing has moved"):
+            record(options, person)
+        assert not (tmp_path / "set").exists()
+    else:
+        result = record(options, person)
+        assert result["experiments"] == ["chirp_payload"] and result["skipped"] == []
+    (question,) = person.questions
+    assert question.startswith("Mount the payload on joint 0 now") and "kg m2" in question
+
+
+def test_a_payload_that_nobody_described_is_refused(robot: str, tmp_path: Path) -> None:
+    values = yaml.safe_load(Path(robot).read_text())
+    del values["joints"]["0"]["simulated"]["payload"]
+    Path(robot).write_text(yaml.safe_dump(values))
+    with pytest.raises(UsageError, match="payload of joint 0 is not known") as told:
+        record(GapRecordOptions(robot, "0", short=True, payload=True, out=tmp_path / "set"), Silent())
+    assert "gravity_cos_nm" in told.value.next_step
 
 
 def test_a_second_recording_adds_to_the_set_and_none_is_overwritten(robot: str, tmp_path: Path) -> None:
