@@ -32,8 +32,15 @@ _SMOOTHING_S = 0.02
 _TURN_SHARE = 0.3
 """A turning point is followed by at least this share of the whole travel in the other direction."""
 _LEAST_ROWS = 20
-_PLAINLY = 0.5
-"""A joint yields gradually where that shape leaves less than this share of what the other leaves (mean squares)."""
+_PLAINLY = 0.015
+"""A joint is called gradual where that shape leaves nowhere more than this share of D.
+
+Averaged over a tenth of D / sigma. A joint whose friction is partly of the other kind leaves 2 % and more, and would hunt
+with a spring that is twice as stiff after the turning point as at rest (docs/compensation.md).
+"""
+_LOOKED_AT = 20
+"""Tenths of D / sigma from the turning point on; friction has turned over long before."""
+_LEAST_IN_TENTH = 10
 _LEAST_CLARITY = 4.0
 """The passage is larger than what the fitted shape leaves by at least this factor."""
 
@@ -57,6 +64,16 @@ class Presliding:
 class _Passage:
     travel: Array  # since the turning point, positive
     drop: Array  # torque, signed so that it falls
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """One shape through all passages that it could be fitted to."""
+
+    stiffness: Array
+    change: Array
+    mean_square: float
+    largest_misfit: float  # share of D, averaged over a tenth of D / sigma
 
 
 def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Presliding:
@@ -91,9 +108,9 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
             where=where,
             cause="the reversal is shorter than the presliding travel, or torque is too noisy",
         )
-    found, _ = min(shapes, key=lambda fitted: fitted[1])
-    gradual = at_once is not None and gradually is not None and gradually[1] < _PLAINLY * at_once[1]
-    return Presliding(_mean(found[:, 0]), _mean(0.5 * found[:, 1]), gradual)
+    best = min(shapes, key=lambda fitted: fitted.mean_square)
+    gradual = best is gradually and best.largest_misfit < _PLAINLY
+    return Presliding(_mean(best.stiffness), _mean(0.5 * best.change), gradual)
 
 
 def _mean(values: Array) -> Measured:
@@ -135,13 +152,10 @@ def _gradually(travel: Array, start: float, stiffness: float, change: float) -> 
     return falling
 
 
-def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Array, float] | None:
-    """(Stiffness, change) of every passage that could be fitted, shape (n, 2), and the mean square left.
-
-    None where fewer than two could.
-    """
+def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> _Fitted | None:
+    """None where fewer than two passages could be fitted."""
     found: list[tuple[float, float]] = []
-    left = 0.0
+    squares, misfits = [], []
     for passage in passages:
         travel, drop = passage.travel, passage.drop
         top, bottom = np.quantile(drop, 0.98), np.quantile(drop, 0.1)
@@ -156,10 +170,20 @@ def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> tuple[Arr
             )
         except (RuntimeError, ValueError):
             continue
-        rest = float(np.mean((shape(travel, *values) - drop) ** 2))
-        if np.sqrt(spread[1, 1]) < 0.5 * values[1] and values[2] > _LEAST_CLARITY * np.sqrt(rest):
+        rest = drop - shape(travel, *values)
+        mean_square = float(np.mean(rest**2))
+        if np.sqrt(spread[1, 1]) < 0.5 * values[1] and values[2] > _LEAST_CLARITY * np.sqrt(mean_square):
             found.append((float(values[1]), float(values[2])))
-            left += rest
+            squares.append(mean_square)
+            misfits.append(_largest_misfit(travel * values[1] / values[2], rest / values[2]))
     if len(found) < 2:
         return None
-    return np.array(found), left / len(found)
+    stiffness, changes = np.array(found).T
+    return _Fitted(stiffness, changes, float(np.mean(squares)), max(misfits))
+
+
+def _largest_misfit(travel: Array, rest: Array) -> float:
+    """Largest mean of what is left over a tenth of the travel: noise averages out, a wrong shape stays."""
+    tenth = np.floor(10.0 * travel).astype(int)
+    means = [abs(rest[tenth == k].mean()) for k in range(_LOOKED_AT) if (tenth == k).sum() >= _LEAST_IN_TENTH]
+    return float(max(means, default=np.inf))

@@ -48,9 +48,10 @@ def test_stiffness_at_rest_is_found_through_noise_steps_and_gravity(model, stiff
     assert found.gradual == (model is dahl)
 
 
-def test_a_joint_between_the_two_shapes_is_not_called_gradual():
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_a_joint_between_the_two_shapes_is_not_called_gradual(share):
     time, path = triangles()
-    torque = 0.5 * (slip(path, 6_000.0, 5.0) + dahl(path, 6_000.0, 5.0))
+    torque = (1 - share) * slip(path, 6_000.0, 5.0) + share * dahl(path, 6_000.0, 5.0)
     assert not presliding(time, path, torque).gradual
 
 
