@@ -86,7 +86,7 @@ def calibrate(
     ] = "thorough",
     together: Annotated[
         bool,
-        typer.Option("--together", help="Experimental: all joints at once, in phase; the cell must allow it."),
+        typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
     ] = False,
     rate: Annotated[
         float | None,

@@ -67,6 +67,16 @@ def pull(recording: CycleRecording, motion: Motion) -> Pull | None:
     return Pull(inertia, accelerations(others, motion), np.diag(deviation**2))
 
 
+def posture(motion: Motion) -> Array:
+    """What changes along the travel while other joints move: inertia, and velocity products, shape (n, 5).
+
+    A joint that moves alone has the same inertia everywhere, and no torque that goes with the speed squared.
+    """
+    q = motion.position_rad - np.mean(motion.position_rad)
+    a, squared = motion.acceleration_rad_s2, motion.velocity_rad_s**2
+    return np.column_stack([q * a, q**2 * a, squared, q * squared, q**2 * squared])
+
+
 def accelerations(others: tuple[Companion, ...], motion: Motion) -> Array:
     """Of other joints at the instants of this motion, through its own kernel, rad/s2, shape (n, m)."""
     columns = [_acceleration(other, motion) for other in others]

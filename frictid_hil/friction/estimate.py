@@ -20,7 +20,7 @@ import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
-from frictid_hil.friction.coupling import Pull, pull
+from frictid_hil.friction.coupling import Pull, posture, pull
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
@@ -121,7 +121,9 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     taken: Link | Pull | None = link or others
     doubtful = None if taken is None else taken.columns
     try:
-        solved = fit(recording, motion, least_squares.curve_knots(recording), level, doubtful=doubtful)
+        knots = least_squares.curve_knots(recording)
+        extra = posture(motion) if recording.coupled else None
+        solved = fit(recording, motion, knots, level, extra=extra, doubtful=doubtful)
     except IdentificationError as problem:
         if method == "least-squares":
             raise

@@ -150,7 +150,7 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
     notes += _notes(procedures, expected, rehearse)
     if options.together:
-        notes.append(_TOGETHER_NOTE)
+        notes += _together_notes(setup)
     plan = calibration_plan(
         robot,
         setup,
@@ -414,10 +414,16 @@ def _unseen(
     ]
 
 
-_TOGETHER_NOTE = (
-    "all joints at once is experimental: where links drive each other, inertia and gravity come out as those of the "
-    "combined motion, and curves differ by up to 0.7 % from one by one"
-)
+def _together_notes(setup: RobotSetup) -> list[str]:
+    notes = [
+        "all joints move at once: inertia and gravity of a single joint cannot be told then; where they are needed, "
+        "calibrate one by one"
+    ]
+    if setup.workspace is None:
+        notes.append(
+            "no `workspace` in the robot file: the combined motion was checked against the joints' own limits only"
+        )
+    return notes
 
 
 def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:

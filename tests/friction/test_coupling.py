@@ -121,3 +121,20 @@ def test_shaking_keeps_to_the_travel_and_never_reverses(amplitude_deg: float, pl
     assert abs(speed[0]) < 1e-3 and abs(speed[-1]) < 1e-3
     fastest = procedure.velocity_rad_s * procedure.angular_frequencies_rad_s[-1]
     assert np.abs(np.gradient(speed, time_s)).max() < 0.75 * fastest
+
+
+def test_least_squares_follows_an_inertia_that_changes_along_the_travel() -> None:
+    """As of the swing axis while the arm folds; a joint that moves alone has no such thing."""
+    lone = cycles(np.diag(np.diag(INERTIA)))["0"]
+    q, v, a = lone.position_rad, np.gradient(lone.position_rad, STEP_S), np.zeros_like(lone.position_rad)
+    a[1:-1] = np.diff(lone.position_rad, 2) / STEP_S**2
+    folding = replace(lone, torque_nm=lone.torque_nm + 4.0 * (q - 0.17) * a + 2.0 * v**2, coupled=True)
+    truth = estimate(lone, "least-squares").curve
+    speeds = np.linspace(0.2, 2.0, 50)
+
+    def off(recording: CycleRecording) -> float:
+        curve = estimate(recording, "least-squares").curve
+        return float(np.abs(curve.magnitude(speeds) - truth.magnitude(speeds)).mean() / truth.coulomb_nm)
+
+    assert off(folding) < 0.003
+    assert off(folding) < 0.3 * off(replace(folding, coupled=False))

@@ -1,0 +1,210 @@
+"""All six joints at once against one by one, joints on one arm: how far the curves differ, how long it takes.
+
+    python benchmarks/together.py [--seeds 1,2,3] [--out FOLDER]
+
+`profiles/hp3j-arm.yaml` is calibrated through the bus at its own rate, once with all joints together and once with each
+joint alone, first without torque noise - what then differs is of the method -, then with the shipped noise, for every
+seed. `repeat` is what two calibrations of one joint alone differ by when nothing but the seed of the noise changed;
+less than that cannot be seen in one pair of runs. `left in` is the distance with nothing taken off for other joints.
+Distances are (15) in percent of the curve's mean, over the measured range [V_1, V_N] and, without noise, over [0, V].
+`M found` is the largest error of the off-diagonal inertia against MuJoCo's, in percent of sqrt(M_ii M_jj).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import load_driver
+from frictid_hil.friction.metrics import CurveDistance, curve_distance
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
+from frictid_hil.jobs.compare import true_curve
+from frictid_hil.jobs.joint_profile import identify_joint
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.recording.read import read
+from frictid_hil.simulation.arm_model import ArmModel
+from frictid_hil.simulation.rigid_bodies import RigidBodies
+
+ROBOT = "hp3j-arm.yaml"
+NAMES = ("0", "1", "2", "3", "4", "5")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One calibration of the whole arm.
+
+    Attributes:
+        profile: what came of it.
+        duration_s: of motion and powering, summed over sessions.
+        folder: of the recording; of the first joint where they were run one by one.
+    """
+
+    profile: dict[str, JointProfile]
+    duration_s: float
+    folder: Path
+
+
+def calibrated(robot: str, out: Path, seed: int, joints: tuple[str, ...], *, together: bool) -> Run:
+    options = CalibrateOptions(
+        robot, bus=f"virtual:bench-{out.name}", out=out, seed=seed, joints=joints, together=together
+    )
+    if not (out / "profile.yaml").exists():
+        result = calibrate(options, Silent())
+        if result["outcome"] not in ("ok", "gate_failed"):
+            raise SystemExit(f"{out}: {result}")
+    profile: FrictionProfile = load_profile(out / "profile.yaml")
+    return Run({name: profile.joint(name) for name in joints}, _duration_s(out, together=together), out)
+
+
+def _duration_s(out: Path, *, together: bool) -> float:
+    """Run time from the first to the last sample of the joints' sessions."""
+    spans = [joint.time_s[-1] - joint.time_s[0] for joint in read(out, None) if joint.marks]
+    return float(max(spans) if together else sum(spans))
+
+
+def one_by_one(robot: str, folder: Path, name: str, seed: int) -> Run:
+    runs = [calibrated(robot, folder / f"{name}-{j}", seed, (j,), together=False) for j in NAMES]
+    return Run(
+        {j: run.profile[j] for j, run in zip(NAMES, runs, strict=True)},
+        sum(run.duration_s for run in runs),
+        runs[0].folder,
+    )
+
+
+def distance(first: JointProfile, second: JointProfile) -> CurveDistance:
+    assert first.procedure is not None
+    return curve_distance(first.curve(), second.curve(), first.procedure.velocity_rad_s)
+
+
+def to_truth(profile: JointProfile, joint: str) -> float:
+    assert profile.procedure is not None
+    velocity = profile.procedure.velocity_rad_s
+    truth = true_curve(load_robot(ROBOT), joint, velocity)
+    return curve_distance(profile.curve(), truth, velocity).e_percent_measured_range
+
+
+def left_in(run: Run, alone: Run) -> dict[str, float]:
+    """Distances of the same recording, the other joints' columns withheld."""
+    setup = load_robot(ROBOT).to_setup()
+    found = {s.joint: identify_joint(s, setup.joint(s.joint), method="aligned") for s in read(run.folder, None)}
+    return {name: distance(found[name], alone.profile[name]).e_percent_measured_range for name in NAMES}
+
+
+def inertia_error(run: Run) -> dict[str, float]:
+    """Largest error of each joint's row, in percent of sqrt(M_ii M_jj), in the middle of the travel."""
+    setup = load_robot(ROBOT).to_setup()
+    arm = ArmModel.from_mapping(setup.simulated_arm, {joint.name: joint.dh for joint in setup.joints})
+    middle = [joint.start_position_rad + math.radians(10) for joint in setup.joints]
+    matrix, _ = RigidBodies(arm).at(np.array(middle), np.zeros(6))
+    worst = {}
+    for i, name in enumerate(NAMES):
+        row = run.profile[name].quality["coupling_kg_m2"]
+        scale = np.sqrt(matrix[i, i] * np.diag(matrix))
+        worst[name] = 100 * max(abs(row[o] - matrix[i, j]) / scale[j] for j, o in enumerate(NAMES) if j != i)
+    return worst
+
+
+def quiet(folder: Path) -> str:
+    path = folder / "quiet.yaml"
+    lines = "".join(f"  '{name}': {{simulated: {{drive: {{torque_noise_per_mille: 0}}}}}}\n" for name in NAMES)
+    path.write_text(f"schema: frictid.robot/1\nextends: {ROBOT}\nname: hp3j-arm-quiet\njoints:\n{lines}")
+    return str(path)
+
+
+def table(title: str, rows: dict[str, dict[str, float]]) -> None:
+    print(f"\n{title}")
+    print(f"| {'':34} | " + " | ".join(f"J{name:<5}" for name in NAMES) + " |")
+    for name, row in rows.items():
+        print(f"| {name:34} | " + " | ".join(f"{row[joint]:6.3f}" for joint in NAMES) + " |")
+
+
+def mean_curves(runs: list[Run], others: list[Run]) -> dict[str, float]:
+    """Distance of the curves averaged over the seeds, at the second ones' knots, in percent of their mean."""
+    gaps = {}
+    for name in NAMES:
+        speeds = np.mean([run.profile[name].velocity_rad_s for run in others], axis=0)
+        first, second = (
+            np.mean([run.profile[name].curve().magnitude(speeds) for run in group], axis=0) for group in (runs, others)
+        )
+        gaps[name] = float(100 * np.trapezoid(np.abs(first - second), speeds) / np.trapezoid(second, speeds))
+    return gaps
+
+
+def averaged(rows: list[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([row[name] for row in rows])) for name in NAMES}
+
+
+def highest_rates_hz() -> None:
+    for bitrate in (1_000_000, 500_000):
+        for joints, together in ((("0",), False), (NAMES[:3], True), (NAMES, True)):
+            planned = plan_calibration(CalibrateOptions(ROBOT, joints=joints, together=together))
+            options = {**planned.setup.options, "bitrate": bitrate}
+            setup = replace(planned.setup, bus="virtual:bench-rates", options=options)
+            driver = load_driver("virtual")(setup)  # type: ignore[call-arg]
+            driver.open(lambda *_: None)
+            try:
+                driver.configure(100.0, joints)
+                rate = driver.capabilities().max_cycle_hz
+            finally:
+                driver.close()
+            print(f"{len(joints)} joints moving, {bitrate // 1000} kbit/s: at most {rate:.0f} Hz")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", default="1,2,3")
+    parser.add_argument("--out", type=Path, help="keep the runs here, and go on with those that are there")
+    options = parser.parse_args()
+    seeds = [int(seed) for seed in options.seeds.split(",")]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.out or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        report(folder, seeds)
+
+
+def report(folder: Path, seeds: list[int]) -> None:
+    file = quiet(folder)
+    together = calibrated(file, folder / "quiet-together", 1, NAMES, together=True)
+    alone = one_by_one(file, folder, "quiet", 1)
+    gaps = {name: distance(together.profile[name], alone.profile[name]) for name in NAMES}
+    table(
+        "without torque noise, percent",
+        {
+            "together - one by one, [V_1, V_N]": {name: gap.e_percent_measured_range for name, gap in gaps.items()},
+            "together - one by one, [0, V]": {name: gap.e_percent for name, gap in gaps.items()},
+            "left in: other joints not taken off": left_in(together, alone),
+            "truth - together": {name: to_truth(together.profile[name], name) for name in NAMES},
+            "truth - one by one": {name: to_truth(alone.profile[name], name) for name in NAMES},
+            "M found: largest error": inertia_error(together),
+        },
+    )
+    print(f"\ntogether {together.duration_s:.1f} s; one by one {alone.duration_s:.1f} s")
+
+    all_together = [calibrated(ROBOT, folder / f"s{seed}-together", seed, NAMES, together=True) for seed in seeds]
+    all_alone = [one_by_one(ROBOT, folder, f"s{seed}", seed) for seed in seeds]
+    pairs = list(zip(all_together, all_alone, strict=True))
+    repeats = [(a, b) for k, a in enumerate(all_alone) for b in all_alone[k + 1 :]]
+
+    def measured(first: Run, second: Run) -> dict[str, float]:
+        return {n: distance(first.profile[n], second.profile[n]).e_percent_measured_range for n in NAMES}
+
+    rows = {"together - one by one, mean of pairs": averaged([measured(a, b) for a, b in pairs])}
+    if repeats:
+        rows["repeat: one by one, other noise"] = averaged([measured(a, b) for a, b in repeats])
+    rows["curves averaged over the seeds"] = mean_curves(all_together, all_alone)
+    rows["truth - together"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_together])
+    rows["truth - one by one"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_alone])
+    rows["M found: largest error"] = averaged([inertia_error(run) for run in all_together])
+    table(f"with the shipped noise, {len(seeds)} seeds, [V_1, V_N], percent", rows)
+    highest_rates_hz()
+
+
+if __name__ == "__main__":
+    main()
