@@ -131,13 +131,32 @@ def pushed(task: Task, from_rad: float, torque_nm: Array, gravity_share: float) 
     return _motion(task, np.array(rows))
 
 
-def constant_velocity(task: Task) -> Outcome:
-    """Ten constant speeds to and fro, trapezoidal speed, feed-forward of inertia, gravity and Coulomb friction."""
+SETTLE_S = (0.005, 0.01, 0.02, 0.04, 0.08)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One setting of the constant-velocity sweep."""
+
+    rate_rad_s2: float
+    feed_forward: bool
+    settle_s: float
+
+
+def constant_velocity(task: Task, only: Sweep | None = None) -> Outcome:
+    """Ten constant speeds to and fro, trapezoidal speed, feed-forward of inertia, gravity and Coulomb friction.
+
+    Args:
+        task: what everybody is asked to do.
+        only: this setting alone; else the best of all.
+    """
     most = task.spare_torque_nm / task.model.inertia_kg_m2
     rates = [rate for rate in (3.0, 6.0, 12.0, 23.0, 40.0, 80.0) if rate <= most] or [most]
+    combinations = itertools.product(rates, (True, False)) if only is None else [(only.rate_rad_s2, only.feed_forward)]
+    settle = SETTLE_S if only is None else (only.settle_s,)
 
     def outcomes() -> Iterable[Outcome]:
-        for rate, feed_forward in itertools.product(rates, (True, False)):
+        for rate, feed_forward in combinations:
             speeds, motions, time_s, travel = [], [], 0.0, 0.0
             for n in range(1, 11):
                 speed = n * task.velocity_rad_s / 10
@@ -150,7 +169,7 @@ def constant_velocity(task: Task) -> Outcome:
                 motions.append(motion)
                 time_s += path.size * STEP_S
                 travel = max(travel, motion.travel_rad)
-            for settle_s in (0.005, 0.01, 0.02, 0.04, 0.08):
+            for settle_s in settle:
                 fed = "with" if feed_forward else "no"
                 yield _from_plateaus(
                     f"{rate:.3g} rad/s2, {fed} feed-forward, {1e3 * settle_s:.0f} ms to settle",

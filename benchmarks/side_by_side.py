@@ -17,8 +17,10 @@ from pathlib import Path
 
 import estimators
 import numpy as np
+import why_lost
 from other_methods import TORQUE_SHARE, Outcome, Task, constant_velocity, fourier, torque_sine
 
+from frictid_hil.config.provenance import git_revision
 from frictid_hil.errors import FrictidError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.estimate import estimate
@@ -115,27 +117,19 @@ def lost(rows: list[Row], kind: str, amplitude_deg: float) -> str:
     told = []
     for entry in rows:
         if not entry.ours and entry.error_percent < default:
-            short = {"flexible": SOFT, "load": LOADED} if amplitude_deg < 10 else {}
-            why = short.get(kind, WHY[entry.method])
+            why = LOADED if kind == "load" and amplitude_deg < 10 else WHY[entry.method]
             whom = "all of ours" if entry.error_percent < top else "aligned, behind our best"
             told.append(f"{entry.method} is ahead of {whom} ({why})")
     return "; ".join(told)
 
 
 WHY = {
-    "constant velocity": "inertia is no question on a plateau, its lowest speed is about ours, and both continue the "
-    "Stribeck dip below it by a line; acceleration, feed-forward and settling time were chosen by the truth",
+    "constant velocity": "acceleration, feed-forward and settling time were chosen by the truth, and its first speed "
+    "happens to continue the Stribeck dip by a better line",
     "Fourier + Coulomb/viscous": "its two parameters, chosen by the truth, nearly make a line of this curve",
     "torque sine": "its torque was chosen by the truth",
 }
-SOFT = (
-    "so short a travel makes our fastest cycle swing the link, the link_resonance gate says so, and the result is not "
-    "promoted; the few slow speeds of the others swing it less: raise A, or lower V"
-)
-LOADED = (
-    "friction that grows with the load is not constant over a cycle, and our window at the lowest speeds of so short a "
-    "travel is as long as the travel"
-)
+LOADED = "the link's own acceleration loads the gear and raises its friction within our windows; a plateau has none"
 
 HEADINGS = [
     "method",
@@ -163,8 +157,9 @@ range; time without the moves to and from the start. Rows in bold are this tool'
 - Torque sine: 0.5 to 4 Hz, six sizes, begun gently in the middle of the travel, perfect gravity compensation; it ends
   where the joint leaves the travel.
 
-Written by `python benchmarks/side_by_side.py --docs docs`. No bus here: every method meets exactly the same joint,
-cycle by cycle. What the bus adds to ours is shown in [the paper's section 4](paper-section4.md).
+Written by `python benchmarks/side_by_side.py --docs docs` at commit {commit}. No bus here: every method meets exactly
+the same joint, cycle by cycle. What the bus adds to ours is shown in [the paper's section 4](paper-section4.md). Why a row is ahead of
+ours is said below its table, and tested at the end of the page by taking the cause away.
 """
 
 
@@ -196,7 +191,8 @@ def main() -> None:
                 print("\n".join(block), flush=True)
                 text += block
     if arguments.docs:
-        (arguments.docs / "side-by-side.md").write_text("\n".join([PAGE, *text]), encoding="utf-8")
+        page = "\n".join([PAGE.format(commit=git_revision()[:7]), *text, why_lost.text()])
+        (arguments.docs / "side-by-side.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
