@@ -1,6 +1,7 @@
 """The diagnosis on real machines: fitted on some recordings, judged on others, both ways.
 
-Prints one line per set and direction: verdict, causes, and every effect's held-out change. The recordings are named by
+Prints one line per set and direction: verdict, causes, and every effect's held-out change; ``--write-docs`` puts the
+tables into ``docs/gap-real.md``. The recordings are named by
 FRICTID_REAL_DATA; see their README for origin and licences.
 """
 
@@ -10,7 +11,7 @@ import ast
 import gzip
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +23,14 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
+from frictid_hil.simulation.effects import all_effects
 
 EMPS = {"mass_kg": 95.1089, "viscous_n_s_per_m": 203.5034, "coulomb_n": 20.3935, "offset_n": -3.1648}
 MOTION_HZ = 8.0
 """Band of the pendulum's motion that its rigid-body torque is formed in."""
+DOCS_PAGE = Path(__file__).resolve().parents[1] / "docs" / "gap-real.md"
+BEGIN, END = "<!-- written by benchmarks/gap_real.py -->", "<!-- end of what it wrote -->"
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 
 
@@ -221,14 +226,116 @@ def row(name: str, d: Diagnosis) -> str:
     return f"{name} | {d.verdict} | {causes} | {held_out}"
 
 
+GROUPS = {"EMPS": "EMPS, a linear axis", "a0": "Double pendulum, design A.0", "c1": "Double pendulum, design C.1"}
+"""Headings by the beginning of a set's name; the rest is the SO-101 arm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What was expected of some sets before they were diagnosed.
+
+    Attributes:
+        text: as a person says it.
+        sets: beginning of the sets' names.
+        holds: whether one diagnosis is as expected.
+    """
+
+    text: str
+    sets: str
+    holds: Callable[[Diagnosis], bool]
+
+
+def _first(effect: str) -> Callable[[Diagnosis], bool]:
+    return lambda d: bool(d.causes) and d.causes[0].effect == effect
+
+
+def _largest(effect: str) -> Callable[[Diagnosis], bool]:
+    return lambda d: bool(d.held_out) and min(d.held_out, key=lambda name: d.held_out[name]) == effect
+
+
+def _flagged(effect: str, partner: str) -> Callable[[Diagnosis], bool]:
+    return lambda d: any(c.effect == effect and partner in c.confusable_with for c in d.causes)
+
+
+def _play_with_its_partner(d: Diagnosis) -> bool:
+    found = [c for c in d.causes if c.effect in ("backlash", "stiction_breakaway")]
+    return bool(found) and {"backlash", "stiction_breakaway"} & set(found[0].confusable_with) != set()
+
+
+EXPECTED = (
+    Expected("EMPS: direction asymmetry named first", "EMPS", _first("direction_asymmetry")),
+    Expected("EMPS: direction asymmetry with the largest held-out change", "EMPS", _largest("direction_asymmetry")),
+    Expected(
+        "EMPS: presliding flagged as its partner", "EMPS", _flagged("direction_asymmetry", "presliding_hysteresis")
+    ),
+    Expected("A.0, first joint: load-dependent friction first", "a0 joint 1", _first("load_dependent_friction")),
+    Expected("A.0, second joint: presliding hysteresis first", "a0 joint 2", _first("presliding_hysteresis")),
+    Expected("C.1, both joints: none", "c1", lambda d: d.verdict == "none"),
+    Expected("SO-101: torque delay named first", "SO-101", _first("torque_delay")),
+    Expected("SO-101: then play or stiction, the other one flagged", "SO-101", _play_with_its_partner),
+    Expected("SO-101, one log of one joint: ambiguous", "SO-101 Elbow, backlash", lambda d: d.verdict == "ambiguous"),
+)
+
+
+def page(found: Mapping[str, Diagnosis]) -> str:
+    """The tables of ``docs/gap-real.md``."""
+    parts = ["## What was expected, and what came\n", "| expected | sets as expected |", "|---|---|"]
+    for expected in EXPECTED:
+        chosen = {name: d for name, d in found.items() if name.startswith(expected.sets)}
+        held = [name for name, d in chosen.items() if expected.holds(d)]
+        parts.append(f"| {expected.text} | {len(held)} of {len(chosen)} |")
+    for prefix, title in (*GROUPS.items(), ("SO-101", "SO-101, a hobby arm: command and position only")):
+        parts += ["", f"## {title}", "", *_group({n: d for n, d in found.items() if n.startswith(prefix)})]
+    return "\n".join(parts)
+
+
+def _group(found: Mapping[str, Diagnosis]) -> list[str]:
+    unit = "rad" if all(d.before.inverse_nm is None for d in found.values()) else "N m"
+    lines = [
+        f"| set | verdict | causes (confidence; confusable with) | gap before, after [{unit}] |",
+        "|---|---|---|---|",
+    ]
+    for letter, (name, d) in zip(LETTERS, found.items(), strict=False):
+        causes = "; ".join(
+            f"{c.effect} ({c.confidence:.2f}{'; ' + ', '.join(c.confusable_with) if c.confusable_with else ''})"
+            for c in d.causes
+        )
+        before, after = (f.inverse_nm if unit == "N m" else f.forward_position_rad for f in (d.before, d.after))
+        lines.append(f"| {letter}: {name} | {d.verdict} | {causes} | {before:.3g}, {after:.3g} |")
+    effects = sorted({effect for d in found.values() for effect in d.held_out})
+    lines += [
+        "",
+        "Change of the held-out RMS when an effect alone is added:"
+        if unit == "rad"
+        else "Change of the held-out RMS when an effect alone is added (negative: better on logs that did not fit it):",
+        "",
+        f"| effect | {' | '.join(LETTERS[: len(found)])} |",
+        f"|---{'|---' * len(found)}|",
+    ]
+    for effect in effects:
+        changes = (d.held_out.get(effect) for d in found.values())
+        cells = ("-" if change is None else f"{change:+.1f} %" for change in changes)
+        lines.append(f"| {effect} | {' | '.join(cells)} |")
+    absent = sorted(set(all_effects()) - set(effects))
+    lines += ["", f"Cannot be formed on these recordings: {', '.join(absent)}.", ""]
+    reasons = {subject: why for d in found.values() for subject, why in d.reasons.items()}
+    lines += [f"- {subject}: {why}" for subject, why in sorted(reasons.items())]
+    return lines
+
+
 def main() -> int:
-    """Print the table."""
+    """Print a line per set; with ``--write-docs`` put the tables into the docs page."""
     folder = real_data()
     if folder is None:
         print("no recordings: set FRICTID_REAL_DATA", file=sys.stderr)
         return 1
+    found = {}
     for name, experiments in cases(folder):
-        print(row(name, diagnose(experiments)), flush=True)
+        found[name] = diagnose(experiments)
+        print(row(name, found[name]), flush=True)
+    if "--write-docs" in sys.argv:
+        before, rest = DOCS_PAGE.read_text().split(BEGIN, 1)
+        DOCS_PAGE.write_text(f"{before}{BEGIN}\n\n{page(found)}\n\n{END}{rest.split(END, 1)[1]}")
     return 0
 
 

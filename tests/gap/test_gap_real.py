@@ -1,0 +1,64 @@
+"""The diagnosis on real machines, the quick ones of ``benchmarks/gap_real.py``; skipped without recordings."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import gap_sets
+import pytest
+
+from frictid_hil.gap.diagnose import diagnose
+
+ROOT = Path(__file__).resolve().parents[2]
+REAL = gap_sets.real_data()
+
+pytestmark = [
+    pytest.mark.real_data,
+    pytest.mark.skipif(REAL is None, reason="no real recordings (FRICTID_REAL_DATA)"),
+]
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("gap_real", ROOT / "benchmarks" / "gap_real.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("judge_pulses", [True, False])
+def test_the_linear_axis_is_asymmetric_whichever_half_is_judged(benchmark: ModuleType, judge_pulses: bool) -> None:
+    found = diagnose(benchmark.emps(REAL, judge_pulses))
+    assert min(found.held_out, key=lambda name: found.held_out[name]) == "direction_asymmetry"
+    assert found.causes[0].effect == "direction_asymmetry"
+    assert found.held_out["direction_asymmetry"] < -10.0
+    assert found.before.forward_torque_nm is None and "controller" in found.reasons["forward_torque_nm"]
+
+
+@pytest.mark.parametrize("odd_judged", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_the_second_joint_of_the_pendulum_has_no_gap_that_matters(benchmark: ModuleType, odd_judged: bool) -> None:
+    found = diagnose(benchmark.double_pendulum(REAL, "c1", 2, odd_judged))
+    assert found.verdict == "none" and not found.causes
+    assert min(found.held_out.values()) > -5.0
+
+
+def test_play_and_gain_are_not_told_apart_on_one_log_of_the_arm(benchmark: ModuleType) -> None:
+    found = diagnose(benchmark.so101(REAL, "Elbow", (), ("backlash_detection",)))
+    assert found.verdict == "ambiguous" and found.next_experiment is not None
+    assert found.causes[0].effect == "torque_delay"
+    assert all(c.confidence < 0.9 for c in found.causes)
+    assert {"torque_constant_error", "stiction_breakaway"} <= set(found.causes[1].confusable_with)
+
+
+@pytest.mark.slow
+def test_the_arm_is_late_whichever_motions_are_judged(benchmark: ModuleType) -> None:
+    motions = sorted(path.name for path in (REAL / "so101").iterdir() if path.is_dir())  # type: ignore[operator]
+    for judged in (motions[::2], motions[1::2]):
+        found = diagnose(benchmark.so101(REAL, "Rotation", judged))
+        assert found.causes[0].effect == "torque_delay"
+        assert 0.0 < found.causes[0].parameters["delay_s"].value < 0.3
