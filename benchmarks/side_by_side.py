@@ -158,8 +158,8 @@ range; time without the moves to and from the start. Rows in bold are this tool'
   where the joint leaves the travel.
 
 Written by `python benchmarks/side_by_side.py --docs docs` at commit {commit}. No bus here: every method meets exactly
-the same joint, cycle by cycle. What the bus adds to ours is shown in [the paper's section 4](paper-section4.md). Why a row is ahead of
-ours is said below its table, and tested at the end of the page by taking the cause away.
+the same joint, cycle by cycle. What the bus adds to ours is shown in [the paper's section 4](paper-section4.md). Why a
+row is ahead of ours is said below its table, and tested at the end of the page by taking the cause away.
 """
 
 
