@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from frictid_hil.friction.trajectory import Array
 
 
@@ -105,3 +107,10 @@ class KinematicForm:
     parameter: str
     read: Callable[[Sequence[MotionView], Believed], Finding | None]
     position_step: bool = False
+
+
+def guesses_by_sample(step_s: float, upper_s: float) -> Array:
+    """Times to try for what comes late: parts of a sample, then up to eight of them, none above ``upper_s``."""
+    times = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * step_s
+    guesses: Array = times[times <= upper_s]
+    return guesses

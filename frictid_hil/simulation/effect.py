@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, KinematicForm
 from frictid_hil.simulation.inverse import InverseForm
@@ -95,6 +97,15 @@ class Illustration:
     x_label: str
     y_label: str
     curves: tuple[tuple[str, Array, Array], ...]
+
+
+def lagging_step(time_constant_s: float, y_label: str, true: str, lagging: str) -> Illustration:
+    """A step and its first-order lag, under the names given."""
+    constant = max(time_constant_s, 1e-5)
+    time = np.linspace(-1.0, 5.0, 601) * constant
+    step = np.where(time >= 0.0, 1.0, 0.0)
+    late = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
+    return Illustration("time (s)", y_label, ((true, time, step), (lagging, time, late)))
 
 
 @dataclass(frozen=True, slots=True)

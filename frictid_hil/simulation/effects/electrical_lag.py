@@ -9,8 +9,17 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, DriveView
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView, guesses_by_sample
+from frictid_hil.simulation.effect import (
+    Channel,
+    Effect,
+    Hook,
+    Illustration,
+    Parameter,
+    Region,
+    Signature,
+    lagging_step,
+)
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -46,8 +55,7 @@ def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: 
 
 def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     """Up to eight samples."""
-    constants = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * views[0].step_s
-    return constants[constants <= EFFECT.parameters[0].upper]
+    return guesses_by_sample(views[0].step_s, EFFECT.parameters[0].upper)
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
@@ -56,11 +64,7 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
 def illustrate(parameters: Mapping[str, float]) -> Illustration:
     """A step of demand and the current that follows."""
     p = EFFECT.complete(parameters or EFFECT.typical)
-    constant = max(p["time_constant_s"], 1e-5)
-    time = np.linspace(-1.0, 5.0, 601) * constant
-    demand = np.where(time >= 0.0, 1.0, 0.0)
-    current_nm = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
-    return Illustration("time (s)", "torque (N m)", (("demand", time, demand), ("current", time, current_nm)))
+    return lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current")
 
 
 EFFECT = Effect(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, DriveView
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView, guesses_by_sample
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -55,8 +55,7 @@ def _shifted(torque_nm: Array, rows: int) -> Array:
 
 def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     """Up to eight samples."""
-    delays = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * views[0].step_s
-    return delays[delays <= EFFECT.parameters[0].upper]
+    return guesses_by_sample(views[0].step_s, EFFECT.parameters[0].upper)
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------

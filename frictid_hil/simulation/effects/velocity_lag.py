@@ -11,7 +11,16 @@ from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, Believed, DriveView, Finding, KinematicForm, MotionView
-from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+from frictid_hil.simulation.effect import (
+    Channel,
+    Effect,
+    Hook,
+    Illustration,
+    Parameter,
+    Region,
+    Signature,
+    lagging_step,
+)
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -81,11 +90,7 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
 def illustrate(parameters: Mapping[str, float]) -> Illustration:
     """A step of velocity and its report."""
     p = EFFECT.complete(parameters or EFFECT.typical)
-    constant = max(p["time_constant_s"], 1e-5)
-    time = np.linspace(-1.0, 5.0, 601) * constant
-    true = np.where(time >= 0.0, 1.0, 0.0)
-    report = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
-    return Illustration("time (s)", "velocity (rad/s)", (("true", time, true), ("reported", time, report)))
+    return lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported")
 
 
 EFFECT = Effect(
