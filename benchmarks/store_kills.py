@@ -138,6 +138,8 @@ def killed_nights(place: Path, kills: int) -> None:
         except Exception as error:  # whatever it is, it is what this benchmark looks for
             bad += 1
             print(f"after the kill of night {number}: {error!r}")
+        if number % 50 == 1:
+            print(f"{number - 1} nights killed so far, {bad} bad stores", file=sys.stderr, flush=True)
     assert night(place, kills + 2)["promoted"], "the night after all of them must be a good one"
     print(
         f"{kills} nights killed in {time.monotonic() - started:.0f} s (a whole one takes {lasts_s:.2f} s): {stored} had"
