@@ -163,6 +163,15 @@ def test_a_defect_of_the_program_is_an_ending_too(
     assert (last.exit_code, last.promoted) == (1, False) and "ZeroDivisionError" in last.reason and last.next_step
 
 
+def test_a_night_that_could_not_begin_is_notified_too(tmp_path: Path) -> None:
+    told = tmp_path / "told.json"
+    command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments(tmp_path, robot_file(tmp_path))]
+    command += ["--bus", "socketcan:no0", "--notify", f"tee '{told}'"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert ended.returncode == 2
+    assert json.loads(told.read_text()) == json.loads(ended.stdout)
+
+
 def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Path, tmp_path: Path) -> None:
     shutil.copytree(first_night, tmp_path / "store")
     command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments(tmp_path, robot_file(tmp_path)), "--realtime"]
