@@ -88,6 +88,7 @@ class Controller(Open):
     kd: NotNegative | None = None
     velocity_filter_s: NotNegative | None = None
     torque_limit_nm: Positive | None = None
+    command_rate: Literal["central", "backward"] | None = None
 
 
 class Drive(Open):
@@ -113,7 +114,7 @@ class Experiment(Open):
 
     name: str = Field(min_length=1)
     file: str | None = None
-    role: Literal["identification", "validation"]
+    role: Literal["identification", "validation"] = "identification"
     payload: bool = False
     run_order: int | None = None
     duration_s: NotNegative | None = None
