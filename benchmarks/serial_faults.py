@@ -1,10 +1,11 @@
 """Every fault of the serial emulator at every phase of a whole ``calibrate``, streamed and in batch.
 
-    python benchmarks/serial_faults.py [--places 2] [--docs PAGE]   virtual time (about 12 minutes of processor time)
+    python benchmarks/serial_faults.py [--places 2] [--docs PAGE]   virtual time (about 12 minutes of processor time;
+                                                                    --kept FILE goes on after an interruption)
     python benchmarks/serial_faults.py --pty [--docs PAGE]          20 of them through the command line, on a pseudo
                                                                     terminal and the wall clock (about 10 minutes)
 
-One light joint, the quick programme. A healthy run first tells which acknowledgement, block, frame or tick belongs to
+Joint 3, the quick programme. A healthy run first tells which acknowledgement, block, frame or tick belongs to
 which phase; then every kind of fault strikes at some of them. Every run must end - at most 150 s of the controller's
 time later than a healthy one - with an outcome and no traceback; the joint must stand afterwards; an error must name a
 cause that this fault can have; a run that succeeds must be within 2.5 % of the truth; what moved must be recorded; and
@@ -24,7 +25,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ from frictid_hil.recording.mcap_reader import read_mcap
 from frictid_hil.runner import run as run_module
 from frictid_hil.runner.events import Event, JobProgress, Marked, PhaseStarted
 
-JOINT, LIMIT_PERCENT, LATER_S, TICK_NS = "5", 2.5, 150.0, 4_000_000
+JOINT, LIMIT_PERCENT, LATER_S, TICK_NS = "3", 2.5, 150.0, 4_000_000
 ROBOT = """\
 schema: frictid.robot/1
 extends: hp3j-serial.yaml
@@ -256,10 +257,13 @@ def judge_recording(watched: Watched, out: Path, *, code: int) -> Iterator[str]:
         yield f"{wrong} of {len(measured)} samples are not what happened"
 
 
+Phases = dict[str, tuple[Counter[str], Counter[str]]]
+"""By name: how often every occasion had come at its begin, and at its end."""
+
 # -- phases ------------------------------------------------------------------------------------------------------------
 
 
-def phases_of(layer: str) -> tuple[dict[str, tuple[Counter[str], Counter[str]]], float]:
+def phases_of(layer: str) -> tuple[Phases, float]:
     """Every phase of a healthy run, with the counts of all occasions at its begin and end; and how long it takes."""
     bounds: list[tuple[str, Counter[str]]] = [("open", Counter())]
 
@@ -285,7 +289,7 @@ def phases_of(layer: str) -> tuple[dict[str, tuple[Counter[str], Counter[str]]],
     if healthy.exit_code or healthy.wrong:
         raise SystemExit(f"{layer}: the healthy run fails: {healthy}")
     last = Counter(INJECTED[-1][-1].emulator.faults.counted)
-    phases: dict[str, tuple[Counter[str], Counter[str]]] = {}
+    phases: Phases = {}
     for (name, begin), (_, end) in zip(bounds, [*bounds[1:], ("", last)], strict=True):
         name = f"{name} of the cycles" if name == "its transfer" and name in phases else name
         phases[name] = (phases[name][0] if name in phases else begin, end)
@@ -300,35 +304,54 @@ def places(kind: str, begin: Counter[str], end: Counter[str], count: int) -> lis
     return sorted({low + (high - low) * (2 * k + 1) // (2 * count) for k in range(count)})
 
 
-def in_virtual_time(count: int) -> tuple[str, int, int]:
+@dataclass(frozen=True)
+class Row:
+    """One kind of fault over all phases of a layer."""
+
+    cells: list[str]
+    runs: int
+    wrong: int
+
+
+def row(layer: str, kind: str, phases: Phases, healthy_s: float, count: int) -> Row:
+    """Let this kind strike at ``count`` places of every phase."""
+    name, _, how = kind.partition(" ")
+    cells, runs, wrong = [], 0, 0
+    for phase, (begin, end) in phases.items():
+        outcomes = []
+        for at in places(kind, begin, end, count):
+            fault = f"{name}@{at}{how}"
+            outcome = inject(layer, [fault], limit_s=healthy_s + LATER_S, told=lambda event: None)
+            outcomes.append("**WRONG**" if outcome.wrong else outcome.cell)
+            runs += 1
+            wrong += bool(outcome.wrong)
+            if outcome.wrong:
+                print(f"{layer} {phase} {fault}: {'; '.join(outcome.wrong)}", file=sys.stderr, flush=True)
+            INJECTED.clear()
+        cells.append(", ".join(dict.fromkeys(outcomes)) or "-")
+    return Row(cells, runs, wrong)
+
+
+def in_virtual_time(kinds: Sequence[str], count: int, kept: Path | None) -> tuple[str, int, int]:
     """The whole table, how many runs it took, and how many of them were wrong."""
-    lines, runs, bad = [], 0, 0
+    known = json.loads(kept.read_text()) if kept is not None and kept.exists() else {}
+    lines, runs, wrong = [], 0, 0
     for layer in ("stream", "batch"):
         phases, healthy_s = phases_of(layer)
         lines += [f"| {layer} | " + " | ".join(phases) + " |", "|---|" + "---|" * len(phases)]
-        print(*lines[-2:], sep="\n", flush=True)
-        for kind in KINDS:
-            name, _, how = kind.partition(" ")
-            cells = []
-            for phase, (begin, end) in phases.items():
-                outcomes = []
-                for at in places(kind, begin, end, count):
-                    fault = f"{name}@{at}{how}"
-                    outcome = inject(layer, [fault], limit_s=healthy_s + LATER_S, told=lambda event: None)
-                    outcomes.append(outcome.cell)
-                    runs += 1
-                    if outcome.wrong:
-                        bad += 1
-                        outcomes[-1] = "**WRONG**"
-                        print(f"{layer} {phase} {fault}: {'; '.join(outcome.wrong)}", file=sys.stderr, flush=True)
-                    INJECTED.clear()
-                cells.append(", ".join(dict.fromkeys(outcomes)) or "-")
-            if any(cell != "-" for cell in cells):
-                lines.append(f"| `{kind}` | " + " | ".join(cells) + " |")
+        for kind in kinds:
+            name = f"{layer} {kind} {count}"
+            done = Row(**known[name]) if name in known else row(layer, kind, phases, healthy_s, count)
+            known[name] = asdict(done)
+            if kept is not None:
+                kept.write_text(json.dumps(known, indent=1))
+            runs, wrong = runs + done.runs, wrong + done.wrong
+            if done.runs:
+                lines.append(f"| `{kind}` | " + " | ".join(done.cells) + " |")
                 print(lines[-1], flush=True)
         lines.append("")
-    lines.insert(0, f"{runs} runs, {bad} of them wrong.\n")
-    return "\n".join(lines), runs, bad
+    lines.insert(0, f"{runs} runs, {wrong} of them wrong.\n")
+    return "\n".join(lines), runs, wrong
 
 
 # -- the same on a pseudo terminal -------------------------------------------------------------------------------------
@@ -422,10 +445,12 @@ def main() -> int:
     """0 when nothing was wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=2, help="how many places per phase and kind")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="some of them, separated by commas")
+    parser.add_argument("--kept", type=Path, help="rows that are there already, and where new ones go")
     parser.add_argument("--pty", action="store_true")
     parser.add_argument("--docs", type=Path, help="the page to write the table to")
     asked = parser.parse_args()
-    text, runs, bad = on_terminals() if asked.pty else in_virtual_time(asked.places)
+    text, runs, bad = on_terminals() if asked.pty else in_virtual_time(asked.kinds.split(","), asked.places, asked.kept)
     print(f"{runs} runs, {bad} wrong")
     if asked.docs:
         write(asked.docs, "faults-pty" if asked.pty else "faults", text)
