@@ -36,6 +36,8 @@ _STEP = 0.12
 """Of the search over the logarithm of the frequency."""
 _GAIN = 0.985
 """The link must leave less than this share of the residual's rms."""
+_SURE = 3.0
+"""Standard deviations that the link's inertia must have: 5 % wrong in all, of some twenty frequencies looked at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +119,7 @@ def soft_link(recording: CycleRecording, motion: Motion, level_nm: float) -> Lin
     whole = float(solved.values[solved.blocks.inertia])
     inertia = float(solved.values[block.start])
     covariance = solved.covariance[block, block]
-    if not 0.0 < inertia < whole or inertia < COVERAGE * np.sqrt(covariance[0, 0]):
+    if not 0.0 < inertia < whole or inertia < _SURE * np.sqrt(covariance[0, 0]):
         return None
     scale = np.array([1.0, inertia, inertia])
     covariance = covariance / np.outer(scale, scale)
