@@ -14,6 +14,8 @@ from frictid_hil.driver import Feedback
 from frictid_hil.errors import ConfigError, PlanRefused, SafetyAbort
 from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
 from frictid_hil.kinematics import DhRow
+from frictid_hil.runner.ring import Rows
+from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
 from frictid_hil.workspace import Workspace
 
@@ -113,3 +115,31 @@ def test_the_box_is_watched_while_the_arm_moves() -> None:
     watch.check([Feedback(position_rad=0.0), Feedback(position_rad=0.0)])  # 10 mm: within what a lag may do
     with pytest.raises(SafetyAbort, match=r"leaves the workspace box: x = 0.800 m"):
         WorkspaceWatch(replace(box, clearance_m=0.001), ["0", "1"], 50.0).check([Feedback(position_rad=0.0)] * 2)
+
+
+class Nothing:
+    """Keeps nothing of a run."""
+
+    def samples(self, rows: Rows) -> None:
+        """Forget."""
+
+    def frames(self, rows: Rows) -> None:
+        """Forget."""
+
+
+def test_an_arm_that_leaves_the_box_is_stopped(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    planned = plan_calibration(
+        CalibrateOptions(boxed(tmp_path, "[-0.4, 0.4]"), bus="virtual:test-box", joints=("0",), cycles=2)
+    )
+    assert planned.setup.workspace is not None
+    narrow = replace(planned.setup.workspace, box_m=((-0.2, 0.9), (-0.1, 0.4), (0.0, 1.2)))
+    with pytest.raises(SafetyAbort, match=r"y = -0.06\d m is \d+ mm below its bound of -0.060 m, with joints 0 at -\d"):
+        run_plan(
+            "virtual",
+            replace(planned.setup, workspace=narrow),
+            planned.plan,
+            Nothing(),
+            notify=lambda _: None,
+            proceed=lambda _: True,
+        )

@@ -24,7 +24,8 @@ class Mark:
     """A named stretch of run time, half-open: ``[start_ns, end_ns)``.
 
     Attributes:
-        name: ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``reversal``, an experiment's name, ...
+        name: ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``coupling``, ``reversal``,
+            an experiment's name, ...
         start_ns: run time.
         end_ns: run time.
         details: parameters of the stretch (for ``cycles``: amplitude_rad, velocity_rad_s, cycles, ratio).
