@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -85,50 +86,73 @@ def another_drive_in_force(place: Path) -> Iterator[None]:
     yield
 
 
-OPEN = [{"kind": "interlock_open", "joint": "5", "at_s": 0.0}]
-STUCK = [{"kind": "stuck_encoder", "joint": "5", "at_s": 6.0}]
-OFF = [{"kind": "mute", "joint": "5", "at_s": 3.0}]
+def nothing_special(_: Path) -> AbstractContextManager[None]:
+    return nullcontext()
 
+
+@dataclass(frozen=True)
+class Ending:
+    """How a night is made to end, and what must be told of it.
+
+    Attributes:
+        code: exit code.
+        outcome: word of the JSON.
+        says: part of the reason.
+        next_step: part of it.
+        changes: of the robot file.
+        more: arguments.
+        meanwhile: what is the case while the night is tried.
+    """
+
+    code: int
+    outcome: str
+    says: str = ""
+    next_step: str = ""
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    more: tuple[str, ...] = ()
+    meanwhile: Callable[[Path], AbstractContextManager[None]] = nothing_special
+
+
+def fault(kind: str, at_s: float) -> dict[str, Any]:
+    return {"faults": [{"kind": kind, "joint": "5", "at_s": at_s}]}
+
+
+ALLOWED = {"unattended": UNATTENDED}
+NO_CAN = ("--bus", "socketcan:no0")
 ENDINGS = {
-    "within the policy": ({}, nullcontext, [], 0, "ok", "within every limit", "nothing to do"),
-    "left to a person": ({"promotion": "by_person"}, nullcontext, [], 0, "ok", "to a person", "profile promote"),
-    "no permission": ({}, nullcontext, ["--bus", "socketcan:no0"], 2, "refused", "unattended", "add policy.unattended"),
-    "not reachable": (
-        {"unattended": UNATTENDED},
-        nullcontext,
-        ["--bus", "socketcan:no0"],
-        3,
-        "aborted",
-        "cannot open the bus",
-        "ip link set no0 up",
+    "within the policy": Ending(0, "ok", "within every limit", "nothing to do"),
+    "left to a person": Ending(0, "ok", "to a person", "profile promote", {"promotion": "by_person"}),
+    "no permission": Ending(2, "refused", "unattended", "add policy.unattended", more=NO_CAN),
+    "not reachable": Ending(3, "aborted", "cannot open the bus", "ip link set no0 up", ALLOWED, NO_CAN),
+    "bus held": Ending(3, "aborted", "in use", "wait for it", meanwhile=bus_held),
+    "another at work": Ending(
+        3, "aborted", "another recalibration", "wait for it", meanwhile=held_by_another_recalibration
     ),
-    "power lost": ({"faults": OFF}, nullcontext, [], 4, "aborted", "", ""),
-    "bus held": ({}, bus_held, [], 3, "aborted", "in use", "wait for it"),
-    "another at work": ({}, held_by_another_recalibration, [], 3, "aborted", "another recalibration", "wait for it"),
-    "interlock open": ({"unattended": UNATTENDED, "faults": OPEN}, nullcontext, [], 4, "aborted", "interlock", ""),
-    "encoder lost": ({"faults": STUCK}, nullcontext, [], 4, "aborted", "", ""),
-    "changed too much": ({"friction": 0.6}, nullcontext, [], 5, "gate_failed", "changed since", "look at joints 5"),
-    "drive exchanged": ({}, another_drive_in_force, [], 5, "gate_failed", "drive serial 1234", "--baseline"),
+    "power lost": Ending(4, "aborted", changes=fault("mute", 3.0)),
+    "encoder lost": Ending(4, "aborted", "following error", "look at the joint", fault("stuck_encoder", 6.0)),
+    "interlock open": Ending(4, "aborted", "interlock", "close the cell", {**ALLOWED, **fault("interlock_open", 0.0)}),
+    "changed too much": Ending(5, "gate_failed", "changed since", "look at joints 5", {"friction": 0.6}),
+    "drive exchanged": Ending(5, "gate_failed", "drive serial 1234", "--baseline", meanwhile=another_drive_in_force),
 }
 
 
 @pytest.mark.parametrize("name", ENDINGS)
 def test_every_ending(name: str, first_night: Path, tmp_path: Path) -> None:
-    changes, circumstances, more, code, outcome, says, next_step = ENDINGS[name]
+    wanted = ENDINGS[name]
     shutil.copytree(first_night, tmp_path / "store")
     store = ProfileStore(tmp_path / "store")
-    robot = robot_file(tmp_path, **changes)
-    with nullcontext() if circumstances is nullcontext else circumstances(tmp_path):
+    robot = robot_file(tmp_path, **wanted.changes)
+    with wanted.meanwhile(tmp_path):
         before = store.active(ROBOT)
-        ended = CliRunner().invoke(app, [*arguments(tmp_path, robot), *more])
-    assert ended.exit_code == code, ended.stderr
+        ended = CliRunner().invoke(app, [*arguments(tmp_path, robot), *wanted.more])
+    assert ended.exit_code == wanted.code, ended.stderr
     (line,) = ended.stdout.splitlines()
     result = json.loads(line)
-    assert (result["schema"], result["outcome"]) == ("frictid.recalibrate/1", outcome)
+    assert (result["schema"], result["outcome"]) == ("frictid.recalibrate/1", wanted.outcome)
     told = result["error"] if "error" in result else {"what": result["reason"], "next_step": result["next_step"]}
-    assert says in told["what"] and told["next_step"] and next_step in told["next_step"], told
+    assert wanted.says in told["what"] and told["next_step"] and wanted.next_step in told["next_step"], told
     last = attempts(store.root, ROBOT)[-1]
-    assert (last.exit_code, last.outcome, last.next_step) == (code, outcome, told["next_step"])
+    assert (last.exit_code, last.outcome, last.next_step) == (wanted.code, wanted.outcome, told["next_step"])
     assert last.promoted is (name == "within the policy")
     assert store.active_profile(ROBOT) is not None
     assert (store.active(ROBOT) != before) is last.promoted
