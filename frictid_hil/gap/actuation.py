@@ -19,8 +19,11 @@ from frictid_hil.gap.residuals import LowPass, Recording, demand_of, rms, settle
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
 
-BLOCK_S = 1.0
-"""Length of the blocks that a validation log is cut into where it must be fitted and judged at once."""
+BLOCK_S = 0.1
+"""Length of the blocks that a log is cut into where it must be fitted and judged at once.
+
+Several times what the low-pass smears, and short enough that a peak of the demand reaches into two of them.
+"""
 CLEARED = 0.7
 """Share of one log's low-passed squares that a candidate may leave to be taken though all logs show it little."""
 
@@ -40,6 +43,13 @@ def velocity_lag_s(effects: Mapping[str, Mapping[str, float]]) -> float:
     )
 
 
+def late_s(effects: Mapping[str, Mapping[str, float]]) -> float:
+    """Time by which effects let the torque come late."""
+    return sum(
+        effects[name].get(form.parameter, 0.0) for name, form in _forms().items() if form.late and name in effects
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
     """What stands between demand and reported torque: parameters by effect."""
@@ -54,22 +64,27 @@ class Drive:
     @property
     def late_s(self) -> float:
         """Time by which the torque comes late."""
-        forms = _forms()
-        return sum(values[forms[name].parameter] for name, values in self.effects.items() if forms[name].late)
+        return late_s(self.effects)
 
     def reported(self, demand_nm: Array, step_s: float, limit_nm: float) -> Array:
         """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
         torque = np.concatenate([demand_nm[:1], demand_nm[:-1]])
         for name, form in _forms().items():
             if name in self.effects and form.torque is not None:
-                value = self.effects[name][form.parameter]
+                values = self.effects[name]
+                value = values[form.parameter]
                 if value != all_effects()[name].off[form.parameter]:
-                    torque = form.torque(torque, value, step_s, limit_nm)
+                    detail = (values.get(form.detail, form.details[0]),) if form.detail else ()
+                    torque = form.torque(torque, value, step_s, limit_nm, *detail)
         return torque
 
     def with_effect(self, name: str, value: float) -> Drive:
         """The drive with one effect set."""
-        return Drive({**self.effects, name: {_forms()[name].parameter: value}})
+        return Drive({**self.effects, name: {**self.effects.get(name, {}), _forms()[name].parameter: value}})
+
+    def with_detail(self, name: str, value: float) -> Drive:
+        """The drive with one effect's detail set."""
+        return Drive({**self.effects, name: {**self.effects[name], _forms()[name].detail: value}})
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +102,7 @@ class ActuationFit:
         motion_ratio: what is left while the demand changes fast over what is left while it rests; noise gives 1.
         judged_in_blocks: effects that show in no identification log; fitted on every other block of the validation
             logs, judged on the blocks between.
+        shows_in: effect name -> logs in which it clears the low-passed residual, judged on blocks that did not fit it.
     """
 
     nominal: Drive
@@ -98,6 +114,7 @@ class ActuationFit:
     intervals: Mapping[str, float] = field(default_factory=dict)
     motion_ratio: float = 1.0
     judged_in_blocks: tuple[str, ...] = ()
+    shows_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def residual(self, recording: Recording, controller: Controller) -> Array:
         """A of one recording with the fitted drive."""
@@ -187,13 +204,18 @@ def fit_actuation(
         if not found:
             rivals = {other: 0.5 * rows * math.log(current / value) / gain for other, (value, _) in tried.items()}
         found[name] = gain
-        drive, current = best, least
+        drive, current = _detailed(name, best, least, squares)
     in_blocks: tuple[str, ...] = ()
     hidden = _in_validation_alone(logs, drive, controller, [n for n in library if n not in found], seen, demand, left)
     if hidden is not None:
         name, found[name], drive = hidden
         in_blocks = (name,)
         current = squares(drive)
+    views = [_view(r, controller, demand(r, drive.velocity_lag_s)) for r in logs]
+    shows_in = {
+        name: _shows_in(name, drive, logs, _near(drive, name, _forms()[name].guesses(views, seen.get(name))), left)
+        for name in found
+    }
     gain_of_noise = {r.experiment.name: LowPass.at(1.0 / r.step_s) for r in logs}
 
     def ratios(which: Drive) -> dict[str, float]:
@@ -215,7 +237,17 @@ def fit_actuation(
         _intervals(drive, [name for name in found if name not in in_blocks], squares, current, rows),
         _motion_ratio([(demand(r, drive.velocity_lag_s), left(drive, r), r.step_s) for r in logs]),
         in_blocks,
+        shows_in,
     )
+
+
+def _near(drive: Drive, name: str, guesses: Array) -> Array:
+    """The guesses around the value that was found, so that few need to be tried again."""
+    if guesses.size <= 3:
+        return guesses
+    value = drive.effects[name][_forms()[name].parameter]
+    at = int(np.clip(np.searchsorted(guesses, value), 1, guesses.size - 2))
+    return guesses[at - 1 : at + 2]
 
 
 def _motion_ratio(channels: Sequence[tuple[Array, Array, float]]) -> float:
@@ -251,32 +283,61 @@ def _in_validation_alone(
     judged = [r for r in logs if r.experiment.validation]
     if not judged:
         return None
-
-    def parts(which: Drive, odd: bool) -> Array:
-        out = []
-        for r in judged:
-            low_passed = LowPass.at(1.0 / r.step_s)(left(which, r))
-            block = (np.arange(low_passed.size) * r.step_s / BLOCK_S).astype(int)
-            out.append(low_passed[(block % 2 == 1) == odd])
-        return np.concatenate(out)
-
-    def squares(which: Drive) -> float:
-        return float(np.sum(parts(which, odd=False) ** 2))
-
+    left_of = {r.experiment.name: r for r in judged}
     views = [_view(r, controller, demand(r, drive.velocity_lag_s)) for r in judged]
-    fitted, unseen = squares(drive), float(np.sum(parts(drive, odd=True) ** 2))
+    before = _by_block(judged, drive, left)
     tried = []
     for name, form in _forms().items():
-        candidate = _best(name, drive, squares, form.guesses(views, seen.get(name))) if name in names else None
-        if candidate is not None and candidate[0] < CLEARED * fitted:
-            tried.append((float(np.sum(parts(candidate[1], odd=True) ** 2)), name, candidate[1]))
+        if name not in names:
+            continue
+        candidate = _best(
+            name,
+            drive,
+            lambda which: sum(even for even, _ in _by_block(judged, which, left).values()),
+            form.guesses(views, seen.get(name)),
+        )
+        if candidate is None:
+            continue
+        after = _by_block(judged, candidate[1], left)
+        cleared = [n for n in left_of if all(new < CLEARED * old for new, old in zip(after[n], before[n], strict=True))]
+        if cleared:
+            tried.append((sum(odd for _, odd in after.values()), name, candidate[1]))
     if not tried:
         return None
-    least, name, best = min(tried, key=lambda t: t[0])
-    if least > CLEARED * unseen:
-        return None
+    _, name, best = min(tried, key=lambda t: t[0])
+    best, _ = _detailed(name, best, math.inf, lambda w: sum(even for even, _ in _by_block(judged, w, left).values()))
+    least = sum(odd for _, odd in _by_block(judged, best, left).values())
     rows = sum(r.experiment.position_rad.size for r in judged) // 2
+    unseen = sum(odd for _, odd in before.values())
     return name, 0.5 * rows * math.log(unseen / max(least, 1e-300)), best
+
+
+def _by_block(
+    logs: Sequence[Recording], drive: Drive, left: Callable[[Drive, Recording], Array]
+) -> dict[str, tuple[float, float]]:
+    """By log: low-passed squares that a drive leaves in (every other block, the blocks between)."""
+    out = {}
+    for r in logs:
+        squares = LowPass.at(1.0 / r.step_s)(left(drive, r)) ** 2
+        odd = (np.arange(squares.size) * r.step_s / BLOCK_S).astype(int) % 2 == 1
+        out[r.experiment.name] = (float(np.sum(squares[~odd])), float(np.sum(squares[odd])))
+    return out
+
+
+def _shows_in(
+    name: str,
+    drive: Drive,
+    logs: Sequence[Recording],
+    guesses: Array,
+    left: Callable[[Drive, Recording], Array],
+) -> tuple[str, ...]:
+    """Logs whose residual one effect clears, its value fitted on every other block and judged on those between."""
+    without = Drive({n: v for n, v in drive.effects.items() if n != name})
+    candidate = _best(name, drive, lambda which: sum(e for e, _ in _by_block(logs, which, left).values()), guesses)
+    if candidate is None:
+        return ()
+    before, after = _by_block(logs, without, left), _by_block(logs, candidate[1], left)
+    return tuple(n for n in before if after[n][1] < CLEARED * before[n][1])
 
 
 def _view(recording: Recording, controller: Controller, demand_nm: Array) -> DriveView:
@@ -305,6 +366,18 @@ def _best(name: str, drive: Drive, squares: Callable[[Drive], float], grid: Arra
     )
     value, cost = (float(found.x), float(found.fun)) if found.fun < costs[k] else (float(grid[k]), costs[k])
     return cost, drive.with_effect(name, value)
+
+
+def _detailed(name: str, drive: Drive, least: float, squares: Callable[[Drive], float]) -> tuple[Drive, float]:
+    """(the drive with the best detail of one effect, its value fitted again, squares left)."""
+    form = _forms()[name]
+    value = drive.effects[name][form.parameter]
+    around = value * np.linspace(0.97, 1.09, 7)
+    for detail in form.details:
+        candidate = _best(name, drive.with_effect(name, value).with_detail(name, detail), squares, around)
+        if candidate is not None and candidate[0] < least:
+            least, drive = candidate
+    return drive, least
 
 
 def structured_share(recordings: Sequence[Recording], controller: Controller, drive: Drive) -> float:

@@ -10,38 +10,25 @@ import numpy as np
 
 from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share, velocity_lag_s
 from frictid_hil.gap.cautions import ONE_SINUSOID, below_first_pair, one_sinusoid, tied_on_a_sinusoid
-from frictid_hil.gap.confidence import confidence
+from frictid_hil.gap.confidence import clues_of
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
+from frictid_hil.gap.echo import echoes_nm
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, Replayed, bounded, pooled, settled_nm, why_not
-from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, needed, shares
+from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, hollow, needed, shares
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
+from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.gap.where import lives, where
 from frictid_hil.gap.which import Model, Ranking, best_family, rank, replacements
-from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 
-FAMILY_SHARE = 0.25
-"""Share of what is left that a family without a cause may explain before the answer is unknown."""
-FAMILY_AHEAD = 0.03
-"""How far such a family alone may be ahead of the library's effects."""
-DRIVE_CLOSES = 0.25
-"""Share of the squared gap above the floor that a fault of the drive may leave and still explain it."""
-FOLLOWS_MOTION = 1.5
-"""Actuation residual in fast changes of the demand over that at rest; healthy drives reach 1.1."""
-UNEXPLAINED = 3.0
-"""Held-out squares per row of a plant that cannot be called healthy, whatever its replay shows."""
-COLOURED = 3.0
-"""Low-passed actuation residual over what its white part leaves; slow noise of a healthy drive reaches 2."""
 QUIET = 1.25
 """Noise of the judged logs over that of the median log, at most; more is a fault of the drive in those logs."""
-HELD_SHARE = 0.002
-"""Share of repeated positions in motion from which the position itself is in doubt."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +67,18 @@ def _full(
     channels = drive_channels(experiments, logs, allowed)
     found = tuple(channels.actuation.found) if channels.actuation is not None else ()
     late_s = Drive({name: channels.drive[name] for name in found}).late_s
-    evidence = Evidence(logs, channels.kinematic.step_rad, allowed, None, late_s=late_s)
+    # What the drive's own channels show is not sought in the plant again, nor why else its torque is late there.
+    library = tuple(n for n in allowed if n not in channels.drive and not (late_s > 0.0 and _late(n)))
+    replay = Replay(
+        experiments,
+        controller_lags=velocity_lag_s({name: channels.drive[name] for name in found}) > 0.0,
+        reported_early=late_s == 0.0,
+    )
+    coarse = {name: values for name, values in channels.drive.items() if _steps(name)}
+    echoes = echoes_nm(experiments, replay, coarse) if coarse else None
+    step_rad = channels.kinematic.step_rad if echoes is None else nominal.encoder_resolution_rad or 0.0
+    evidence = Evidence(logs, step_rad, library, None, late_s=late_s, echoes_nm=echoes)
     ranking = rank(evidence)
-    replay = Replay(experiments, controller_lags=velocity_lag_s({name: channels.drive[name] for name in found}) > 0.0)
     judged = [r for r in logs if r.experiment.validation] or list(logs)
     has_validation = any(r.experiment.validation for r in logs)
     low_pass = LowPass.at(1.0 / logs[0].step_s)
@@ -121,8 +117,12 @@ def _full(
         drive_gain=dict(channels.actuation.found) if channels.actuation is not None else {},
         actuation_ratio=float(np.median(list(channels.actuation.ratio.values()))) if channels.actuation else 1.0,
         actuation_motion=channels.actuation.motion_ratio if channels.actuation else 1.0,
+        actuation_rest=_actuation_rest(channels.actuation),
+        actuation_worst=max(channels.actuation.ratio.values()) if channels.actuation else 1.0,
         coarse=channels.kinematic.step_factor,
         floor_nm=floor,
+        probed={name: hypothesis.probe for name in hypothesis.replayed},
+        hollow={name: hollow(judge, hypothesis, name) for name in hypothesis.names},
     )
     return _conclude(
         experiments,
@@ -143,59 +143,16 @@ def _full(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Features:
-    """The figures that the verdict rests on."""
-
-    before: float
-    after: float
-    misfit: float
-    misfit_before: float
-    family_share: float
-    family_gain: float
-    family_name: str
-    family_alone: float
-    actuation_left: float
-    held_share: float
-    names: tuple[str, ...]
-    gain: float
-    rivals: Mapping[str, tuple[float, str]]
-    rival_drive: Mapping[str, float]
-    drive_gain: Mapping[str, float]
-    actuation_ratio: float
-    actuation_motion: float
-    coarse: float
-    floor_nm: float
+def _late(name: str) -> bool:
+    """Whether an effect lets the torque come late."""
+    form = all_effects()[name].actuation
+    return form is not None and form.late
 
 
-def verdict_of(f: Features) -> tuple[str, str]:
-    """(verdict, where it lives if unknown)."""
-    if f.actuation_left > 0.3 or f.actuation_ratio > COLOURED or f.actuation_motion > FOLLOWS_MOTION:
-        return "unknown", "actuation"
-    if f.held_share > HELD_SHARE:
-        return "unknown", "kinematics: positions repeat while the joint moves"
-    if not f.names:
-        there = (f.before > 1.6 and f.misfit_before > 1.5) or f.misfit_before > UNEXPLAINED
-        return ("unknown", f.family_name) if there else ("none", "")
-    # What a late torque leaves in the plant is its own trace where the drive alone closes the gap.
-    if not f.rivals and f.after**2 - 1.0 < DRIVE_CLOSES * (f.before**2 - 1.0):
-        return "explained", ""
-    # A velocity curve that fits better than a velocity effect's formula is still that effect.
-    same_kind = f.family_name == "velocity" and any(_shapes_the_curve(name) for name in f.names)
-    plant_alone = bool(f.rivals) and set(f.rivals) == set(f.names)
-    if plant_alone and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1 and not same_kind:
-        return "unknown", f.family_name
-    if f.family_share > FAMILY_SHARE and f.misfit > 1.3 and f.after > 1.2 and not same_kind:
-        return "unknown", f.family_name
-    if f.after > 2.0 and f.misfit > 3.0 and f.coarse <= 1.5 and f.after > 0.25 * f.before:
-        return "unknown", f.family_name
-    return "explained", ""
-
-
-def _shapes_the_curve(name: str) -> bool:
-    """Whether an effect is above all a change of the friction curve."""
-    effect = all_effects()[name]
-    return effect.inverse is not None and effect.signature.regions[0] is Region.VELOCITY_BAND
+def _steps(name: str) -> bool:
+    """Whether an effect is a step of the reported position."""
+    form = all_effects()[name].kinematic
+    return form is not None and form.position_step
 
 
 def drive_channels(experiments: ExperimentSet, logs: Sequence[Recording], allowed: Sequence[str]) -> _Channels:
@@ -214,6 +171,14 @@ def drive_channels(experiments: ExperimentSet, logs: Sequence[Recording], allowe
             if name not in drive:
                 drive[name] = bounded(name, actuation.drive.effects[name])
     return _Channels(kinematic, actuation, drive, left)
+
+
+def _actuation_rest(fit: ActuationFit | None) -> float:
+    """What the found effects leave of the actuation residual in the log where it was largest, 0..1."""
+    if fit is None or not fit.found:
+        return 1.0
+    worst = max(fit.before_ratio, key=lambda name: fit.before_ratio[name])
+    return fit.ratio[worst] / fit.before_ratio[worst]
 
 
 def _actuation_left(
@@ -265,7 +230,9 @@ def _needed_drive(
             left = rms(np.concatenate([low_pass(r.actuation_nm) for r in judged if r.actuation_nm is not None]))
             fitted = rms(np.concatenate([low_pass(channels.actuation.residual(r, controller)) for r in judged]))
             single = len(channels.actuation.found) <= 1
-            if left**2 - fitted**2 > (0.6 * fitted) ** 2 or (not single and left > 1.2 * fitted):
+            needed = left**2 - fitted**2 > (0.6 * fitted) ** 2 or (not single and left > 1.2 * fitted)
+            # A limit that only other motions reach is no less a fault of the drive.
+            if needed or channels.actuation.shows_in.get(name):
                 kept[name] = values
     return kept
 
@@ -309,18 +276,20 @@ def _conclude(
         closed = 100.0 * (1.0 - max(0.0, rest) / max(1e-30, before.forward_torque_nm**2 - noise_nm**2))
     causes = []
     for name in names:
-        rival_gain, rival = features.rivals.get(name, (0.0, ""))
-        chance, confusable = confidence(name, features)
+        values = _values(name, hypothesis, channels, drive)
+        plain = {parameter: value.value for parameter, value in values.items()}
+        clues, confusable = clues_of(name, features, shapley.get(name, 0.0), plain)
+        chance = round(clues.chance(), 3)
         causes.append(
             Cause(
                 effect=name,
                 confidence=chance if verdict == "explained" else min(chance, 0.4),
-                parameters=_values(name, hypothesis, channels, drive),
+                parameters=values,
                 confusable_with=confusable,
                 gap_closed_percent=round(closed * shapley.get(name, 0.0), 2),
+                clues=clues,
             )
         )
-        del rival_gain, rival
     causes.sort(key=lambda c: (c.confidence, c.gap_closed_percent or 0.0), reverse=True)
     reasons: dict[str, str] = dict(hints)
     upcoming = None
@@ -337,7 +306,8 @@ def _conclude(
         and (causes[0].confusable_with or "motion" in hints)
     ):
         verdict = "ambiguous"
-        rival = causes[0].confusable_with[0] if causes[0].confusable_with else "torque_bias"
+        others = (m.effects[0] for m in ranking.singles if m.effects[0] != causes[0].effect)
+        rival = causes[0].confusable_with[0] if causes[0].confusable_with else next(others, causes[0].effect)
         upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
         if len(causes) == 1:
             chance = min(0.5, causes[0].confidence, 1.0 - causes[0].confidence)
@@ -345,7 +315,8 @@ def _conclude(
     applied = verdict == "explained"
     result = Figures(inverse_after, pooled(after, "torque_nm"), pooled(after, "position_rad")) if applied else before
     if verdict == "unknown":
-        reasons["cause"] = f"no effect of the library explains the gap; it lives in: {place}"
+        part = "the effects listed explain a part of it; the rest" if causes else "no effect explains it; it"
+        reasons["cause"] = f"{part} lives in: {place}"
     if verdict in ("unknown", "ambiguous"):
         reasons["after"] = "nothing is applied on this verdict, so the gap after is the gap before"
     if channels.actuation is not None and channels.actuation.judged_in_blocks:
@@ -420,10 +391,27 @@ def _summary(
     if verdict == "none":
         return f"{name}: no gap beyond noise and the nominal model's tolerances."
     if verdict == "unknown":
-        return f"{name}: {there}; no known effect explains it ({place})."
-    effects = " and ".join(f"{c.effect} ({c.confidence:.2f})" for c in causes)
+        if not causes or closed < 5.0:
+            return f"{name}: {there}; no known effect explains it ({place})."
+        part = _listed([c.effect for c in causes])
+        return (
+            f"{name}: {there}; {part} would close {closed:.0f} % of it on recordings not used for fitting, but what "
+            f"remains no known effect explains ({place}), so {'they are' if len(causes) > 1 else 'it is'} not certain."
+        )
+    effects = _listed([_with_share(c, len(causes) > 1) for c in causes])
     if verdict == "ambiguous":
         return f"{name}: {there}; these recordings cannot decide between {effects}."
     return (
-        f"{name}: {there}; {effects} explains it; adding it closes {closed:.0f} % on recordings not used for fitting."
+        f"{name}: {there}; {effects} {'explain' if len(causes) > 1 else 'explains'} it; adding "
+        f"{'them' if len(causes) > 1 else 'it'} closes {closed:.0f} % on recordings not used for fitting."
     )
+
+
+def _with_share(cause: Cause, several: bool) -> str:
+    share = f", {cause.gap_closed_percent:.0f} % of the gap" if several and cause.gap_closed_percent is not None else ""
+    return f"{cause.effect} ({cause.confidence:.2f}{share})"
+
+
+def _listed(items: Sequence[str]) -> str:
+    """a; a and b; a, b and c."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

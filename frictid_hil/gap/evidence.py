@@ -35,6 +35,8 @@ Group = tuple[str, int]
 """(effect or family, shape's index)."""
 EDGE_ROWS = 3
 """Thinned rows left out at either end of a log, where the filter has seen too little."""
+ACTIVE_SET_STEPS = 20
+"""Bounds are taken and let go so many times at most; a handful of nuisances settles in a few."""
 FAMILY = "family "
 """Prefix of the generic families' names."""
 
@@ -104,6 +106,7 @@ class Evidence:
         tolerance_factor: float = 1.0,
         offset_nm: float = 0.0,
         late_s: float = 0.0,
+        echoes_nm: Mapping[str, Array] | None = None,
     ) -> None:
         self.recordings = [r for r in recordings if r.view is not None and r.plant_nm is not None]
         views = [r.view for r in self.recordings if r.view is not None]
@@ -134,19 +137,26 @@ class Evidence:
         self._prior = np.array([1.0 / (tolerance_factor * n.deviation) ** 2 for n in NUISANCES])
         self._bound = tolerance_factor * np.array([n.bound for n in NUISANCES])
         if late_s > 0.0:
-            # A drive whose torque is late reports it at a time known no better than that.
+            # A drive whose torque is late reports it at a time known no better than that, or than half a sample.
+            late_s = max(late_s, 0.5 * self.recordings[0].step_s)
             timing = [n.name for n in NUISANCES].index("timing")
             self._prior[timing] = min(self._prior[timing], late_s**-2)
             self._bound[timing] = max(self._bound[timing], 1.5 * late_s)
         self._views = views
         self._refined: dict[Group, dict[str, float]] = {}
-        self._weigh(parts, encoder_step_rad, noise_nm)
+        self._weigh(parts, encoder_step_rad, noise_nm, echoes_nm or {})
         self._reduce()
 
     def _thin(self, columns: Sequence[Array]) -> list[Array]:
         return [self.low_pass.thinned(part) for part in columns]
 
-    def _weigh(self, parts: list[list[Array]], encoder_step_rad: float, noise_nm: float | None) -> None:
+    def _weigh(
+        self,
+        parts: list[list[Array]],
+        encoder_step_rad: float,
+        noise_nm: float | None,
+        echoes_nm: Mapping[str, Array],
+    ) -> None:
         stride = self.low_pass.stride
         self.deviation_nm: list[Array] = []
         self.thin: list[tuple[Array, Array]] = []
@@ -154,7 +164,9 @@ class Evidence:
             view, residual = recording.view, recording.plant_nm
             assert view is not None and residual is not None
             table = np.concatenate([part[k] for part in parts] + self._thin([residual[:, None]]), axis=1)
-            deviation = deviation_nm(recording, view, self.low_pass, encoder_step_rad, noise_nm)[::stride]
+            deviation = deviation_nm(recording, view, self.low_pass, encoder_step_rad, noise_nm)
+            echo_nm = echoes_nm.get(recording.experiment.name)
+            deviation = (deviation if echo_nm is None else np.hypot(deviation, echo_nm))[::stride]
             keep = slice(EDGE_ROWS, max(EDGE_ROWS + 1, table.shape[0] - EDGE_ROWS))
             self.deviation_nm.append(deviation[: table.shape[0]][keep])
             table = table[keep] / self.deviation_nm[-1][:, None]
@@ -314,19 +326,27 @@ class Evidence:
         inner[diagonal[bounded:], diagonal[bounded:]] *= 1.0 + 1e-9
         inner[diagonal, diagonal] += 1e-12
         weights: Array = np.linalg.solve(inner, right)
+        bound = self._bound
+        if not np.any(np.abs(weights[:bounded]) > bound):
+            return weights
         fixed = np.zeros(at.size, dtype=bool)
-        value = np.zeros(at.size)
-        for _ in range(6):
+        for _ in range(ACTIVE_SET_STEPS):
             over = np.zeros(at.size, dtype=bool)
-            over[:bounded] = (np.abs(weights[:bounded]) > self._bound) & ~fixed[:bounded]
-            if not over.any():
-                break
-            value[over] = np.sign(weights[over]) * self._bound[over[:bounded]]
-            fixed |= over
+            over[:bounded] = ~fixed[:bounded] & (np.abs(weights[:bounded]) > bound * (1.0 + 1e-9))
+            if over.any():
+                weights[over] = np.sign(weights[over]) * bound[over[:bounded]]
+                fixed |= over
+            else:
+                # A bound that pulls inwards was taken too early: scales that trade against each other do that.
+                slope = inner @ weights - right
+                inwards = fixed & (slope * weights > 1e-9 * np.abs(right).max() * np.abs(weights))
+                if not inwards.any():
+                    break
+                fixed &= ~inwards
             free = ~fixed
-            weights = value.copy()
-            target = right[free] - inner[np.ix_(free, fixed)] @ value[fixed]
+            target = right[free] - inner[np.ix_(free, fixed)] @ weights[fixed]
             weights[free] = np.linalg.solve(inner[np.ix_(free, free)], target)
+        weights[:bounded] = np.clip(weights[:bounded], -bound, bound)
         return weights
 
 

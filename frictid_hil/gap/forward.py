@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.actuation import velocity_lag_s
+from frictid_hil.gap.actuation import late_s, velocity_lag_s
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, first_slide, friction_scales, rms
 from frictid_hil.simulation.effects import all_effects
@@ -94,10 +94,18 @@ def bounded(name: str, values: Mapping[str, float]) -> dict[str, float]:
 
 
 class Replay:
-    """Replays of one experiment set; the nominal model may carry any effects."""
+    """Replays of one experiment set; the nominal model may carry any effects.
 
-    def __init__(self, experiments: ExperimentSet, controller_lags: bool = False) -> None:
+    Args:
+        experiments: the set.
+        controller_lags: the controller sees a velocity as late as effects say.
+        reported_early: the drive reports the torque of its sampling instant, in which a delay within the sample is
+            over; the simulator reports the mean over the sample, which such a delay makes late.
+    """
+
+    def __init__(self, experiments: ExperimentSet, controller_lags: bool = False, reported_early: bool = False) -> None:
         self._lagging = controller_lags
+        self._early = reported_early
         self._experiments = experiments.experiments
         self._nominal = nominal_model(experiments.nominal)
         coulomb, stiffness = friction_scales(experiments.nominal)
@@ -120,6 +128,29 @@ class Replay:
         for name, values in effects.items():
             merged[name] = {**merged.get(name, {}), **bounded(name, values)}
         return self._nominal.with_effects(merged)
+
+    def simulated(self, effects: Effects) -> tuple[Experiment, ...]:
+        """All experiments as the nominal joint with ``effects`` would have recorded them."""
+        model = self.model(effects)
+        state: CarryOver | None = None
+        result = []
+        for e in self._experiments:
+            command = e.position_command_rad
+            assert command is not None
+            rows = closed_loop(
+                model,
+                self._controller,
+                e.time_s,
+                command,
+                payload=e.payload,
+                state=state,
+                substep_s=SEARCH_SUBSTEP_S,
+            )
+            state = rows.state
+            result.append(
+                replace(e, position_rad=rows.position_rad, velocity_rad_s=rows.velocity_rad_s, torque_nm=rows.torque_nm)
+            )
+        return tuple(result)
 
     def __call__(
         self, effects: Effects, *, validation: bool | None = None, substep_s: float = SUBSTEP_S
@@ -145,7 +176,8 @@ class Replay:
             wanted = validation is None or experiment.validation == validation
             if not wanted and not carried:
                 continue
-            difference, state = self._one(model, controller, experiment, state, substep_s)
+            early_s = late_s(effects) if self._early else 0.0
+            difference, state = self._one(model, controller, experiment, state, substep_s, early_s)
             if wanted:
                 result[experiment.name] = difference
         return result
@@ -157,6 +189,7 @@ class Replay:
         experiment: Experiment,
         state: CarryOver | None,
         substep_s: float,
+        early_s: float,
     ) -> tuple[Replayed, CarryOver]:
         command = experiment.position_command_rad
         assert command is not None
@@ -171,7 +204,10 @@ class Replay:
         )
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
-        torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
+        reported = rows.torque_nm
+        if early_s > 0.0:
+            reported = np.interp(experiment.time_s + early_s, experiment.time_s, reported)
+        torque = np.zeros_like(reported) if measured is None else measured - reported
         held = first_slide(experiment.position_rad, self._slide_rad) + round(SETTLING_S * low_pass.rate_hz)
         return Replayed(
             low_pass(torque),

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.residuals import slip_state
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import lagged
 
@@ -22,7 +23,11 @@ DESCRIPTIONS = {
     "time": "a slow change over the whole session",
     "time in a log": "a change within each recording",
     "acceleration": "friction that depends on acceleration",
+    "torque": "a torque gain that depends on the torque",
+    "travel": "a torque that builds up over a good part of the travel after a reversal",
 }
+REACHES = (0.1, 0.25, 0.5)
+"""Travels over which such a torque builds up, over the whole travel."""
 
 
 def families(views: Sequence[View]) -> dict[str, list[Array]]:
@@ -63,6 +68,15 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         a = lagged(v.acceleration_rad_s2, v.step_s, 0.01)
         return np.stack([np.abs(a), np.abs(a) * v.slip, a * np.abs(a), a * np.abs(v.velocity_rad_s)], axis=1)
 
+    top_nm = max(float(np.quantile(np.abs(v.torque_nm), 0.99)) for v in views)
+
+    def gain(v: View) -> Array:
+        t = v.torque_nm / max(top_nm, 1e-12)
+        return np.stack([t * np.abs(t), t**3], axis=1)
+
+    def since_reversal(v: View) -> Array:
+        return np.stack([slip_state(v.position_rad, 1.0 / max(r * (high - low), 1e-9)) for r in REACHES], axis=1)
+
     return {
         "position": [place(v) for v in views],
         "position friction": [place(v) * v.slip[:, None] for v in views],
@@ -72,4 +86,6 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         "time": [session(v) for v in views],
         "time in a log": [within(v) for v in views],
         "acceleration": [accelerated(v) for v in views],
+        "torque": [gain(v) for v in views],
+        "travel": [since_reversal(v) for v in views],
     }

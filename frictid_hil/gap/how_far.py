@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-from frictid_hil.gap.evidence import Evidence, Group
+from frictid_hil.gap.evidence import FAMILY, Evidence, Group
 from frictid_hil.gap.forward import SEARCH_SUBSTEP_S, Effects, Replay, Replayed, pooled, refine, settled_nm
 from frictid_hil.gap.which import Model, Ranking
 from frictid_hil.simulation.effects import all_effects
@@ -27,12 +27,20 @@ CLEAR = 1.5
 """Fall of the plant's held-out squares from which a lone effect needs to take off no more than one beside others."""
 UNHEALTHY = 2.2
 """Held-out squares per row that traces below the floor do not reach."""
+FAINT = 0.02
+"""Part of an effect's strength that is next to nothing."""
 CLOSE_RIVAL = 0.80
 """Gain over the best one's from which a rival is replayed too."""
 WIDER_GAIN = 100.0
 """Log-likelihood, per misfit ratio, from which a second effect is replayed."""
 NO_GAP = 1.05
 """Torque difference over the floor at which a plant with healthy held-out squares needs no effect."""
+FURTHER = 2
+"""Effects that may be added to three."""
+FURTHER_FROM = 1.3
+"""Torque difference over the floor from which they are sought."""
+FURTHER_LEAVES = 0.7
+"""Part of the plant's held-out squares that each of them may leave at most."""
 PROBE_FROM = 1.2
 """Torque difference over the floor from which effects are also searched for by replay."""
 PROBE_TAKES = 0.5
@@ -54,6 +62,7 @@ class Hypothesis:
         judged_nm: on the validation logs.
         misfit: of the plant channel, held-out squares per row.
         inverse_nm: left of the plant channel on the validation logs, RMS.
+        probe: of what only the replay shows: (log-likelihood it gained, the same of its best rival, that rival).
     """
 
     groups: tuple[Group, ...]
@@ -64,6 +73,7 @@ class Hypothesis:
     misfit: float
     inverse_nm: float
     replayed: tuple[str, ...] = ()
+    probe: tuple[float, float, str] = (0.0, 0.0, "")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -106,7 +116,7 @@ class Judge:
     def probed(self, given: Hypothesis, name: str) -> Hypothesis | None:
         """``given`` with a transmission effect found by replay, or in the place of its transmission effect."""
         shapes = self.evidence.probes(name)
-        if not shapes or name in given.names:
+        if not shapes or name in given.replayed:
             return None
         rest = {n: v for n, v in given.effects.items() if n not in swinging()}
         tried = [(self._squares({**rest, name: dict(shape)}), k) for k, shape in enumerate(shapes)]
@@ -131,7 +141,7 @@ class Judge:
         rest = self(tuple(g for g in given.groups if g[0] != name))
         for hidden in given.replayed:
             if hidden != name:
-                rest = self.probed(rest, hidden) or rest
+                rest = replace(self.probed(rest, hidden) or rest, probe=given.probe)
         return rest
 
     def _squares(self, effects: Effects) -> float:
@@ -198,6 +208,24 @@ def _chosen_by_plant(judge: Judge, ranking: Ranking, current: Hypothesis, floor_
         triple = judge(ranking.widest.groups)
         if set(current.names) < set(triple.names) and _stands_out(current, triple, floor_nm, STANDS_BESIDE):
             current = triple
+            current = _with_further(judge, current, floor_nm)
+    return current
+
+
+def _with_further(judge: Judge, current: Hypothesis, floor_nm: float) -> Hypothesis:
+    """The hypothesis with more effects, one at a time, while each leaves much less than the ones before it.
+
+    A joint with four faults is rare, and four effects explain much that is none of them: the bar is higher here.
+    """
+    effects = sorted({g[0] for g in judge.evidence.groups if not g[0].startswith(FAMILY)})
+    for _ in range(FURTHER):
+        if current.judged_nm <= FURTHER_FROM * floor_nm and current.misfit < UNHEALTHY:
+            break
+        tried = [judge.evidence.best_shape(e, current.groups) for e in effects if e not in current.names]
+        wider = judge((*current.groups, max(tried)[1]))
+        if wider.misfit > FURTHER_LEAVES * current.misfit or not _stands_out(current, wider, floor_nm, STANDS_BESIDE):
+            break
+        current = wider
     return current
 
 
@@ -216,7 +244,13 @@ def _with_probed(judge: Judge, current: Hypothesis, floor_nm: float) -> Hypothes
     excess = current.judged_nm**2 - floor_nm**2
     if current.judged_nm**2 - best.judged_nm**2 < PROBE_TAKES * excess or best.fitted_nm > 0.95 * current.fitted_nm:
         return current
-    return best
+    rows = judge.evidence.fitted.rows if judge.evidence.fitted is not None else 1.0
+
+    def gain(h: Hypothesis) -> float:
+        return rows * math.log(current.fitted_nm / max(h.fitted_nm, 1e-30))
+
+    rivals = [(gain(h), h.replayed[0]) for h in tried if h is not best]
+    return replace(best, probe=(gain(best), *max(rivals, default=(0.0, ""))))
 
 
 def _stands_out(before: Hypothesis, after: Hypothesis, floor_nm: float, share: float) -> bool:
@@ -256,6 +290,23 @@ def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[s
                 value += weight * (left(kept) - left(kept | {name}))
         result[name] = value / total if total > 0.0 else 0.0
     return result
+
+
+def hollow(judge: Judge, hypothesis: Hypothesis, name: str) -> float:
+    """Part of what an effect closes that its shape closes alone, its strength next to nothing; 0..1.
+
+    A play brings the stiffness of its closed contact along. Where that alone closes the gap, the play is not the cause.
+    """
+    values = hypothesis.effects[name]
+    off = all_effects()[name].off
+    strengths = [p.name for p in all_effects()[name].strengths if p.name in values]
+    faint = {p: off[p] + FAINT * (values[p] - off[p]) for p in strengths}
+    without = {n: v for n, v in hypothesis.effects.items() if n != name}
+    with_shape = {**without, name: {**values, **faint}}
+    nothing, shape, whole = (
+        settled_nm(judge.judged(effects)) ** 2 for effects in (without, with_shape, hypothesis.effects)
+    )
+    return min(1.0, max(0.0, (nothing - shape) / (nothing - whole))) if nothing > whole else 0.0
 
 
 def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:

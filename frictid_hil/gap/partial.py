@@ -109,8 +109,8 @@ def diagnose_without_replay(
         causes = (*causes, Cause(confusable[0], round(min(0.5, causes[0].confidence), 3), {}, (causes[0].effect,)))
     upcoming = None
     if verdict == "ambiguous":
-        others = (*causes[0].confusable_with, *(c.effect for c in causes[1:]), "torque_delay")
-        rival = others[0]
+        others = [*causes[0].confusable_with, *(c.effect for c in causes[1:]), *(t.groups[0][0] for t in trials)]
+        rival = next((name for name in others if name != causes[0].effect), causes[0].effect)
         upcoming = next_experiment(causes[0].effect, rival, tuple(r.experiment.name for r in logs))
     noise = float(np.sqrt(np.mean(np.concatenate(evidence.noise_nm) ** 2)))
     applied = verdict == "explained"

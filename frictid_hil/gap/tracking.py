@@ -1,17 +1,16 @@
-"""Command and position alone: what stands between them is a chain of delay, lag, play and gain.
+"""Command and position alone: what stands between them is a chain of links that effects bring along.
 
-The measured position is predicted from the command; every link of the chain is fitted on the identification logs and
-must pay on the validation logs. A play whose prediction a free gain matches is not called one.
+The measured position is predicted from the command; every effect's links are fitted on the identification logs and
+must pay on the validation logs. An effect that another one predicts as well is named with it, and neither is sure.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
@@ -20,43 +19,59 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.residuals import Recording, rms
-from frictid_hil.simulation.inverse_loops import lagged
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 LEAST_FALL = 0.1
-"""Fall of the held-out RMS that a link of the chain must bring."""
+"""Fall of the held-out RMS that an effect of the chain must bring."""
+TIED = 1.15
+"""RMS of a mimic over that of the effect at which the two cannot be told apart."""
+TENTATIVE = 0.55
+"""Confidence at most where nothing is judged apart from what was fitted."""
+MIMICKED = 0.4
+"""Confidence where a mimic predicts as well."""
+
+
+def _forms() -> dict[str, TrackingForm]:
+    """Every effect's form in the chain, in the order in which they act."""
+    forms = {name: effect.tracking for name, effect in all_effects().items() if effect.tracking is not None}
+    return dict(sorted(forms.items(), key=lambda item: item[1].order))
+
+
+def _links() -> dict[str, Link]:
+    return {link.name: link for form in _forms().values() for link in form.links}
 
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """What turns a command into a position.
+    """What turns a command into a position: values by link; links left out change nothing."""
 
-    Attributes:
-        delay_s: dead time.
-        lag_s: first-order time constant.
-        play_rad: whole width of a play after them.
-        gain: of the whole.
-    """
-
-    delay_s: float = 0.0
-    lag_s: float = 0.0
-    play_rad: float = 0.0
-    gain: float = 1.0
+    values: Mapping[str, float] = field(default_factory=dict)
 
     def position(self, command_rad: Array, step_s: float) -> Array:
         """Position for a command, shape (n,)."""
-        time = step_s * np.arange(command_rad.size)
-        late = np.interp(time - self.delay_s, time, command_rad)
-        slow = lagged(late, step_s, self.lag_s)
-        return self.gain * (_played(slow, 0.5 * self.play_rad) if self.play_rad > 0.0 else slow)
+        position = command_rad
+        for name, link in _links().items():
+            if self.values.get(name, link.neutral) != link.neutral:
+                position = link.position(position, self.values[name], step_s)
+        return position
+
+    def value(self, name: str) -> float:
+        """Of one link."""
+        return self.values.get(name, _links()[name].neutral)
+
+    def with_values(self, values: Mapping[str, float]) -> Chain:
+        """The chain with some links changed."""
+        return Chain({**self.values, **values})
 
 
-@njit(cache=True)
-def _played(values: Array, half: float) -> Array:
-    out = np.empty_like(values)
-    out[0] = values[0]
-    for k in range(1, values.shape[0]):
-        out[k] = min(values[k] + half, max(values[k] - half, out[k - 1]))
-    return out
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """An effect taken into the chain: the fall of the RMS that it brought, and the effects that look like it."""
+
+    effect: str
+    fall: float
+    mimics: tuple[str, ...]
 
 
 def diagnose_tracking(
@@ -72,33 +87,30 @@ def diagnose_tracking(
     unseen = judged or usable
     chain = Chain()
     before = _left(chain, unseen)
-    steps: list[tuple[str, float, tuple[str, ...]]] = []
+    steps: list[_Step] = []
     held_out: dict[str, float] = {}
-    links: tuple[tuple[str, str, tuple[str, ...], Callable[[Chain], Chain]], ...] = (
-        ("torque_delay", "delay_s", ("electrical_lag",), lambda c: _fit(c, fitted, ("delay_s", "lag_s"))),
-        ("backlash", "play_rad", ("stiction_breakaway",), lambda c: _fit(c, fitted, ("play_rad", "delay_s", "lag_s"))),
-    )
-    free_gain = _left(_fit(_fit(chain, fitted, ("delay_s", "lag_s")), fitted, ("gain", "delay_s", "lag_s")), unseen)
-    for effect, _, partners, widen in links:
-        if effect not in allowed:
+    for effect, form in _forms().items():
+        if effect not in allowed or form.mimics:
             continue
-        wider = widen(chain)
+        wider = _fit(chain, fitted, _beside(form))
         now, then = _left(chain, unseen), _left(wider, unseen)
         held_out[effect] = round(100.0 * (then / now - 1.0), 2) if now > 0.0 else 0.0
         if then < (1.0 - LEAST_FALL) * now:
-            tied = effect == "backlash" and free_gain < 1.15 * then
-            steps.append((effect, 1.0 - then / now, (*partners, "torque_constant_error") if tied else partners))
+            tied = tuple(
+                n for n, m in _forms().items() if effect in m.mimics and _mimicked(m, form, fitted, unseen, then)
+            )
+            steps.append(_Step(effect, 1.0 - then / now, tied))
             chain = wider
             if tied:
-                notes["backlash"] = "a free gain predicts these logs as well as a play"
+                notes[effect] = f"these logs are predicted as well by {' or '.join(tied)}"
     after = _left(chain, unseen)
     causes = tied_on_a_sinusoid([_cause(step, chain, bool(judged), fitted) for step in steps], notes)
-    undecided = "sinusoid" in notes or any("torque_constant_error" in c.confusable_with for c in causes)
+    undecided = "sinusoid" in notes or any(step.mimics for step in steps)
     ambiguous = bool(causes) and (not judged or undecided)
     verdict = "none" if not causes else ("ambiguous" if ambiguous else "explained")
     if not causes and before > 0.02 * _travel(unseen):
         verdict = "unknown"
-        notes["cause"] = "neither delay, lag nor play explains how the position differs from its command"
+        notes["cause"] = f"none of {', '.join(held_out)} explains how the position differs from its command"
     upcoming = None
     if verdict == "ambiguous":
         weakest = causes[-1]
@@ -136,23 +148,51 @@ def _left(chain: Chain, logs: Sequence[Recording]) -> float:
     return rms(np.concatenate(parts))
 
 
+def _beside(form: TrackingForm) -> tuple[str, ...]:
+    """The form's own links, and those of the effects that act before it."""
+    earlier = [link.name for other in _forms().values() if other.order < form.order for link in other.links]
+    own = [link.name for link in form.links]
+    return tuple(dict.fromkeys((*own, *(n for n in earlier))))
+
+
+def _mimicked(
+    mimic: TrackingForm, form: TrackingForm, fitted: Sequence[Recording], unseen: Sequence[Recording], left: float
+) -> bool:
+    """Whether a mimic in the place of an effect predicts the logs as well."""
+    own = {link.name for link in form.links}
+    earlier = tuple(n for n in _beside(form) if n not in own)
+    start = _fit(Chain(), fitted, earlier) if earlier else Chain()
+    names = (*(link.name for link in mimic.links), *earlier)
+    return _left(_fit(start, fitted, names), unseen) < TIED * left
+
+
 def _fit(chain: Chain, logs: Sequence[Recording], names: tuple[str, ...]) -> Chain:
-    """The chain with the named numbers fitted, from several starts."""
+    """The chain with the named links fitted, from several starts."""
     travel = _travel(logs)
-    scale = {"delay_s": 0.05, "lag_s": 0.05, "play_rad": 0.02 * travel, "gain": 0.05}
-    top = {"delay_s": 0.5, "lag_s": 0.5, "play_rad": 0.5 * travel, "gain": 2.0}
-    low = {"delay_s": 0.0, "lag_s": 0.0, "play_rad": 0.0, "gain": 0.5}
+    links = [_links()[name] for name in names]
+    scale = {link.name: link.start * (travel if link.of_travel else 1.0) for link in links}
+    top = {link.name: link.upper * (travel if link.of_travel else 1.0) for link in links}
 
     def built(x: Array) -> Chain:
-        values = {n: float(np.clip(v * scale[n], low[n], top[n])) for n, v in zip(names, x, strict=True)}
-        return replace(chain, **values)
+        return chain.with_values(
+            {
+                link.name: float(np.clip(v * scale[link.name], link.lower, top[link.name]))
+                for link, v in zip(links, x, strict=True)
+            }
+        )
 
     def cost_of(x: Array) -> float:
         return _left(built(x), logs)
 
     best, least = chain, _left(chain, logs)
     for start in (0.3, 1.0, 3.0):
-        x0 = np.array([(1.0 if n == "gain" else max(getattr(chain, n), start * scale[n])) / scale[n] for n in names])
+        x0 = np.array(
+            [
+                (link.neutral if link.neutral else max(chain.value(link.name), start * scale[link.name]))
+                / scale[link.name]
+                for link in links
+            ]
+        )
         found = optimize.fmin(cost_of, x0, maxiter=80 * len(names), ftol=1e-9, disp=False)
         cost = cost_of(found)
         if cost < least:
@@ -160,28 +200,25 @@ def _fit(chain: Chain, logs: Sequence[Recording], names: tuple[str, ...]) -> Cha
     return best
 
 
-def _cause(step: tuple[str, float, tuple[str, ...]], chain: Chain, judged: bool, fitted: Sequence[Recording]) -> Cause:
-    effect, fall, partners = step
-    parameters = (
-        {"delay_s": _value(chain, "delay_s", fitted), "lag_s": _value(chain, "lag_s", fitted)}
-        if effect == "torque_delay"
-        else {"gap_rad": _value(chain, "play_rad", fitted)}
+def _cause(step: _Step, chain: Chain, judged: bool, fitted: Sequence[Recording]) -> Cause:
+    form = _forms()[step.effect]
+    chance = form.certainty if judged else min(form.certainty, TENTATIVE)
+    return Cause(
+        step.effect,
+        MIMICKED if step.mimics else chance,
+        {link.name: _value(chain, link.name, fitted) for link in form.links},
+        (*form.looks_like, *step.mimics),
+        round(100.0 * step.fall, 2),
     )
-    chance = 0.92 if effect == "torque_delay" else 0.6
-    if not judged:
-        chance = min(chance, 0.55)
-    if "torque_constant_error" in partners:
-        chance = 0.4
-    return Cause(effect, chance, parameters, partners, round(100.0 * fall, 2))
 
 
 def _value(chain: Chain, name: str, fitted: Sequence[Recording]) -> Value:
     """A number with the interval in which the fitted squares rise by what two correlated residuals explain."""
-    value = getattr(chain, name)
+    value = chain.value(name)
     h = max(0.05 * value, 1e-5)
     least = _left(chain, fitted) ** 2
-    bend = _left(replace(chain, **{name: value + h}), fitted) ** 2 - 2.0 * least
-    bend += _left(replace(chain, **{name: max(0.0, value - h)}), fitted) ** 2
+    bend = _left(chain.with_values({name: value + h}), fitted) ** 2 - 2.0 * least
+    bend += _left(chain.with_values({name: max(0.0, value - h)}), fitted) ** 2
     rows = sum(r.experiment.position_rad.size for r in fitted) / 10.0
     if bend <= 0.0:
         return Value(value)

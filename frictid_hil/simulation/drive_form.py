@@ -40,18 +40,23 @@ class ActuationForm:
         parameter: the effect's parameter that is fitted.
         guesses: (recordings, value found in the kinematic channel or None) -> values to try, rising; the best one is
             refined between its neighbours; a single one is taken as it is, none at all says that it cannot show.
-        torque: (torque it is given (n,), value, step_s, limit_nm) -> torque it lets through (n,); None where it acts on
-            the controller's velocity instead, its value being the time constant of a further first-order lag there.
+        torque: (torque it is given (n,), value, step_s, limit_nm and, where there is one, detail) -> torque it lets
+            through (n,); None where it acts on the controller's velocity instead, its value being the time constant of
+            a further first-order lag there.
         order: forms of a chain act by rising order.
         late: its value is a time by which the torque comes late.
+        detail: a further parameter, ``torque``'s fifth argument, that shapes the effect; empty where there is none.
+        details: values of it to try, the plainest first; it stays where no other predicts better.
         believed_as: key in the ``drive`` section of nominal.yaml that already states it; empty where there is none.
     """
 
     parameter: str
     guesses: Callable[[Sequence[DriveView], float | None], Array]
-    torque: Callable[[Array, float, float, float], Array] | None
+    torque: Callable[..., Array] | None
     order: int = 50
     late: bool = False
+    detail: str = ""
+    details: tuple[float, ...] = ()
     believed_as: str = ""
 
 

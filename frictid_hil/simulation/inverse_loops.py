@@ -23,6 +23,16 @@ def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:
 
 
 @njit(cache=True)
+def played(values: Array, gap: float) -> Array:
+    """Values behind a play of a whole width ``gap``, shape (n,)."""
+    out = np.empty_like(values)
+    out[0] = values[0]
+    for k in range(1, values.shape[0]):
+        out[k] = min(values[k] + 0.5 * gap, max(values[k] - 0.5 * gap, out[k - 1]))
+    return out
+
+
+@njit(cache=True)
 def soft_spring(position_rad: Array, distance_rad: float, loop_exponent: float, loop_beta: float) -> Array:
     """State of the Bouc-Wen element of presliding_hysteresis, from a relaxed start, shape (n,)."""
     state = np.zeros(position_rad.shape[0])

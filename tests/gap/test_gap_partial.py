@@ -106,7 +106,7 @@ def test_play_on_one_sinusoid_is_ambiguous_with_a_gain() -> None:
     command = 0.4 * np.sin(1.0 * time)
     from frictid_hil.gap.tracking import Chain
 
-    position = Chain(delay_s=0.08, play_rad=0.03).position(command, 0.02)
+    position = Chain({"delay_s": 0.08, "gap_rad": 0.03}).position(command, 0.02)
     log = Experiment("backlash_detection", False, False, 0, time, position, position_command_rad=command)
     d = diagnose(ExperimentSet("one", Nominal(), (log,)))
     assert d.verdict == "ambiguous" and d.next_experiment is not None and d.next_experiment.duration_s > 0

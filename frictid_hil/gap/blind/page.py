@@ -63,8 +63,10 @@ def page(result: Mapping[str, Any]) -> str:
     scores = result["scores"]
     lines = [
         _HEAD,
-        f"{result['cases']} joints, seed {result['seed']}, frictid-hil {version('frictid-hil')}. SHA-256 of the truth, "
-        f"published before the first answer: `{result['truth_sha256']}`.",
+        f"{result['cases']} joints, seed {result['seed']}, frictid-hil {version('frictid-hil')}: "
+        f"`python benchmarks/gap_check.py --cases {result['cases']} --seed {result['seed']}"
+        f"{' --leave-one-out' if result.get('leave_one_out') else ''}`. SHA-256 of the truth, published before the "
+        f"first answer: `{result['truth_sha256']}`; of the code that answered: `{result['code_sha256']}`.",
         "",
         *_rates(scores),
         *_by_size(scores),
@@ -84,11 +86,11 @@ def _rates(scores: Mapping[str, Any]) -> list[str]:
     return [
         "### Rates",
         "",
-        "| | aim | share | 95 % interval | count |",
-        "|---|---|---|---|---|",
+        "| | aim | share | 95 % interval | count | |",
+        "|---|---|---|---|---|---|",
         *(
             f"| {_LABELS[name]} | {_percent(AIMS.get(name))} | {_percent(rate['rate'])} | {_interval(rate)} "
-            f"| {_count(rate)} |"
+            f"| {_count(rate)} | {_met(rate, AIMS.get(name))} |"
             for name, rate in headline(scores).items()
         ),
         "",
@@ -225,6 +227,15 @@ def _left_out(check: Mapping[str, Any]) -> list[str]:
 
 def _counts(answers: Mapping[str, int]) -> str:
     return ", ".join(f"{answer} {count}" for answer, count in answers.items())
+
+
+def _met(rate: Mapping[str, Any], aim: float | None) -> str:
+    """Whether a rate reaches its aim, and where it does not, whether its interval still holds the aim."""
+    if aim is None or rate["rate"] is None:
+        return ""
+    if rate["rate"] >= aim:
+        return "met"
+    return "missed, within the interval" if rate["high"] >= aim else "**missed**"
 
 
 def _percent(share: float | None) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -85,6 +86,13 @@ def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
     return tuple(found)
 
 
+def behind_play(position_rad: Array, gap_rad: float, step_s: float) -> Array:
+    """A position behind the play."""
+    from frictid_hil.simulation.inverse_loops import played
+
+    return played(position_rad, gap_rad)
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -128,6 +136,11 @@ EFFECT = Effect(
             "moves through zero load torque: play shows there alone, elasticity everywhere under acceleration",
             12.0,
         ),
+    ),
+    tracking=TrackingForm(
+        links=(Link("gap_rad", behind_play, 0.02, 0.5, of_travel=True),),
+        order=40,
+        looks_like=("stiction_breakaway",),
     ),
     inverse=InverseForm(
         shapes=SHAPES,

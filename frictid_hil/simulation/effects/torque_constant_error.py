@@ -9,6 +9,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -24,6 +25,11 @@ def shaft(torque_nm: float, error_share: float) -> float:
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """The measured torque, per share."""
     return [np.stack([-v.torque_nm], axis=1) for v in views]
+
+
+def scaled(position_rad: Array, gain: float, step_s: float) -> Array:
+    """A position that falls short of its command by a factor, as a loop without integral does."""
+    return gain * position_rad
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
@@ -53,6 +59,7 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.ACCELERATION, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft, order=10),),
     illustrate=illustrate,
+    tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,

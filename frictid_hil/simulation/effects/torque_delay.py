@@ -10,6 +10,8 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView, guesses_by_sample
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -58,6 +60,30 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return guesses_by_sample(views[0].step_s, EFFECT.parameters[0].upper)
 
 
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """What a torque that acts up to one sample later than it is reported leaves in the plant, per sample."""
+    return [v.step_s * np.gradient(v.torque_nm, v.step_s)[:, None] for v in views]
+
+
+def sample(views: Sequence[View]) -> tuple[Shape, ...]:
+    """The sampling step: a longer delay shows in the reported torque itself."""
+    return ({"sample_s": views[0].step_s},) if views else ({"sample_s": 0.0},)
+
+
+def delayed(position_rad: Array, delay_s: float, step_s: float) -> Array:
+    """A position that comes late."""
+    time = step_s * np.arange(position_rad.size)
+    late: Array = np.interp(time - delay_s, time, position_rad)
+    return late
+
+
+def followed(position_rad: Array, lag_s: float, step_s: float) -> Array:
+    """A position that a servo follows with a first-order lag."""
+    from frictid_hil.simulation.inverse_loops import lagged
+
+    return lagged(position_rad, step_s, lag_s)
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -76,10 +102,11 @@ EFFECT = Effect(
     documentation=(
         "Buses, cycles and computing add a pure delay between the demand and the current: tau(t) = demand(t - "
         "delay). It costs phase in the loop and shows as a shift between the controller's demand and the reported "
-        "torque, at every frequency alike in time. Source: K. J. Astrom, B. Wittenmark, 'Computer-Controlled "
-        "Systems', 3rd ed., 1997, section 2."
+        "torque, at every frequency alike in time. A delay of less than a sample may be over before the torque is "
+        "reported; then it shows in the plant alone, where torque and motion do not belong to the same time. "
+        "Source: K. J. Astrom, B. Wittenmark, 'Computer-Controlled Systems', 3rd ed., 1997, section 2."
     ),
-    parameters=(Parameter("delay_s", 0.0, 0.05, 0.002, "from demand to current", off=0.0),),
+    parameters=(Parameter("delay_s", 0.0, 0.05, 0.002, "from demand to current", off=0.0, replayed=False),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(
         Hook("current", current, order=20),
@@ -87,6 +114,20 @@ EFFECT = Effect(
     ),
     illustrate=illustrate,
     actuation=ActuationForm("delay_s", guesses, reported, order=20, late=True, believed_as="torque_delay_s"),
+    inverse=InverseForm(
+        shapes=({"sample_s": 0.0},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"delay_s": max(0.0, float(coefficients[0])) * shape["sample_s"]},
+        first_coefficient=(0.1, 1.2),
+        continuous=False,
+        shapes_for=sample,
+    ),
+    tracking=TrackingForm(
+        links=(Link("delay_s", delayed, 0.05, 0.5), Link("lag_s", followed, 0.05, 0.5)),
+        order=20,
+        certainty=0.92,
+        looks_like=("electrical_lag",),
+    ),
     parted=(
         Parting("electrical_lag", "chirp", "a chirp up to 8 Hz: a lag damps high frequencies, a delay does not", 11.0),
         Parting(

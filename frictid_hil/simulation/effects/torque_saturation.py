@@ -14,19 +14,30 @@ from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, P
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
-def current(current_nm: float, limit_nm: float, limit_share: float) -> float:
-    """The demand, clipped."""
+HARD = 60.0
+"""Exponent from which a knee is a corner."""
+
+
+def current(current_nm: float, limit_nm: float, limit_share: float, exponent: float) -> float:
+    """The demand, bent towards the limit; clipped where the knee is sharp."""
     if limit_share >= 1.0:
         return current_nm
-    return min(limit_share * limit_nm, max(-limit_share * limit_nm, current_nm))
+    limit = limit_share * limit_nm
+    if exponent >= 60.0:  # HARD; the kernel takes this function's text alone
+        return min(limit, max(-limit, current_nm))
+    return float(current_nm / (1.0 + abs(current_nm / limit) ** exponent) ** (1.0 / exponent))
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
-def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: float) -> Array:
-    """The torque, clipped."""
-    return np.clip(torque_nm, -limit_share * limit_nm, limit_share * limit_nm)
+def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: float, exponent: float) -> Array:
+    """The torque, bent towards the limit."""
+    limit = limit_share * limit_nm
+    if exponent >= HARD:
+        return np.clip(torque_nm, -limit, limit)
+    bent: Array = torque_nm / (1.0 + np.abs(torque_nm / limit) ** exponent) ** (1.0 / exponent)
+    return bent
 
 
 def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
@@ -46,7 +57,7 @@ def illustrate(parameters: Mapping[str, float]) -> Illustration:
     """Torque over demand, in units of the stated limit."""
     p = EFFECT.complete(parameters or EFFECT.typical)
     demand = np.linspace(-1.0, 1.0, 201)
-    clipped = np.clip(demand, -p["limit_share"], p["limit_share"])
+    clipped = reported(demand, p["limit_share"], 0.0, 1.0, p["exponent"])
     return Illustration("demand / limit", "torque / limit", (("stated", demand, demand), ("with", demand, clipped)))
 
 
@@ -56,13 +67,19 @@ EFFECT = Effect(
     documentation=(
         "Current limits, thermal derating or a sagging supply clip the torque before the limit that the "
         "controller knows of: |tau| <= share * limit. The controller's integral keeps working against a demand "
-        "that is never met. It shows only where the demand is high, as a flat top. Source: the drive's limits "
+        "that is never met. It shows only where the demand is high, as a flat top; how round its corner is, is the "
+        "exponent n of demand / (1 + |demand / limit|^n)^(1/n). Source: the drive's limits "
         "(CiA 402-2, objects 6072 and 6073); L. Zaccarian, A. R. Teel, 'Modern Anti-windup Synthesis', 2011, for "
         "what follows in the loop."
     ),
-    parameters=(Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0, replayed=False),),
+    parameters=(
+        Parameter("limit_share", 0.02, 1.0, 0.6, "true over stated torque limit", off=1.0, replayed=False),
+        Parameter("exponent", 4.0, HARD, HARD, "n of the corner; the largest is a clip", replayed=False),
+    ),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.ACCELERATION)),
     hooks=(Hook("current", current, order=30),),
     illustrate=illustrate,
-    actuation=ActuationForm("limit_share", guesses, reported, order=50),
+    actuation=ActuationForm(
+        "limit_share", guesses, reported, order=50, detail="exponent", details=(HARD, 30.0, 20.0, 14.0, 10.0)
+    ),
 )
