@@ -83,7 +83,7 @@ def diagnose_without_replay(
     swapped = [replace(r, experiment=replace(r.experiment, validation=not r.experiment.validation)) for r in usable]
     other = evidence_of(swapped) if judged_apart else None
     trials = _trials(evidence)
-    chosen = _chosen(evidence, other, trials)
+    chosen = _chosen(evidence, other, trials, as_stated=base.offset_nm == 0.0)
     nominal_nm = _judged_nm(evidence, ())
     after_nm = _judged_nm(evidence, chosen)
     family = best_family(evidence, chosen)
@@ -165,20 +165,26 @@ def _judged(evidence: Evidence, before: tuple[Group, ...], after: tuple[Group, .
     return _Trial(after, 1.0 - math.sqrt(max(total_new, 1e-12) / max(total_old, 1e-12)), max(ratios.values()))
 
 
-def _chosen(evidence: Evidence, other: Evidence | None, trials: Sequence[_Trial]) -> tuple[Group, ...]:
+def _chosen(
+    evidence: Evidence, other: Evidence | None, trials: Sequence[_Trial], *, as_stated: bool
+) -> tuple[Group, ...]:
     """The best effect that pays on unseen logs, and a second one that still pays beside it, both ways.
 
     Args:
         evidence: fitted on the identification logs.
         other: the same with the logs' roles exchanged; None where all logs have one role.
         trials: every effect alone.
+        as_stated: the base model is the file's, so an effect must close the gap of that one, not of a base model that
+            its tolerances bend to fit it.
     """
+    nominal_nm = _judged_nm(evidence, ())
     rows = evidence.fitted.rows if evidence.fitted is not None else 1.0
     bare = evidence.score(())
     passing = [
         t
         for t in trials
         if _possible(evidence, t.groups)
+        and not (as_stated and _judged_nm(evidence, t.groups) > nominal_nm)
         and t.improvement >= LEAST_IMPROVEMENT
         and t.worst <= WORST_LOG
         and evidence.score(t.groups) - bare > 12.0 * max(1.0, -2.0 * evidence.score(t.groups) / rows)
