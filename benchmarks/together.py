@@ -30,7 +30,7 @@ from frictid_hil.friction.metrics import CurveDistance, curve_distance
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.declared import declared_skew
-from frictid_hil.jobs.joint_profile import identify_joint
+from frictid_hil.jobs.joint_profile import identify_joint, procedure_of
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.recording.read import read
 from frictid_hil.simulation.arm_model import ArmModel
@@ -140,6 +140,39 @@ def without_true(run: Run, alone: Run, parts: Sequence[str]) -> dict[str, float]
     return {name: distance(found[name], alone.profile[name]).e_percent_measured_range for name in NAMES}
 
 
+def by_least_squares(folder: Path, prefix: str) -> dict[str, float]:
+    """Distances of the same recordings, identified by least squares."""
+    setup = load_robot(ROBOT).to_setup()
+    company = read(folder / f"{prefix}-together", None)
+    gaps = {}
+    for samples in company:
+        name = samples.joint
+        (alone,) = (one for one in read(folder / f"{prefix}-{name}", None) if one.joint == name)
+        first = identify_joint(samples, setup.joint(name), method="least-squares", company=company)
+        second = identify_joint(alone, setup.joint(name), method="least-squares")
+        gaps[name] = distance(first, second).e_percent_measured_range
+    return gaps
+
+
+def lag_ms(run: Run) -> dict[str, float]:
+    """Of the measured position behind its set-point in the fastest cycle, milliseconds."""
+    lags = {}
+    for samples in read(run.folder, None):
+        (mark,) = samples.marked("cycles")
+        procedure = procedure_of(mark)
+        time_s = samples.time_s - mark.start_ns * 1e-9
+        starts_s, frequency_rad_s = procedure.cycle_starts_s, procedure.angular_frequencies_rad_s[-1]
+        kept = (time_s >= starts_s[-2]) & (time_s < starts_s[-1])
+        turn = np.exp(-1j * frequency_rad_s * time_s[kept])
+        assert samples.position_command_rad is not None
+        ahead, behind = (
+            np.angle(np.sum((column[kept] - column[kept].mean()) * turn))
+            for column in (samples.position_command_rad, samples.position_rad)
+        )
+        lags[samples.joint] = float(1e3 * ((ahead - behind + np.pi) % (2 * np.pi) - np.pi) / frequency_rad_s)
+    return lags
+
+
 def the_arm() -> ArmModel:
     setup = load_robot(ROBOT).to_setup()
     return ArmModel.from_mapping(setup.simulated_arm, {joint.name: joint.dh for joint in setup.joints})
@@ -235,6 +268,8 @@ def report(folder: Path, seeds: list[int]) -> None:
             "truth - together": {name: to_truth(together.profile[name], name) for name in NAMES},
             "truth - one by one": {name: to_truth(alone.profile[name], name) for name in NAMES},
             "M found: largest error": inertia_error(together),
+            "least squares, [V_1, V_N]": by_least_squares(folder, "quiet"),
+            "lag behind the set-point, ms": lag_ms(together),
         },
     )
     print(f"\ntogether {together.duration_s:.1f} s; one by one {alone.duration_s:.1f} s")
