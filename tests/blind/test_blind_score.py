@@ -188,7 +188,8 @@ def test_the_page_lists_every_miss() -> None:
         (truth("case_007", "single", "stribeck"), answer("explained", ("backlash", 0.61))),
         (truth("case_008", "none", ratio=1.0), answer("none")),
     )
-    text = page({"cases": 2, "seed": 5, "truth_sha256": "ab" * 32, "scores": s, "leave_one_out": None})
+    hashes = {"truth_sha256": "ab" * 32, "code_sha256": "cd" * 32}
+    text = page({"cases": 2, "seed": 5, **hashes, "scores": s, "leave_one_out": None})
     assert "| case_007 | stribeck (single) | 5.00 | explained | backlash (0.61) |" in text
     assert "case_008" not in text
     assert "0 of 1" in text
