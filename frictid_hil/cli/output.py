@@ -67,6 +67,8 @@ class Output:
             self._fail(verb, error)
         except BrokenPipeError:
             os._exit(1)
+        except typer.Exit:  # a verb that has printed its own result
+            raise
         except Exception as error:  # a job that nobody watches must end with a line as well
             traceback.print_exc()
             self._fail(verb, Defect.of(error))

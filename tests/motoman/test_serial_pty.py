@@ -105,6 +105,16 @@ def test_even_parity_on_a_pseudo_terminal_is_an_error_and_never_a_fallback(port:
             driver_on(port, parity="E").open()
 
 
+def test_the_verb_prints_its_port_and_ends_quietly_when_asked_to() -> None:
+    command = [sys.executable, "-m", "frictid_hil.cli.app", "emulate", "motoman", "--pty"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("port: /dev/")
+    process.terminate()
+    assert process.communicate(timeout=20) == ("", "")
+    assert process.returncode == 0
+
+
 def test_a_port_that_does_not_exist_says_so() -> None:
     with pytest.raises(HardwareError, match="cannot be opened") as caught:
         driver_on("/dev/no-such-port").open()
