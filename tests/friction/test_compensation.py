@@ -118,11 +118,11 @@ def test_six_joints_cost_less_than_3_us_per_cycle(gradual: bool) -> None:
     joints = [Compensation(settings(gradual=gradual), DT) for _ in range(6)]
 
     def cycle_s() -> float:
-        began = time.perf_counter()
+        began = time.process_time()
         for velocity in VELOCITIES[:2000]:
             for joint in joints:
                 joint.step(DT * velocity, velocity)
-        return (time.perf_counter() - began) / 2000
+        return (time.process_time() - began) / 2000
 
     assert min(cycle_s() for _ in range(40)) <= 3e-6
 
