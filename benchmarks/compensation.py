@@ -98,16 +98,16 @@ def viscosity(options: argparse.Namespace) -> None:
         modes = compensation(options, joint, "track", "nc,mol,mop", *more)["modes"]
         found = {1.0: modes["mol"]["reduction_percent"]}
 
-        def less(factor: float, joint=joint, line=line, found=found) -> float:
+        def less(factor: float, joint=joint, line=line, found=found, error=modes["nc"]["tracking_rms_rad"]) -> float:
             if factor not in found:
                 tuned = ("--viscosity", f"{factor * line:.6g}")
-                found[factor] = compensation(options, joint, "track", "nc,mol", *more, *tuned)["modes"]["mol"][
-                    "reduction_percent"
-                ]
+                mol = compensation(options, joint, "track", "mol", *more, *tuned)["modes"].get("mol")
+                # More than friction takes, and the supervisor trips.
+                found[factor] = 100.0 * (1.0 - mol["tracking_rms_rad"] / error) if mol else float("-inf")
             return found[factor]
 
         step = 0.5
-        for factor in (0.5, 1.5, 2.0):
+        for factor in (0.5, 1.5):
             less(factor)
         while step > 0.13:
             best = max(found, key=found.__getitem__)

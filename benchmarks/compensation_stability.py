@@ -204,12 +204,13 @@ def limits(options: argparse.Namespace) -> None:
                 return all(alone(law, setup, delay, push, plant) < STILL_DEG_S for push in (1.0, -1.0))
 
             largest_ratio = largest(lambda r, own=ours.ratio: stands(r - own, 1.0, False), ours.ratio, 1.3)
-            largest_k = [
-                largest(
-                    lambda k, share=share, hold=hold: stands(0.0, k / share, hold), math.floor(100 * share) / 100, 4
-                )
-                for hold in (False, True)
-            ]
+            largest_k = [math.nan, math.nan]
+            if not options.ratio_only:
+                lowest = math.floor(100 * share) / 100
+                largest_k = [
+                    largest(lambda k, share=share, hold=hold: stands(0.0, k / share, hold), lowest, 4.0)
+                    for hold in (False, True)
+                ]
             print(
                 f"| {joint} | {delay} | {share:.2f} | {largest_ratio:.2f} | {largest_k[0]:.2f} | {largest_k[1]:.2f} |",
                 flush=True,
@@ -284,6 +285,7 @@ def main() -> None:
     parser.add_argument("--elastic", type=float, default=0.0)
     parser.add_argument("--other", action="store_true")
     parser.add_argument("--delay", type=int, action="append")
+    parser.add_argument("--ratio-only", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     VERBS[options.what](options)
