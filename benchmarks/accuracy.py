@@ -1,6 +1,6 @@
 """Accuracy of the main job against withheld truth: the shipped robot, changed copies, and plants written differently.
 
-    python benchmarks/accuracy.py [--quick]
+    python benchmarks/accuracy.py [--quick] [--robots hp3j,hp3j-flexible-30,mujoco] [--amplitudes 20,50]
 
 Each robot is calibrated whole, through bus, driver and scheduler; the truth is the simulated joints' own steady sliding
 curve. The copies have every friction parameter changed by up to 30 % (seeded), or a flexible link. The MuJoCo joint is
@@ -145,12 +145,17 @@ def mujoco_errors(amplitude_deg: float) -> tuple[float, float, float]:
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--quick", action="store_true", help="one changed copy instead of three")
-    quick = arguments.parse_args().quick
+    arguments.add_argument("--robots", default="", help="only these, by name")
+    arguments.add_argument("--amplitudes", default="20,50", help="only these, deg")
+    options = arguments.parse_args()
+    quick = options.quick
     base = shipped()
     robots = [(base, 20.0), (base, 50.0)]
     for seed in (1,) if quick else (1, 2, 3):
         robots += [(scaled(base, seed), 20.0), (scaled(base, seed), 50.0)]
     robots.append((flexible(base, 30.0), 20.0))
+    wanted, amplitudes = options.robots.split(","), [float(value) for value in options.amplitudes.split(",")]
+    robots = [pair for pair in robots if pair[1] in amplitudes and (wanted == [""] or pair[0]["name"] in wanted)]
     print("error to truth, percent of the curve's mean: Function A [0, V] / aligned [0, V] / aligned [V_1, V_N]\n")
     print(f"| {'robot':<22} | A | " + " | ".join(f"joint {j}" for j in base["joints"]) + " |")
     print("|---|---|" + "---|" * len(base["joints"]))
@@ -159,7 +164,7 @@ def main() -> None:
             found = errors_of(robot, amplitude, Path(temporary))
             cells = " | ".join("{:.2f} / {:.2f} / {:.2f}".format(*found[j]) for j in base["joints"] if j in found)
             print(f"| {robot['name']:<22} | {amplitude:g} | {cells} |", flush=True)
-    for amplitude in (20.0, 50.0):
+    for amplitude in amplitudes if wanted == [""] or "mujoco" in wanted else ():
         print(f"\nMuJoCo joint, A = {amplitude:g} deg: " + " / ".join(f"{e:.2f}" for e in mujoco_errors(amplitude)))
 
 

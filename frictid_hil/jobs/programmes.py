@@ -46,8 +46,8 @@ PROGRAMMES = {
     programme.name: programme
     for programme in (
         Programme("thorough", (), "aligned", 0.25),
-        Programme("standard", (12 / _TOP, 60 / _TOP, 1.0), "least-squares", 0.5),
-        Programme("quick", (30 / _TOP, 1.0), "least-squares", 1.3),
+        Programme("standard", (12 / _TOP, 60 / _TOP, 1.0), "least-squares", 0.3),
+        Programme("quick", (30 / _TOP, 1.0), "least-squares", 0.35),
     )
 }
 DEFAULT = PROGRAMMES["thorough"]
