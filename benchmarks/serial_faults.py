@@ -215,8 +215,8 @@ def inject(layer: str, faults: Sequence[str], *, limit_s: float, told: Callable[
     return Outcome(int(result["exit_code"]), text, tuple(wrong), ended_s)
 
 
-ARMING_TICKS = 100
-"""So long after a stream began, the joint moves."""
+MOVED_PULSES = 500
+"""Less than half a degree of any joint: more than it gives way when power comes on."""
 INJECTED: list[list[Watched]] = []
 """The runs so far; the healthy one is looked at while it goes on."""
 
@@ -242,7 +242,8 @@ def judge_recording(watched: Watched, out: Path, *, code: int) -> Iterator[str]:
     """What moved is there, and is what happened."""
     # A stream tells of every tick. A job's recording must be fetched, for which a line that failed leaves no chance.
     jobs_to_fetch = len(watched.jobs) - (code == 3)
-    recorded = jobs_to_fetch > 0 or len(watched.truth_pulses) > ARMING_TICKS
+    streamed = list(watched.truth_pulses.values())
+    recorded = jobs_to_fetch > 0 or bool(streamed and max(streamed) - min(streamed) > MOVED_PULSES)
     path = out / "samples.mcap"
     kept = read_mcap(path, JOINT)[0] if path.exists() and path.stat().st_size else None
     if kept is None or len(kept.time_ns) == 0:
