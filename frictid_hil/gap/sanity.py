@@ -22,6 +22,8 @@ SLOWEST_STEP_S = 0.2
 """Sampling steps longer than this are more likely in milliseconds."""
 OTHER_UNIT = 20.0
 """Factor between what a nominal joint or its controller asks for and what was measured that no joint explains."""
+LONGEST_HALT = 0.25
+"""Part of a log in which a position may repeat itself far from its command."""
 
 _COLUMNS = (
     "time_s", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad", "rigid_body_torque_nm",
@@ -124,6 +126,30 @@ def _check_command(e: Experiment, command: Array) -> None:
         )
     if float(np.corrcoef(command, e.position_rad)[0, 1]) < -0.5:
         raise InputFileError("position and command move in opposite directions", where=e.name, cause="a swapped sign")
+
+    start, rows = _longest_halt(e.position_rad)
+    inside = slice(start, start + rows)
+    error = np.abs(command - e.position_rad)
+    outside = np.delete(error, np.s_[start : start + rows])
+    # A worn gear rests too, but never that far from its command as a joint whose torque would have moved it.
+    if (
+        e.torque_nm is not None
+        and rows > LONGEST_HALT * command.size
+        and float(np.max(error[inside])) > 5.0 * float(np.max(outside, initial=0.0))
+    ):
+        raise InputFileError(
+            f"the position repeats itself for {rows} rows from row {start} while its command travels",
+            where=e.name,
+            cause="the sensor stopped, or the recording went on without it",
+        )
+
+
+def _longest_halt(position_rad: Array) -> tuple[int, int]:
+    """(first row, rows) of the longest stretch of one and the same value."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(position_rad) != 0.0) + 1, [position_rad.size]])
+    lengths = np.diff(edges)
+    at = int(np.argmax(lengths))
+    return int(edges[at]), int(lengths[at])
 
 
 def _check_scale(experiments: ExperimentSet) -> None:
