@@ -1,0 +1,51 @@
+"""Causes that hide: behind tolerances, in one log alone, within one sample, behind a coarse encoder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gap_sets
+import numpy as np
+import pytest
+
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.experiment_set import Experiment
+from frictid_hil.simulation.effects.torque_saturation import HARD, reported
+
+
+def test_a_scale_of_all_parts_is_not_lost_behind_their_tolerances() -> None:
+    found = diagnose(gap_sets.make({"torque_constant_error": {"error_share": -0.02}}))
+    assert found.causes[0].effect == "torque_constant_error"
+    assert found.causes[0].parameters["error_share"].value == pytest.approx(-0.02, abs=0.004)
+
+
+@pytest.mark.slow
+def test_a_delay_that_is_over_when_the_torque_is_reported_is_found_in_the_plant() -> None:
+    made = gap_sets.make({"torque_delay": {"delay_s": 0.0015}}, noise_nm=0.0)
+    random = np.random.default_rng(3)
+
+    def early(e: Experiment) -> Experiment:
+        assert e.torque_nm is not None
+        torque = np.interp(e.time_s + 0.0015, e.time_s, e.torque_nm)
+        return replace(e, torque_nm=torque + 0.02 * random.standard_normal(torque.size))
+
+    found = diagnose(replace(made, experiments=tuple(early(e) for e in made.experiments)))
+    assert found.causes[0].effect == "torque_delay"
+    assert found.causes[0].parameters["delay_s"].value == pytest.approx(0.0015, abs=0.0004)
+
+
+@pytest.mark.slow
+def test_a_coarse_encoder_is_not_taken_for_friction() -> None:
+    found = diagnose(gap_sets.make({"encoder_quantisation": {"step_rad": 4e-4}}))
+    assert [c.effect for c in found.causes][:1] == ["encoder_quantisation"]
+    assert found.verdict == "explained"
+
+
+def test_a_round_knee_approaches_the_clip() -> None:
+    demand = np.linspace(-3.0, 3.0, 61)
+    clip = reported(demand, 0.5, 0.002, 2.0, HARD)
+    assert clip.max() == 1.0
+    knees = [reported(demand, 0.5, 0.002, 2.0, n) for n in (8.0, 20.0, 50.0)]
+    distances = [float(np.max(np.abs(knee - clip))) for knee in knees]
+    assert distances == sorted(distances, reverse=True)
+    assert all(np.abs(knee).max() <= 1.0 for knee in knees)
