@@ -64,6 +64,7 @@ KINDS = (
 )
 LINK = (
     "no answer|rejected|unreadable|silent|no reply|ended|never acknowledged|no HELLO|in the middle|instead of|asked for"
+    "|whole numbers|heard nothing"
 )
 LOST = "watchdog|no HELLO|no feedback"
 CAUSES = {
