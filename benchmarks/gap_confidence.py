@@ -5,9 +5,9 @@ Run: python benchmarks/gap_confidence.py [--cases 200] [--seed 31003] [--jobs 2]
 
 Every joint is drawn as the blind check draws it and diagnosed; a visible joint with one effect again with that effect
 taken out of the library, where every named cause is wrong. Clues of all named causes are kept in the folder, so an
-interrupted run goes on. ``--write`` replaces frictid_hil/gap/confidence_fit.py. Weights of one sign each (a map that
-cannot turn round on a chance correlation), shrunk towards zero, and moved until in joints left out of the fit those
-of 0.9 and more are right as often as they claim.
+interrupted run goes on. Weights have one sign each (a map that cannot turn round on a chance correlation) and are
+shrunk towards zero; the table judges every joint by weights that it did not fit. ``--write`` puts them into
+frictid_hil/gap/confidence_fit.py, from where the product takes them instead of its map set by hand.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def page(weights: Mapping[str, float], table: Sequence[str], joints: int, seeds:
         '"""Weights of the confidence\'s logistic map; written by ``benchmarks/gap_confidence.py --write``.\n\n'
         f"{joints} joints of seeds {asked}, diagnosed at commit {commit.stdout.strip()}. Causes named in joints that "
         "did\nnot fit the weights they are judged by (ten folds):\n\n" + "\n".join(table) + '\n"""\n\n'
-        f"WEIGHTS = {{\n{numbers}\n}}\n"
+        f"from __future__ import annotations\n\nWEIGHTS: dict[str, float] = {{\n{numbers}\n}}\n"
     )
 
 

@@ -1,6 +1,6 @@
 """Confidence: the chance that a named effect is there, from how far its best rival stays behind and what is left.
 
-The map is set by hand; ``benchmarks/gap_confidence.py`` collects its clues and fits a logistic map of them. The blind
+The map is set by hand until ``confidence_fit.py`` holds weights of a logistic one, fitted to the same clues. The blind
 check holds it to its promise that causes named with 0.9 or more are right in 95 of 100 joints. Nothing here knows a
 joint or an effect.
 """
@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from frictid_hil.gap.confidence_fit import WEIGHTS
 from frictid_hil.gap.verdict import Features
 from frictid_hil.simulation.effects import all_effects
 
@@ -89,6 +90,9 @@ class Clues:
 
     def chance(self) -> float:
         """The chance that the effect is there."""
+        if WEIGHTS:
+            logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
+            return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, MOST)
         chance = 1.0 - 0.65 * math.exp(-max(0.0, self.lead) / 60.0)
         # What is left to explain could be the true cause.
         chance *= 1.0 - min(0.6, 1.5 * max(0.0, self.unexplained - 0.06))
