@@ -38,14 +38,15 @@ def one_sinusoid(experiments: ExperimentSet) -> bool:
         q = q[moving[0] : moving[-1] + 1] - float(np.mean(q[moving[0] : moving[-1] + 1]))
         time_s = step_s * np.arange(q.size)
         found = _sinusoid(q, time_s)
-        if found is None:
+        # A triangle's position is nearly a sinusoid; its speed is none.
+        if found is None or _sinusoid(np.gradient(LowPass.at(1.0 / step_s)(q), step_s), time_s) is None:
             return False
         seen.append(found)
     return all(abs(a / seen[0][0] - 1.0) < 0.1 and abs(b / seen[0][1] - 1.0) < 0.1 for a, b in seen)
 
 
 def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
-    """(frequency in Hz, amplitude in rad) where one sinusoid leaves less than 1 % of the squares; else None."""
+    """(frequency in Hz, amplitude in rad) where one sinusoid leaves less than 3 % of the squares; else None."""
     spectrum = np.abs(np.fft.rfft(q * np.hanning(q.size), 8 * q.size))
     coarse = float(np.argmax(spectrum)) / (8 * q.size * float(time_s[1] - time_s[0]))
     best: tuple[float, float, float] | None = None
@@ -56,7 +57,7 @@ def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
         left = float(np.mean((q - columns @ weights) ** 2))
         if best is None or left < best[0]:
             best = left, float(hertz), float(np.hypot(weights[0], weights[1]))
-    if best is None or best[0] > 0.01 * float(np.mean(q**2)):
+    if best is None or best[0] > 0.03 * float(np.mean(q**2)):
         return None
     return best[1], best[2]
 
