@@ -16,11 +16,9 @@ from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.watch import Silent
 
-SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "hp3j.yaml"
-
 
 def test_torque_four_milliseconds_late_changes_nothing_where_the_drive_declares_it(tmp_path: Path) -> None:
-    values = yaml.safe_load(SHIPPED.read_text())
+    values = load_robot("hp3j").values()
     values["joints"]["4"]["simulated"]["drive"]["torque_filter_s"] = 0.004
     robot = tmp_path / "late.yaml"
     robot.write_text(yaml.safe_dump(values))

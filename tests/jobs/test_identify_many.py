@@ -74,14 +74,14 @@ def test_over_a_cluster_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, c
     check_as_alone(logs, cluster, tmp_path)
 
 
-def die_at_two(task: int) -> int:
-    """A task whose worker is killed, as by the system when memory runs out."""
-    if task == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return 10 * task
-
-
 def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> None:
+    # Defined here, so that it travels by value: workers cannot import the tests.
+    def die_at_two(task: int) -> int:
+        """A task whose worker is killed, as by the system when memory runs out."""
+        if task == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 10 * task
+
     with executor(cluster, 4) as pool:
         got = list(answers(pool, die_at_two, range(4)))
     assert [got[0], got[1], got[3]] == [0, 10, 30]
