@@ -7,7 +7,7 @@ Every joint is drawn as the blind check draws it and diagnosed; a visible joint 
 taken out of the library, where every named cause is wrong. Clues of all named causes are kept in the folder, so an
 interrupted run goes on. Weights have one sign each (a map that cannot turn round on a chance correlation) and are
 shrunk towards zero; the table judges every joint by weights that it did not fit. ``--write`` puts them into
-frictid_hil/gap/confidence_fit.py, from where the product takes them instead of its map set by hand.
+frictid_hil/gap/confidence_fit.py, from where the product takes them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Confidence: the chance that a named effect is there, from how far its best rival stays behind and what is left.
 
-The map is set by hand until ``confidence_fit.py`` holds weights of a logistic one, fitted to the same clues. The blind
-check holds it to its promise that causes named with 0.9 or more are right in 95 of 100 joints. Nothing here knows a
-joint or an effect.
+The map is logistic in a few clues; its weights, fitted to joints whose truth was known, are in ``confidence_fit.py``.
+The blind check holds it to its promise that causes named with 0.9 or more are right in 95 of 100 joints. Nothing here
+knows a joint or an effect.
 """
 
 from __future__ import annotations
@@ -90,16 +90,8 @@ class Clues:
 
     def chance(self) -> float:
         """The chance that the effect is there."""
-        if WEIGHTS:
-            logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
-            return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, MOST)
-        chance = 1.0 - 0.65 * math.exp(-max(0.0, self.lead) / 60.0)
-        # What is left to explain could be the true cause.
-        chance *= 1.0 - min(0.6, 1.5 * max(0.0, self.unexplained - 0.06))
-        if self.misfit > 2.0:
-            chance *= 1.0 - min(0.5, 0.2 * max(0.0, self.left - 1.5))
-        # A shape that does without its strength, and a parameter that wants beyond its range, belong to something else.
-        return _within(chance * (1.0 - 0.6 * self.hollow) * (1.0 - 0.3 * self.edge), LEAST, MOST)
+        logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
+        return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, MOST)
 
 
 def clues_of(name: str, features: Features, own: float, values: Mapping[str, float]) -> tuple[Clues, tuple[str, ...]]:
