@@ -207,8 +207,19 @@ def _published(recording: CycleRecording, notes: list[str], *, required: bool) -
         return None
 
 
+_GAP_STEPS = 3.0
+"""Between two samples, in sample periods: a longer one has jerked the joint."""
+
+
 def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> Link | None:
     if recording.coupled:
+        return None
+    steps_s = np.diff(recording.time_s)
+    if steps_s.size and steps_s.max() > _GAP_STEPS * np.median(steps_s):
+        notes.append(
+            f"whether the link swings is not known: {1e3 * steps_s.max():.1f} ms passed between two samples, and a "
+            "joint that jumps after its missing set-points looks like a swinging link"
+        )
         return None
     try:
         link = soft_link(recording, motion, level)

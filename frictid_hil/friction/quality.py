@@ -29,6 +29,8 @@ MOST_LATE = 0.02
 MOST_ASYMMETRY = 0.3
 MOST_KINK = 0.1
 
+_RARE = 0.02
+"""Share of a cycle. A cosine of time spends as much of its period above cos(pi times it) of its peak."""
 _ROUGH_S = 0.008
 _AT_LIMIT = 0.98
 
@@ -74,14 +76,18 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
 
 
 def achieved_over_commanded(recording: CycleRecording, motion: Motion) -> Array:
-    """Peak speed of each cycle, mean of both directions, over nV/N, shape (N,)."""
+    """Peak speed of each cycle, mean of both directions, over nV/N, shape (N,).
+
+    A peak is judged by the speed that ``_RARE`` of the cycle exceeds: one jerk after a late set-point is none.
+    """
     starts = np.searchsorted(motion.time_s, recording.procedure.cycle_starts_s)
     commanded = recording.procedure.peak_velocities_rad_s
     reached = [
-        (float(v.max()) - float(v.min())) / 2 if (v := motion.velocity_rad_s[a:b]).size else 0.0
+        float(np.subtract(*np.quantile(v, (1.0 - _RARE, _RARE)))) / 2 if (v := motion.velocity_rad_s[a:b]).size else 0.0
         for a, b in pairwise(starts)
     ]
-    return np.array(reached) / commanded
+    ratios: Array = np.array(reached) / (commanded * math.cos(math.pi * _RARE))
+    return ratios
 
 
 def _tracking(recording: CycleRecording, motion: Motion) -> Gate:

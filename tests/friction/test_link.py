@@ -75,3 +75,16 @@ def test_the_link_of_a_slow_motion_follows_the_motor(plants):
     sine = np.sin(2 * np.pi * 1.0 * motion.time_s)
     moved = link.swinging(replace(motion, acceleration_rad_s2=sine), 20.0, 0.02)
     assert np.allclose(moved[5000:], sine[5000:] / (20.0**2 - 1), atol=2e-4)
+
+
+def test_a_joint_jerked_by_missing_set_points_is_not_searched_for_a_link(plants):
+    """A joint that catches up after a gap swings like a soft one; a rigid one would lose torque to that link."""
+    recording = plants.record(replace(plants.arm[1], **SOFT), plants.procedure(10))
+    kept = np.ones(recording.time_s.size, dtype=bool)
+    kept[4000:4006] = False
+    columns = ("time_s", "position_rad", "torque_nm", "velocity_rad_s", "command_rad")
+    gap = replace(recording, **{n: getattr(recording, n)[kept] for n in columns if getattr(recording, n) is not None})
+    assert estimate(recording).link_resonance_hz is not None
+    result = estimate(gap)
+    assert result.link_resonance_hz is None
+    assert any("7.0 ms passed between two samples" in note for note in result.notes)

@@ -27,6 +27,15 @@ def test_a_sound_recording_passes_every_gate_and_says_why(sound):
     assert all(len(gate.reason) > 20 for gate in found.values())
 
 
+def test_one_jerk_is_no_peak_and_hunting_is(sound):
+    """1 mrad that a late set-point costs and gives back within 4 ms, against 1 mrad of swinging at 40 Hz."""
+    jerked, swinging = sound.position_rad.copy(), sound.position_rad.copy()
+    jerked[1500:1504] += 1e-3
+    swinging += 1e-3 * np.sin(2 * np.pi * 40 * sound.time_s)
+    assert asked(replace(sound, position_rad=jerked))["tracking"].passed
+    assert not asked(replace(sound, position_rad=swinging))["tracking"].passed
+
+
 def test_drift_of_five_percent_over_the_run_is_caught(plants):
     """Friction falling 5 % over the 16 s is 4.9 % of error: one cycle run again at the end shows it."""
     gate = asked(plants.record(replace(plants.arm[2], drift=-0.06), plants.procedure(20)))["drift"]
