@@ -4,7 +4,9 @@ One process appends, another (or the same, in lock-step) drains. The loop never 
 a whole ring behind, rows are dropped and **counted**, and the count fails the run's quality gate.
 
 Layout of the memory: ``head`` (i64, rows ever appended), ``tail`` (i64, rows ever drained), ``dropped`` (i64), padding
-to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed where 8 bytes are stored at once.
+to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed where 8 bytes are stored at once: an
+element of a memoryview is. ``struct.pack_into`` is not: it fills its bytes one by one, and a reader in between would
+find no rows, or those of long ago.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ PACK_SAMPLE = struct.Struct("<q7dIHH")
 PACK_FRAME = struct.Struct("<qIBBH64s")
 
 _HEADER_BYTES = 64
-_COUNTER = struct.Struct("<q")
+_HEAD, _TAIL, _DROPPED = range(3)
 
 Rows = NDArray[np.void]
 
@@ -70,7 +72,7 @@ class Ring:
         self._row = row
         self._capacity = capacity
         self._head = 0
-        self._counters = np.frombuffer(whole, dtype="<i8", count=3)
+        self._counters = whole[:_HEADER_BYTES].cast("q")
 
     @property
     def name(self) -> str:
@@ -81,21 +83,21 @@ class Ring:
     @property
     def dropped(self) -> int:
         """Rows lost because the reader fell behind."""
-        return int(self._counters[2])
+        return self._counters[_DROPPED]
 
     def append(self, *values: Any) -> None:
         """Pack one row; drops and counts it where the ring is full."""
         head = self._head
-        if head - _COUNTER.unpack_from(self._buffer, 8)[0] >= self._capacity:
-            self._counters[2] += 1
+        if head - self._counters[_TAIL] >= self._capacity:
+            self._counters[_DROPPED] += 1
             return
         self._pack_into(self._buffer, _HEADER_BYTES + (head % self._capacity) * self._row.itemsize, *values)
         self._head = head + 1
-        _COUNTER.pack_into(self._buffer, 0, head + 1)
+        self._counters[_HEAD] = head + 1
 
     def drain(self) -> Rows:
         """All rows since the last drain, in order, as a copy."""
-        head, tail = int(self._counters[0]), int(self._counters[1])
+        head, tail = self._counters[_HEAD], self._counters[_TAIL]
         rows = np.frombuffer(self._buffer, dtype=self._row, count=self._capacity, offset=_HEADER_BYTES)
         first, last = tail % self._capacity, head % self._capacity
         if head == tail:
@@ -104,14 +106,14 @@ class Ring:
             taken = rows[first:last].copy()
         else:
             taken = np.concatenate([rows[first:], rows[:last]])
-        self._counters[1] = head
+        self._counters[_TAIL] = head
         return taken
 
     def close(self) -> None:
         """Let go of the memory; the creator also removes it."""
         if self._memory is None:
             return
-        del self._counters
+        self._counters.release()
         self._buffer.release()
         self._memory.close()
         if self._owner:
