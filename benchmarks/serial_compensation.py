@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def call(*arguments: str) -> dict[str, Any]:
 def effort_nm(joint: str, entry: JointProfile, run: dict[str, Any], ratio: float, delay_ms: float) -> float:
     """What the person needs with this table."""
     setup = load_robot("hp3j-serial.yaml").to_setup("serial:loopback")
-    setup.options["emulator"] = {"table_delay_ms": delay_ms}  # type: ignore[index]  # a mapping of our own
+    setup = replace(setup, options={**setup.options, "emulator": {"table_delay_ms": delay_ms}})
     emulator = build(setup)
     driver = MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
     geometry = setup.joint(joint)

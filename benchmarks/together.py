@@ -228,7 +228,7 @@ def highest_rates_hz() -> None:
             planned = plan_calibration(CalibrateOptions(ROBOT, joints=joints, together=together))
             options = {**planned.setup.options, "bitrate": bitrate}
             setup = replace(planned.setup, bus="virtual:bench-rates", options=options)
-            driver = load_driver("virtual")(setup)  # type: ignore[call-arg]
+            driver = load_driver("virtual")(setup)  # type: ignore[call-arg]  # protocols carry no constructor
             driver.open(lambda *_: None)
             try:
                 driver.configure(100.0, joints)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pprint
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,7 @@ Put the drive's torque demand into data.ctrl[0] (N m on the joint's side of the 
 joint.reading_rad(data) and the drive's torque by joint.torque_nm. Run as a script, the joint is held for a second.
 """
 
-from math import inf  # noqa: F401 - a joint may have no torque limit
-from pathlib import Path
+{imports}from pathlib import Path
 
 import mujoco
 
@@ -73,6 +73,8 @@ def export_mujoco(path: Path, name: str, model: JointModel) -> dict[str, Any]:
     exported = described(model, name)
     write_whole(path, exported.xml)
     text = _SCRIPT.format(
+        # Only a joint without a torque limit has a number that Python does not spell by itself.
+        imports="from math import inf\n" if math.isinf(model.drive.torque_limit_nm) else "",
         model=path.name,
         native=_listed(f"{what}: {how}" for what, how in exported.native.items()),
         callback=_listed(f"{what}: {how}" for what, how in exported.callback.items()),
