@@ -238,7 +238,8 @@ def print_joints(output: Output, result: Result) -> None:
         table.add_column(heading)
     for name, joint in result["joints"].items():
         table.add_row(name, *_row(joint))
-    output.out.print(table)
+    if result["joints"]:
+        output.out.print(table)
     for key in ("profile", "run", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)
