@@ -1,4 +1,5 @@
-import multiprocessing
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -62,29 +63,31 @@ def test_frames_keep_their_bytes() -> None:
     assert np.dtype(FRAME_ROW).itemsize == 80
 
 
-def _append_many(name: str, rows: int) -> None:
-    ring = frame_ring(name=name)
-    for k in range(rows):
-        ring.append(k, 0, 8, 0, 0, b"")
-    ring.close()
+APPEND_MANY = """
+import sys
+from frictid_hil.runner.ring import frame_ring
+ring = frame_ring(name=sys.argv[1])
+for k in range(int(sys.argv[2])):
+    ring.append(k, 0, 8, 0, 0, b"")
+ring.close()
+"""
 
 
 def test_a_reader_in_another_process_gets_every_row_once_and_in_order() -> None:
     """The reader looks as often as it can, also in the midst of a write."""
     rows = 250_000
     ring = frame_ring(shared=True)
-    writer = multiprocessing.get_context("spawn").Process(target=_append_many, args=(ring.name, rows))
-    writer.start()
+    writer = subprocess.Popen([sys.executable, "-c", APPEND_MANY, ring.name, str(rows)])
     expected = 0
     while True:
-        alive = writer.is_alive()
+        ended = writer.poll() is not None
         taken = ring.drain()["t_ns"]
         if taken.size:
             assert taken[0] == expected and taken[-1] == expected + taken.size - 1
             assert np.all(np.diff(taken) == 1)
             expected += taken.size
-        elif not alive:
+        elif ended:
             break
-    writer.join()
-    assert (expected, ring.dropped) == (rows, 0)
+    assert (writer.returncode, expected, ring.dropped) == (0, rows, 0)
+    del taken
     ring.close()
