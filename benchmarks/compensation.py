@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
@@ -28,13 +29,14 @@ DEGREES = 57.29577951308232
 JOINTS = ("0", "1", "2", "3", "4", "5")
 
 
-def call(*arguments: str) -> dict:
+def call(*arguments: str) -> dict[str, Any]:
     """One call of the command line, its JSON."""
     command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments, "--json", "--yes"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if not done.stdout.strip():
         raise SystemExit(done.stderr)
-    return json.loads(done.stdout)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
 
 
 def calibrate(options: argparse.Namespace) -> None:
@@ -98,22 +100,19 @@ def viscosity(options: argparse.Namespace) -> None:
         modes = compensation(options, joint, "track", "nc,mol,mop", *more)["modes"]
         found = {1.0: modes["mol"]["reduction_percent"]}
 
-        def less(factor: float, joint=joint, line=line, found=found, error=modes["nc"]["tracking_rms_rad"]) -> float:
-            if factor not in found:
+        error = modes["nc"]["tracking_rms_rad"]
+        step, factors = 0.5, (0.5, 1.5)
+        while True:
+            for factor in {*factors} - found.keys():
                 tuned = ("--viscosity", f"{factor * line:.6g}")
                 mol = compensation(options, joint, "track", "mol", *more, *tuned)["modes"].get("mol")
                 # More than friction takes, and the supervisor trips.
                 found[factor] = 100.0 * (1.0 - mol["tracking_rms_rad"] / error) if mol else float("-inf")
-            return found[factor]
-
-        step = 0.5
-        for factor in (0.5, 1.5):
-            less(factor)
-        while step > 0.13:
+            if step <= 0.13:
+                break
             best = max(found, key=found.__getitem__)
             step /= 2
-            for factor in (best - step, best + step):
-                less(factor)
+            factors = (best - step, best + step)
         best = max(found, key=found.__getitem__)
         print(
             f"| {joint} | {line:.3f} | {found[1.0]:.1f} % | {best * line:.3f} ({best:g} times) | {found[best]:.1f} % "
@@ -157,7 +156,7 @@ def rounding(options: argparse.Namespace) -> None:
         )
 
 
-def compensation(options: argparse.Namespace, joint: str, task: str, modes: str, *more: str) -> dict:
+def compensation(options: argparse.Namespace, joint: str, task: str, modes: str, *more: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         return call(
             *("compensate", "--robot", options.robot, "--profile", options.profile, "--joint", joint),

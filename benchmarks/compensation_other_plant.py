@@ -26,7 +26,7 @@ JOINTS = ("0", "1", "2", "3", "4", "5")
 
 def calibrated(joint: str, folder: Path, bus: str, seed: int) -> tuple[Path, Path]:
     """(Robot file, profile) of one joint of the other plant, identified by the product."""
-    joint_drive.ServoLoop = OtherPlant  # type: ignore[assignment,misc]
+    joint_drive.ServoLoop = OtherPlant  # type: ignore[attr-defined,assignment]
     robot = variant(folder / "robot.yaml", joints=[joint])
     result = calibrate(CalibrateOptions(str(robot), out=folder / "cal", bus=bus, seed=seed), Silent())
     return robot, Path(result["profile"])

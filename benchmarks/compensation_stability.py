@@ -25,6 +25,7 @@ import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,7 @@ def bus(options: argparse.Namespace) -> None:
         for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
                 robot, entry, plant = of_joint(options, joint, Path(folder), delay)
-                joint_drive.ServoLoop = remembering(plant)  # type: ignore[misc]
+                joint_drive.ServoLoop = remembering(plant)  # type: ignore[attr-defined]
                 found = [on_the_bus(robot, options.bus, entry, joint, hold, options.seed) for hold in (False, True)]
                 friction = changed_law(
                     entry, load_robot(str(robot)).to_setup().joint(joint), False, MORE_RATIO, MORE_STIFFNESS
@@ -197,24 +198,38 @@ def limits(options: argparse.Namespace) -> None:
             assert ours is not None
             share = ours.stiffness_nm_per_rad / presliding
 
-            def stands(
-                more_ratio: float, factor: float, hold: bool, entry=entry, setup=setup, delay=delay, plant=plant
-            ) -> bool:
-                law = changed_law(entry, setup, hold, more_ratio, factor)
-                return all(alone(law, setup, delay, push, plant) < STILL_DEG_S for push in (1.0, -1.0))
-
-            largest_ratio = largest(lambda r, own=ours.ratio: stands(r - own, 1.0, False), ours.ratio, 1.3)
+            stands = partial(stands_with, entry, setup, delay, plant)
+            largest_ratio = largest(partial(by_ratio, stands, ours.ratio), ours.ratio, 1.3)
             largest_k = [math.nan, math.nan]
             if not options.ratio_only:
                 lowest = math.floor(100 * share) / 100
-                largest_k = [
-                    largest(lambda k, share=share, hold=hold: stands(0.0, k / share, hold), lowest, 4.0)
-                    for hold in (False, True)
-                ]
+                largest_k = [largest(partial(by_stiffness, stands, share, hold), lowest, 4.0) for hold in (False, True)]
             print(
                 f"| {joint} | {delay} | {share:.2f} | {largest_ratio:.2f} | {largest_k[0]:.2f} | {largest_k[1]:.2f} |",
                 flush=True,
             )
+
+
+def stands_with(
+    entry: JointProfile,
+    setup: JointSetup,
+    delay: int,
+    plant: Plant,
+    more_ratio: float,
+    factor: float,
+    hold: bool,
+) -> bool:
+    """Whether the joint comes to rest from a push either way, with this much more R and K."""
+    law = changed_law(entry, setup, hold, more_ratio, factor)
+    return all(alone(law, setup, delay, push, plant) < STILL_DEG_S for push in (1.0, -1.0))
+
+
+def by_ratio(stands: Callable[[float, float, bool], bool], own: float, ratio: float) -> bool:
+    return stands(ratio - own, 1.0, False)
+
+
+def by_stiffness(stands: Callable[[float, float, bool], bool], share: float, hold: bool, stiffness: float) -> bool:
+    return stands(0.0, stiffness / share, hold)
 
 
 def told_of(options: argparse.Namespace) -> str:

@@ -105,6 +105,7 @@ def main() -> int:
                 fastest = 0.0
                 if run.exists():
                     samples = next(one for one in read(run) if one.joint == joint)
+                    assert samples.velocity_rad_s is not None
                     fastest = float(np.abs(samples.velocity_rad_s).max())
             share = fastest / robot.file.joints[joint].max_velocity_rad_s
             refused, forced = (result.get("error", {}).get("what", "ran to its end") for result in results)

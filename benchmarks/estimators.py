@@ -13,11 +13,11 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from pathlib import Path
 
 import numpy as np
 import yaml
 
+from frictid_hil.config.search import find
 from frictid_hil.errors import FrictidError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.curve import FrictionCurve
@@ -29,7 +29,7 @@ from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
 STEP_S = 0.001
-ROBOT = Path(__file__).resolve().parents[1] / "profiles" / "hp3j.yaml"
+ROBOT = find("hp3j.yaml")
 
 
 def joints() -> dict[str, tuple[JointModel, float]]:

@@ -208,10 +208,10 @@ def cases(folder: Path) -> Iterator[tuple[str, ExperimentSet]]:
     """Every set with its name, both ways where there are two."""
     for pulses in (True, False):
         yield f"EMPS, judged on {'pulses' if pulses else 'the first'}", emps(folder, pulses)
-    for prefix, joint in (("a0", 1), ("a0", 2), ("c1", 1), ("c1", 2)):
+    for prefix, number in (("a0", 1), ("a0", 2), ("c1", 1), ("c1", 2)):
         for odd in (True, False):
             half = "odd" if odd else "even"
-            yield f"{prefix} joint {joint}, judged on {half} logs", double_pendulum(folder, prefix, joint, odd)
+            yield f"{prefix} joint {number}, judged on {half} logs", double_pendulum(folder, prefix, number, odd)
     motions = sorted(path.name for path in (folder / "so101").iterdir() if path.is_dir())
     for joint in SO101_JOINTS:
         for judged in (motions[::2], motions[1::2]):

@@ -34,7 +34,7 @@ from maxwell import ARM, Joint, record
 from frictid_hil.errors import FrictidError
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
-from frictid_hil.friction.recording import Skew
+from frictid_hil.friction.recording import CycleRecording, Skew
 from frictid_hil.friction.trajectory import Procedure
 
 KINDS = {
@@ -52,14 +52,14 @@ UNCERTAINTY_S = 0.0002
 """Declared one standard deviation of the timing, as the CiA-402 driver declares it of a drive with known filters."""
 
 
-def drawn(joint: Joint, amplitude_deg: float, seed: int):
+def drawn(joint: Joint, amplitude_deg: float, seed: int) -> CycleRecording:
     """One measurement: its noise, its place on the motor's turn and its true timing drawn anew."""
     rng = np.random.default_rng(seed)
     joint = replace(joint, start=joint.start + rng.uniform(0.0, 0.06))
     amplitude = math.radians(amplitude_deg)
     needed = joint.steady(V_RAD_S) + math.hypot(joint.gravity_cos, joint.gravity_sin)
     fastest = math.sqrt((TORQUE_SHARE * joint.max_torque - needed) * amplitude / (2 * joint.inertia))
-    recording = record(joint, Procedure(amplitude, min(V_RAD_S, fastest)), seed=seed)
+    recording: CycleRecording = record(joint, Procedure(amplitude, min(V_RAD_S, fastest)), seed=seed)
     off_s = rng.normal() * UNCERTAINTY_S
     return replace(recording, skew=Skew(torque_delay_s=5e-4 + off_s, uncertainty_s=UNCERTAINTY_S))
 
@@ -73,10 +73,13 @@ def main() -> None:
     parser.add_argument("--terms", action="store_true", help="print what the intervals are made of, in percent")
     arguments = parser.parse_args()
     print("| plant | A | method | cover | width | rms error [%] | flagged |\n|---|---|---|---|---|---|---|")
-    whole: dict[str, tuple[list, list]] = defaultdict(lambda: ([], []))
+    whole: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for kind in arguments.kinds.split(","):
         for amplitude in map(float, arguments.amplitudes.split(",")):
-            errors, widths, flagged, terms = defaultdict(list), defaultdict(list), defaultdict(list), defaultdict(list)
+            errors: dict[str, list[float]] = defaultdict(list)
+            widths: dict[str, list[float]] = defaultdict(list)
+            flagged: dict[str, list[bool]] = defaultdict(list)
+            terms: dict[str, list[list[float]]] = defaultdict(list)
             for index, base in enumerate(ARM):
                 for draw in range(arguments.draws):
                     joint = replace(base, **KINDS[kind])

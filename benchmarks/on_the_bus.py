@@ -13,13 +13,14 @@ import numpy as np
 import yaml
 
 from frictid_hil.config.profile import JointProfile, load_profile
+from frictid_hil.config.search import find
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import CurveDistance, curve_distance
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.simulation.joint import JointModel
 
-SHIPPED = Path(__file__).resolve().parents[1] / "profiles" / "hp3j.yaml"
+SHIPPED = find("hp3j.yaml")
 V_RAD_S = math.radians(115.0)
 RESONANCE_HZ = 28.0
 

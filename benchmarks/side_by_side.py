@@ -26,6 +26,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.quality import gates
+from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.programmes import PROGRAMMES
 
@@ -90,7 +91,7 @@ def our_rows(task: Task) -> Iterable[Row]:
         yield _ours(task, f"least-squares, --program {name}", short, "least-squares", remark)
 
 
-def _ours(task: Task, name: str, recording: estimators.CycleRecording, method: str, remark: str) -> Row:
+def _ours(task: Task, name: str, recording: CycleRecording, method: str, remark: str) -> Row:
     travel = float(np.ptp(recording.position_rad))
     time_s = recording.procedure.duration_s
     try:

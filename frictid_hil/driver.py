@@ -350,7 +350,10 @@ class Driver(Protocol):
     Every method raises ``HardwareError`` when the hardware does not answer, naming node, object and what was expected.
     """
 
-    clock: Clock
+    @property
+    def clock(self) -> Clock:
+        """Whose time everything runs on."""
+        ...
 
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Take the bus exclusively and reach every joint; nothing is enabled. ``HardwareBusy`` when held by another."""

@@ -1,4 +1,5 @@
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,7 +65,7 @@ def test_too_short_a_travel_is_refused_for_its_torque() -> None:
     ("changes", "reason"),
     [({"position_max_rad": 0.3}, "leaves its limits"), ({"max_velocity_rad_s": 1.0}, "planned speed")],
 )
-def test_travel_and_speed_beyond_a_limit_are_refused(changes: dict[str, float], reason: str) -> None:
+def test_travel_and_speed_beyond_a_limit_are_refused(changes: dict[str, Any], reason: str) -> None:
     plan, setup = a_plan(Procedure(20 * DEG, 115 * DEG), a_joint(**changes))
     with pytest.raises(PlanRefused, match=reason):
         refuse_beyond_limits(plan, setup, {})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from typing import Any
 
 import can
 
@@ -112,7 +113,7 @@ class ScriptedDrive:
         self.commands = []
         self.pending = []
         self.syncs = 0
-        self.text = b""
+        self.text: Any = b""
 
     def receive(self, can_id, data):
         if self.silent:
@@ -270,7 +271,7 @@ class HandClock:
 
 def robot(*nodes, options=None, joint_options=None, **changes):
     """Joints "0".. with a gear of 50 and 50 N m rated, one per node."""
-    joint = {
+    joint: dict[str, Any] = {
         "gear_ratio": 50.0,
         "direction": 1,
         "max_velocity_rad_s": 2.0,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import fields
 
 import pytest
 import yaml
@@ -58,6 +59,9 @@ entries = st.builds(
 ).filter(lambda entry: Entry.parse(str(entry)) == entry)
 
 
+PER_UNIT = [one.name for one in fields(JointFrames) if "_per_unit" in one.name]
+
+
 @st.composite
 def frame_maps(draw):
     ids = iter(draw(st.lists(st.integers(1, 0x5FF), min_size=9, max_size=9, unique=True)))
@@ -67,9 +71,8 @@ def frame_maps(draw):
             Frame(next(ids), tuple(draw(st.lists(entries, min_size=1, max_size=2))))
             for _ in range(draw(st.integers(0, 3)))
         ]
-        joints.append(
-            JointFrames(name, draw(st.integers(1, 127)), *[draw(finite) for _ in range(5)], tuple(frames), ())
-        )
+        node, worth = draw(st.integers(1, 127)), {name: draw(finite) for name in PER_UNIT}
+        joints.append(JointFrames(name, node, **worth, reports=tuple(frames)))
     return FrameMap(tuple(joints), draw(st.one_of(st.none(), st.integers(0, 0x7FF))), draw(st.integers(0, 10**9)))
 
 

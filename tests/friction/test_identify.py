@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.identify import function_a
-from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.friction.trajectory import Array, Procedure
 
 P = Procedure(np.radians(20), np.radians(115))
 
@@ -15,7 +15,7 @@ def friction(v):
     return np.sign(v) * (12.0 + 4.0 * np.abs(v))
 
 
-def perfect(procedure=P, *, step=1e-3, inertia=0.0, gravity=0.0, late=0.0):
+def perfect(procedure=P, *, step=1e-3, inertia=0.0, gravity=0.0, late=0.0) -> tuple[Array, Array, Array]:
     """A joint that tracks exactly; ``late`` seconds of torque delay."""
     time = trajectory.sample_times(procedure, step)
     v = trajectory.velocity(procedure, time)
@@ -142,8 +142,7 @@ def test_a_recording_that_ends_early_names_the_missing_cycle():
 
 @pytest.mark.parametrize("column", [1, 2])
 def test_a_value_that_is_not_finite_never_vanishes(column):
-    data = list(perfect())
-    data[column] = data[column].copy()
+    data = perfect()
     data[column][5000] = np.nan
     with pytest.raises(IdentificationError, match="not finite"):
         function_a(*data, P)

@@ -42,9 +42,9 @@ def test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless(plants,
             error, width = outcome(plants, replace(plants.arm[index], **effects), 3 * index + len(kind), method)
             errors.append(error)
             widths.append(width)
-    errors, widths = np.concatenate(errors), np.concatenate(widths)
-    assert np.mean(np.abs(errors) <= widths) >= 0.90
-    assert np.sqrt(np.mean(widths**2)) <= 5 * np.sqrt(np.mean(errors**2))
+    error, width = np.concatenate(errors), np.concatenate(widths)
+    assert np.mean(np.abs(error) <= width) >= 0.90
+    assert np.sqrt(np.mean(width**2)) <= 5 * np.sqrt(np.mean(error**2))
 
 
 def test_a_drifting_joint_gets_wide_intervals(plants):

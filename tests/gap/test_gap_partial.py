@@ -25,7 +25,7 @@ def asymmetric() -> ExperimentSet:
     return gap_sets.make(ASYMMETRY)
 
 
-def _each(experiments: ExperimentSet, change) -> ExperimentSet:  # type: ignore[no-untyped-def]
+def _each(experiments: ExperimentSet, change) -> ExperimentSet:
     return replace(experiments, experiments=tuple(change(e) for e in experiments.experiments))
 
 
@@ -120,7 +120,7 @@ def test_jittered_clock_still_finds_the_cause(asymmetric: ExperimentSet) -> None
     def jitter(e: Experiment) -> Experiment:
         time = e.time_s + 0.0004 * random.uniform(-1, 1, e.time_s.size)
 
-        def at(column):  # type: ignore[no-untyped-def]
+        def at(column):
             return np.interp(time, e.time_s, column)
 
         return replace(

@@ -57,7 +57,7 @@ def test_play_and_gain_are_not_told_apart_on_one_log_of_the_arm(benchmark: Modul
 
 @pytest.mark.slow
 def test_the_arm_is_late_whichever_motions_are_judged(benchmark: ModuleType) -> None:
-    motions = sorted(path.name for path in (REAL / "so101").iterdir() if path.is_dir())  # type: ignore[operator]
+    motions = sorted(path.name for path in (REAL / "so101").iterdir() if path.is_dir())
     for judged in (motions[::2], motions[1::2]):
         found = diagnose(benchmark.so101(REAL, "Rotation", judged))
         assert found.causes[0].effect == "torque_delay"

@@ -45,7 +45,7 @@ def test_traces_that_are_real_but_drown_in_noise_are_no_cause(seed: int) -> None
     found = diagnose(gap_sets.make(traces, seed=seed))
     assert found.verdict == "none" and not found.causes
     assert found.after == found.before
-    assert found.improved_model() is None or not found.improved_model().effects  # type: ignore[union-attr]
+    assert found.improved_model() is None or not found.improved_model().effects
 
 
 # -- the tool's own figures -------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from frictid_hil.simulation.effects import all_effects
 EFFECTS = {**SINGLES, "backlash": {"gap_rad": 2e-3}}
 
 
-def places(effects: dict[str, dict[str, float]]):  # type: ignore[no-untyped-def]
+def places(effects: dict[str, dict[str, float]]):
     noise_nm = gap_sets.NOISE_NM * LowPass.at(1.0 / gap_sets.STEP_S).white_gain
     logs = recordings(gap_sets.make(effects, seed=4))
     return where(logs, noise_nm, velocity_gain_nm_s_per_rad=18.0)

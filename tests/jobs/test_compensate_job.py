@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frictid_drivers.virtual import rack
+from frictid_drivers.virtual import joint_drive, rack
 from frictid_drivers.virtual.servo import Servo
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
@@ -199,7 +199,7 @@ def test_a_drive_with_another_filter_is_refused(
 @pytest.fixture
 def drives_that_compensate(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drives whose own friction compensation was switched on and stored with the vendor's tool."""
-    as_built = rack.servo_for
+    as_built = joint_drive.servo_for
 
     def with_own_compensation(*arguments: Any, **options: Any) -> Servo:
         servo = as_built(*arguments, **options)

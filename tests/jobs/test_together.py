@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,7 +113,7 @@ def test_different_timing_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_combined_torque_is_refused_where_each_alone_is_not() -> None:
-    fast = {"velocity_rad_s": 2.3}
+    fast: dict[str, Any] = {"velocity_rad_s": 2.3}
     plan_calibration(CalibrateOptions("hp3j-arm.yaml", **fast))
     with pytest.raises(PlanRefused, match=r"joint 0: predicted torque .* the most that the other joints can add"):
         plan_calibration(CalibrateOptions("hp3j-arm.yaml", together=True, **fast))

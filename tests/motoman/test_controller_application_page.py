@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,7 +117,8 @@ def stream_examples() -> dict[str, str]:
         return lines([*([(frame, True)] if frame else []), *((data, False) for data in said)])
 
     # The published set-point: session 7, due at tick 100, 500 pulses.
-    emulator.axes[0].servo.measured_position_rad = 480 / emulator.axes[0].plate.pulses_per_rad
+    servo: Any = emulator.axes[0].servo
+    servo.measured_position_rad = 480 / emulator.axes[0].plate.pulses_per_rad
     emulator.axes[0].issued = 480
     app.tick_number = 90
     made = {

@@ -18,7 +18,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.driver import RobotSetup
 from frictid_hil.friction import quality
 from frictid_hil.friction.estimate import Estimate, estimate
-from frictid_hil.friction.recording import CycleRecording, Skew
+from frictid_hil.friction.recording import CycleRecording, Skew, synchronised
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan import Cycles, Hold, JointPlan, Move
 from frictid_hil.runner.care import Care
@@ -130,7 +130,7 @@ def test_a_moving_average_of_150_ms_fails_the_fast_cycles_and_is_named() -> None
     setup = setup_with(emulator={"averaging_ms": 150})
     recording = streamed(setup, "3")
     result = estimate(recording, "aligned")
-    ratios = quality.achieved_over_commanded(recording, quality.synchronised(recording))
+    ratios = quality.achieved_over_commanded(recording, synchronised(recording))
     assert ratios[0] > 0.99
     assert ratios[-1] < 0.9
     (tracking,) = [gate for gate in quality.gates(recording, result) if gate.name == "tracking"]

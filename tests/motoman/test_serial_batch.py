@@ -279,7 +279,7 @@ def test_compensation_is_applied_on_the_controllers_tick() -> None:
         seen.append(axis.feed_forward_nm)
         run(duration_s)
 
-    axis.run = watch  # type: ignore[method-assign]
+    axis.run = watch
     driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0)))
     driver.compensate_by_table([])
     assert max(seen) == pytest.approx(7.0, rel=0.01)

@@ -172,7 +172,7 @@ def test_check_of_a_healthy_controller_has_no_error_and_says_that_it_is_untested
         (lambda panel: setattr(panel, "position_known", False), "position"),
     ],
 )
-def test_check_finds_what_forbids_motion(press, subject: str) -> None:  # type: ignore[no-untyped-def]
+def test_check_finds_what_forbids_motion(press, subject: str) -> None:
     bench = make_bench()
     press(bench.emulator.panel)
     assert findings(bench)[subject][0] is Severity.ERROR
@@ -291,7 +291,7 @@ def test_servo_power_goes_off_only_once_the_arm_stands() -> None:
         moving_when_cut.append(bench.emulator.stream.moving)
         power(on)
 
-    bench.emulator.panel.power = cut  # type: ignore[method-assign]
+    bench.emulator.panel.power = cut
     driver.close()
     assert moving_when_cut == [False]
     assert not bench.emulator.panel.servo_on
@@ -417,7 +417,7 @@ def test_every_byte_is_offered_to_the_bus_log_in_order() -> None:
 
 
 def narrow(**changes: object) -> Bench:
-    return make_bench(axes=6, stream_baud=115200, **changes)  # type: ignore[arg-type]
+    return make_bench(axes=6, stream_baud=115200, **changes)
 
 
 def test_115200_carries_one_joint_at_250_hz_and_keeps_an_eye_on_the_others() -> None:
@@ -454,13 +454,13 @@ def test_the_pulses_that_a_speed_limiter_drops_are_told() -> None:
     flags = 0
     exchange = driver.exchange
 
-    def remember(set_points):  # type: ignore[no-untyped-def]
+    def remember(set_points):
         nonlocal flags
         reports = exchange(set_points)
         flags |= reports[0].status_raw >> 16
         return reports
 
-    driver.exchange = remember  # type: ignore[method-assign]
+    driver.exchange = remember
     stream_motion(driver)
     driver.close()
     assert flags & 4

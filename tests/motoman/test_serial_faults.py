@@ -186,14 +186,14 @@ def test_a_dead_host_is_noticed_by_the_stream_within_its_watchdog() -> None:
 
     exchange = driver.exchange
 
-    def until_killed(set_points):  # type: ignore[no-untyped-def]
+    def until_killed(set_points):
         nonlocal cycles
         cycles += 1
         if cycles == 30:
             raise Killed
         return exchange(set_points)
 
-    driver.exchange = until_killed  # type: ignore[method-assign]
+    driver.exchange = until_killed
     with pytest.raises(Killed):
         stream_motion(driver, into=Dying())
     emulator = bench.emulator

@@ -3,6 +3,7 @@ from __future__ import annotations
 import gzip
 import random
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,9 @@ def test_the_standard_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize("prismatic", [False, True])
 def test_what_is_written_is_read_to_the_last_bit(tmp_path: Path, name: str, prismatic: bool) -> None:
     rng = np.random.default_rng(1)
-    columns = {column: rng.standard_normal(200) * 10.0 ** rng.integers(-9, 9) for column in Samples.COLUMNS}
+    columns: dict[str, Any] = {}
+    for column in Samples.COLUMNS:
+        columns[column] = rng.standard_normal(200) * 10.0 ** rng.integers(-9, 9)
     columns["temperature_c"][3] = np.nan
     time_ns = np.cumsum(rng.integers(1, 5_000_000, 200)).astype(np.int64)
     original = Samples("0", time_ns, prismatic=prismatic, **columns)

@@ -99,7 +99,7 @@ def test_a_tool_that_knows_only_the_standard_reads_it(tmp_path: Path) -> None:
         marks = [message.data for _, _, message in reader.iter_messages(topics=["/marks"])]
         metadata = list(reader.iter_metadata())
     assert [time_ns for time_ns, _ in read] == original.time_ns.tolist()
-    assert [values["torque_nm"] for _, values in read] == original.torque_nm.tolist()  # type: ignore[union-attr]
+    assert [values["torque_nm"] for _, values in read] == original.torque_nm.tolist()
     assert all(v["sec"] * 10**9 + v["nanosec"] == t for t, v in read)
     assert np.isnan(read[0][1]["temperature_c"])
     assert len(marks) == 2

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import os
 import random
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +34,9 @@ MAP = ColumnMap(
 )
 
 
-def mat(folder: Path, values: dict[str, object], **options: object) -> Path:
+def mat(folder: Path, values: Mapping[str, object], **options: Any) -> Path:
     path = folder / "log.mat"
-    scipy.io.savemat(path, values, **options)  # type: ignore[arg-type]
+    scipy.io.savemat(path, values, **options)
     return path
 
 

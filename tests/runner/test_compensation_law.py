@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -233,7 +234,7 @@ def test_the_joint_that_was_identified_passes() -> None:
         ({"temperature": 60.0}, "60.0 degC"),
     ],
 )
-def test_another_joint_does_not_and_both_values_are_named(change: dict[str, float], words: str) -> None:
+def test_another_joint_does_not_and_both_values_are_named(change: dict[str, Any], words: str) -> None:
     with pytest.raises(ProfileMismatch, match=words) as refusal:
         probed(**change)
     assert "profile" in str(refusal.value) and "joint 3" in str(refusal.value)

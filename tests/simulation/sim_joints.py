@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from frictid_hil.simulation.joint import JointModel
@@ -39,7 +41,7 @@ def excitation(rate_hz: float = 500.0) -> tuple[np.ndarray, np.ndarray]:
     return time, 0.2 + sine + creep + chirp
 
 
-def simulate(model: JointModel, **options: object) -> Simulated:
+def simulate(model: JointModel, **options: Any) -> Simulated:
     """The excitation on this joint."""
     time, command = excitation()
     return closed_loop(model, CONTROLLER, time, command, **options)

@@ -12,6 +12,7 @@ from sim_joints import CONTROLLER, COULOMB, GRAVITY, INERTIA, STIFFNESS, VISCOUS
 from frictid_hil.simulation import catalogue, compose
 from frictid_hil.simulation.effect import Channel
 from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.replay import Simulated
 
 NAMES = sorted(all_effects())
 UNITS = (
@@ -95,14 +96,14 @@ PLAIN = {
 }
 
 
-def kinematic_residual(rows: object) -> float:
+def kinematic_residual(rows: Simulated) -> float:
     """Reported velocity minus differenced position, and how coarse the positions are."""
     difference = np.diff(rows.position_rad, prepend=rows.position_rad[0]) * CONTROLLER.rate_hz
     steps = np.unique(np.abs(np.diff(rows.position_rad)))
     return max(np.abs(rows.velocity_rad_s - difference).max(), 1e3 * steps[steps > 1e-9].min())
 
 
-def actuation_residual(rows: object) -> float:
+def actuation_residual(rows: Simulated) -> float:
     """Reported torque minus the controller's demand, the controller written once more in its plainest form."""
     time, command = excitation()
     period = 1 / CONTROLLER.rate_hz
@@ -120,7 +121,7 @@ def actuation_residual(rows: object) -> float:
     return worst
 
 
-def plant_residual(rows: object) -> float:
+def plant_residual(rows: Simulated) -> float:
     """Reported torque minus the bare joint's equation along the reported motion, smoothed over 20 ms, RMS."""
     period = 1 / CONTROLLER.rate_hz
     position = rows.position_rad

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import can
 import pytest
@@ -76,12 +77,16 @@ def test_lock_step_run(make_robot):
     run.driver.close()
 
 
+def noted(frames, *frame):
+    frames.append(frame)
+
+
 def test_two_runs_are_equal_to_the_bit(make_robot):
     logs = []
     for _ in range(2):
         frames = []
         driver = VirtualDriver(make_robot())
-        driver.open(lambda t_ns, can_id, data, sent, frames=frames: frames.append((t_ns, can_id, data, sent)))
+        driver.open(partial(noted, frames))
         driver.configure(1000.0, ["0"])
         driver.start_cycling()
         frames.clear()

@@ -3,6 +3,7 @@
 import hashlib
 import math
 import struct
+from typing import Any
 
 import can
 import pytest
@@ -165,11 +166,12 @@ def test_held_joints_do_not_depend_on_when_they_are_looked_at(make_robot):
         host = Host(make_robot())
         host.start()
         axis = host.rack.servos["1"].axis
+        plant: Any = axis._plant
         for n in range(200):
             host.clock.wait_until(host.clock.now_ns() + MS)
             if n % every == every - 1:
                 axis.catch_up(host.rack.now_ns)
-        positions.append(axis._plant.position_rad)
+        positions.append(plant.position_rad)
         host.close()
     assert positions[0] == pytest.approx(positions[1], abs=1e-12)
 

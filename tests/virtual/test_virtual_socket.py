@@ -21,9 +21,8 @@ MS = 1_000_000
 @pytest.fixture
 def hub(runtime_folder):
     """A hub served by a thread; what it heard, and a way to speak."""
-    hub = Hub(runtime_folder / "desk.sock")
-    hub.log = []
-    hub.heard = lambda can_id, data, stamp_ns: hub.log.append((can_id, data))
+    hub, log = Hub(runtime_folder / "desk.sock"), []
+    hub.heard = lambda can_id, data, stamp_ns: log.append((can_id, data))
     stop = threading.Event()
 
     def serve():
@@ -33,7 +32,7 @@ def hub(runtime_folder):
 
     thread = threading.Thread(target=serve)
     thread.start()
-    yield hub
+    yield hub, log
     stop.set()
     thread.join()
     hub.close()
@@ -48,6 +47,7 @@ def connected(hub, count):
 
 
 def test_registered_interface_joins_members(hub):
+    hub, log = hub
     first, second, third = connected(hub, 3)
     first.send(can.Message(arbitration_id=0x123, data=b"\1\2\3", is_extended_id=False))
     for other in (second, third):
@@ -55,7 +55,7 @@ def test_registered_interface_joins_members(hub):
         assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (0x123, b"\1\2\3", False)
         assert message.timestamp == pytest.approx(time.time(), abs=5)
     assert first.recv(0.02) is None, "nobody hears himself"
-    assert hub.log == [(0x123, b"\1\2\3")]
+    assert log == [(0x123, b"\1\2\3")]
     hub.send(0x181, b"\7" * 8)
     assert all(bytes(bus.recv(2).data) == b"\7" * 8 for bus in (first, second, third))
     assert select.select([first.fileno()], [], [], 0)[0] == []
@@ -99,6 +99,7 @@ def test_a_hub_that_ends_late_leaves_its_successor_alone(runtime_folder):
 
 
 def test_slow_reader_loses_frames_and_holds_up_nobody(hub):
+    hub, _ = hub
     slow, quick = connected(hub, 2)
     began_s = time.monotonic()
     for n in range(30_000):

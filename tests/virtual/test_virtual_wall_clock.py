@@ -3,6 +3,7 @@
 import math
 import random
 import struct
+from collections.abc import Callable
 
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_process import RackProcess
@@ -16,6 +17,7 @@ class Line:
     """A hub without processes: frames lie here until the drives serve, each with the time it was sent."""
 
     members = 1
+    heard: Callable[[int, bytes, int], None]
 
     def __init__(self):
         self.waiting = []

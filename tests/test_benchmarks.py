@@ -1,0 +1,85 @@
+"""Benchmarks run seldom; what they build on must not leave them behind unseen."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.simulation.joint import JointModel
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def benchmark_named(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Any]:
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setattr(sys, "path", list(sys.path))  # one of them adds the folder of the tests' own plant
+    return importlib.import_module
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.py")))
+def test_every_benchmark_can_be_imported(benchmark_named: Callable[[str], Any], name: str) -> None:
+    assert benchmark_named(name).__doc__
+
+
+def joints_of(path: Path) -> dict[str, JointModel]:
+    """The simulated joints of a robot file, as its simulated drives would build them."""
+    return {
+        joint.name: JointModel.from_mapping(
+            joint.simulated,
+            gear_ratio=joint.gear_ratio,
+            rated_torque_nm=joint.rated_torque_nm,
+            max_torque_nm=joint.max_torque_nm,
+        )
+        for joint in load_robot(path).to_setup("virtual:loaded").joints
+    }
+
+
+def test_robots_changed_for_the_accuracy_table_load(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    accuracy = benchmark_named("accuracy")
+    shipped = accuracy.shipped()
+    for values in (shipped, accuracy.scaled(shipped, 1), accuracy.flexible(shipped, 30.0)):
+        path = tmp_path / f"{values['name']}.yaml"
+        path.write_text(dump(values))
+        joints = joints_of(path)
+        assert ("joint_elasticity" in joints["1"].effects) == ("flexible" in values["name"])
+        assert len(joints) == 6
+
+
+@pytest.mark.parametrize("kind", ["rigid", "flexible", "load"])
+def test_robots_of_the_calibrations_on_the_bus_load(
+    benchmark_named: Callable[[str], Any], tmp_path: Path, kind: str
+) -> None:
+    on_the_bus = benchmark_named("on_the_bus")
+    joints = joints_of(on_the_bus.variant(tmp_path, kind, on_the_bus.plant(kind)).path)
+    assert ("joint_elasticity" in joints["0"].effects) == (kind == "flexible")
+    assert ("load_dependent_friction" in joints["0"].effects) == (kind == "load")
+
+
+def test_robots_of_the_compensation_benchmarks_load(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    path = benchmark_named("compensation_robots").variant(tmp_path / "robot.yaml", elastic_hz=30.0, delay_cycles=5)
+    assert all("joint_elasticity" in joint.effects for joint in joints_of(path).values())
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_robots_of_the_serial_benchmarks_load(
+    benchmark_named: Callable[[str], Any], tmp_path: Path, batch: bool
+) -> None:
+    path = benchmark_named("serial_pty").robot_file(tmp_path, batch=batch, averaging_ms=0)
+    assert len(joints_of(path)) == 6
+    path.write_text(benchmark_named("serial_faults").ROBOT.format(layer="batch" if batch else "stream"))
+    assert len(joints_of(path)) == 6
+
+
+def test_joints_of_the_diagnosis_end_to_end_load(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    end_to_end = benchmark_named("gap_end_to_end")
+    for effect in end_to_end.SIZES:
+        joints = joints_of(end_to_end.robot_with({effect: end_to_end.drawn(effect)}, tmp_path))
+        assert set(joints["0"].effects) == {effect}
