@@ -11,12 +11,13 @@ import numpy as np
 from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share, velocity_lag_s
 from frictid_hil.gap.cautions import ONE_SINUSOID, below_first_pair, one_sinusoid, tied_on_a_sinusoid
 from frictid_hil.gap.confidence import clues_of
+from frictid_hil.gap.credit import credits, sound
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.echo import echoes_nm
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, Replayed, bounded, pooled, settled_nm, why_not
-from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, hollow, needed, shares
+from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, hollow, needed
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.partial import diagnose_without_replay
@@ -90,7 +91,7 @@ def _full(
     bare = replay({}, validation=True if has_validation else None)
     drive = _needed_drive(channels, judged, low_pass, noise, floor, experiments)
     judge = Judge(replay, evidence, drive, has_validation)
-    hypothesis = needed(judge, choose(judge, ranking, floor), floor)
+    hypothesis = sound(judge, needed(judge, choose(judge, ranking, floor), floor), floor)
     after = judge.judged(hypothesis.effects)
     effects = sorted({g[0] for g in evidence.groups if not g[0].startswith("family ")})
     bare_score = evidence.score(())
@@ -256,7 +257,7 @@ def _conclude(
 ) -> Diagnosis:
     verdict, place = verdict_of(features)
     names = features.names
-    shapley = shares(judge, hypothesis, names) if names else {}
+    shapley = {name: credit.share for name, credit in credits(judge, hypothesis, names).items()}
     inverse_before, inverse_after = _inverse(evidence, hypothesis)
     view = judged[0].view
     assert view is not None

@@ -287,11 +287,18 @@ class Evidence:
         weights = self.coefficients(model)[self._prior.size :]
         return (y - x[:, columns] @ weights) * scale, y * scale
 
+    def judged_rows(self, model: Sequence[Group]) -> Array:
+        """What model and tolerances leave of the validation logs (else of all), over noise, shape (m,)."""
+        columns, weights = self.columns(model), self.coefficients(model)
+        return np.concatenate([self.thin[k][1] - self.thin[k][0][:, columns] @ weights for k in self._judged()])
+
+    def _judged(self) -> list[int]:
+        chosen = [k for k, r in enumerate(self.recordings) if r.experiment.validation]
+        return chosen or list(range(len(self.recordings)))
+
     def judged_nm(self, model: Sequence[Group]) -> float:
         """RMS that effects leave on the validation logs (on all where there are none), N m."""
-        chosen = [k for k, r in enumerate(self.recordings) if r.experiment.validation]
-        chosen = chosen or list(range(len(self.recordings)))
-        return rms(np.concatenate([self.explained_nm(k, model)[0] for k in chosen]))
+        return rms(np.concatenate([self.explained_nm(k, model)[0] for k in self._judged()]))
 
     def shapes(self, effect: str) -> list[Group]:
         """All groups of one effect."""

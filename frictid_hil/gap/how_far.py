@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 from frictid_hil.gap.evidence import FAMILY, Evidence, Group
 from frictid_hil.gap.forward import SEARCH_SUBSTEP_S, Effects, Replay, Replayed, pooled, refine, settled_nm
@@ -101,10 +100,14 @@ class Judge:
         self.drive = {name: dict(values) for name, values in drive.items()}
         self._has_validation = has_validation
         self._known: dict[frozenset[str], Hypothesis] = {}
+        self._replayed: dict[tuple[tuple[str, tuple[tuple[str, float], ...]], ...], dict[str, Replayed]] = {}
 
     def judged(self, effects: Effects) -> dict[str, Replayed]:
         """Differences on the validation logs; on all where there are none."""
-        return self.replay(effects, validation=True if self._has_validation else None)
+        key = tuple(sorted((name, tuple(sorted(values.items()))) for name, values in effects.items()))
+        if key not in self._replayed:
+            self._replayed[key] = self.replay(effects, validation=True if self._has_validation else None)
+        return self._replayed[key]
 
     def __call__(self, groups: Sequence[Group]) -> Hypothesis:
         """The hypothesis of these plant effects, refined; their shapes join the evidence."""
@@ -254,10 +257,10 @@ def _with_probed(judge: Judge, current: Hypothesis, floor_nm: float) -> Hypothes
 
 
 def _stands_out(before: Hypothesis, after: Hypothesis, floor_nm: float, share: float) -> bool:
-    return _taken(before, after, floor_nm) > share**2 and after.cost < before.cost
+    return taken_off(before, after, floor_nm) > share**2 and after.cost < before.cost
 
 
-def _taken(before: Hypothesis, after: Hypothesis, floor_nm: float) -> float:
+def taken_off(before: Hypothesis, after: Hypothesis, floor_nm: float) -> float:
     """Squared torque that ``after`` takes off over the squared floor: by replay or, where it is quick, in the plant.
 
     A controller hides from its replay what is quicker than itself (play, ripple); inverse dynamics still shows it, less
@@ -266,30 +269,6 @@ def _taken(before: Hypothesis, after: Hypothesis, floor_nm: float) -> float:
     replayed = (before.judged_nm**2 - after.judged_nm**2) / floor_nm**2
     plant = (before.inverse_nm**2 - after.inverse_nm**2) / max(floor_nm, after.inverse_nm) ** 2
     return max(replayed, plant)
-
-
-def shares(judge: Judge, hypothesis: Hypothesis, names: Sequence[str]) -> dict[str, float]:
-    """Shapley share of each effect in the closed part of the gap (squared torque difference), adding up to 1."""
-    cached: dict[frozenset[str], float] = {}
-
-    def left(kept: frozenset[str]) -> float:
-        if kept not in cached:
-            effects = {n: v for n, v in hypothesis.effects.items() if n in kept or n not in names}
-            cached[kept] = settled_nm(judge.judged(effects)) ** 2
-        return cached[kept]
-
-    total = left(frozenset()) - left(frozenset(names))
-    result = {}
-    for name in names:
-        others = [n for n in names if n != name]
-        value = 0.0
-        for size in range(len(others) + 1):
-            weight = math.factorial(size) * math.factorial(len(others) - size) / math.factorial(len(names))
-            for chosen in combinations(others, size):
-                kept = frozenset(chosen)
-                value += weight * (left(kept) - left(kept | {name}))
-        result[name] = value / total if total > 0.0 else 0.0
-    return result
 
 
 def hollow(judge: Judge, hypothesis: Hypothesis, name: str) -> float:
@@ -323,20 +302,22 @@ def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
                 judged_nm=settled_nm(judge.judged(quick)),
                 inverse_nm=judge.evidence.judged_nm(others),
             )
-            taken[name] = _taken(without, hypothesis, floor_nm)
-        # What a quick controller hides from its replay, held-out inverse dynamics may still show beyond doubt.
-        bare = judge.evidence.misfit_ratio(())
-        clear = bare > max(UNHEALTHY, CLEAR * hypothesis.misfit)
-        alone = len(hypothesis.names) == 1 and not judge.drive and not clear
+            taken[name] = taken_off(without, hypothesis, floor_nm)
+        alone = len(hypothesis.names) == 1 and not judge.drive and not clear(judge, hypothesis)
         least = (STANDS_ALONE if alone else STANDS_BESIDE) ** 2
         weakest = min(taken, key=lambda n: taken[n])
         if taken[weakest] >= least:
             return hypothesis
         rest = judge.without(hypothesis, weakest)
-        if _taken(rest, hypothesis, floor_nm) >= least:
+        if taken_off(rest, hypothesis, floor_nm) >= least:
             return hypothesis
         hypothesis = rest
     return hypothesis
+
+
+def clear(judge: Judge, hypothesis: Hypothesis) -> bool:
+    """Whether held-out inverse dynamics shows the effects beyond doubt, though a quick controller hides them."""
+    return judge.evidence.misfit_ratio(()) > max(UNHEALTHY, CLEAR * hypothesis.misfit)
 
 
 def gap_figures(differences: Mapping[str, Replayed]) -> tuple[float, float]:

@@ -235,6 +235,7 @@ def _believed(rng: np.random.Generator, physics: Physics, payload: Payload) -> t
         viscous_low=physics.viscous_low * friction,
         viscous_high=physics.viscous_high * friction,
         slip_length=near(physics.slip_length),
+        rounding=0.0,
     )
     return belief, Payload(near(payload.inertia_kg_m2), near(payload.gravity_nm))
 

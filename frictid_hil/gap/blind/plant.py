@@ -45,6 +45,9 @@ class Physics(NamedTuple):
     gear_ratio: float
     encoder_step: float
     torque_limit: float
+    # How round the bend is and how gradual the first slip; 0 for a belief: two straight lines and one spring, no more
+    # than a nominal file can tell.
+    rounding: float = 1.0
     # Friction.
     weakening: float = 0.0
     weakening_velocity: float = 0.05
@@ -128,7 +131,7 @@ class Controller(NamedTuple):
 @njit(cache=True)
 def _rate_part(p: Physics, speed: float) -> float:
     """Friction above Coulomb at a speed: a hyperbolic bend between two slopes, and what the nominal curve lacks."""
-    width = 0.08 * p.bend_velocity
+    width = 0.08 * p.bend_velocity * p.rounding
     reach = speed - p.bend_velocity
     bent = 0.5 * (speed + p.bend_velocity - math.sqrt(reach * reach + width * width))
     bent -= 0.5 * (p.bend_velocity - math.sqrt(p.bend_velocity * p.bend_velocity + width * width))
@@ -313,11 +316,12 @@ def run(
             dq = h * v
             q += dq
             for i in range(network.size):
-                reach = p.slip_length * _NETWORK_REACH[i]
+                reach = p.slip_length * (1.0 + p.rounding * (_NETWORK_REACH[i] - 1.0))
                 network[i] = min(max(network[i] + dq, -reach), reach)
             slip = 0.0
             for i in range(network.size):
-                slip += _NETWORK_SHARE[i] * network[i] / (p.slip_length * _NETWORK_REACH[i])
+                reach = p.slip_length * (1.0 + p.rounding * (_NETWORK_REACH[i] - 1.0))
+                slip += _NETWORK_SHARE[i] * network[i] / reach
             level = p.coulomb * slip
             if p.soft_share != 0.0:
                 give = 0.0
