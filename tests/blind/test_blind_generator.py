@@ -14,9 +14,11 @@ import yaml
 
 from frictid_hil.gap.blind.effects import LIBRARY
 from frictid_hil.gap.blind.figures import believed_motion, figures, record, together
-from frictid_hil.gap.blind.generator import Assignment, assignments, draw_case, write_case
-from frictid_hil.gap.blind.joints import Joint, base_friction, draw_joint
+from frictid_hil.gap.blind.generator import Assignment, Case, assignments, draw_case, write_case
+from frictid_hil.gap.blind.joints import Joint, base_friction, draw_joint, nominal_mapping
 from frictid_hil.gap.blind.outsiders import OUTSIDERS
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.forward import Replay, pooled
 
 PRACTICE = Path(
     os.environ.get("FRICTID_PRACTICE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data" / "gap-practice")
@@ -97,6 +99,17 @@ def test_a_joint_that_is_as_believed_leaves_noise_only(joint: Joint) -> None:
     assert all_figures["forward_torque_nm"] == pytest.approx(joint.floor_nm, rel=0.15)
     assert all_figures["inverse_nm"] < 2.0 * joint.floor_nm
     assert all_figures["forward_position_rad"] == 0.0
+
+
+def test_the_gap_of_the_truth_is_that_of_the_nominal_file(tmp_path: Path) -> None:
+    healthy = draw_joint(np.random.default_rng([4, 3]), ("sines_repeat",))
+    log = record(healthy, healthy.physics, [1])[0]
+    believed = believed_motion(healthy)
+    write_case(Case("one", nominal_mapping(healthy, "one"), (log,), {}), tmp_path)
+    differences = Replay(ExperimentSet.load(tmp_path))({})
+    reported = pooled(differences, "position_rad")
+    # Believed and nominal joint move alike, so that neither is charged with what the file cannot tell.
+    assert reported == pytest.approx(figures(healthy, log, believed[0])["forward_position_rad"], rel=0.04)
 
 
 def test_at_constant_speed_the_torque_is_gravity_and_the_friction_of_the_curve(joint: Joint) -> None:

@@ -38,6 +38,7 @@ AIMS = {
 }
 """Rates that the diagnosis is to reach."""
 CLOSED_AIMS = {"median": 0.97, "p10": 0.85}
+_QUANTILES = {"median": "median", "p10": "10 % quantile"}
 SECONDS_AIM = 5.0
 LEFT_OUT_AIM = 0.03
 
@@ -94,6 +95,9 @@ def _rates(scores: Mapping[str, Any]) -> list[str]:
             for name, rate in headline(scores).items()
         ),
         "",
+        f"False alarms on healthy joints (aim at most {_percent(1 - AIMS['none_answered_none'])}): "
+        f"{_percent(scores['none']['false_alarms']['rate'])} ({_count(scores['none']['false_alarms'])}).",
+        "",
         f"Processor time per joint (aim: median {SECONDS_AIM:.0f} s): median {_number(seconds['median'])} s, "
         f"90 % within {_number(seconds['p90'])} s, longest {_number(seconds['worst'])} s. Diagnoses that raised an "
         f"error: {len(scores['errors'])}. Answers `unknown` that enlarged the gap: "
@@ -127,15 +131,22 @@ def _closed(scores: Mapping[str, Any]) -> list[str]:
         f"the tool reports them, the floor from the truth. Aim for the torque: median {CLOSED_AIMS['median']}, "
         f"10 % quantile {CLOSED_AIMS['p10']}.",
         "",
-        "| figure | median | 10 % quantile | worst | joints |",
-        "|---|---|---|---|---|",
+        "| figure | median | 10 % quantile | worst | joints | |",
+        "|---|---|---|---|---|---|",
         *(
             f"| `{figure}` | {_number(row['median'])} | {_number(row['p10'])} | {_number(row['worst'])} "
-            f"| {row['joints']} |"
+            f"| {row['joints']} | {_closed_met(row) if figure == 'forward_torque_nm' else ''} |"
             for figure, row in scores["closed"].items()
         ),
         "",
     ]
+
+
+def _closed_met(row: Mapping[str, Any]) -> str:
+    if row["median"] is None:
+        return ""
+    missed = [_QUANTILES[name] for name, aim in CLOSED_AIMS.items() if row[name] < aim]
+    return f"**{' and '.join(missed)} missed**" if missed else "met"
 
 
 def _calibration(scores: Mapping[str, Any]) -> list[str]:
@@ -208,19 +219,39 @@ def _misses(scores: Mapping[str, Any]) -> list[str]:
 
 
 def _left_out(check: Mapping[str, Any]) -> list[str]:
-    wrong = check["confident_wrong"]
+    wrong, partner = check["confident_wrong"], check["confident_partner"]
+    both = {**wrong, "right": wrong["right"] + partner["right"]}
+    both["rate"] = both["right"] / both["of"] if both["of"] else None
     return [
         "### With the joint's own effect taken out of the library",
         "",
         f"{check['joints']} visible joints with one effect. A confident (0.9 and more) wrong cause, aim "
         f"{_percent(LEFT_OUT_AIM)} at most: "
         f"{_percent(wrong['rate'])} ({_count(wrong)}, {_interval(wrong)}); "
-        f"a confident partner of the true one: {_count(check['confident_partner'])}; answered `unknown`: "
+        f"a confident partner of the true one (an honest one is named below 0.9): {_count(partner)}, "
+        f"{_interval(partner)}; the two together: {_percent(both['rate'])}. Answered `unknown`: "
         f"{_percent(check['answered_unknown']['rate'])}.",
         "",
+        *_confident(check),
         "| effect left out | first answers |",
         "|---|---|",
         *(f"| {effect} | {_counts(answers)} |" for effect, answers in check["by_effect"].items()),
+        "",
+    ]
+
+
+def _confident(check: Mapping[str, Any]) -> list[str]:
+    """Every cause named with confidence though its effect was not there."""
+    if not check["wrong_causes"]:
+        return ["No cause was named with confidence.", ""]
+    return [
+        "| case | effect left out | named with confidence | |",
+        "|---|---|---|---|",
+        *(
+            f"| {one['case']} | {one['effect']} | {one['named']} ({one['confidence']:.2f}) "
+            f"| {'partner' if one['partner'] else ''} |"
+            for one in check["wrong_causes"]
+        ),
         "",
     ]
 

@@ -216,7 +216,14 @@ def score_left_out(answers: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[
         "confident_partner": Rate.over(a.confidence >= CONFIDENT and partner(t, a) for t, a in answers).to_json(),
         "answered_unknown": Rate.over(a.verdict == "unknown" for _, a in answers).to_json(),
         "wrong_causes": [
-            {"case": t["case"], "effect": _name(t), "named": a.first, "confidence": a.confidence} for t, a in confident
+            {
+                "case": t["case"],
+                "effect": _name(t),
+                "named": a.first,
+                "confidence": a.confidence,
+                "partner": partner(t, a),
+            }
+            for t, a in confident
         ],
         "by_effect": {
             name: dict(Counter(a.first for t, a in answers if _name(t) == name).most_common())
