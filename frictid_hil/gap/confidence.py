@@ -40,6 +40,11 @@ SIGNS: Mapping[str, int] = {
     "edge": -1,
     "drive_left": -1,
     "hollow": -1,
+    "generic": -1,
+    "generic_share": -1,
+    "worst_log": -1,
+    "spread": -1,
+    "position": -1,
 }
 """Which way a term may move the chance: 1 up, -1 down, 0 either."""
 
@@ -59,6 +64,11 @@ class Clues:
         edge: 1 where a parameter ended at a bound of its range, else 0.
         drive_left: for a fault of the drive, what it leaves of the actuation residual over healthy noise; else 1.
         hollow: part of what it closes that its shape closes without its strength, 0..1.
+        generic: log-likelihood, per misfit ratio, that the best family without a cause adds to the plant's effects.
+        generic_share: the same over what those effects gain.
+        worst_log: misfit of the validation log that is explained worst, over the misfit of all.
+        spread: for a late torque, how far its spread in time may be from what the effect brings, over its square.
+        position: squared position difference left on held-out logs, over what there was.
     """
 
     lead: float
@@ -71,6 +81,11 @@ class Clues:
     edge: float
     drive_left: float
     hollow: float
+    generic: float
+    generic_share: float
+    worst_log: float
+    spread: float
+    position: float
 
     def terms(self) -> dict[str, float]:
         """Terms of the logistic map, each bounded so that no clue outweighs all others."""
@@ -86,6 +101,11 @@ class Clues:
             "edge": self.edge,
             "drive_left": math.log(_within(self.drive_left, 1.0, 5.0)),
             "hollow": _within(self.hollow, 0.0, 1.0),
+            "generic": math.log1p(_within(self.generic, 0.0, 3000.0)),
+            "generic_share": math.log1p(1e3 * _within(self.generic_share, 0.0, 1.0)),
+            "worst_log": math.log(_within(self.worst_log, 1.0, 5.0)),
+            "spread": _within(self.spread, 0.0, 1.5),
+            "position": _within(self.position, 0.0, 1.5),
         }
 
     def chance(self) -> float:
@@ -119,6 +139,8 @@ def clues_of(name: str, features: Features, own: float, values: Mapping[str, flo
             drive_left = features.actuation_worst / COLOUR
     lead = (gain - rival_gain) / scale
     share = rival_gain / gain if gain > 0.0 else 1.0
+    plant = name in features.rivals
+    generic = max(0.0, features.generic) if plant else 0.0
     clues = Clues(
         lead=lead,
         rival_share=share,
@@ -130,6 +152,11 @@ def clues_of(name: str, features: Features, own: float, values: Mapping[str, flo
         edge=float(_at_edge(name, values)),
         drive_left=drive_left,
         hollow=features.hollow.get(name, 0.0),
+        generic=generic / max(1.0, features.misfit),
+        generic_share=generic / max(1.0, features.gain),
+        worst_log=features.worst_log if plant else 1.0,
+        spread=features.spread.get(name, 0.0),
+        position=features.position_left,
     )
     near = bool(rival) and (lead < CONFUSABLE_LEAD or share > CONFUSABLE_SHARE)
     return clues, (rival,) if near else ()

@@ -27,4 +27,9 @@ WEIGHTS: dict[str, float] = {
     "edge": -2.01,
     "drive_left": 0.0,
     "hollow": -6.459,
+    "generic": 0.0,
+    "position": 0.0,
+    "spread": 0.0,
+    "worst_log": 0.0,
+    "generic_share": 0.0,
 }

@@ -17,15 +17,17 @@ from frictid_hil.gap.echo import echoes_nm
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, Replayed, bounded, pooled, settled_nm, why_not
+from frictid_hil.gap.held_out import by_stretch, change
 from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, hollow, needed
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
+from frictid_hil.gap.spread import unlike
 from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.gap.where import lives, where
-from frictid_hil.gap.which import Model, Ranking, best_family, rank, replacements
+from frictid_hil.gap.which import Model, Ranking, best_family, families_beside, rank, replacements
 from frictid_hil.simulation.effects import all_effects
 
 QUIET = 1.25
@@ -97,7 +99,8 @@ def _full(
     bare_score = evidence.score(())
     model = Model(hypothesis.groups, evidence.score(hypothesis.groups) - bare_score)
     rivals = replacements(evidence, model, effects, bare_score)
-    family = best_family(evidence, hypothesis.groups)
+    added = families_beside(evidence, hypothesis.groups)
+    family = best_family(added)
     family_share = family[0] / max(1.0, 0.5 * evidence.misfit_ratio(hypothesis.groups) * ranking.rows)
     names = (*drive, *hypothesis.names)
     features = Features(
@@ -124,6 +127,10 @@ def _full(
         floor_nm=floor,
         probed={name: hypothesis.probe for name in hypothesis.replayed},
         hollow={name: hollow(judge, hypothesis, name) for name in hypothesis.names},
+        generic=max(added.values()),
+        worst_log=_worst_log(evidence, hypothesis),
+        spread=_spread(channels, logs, experiments),
+        position_left=1.0 + change(by_stretch(bare, "position_rad"), by_stretch(after, "position_rad")).share,
     )
     return _conclude(
         experiments,
@@ -142,6 +149,20 @@ def _full(
         channels,
         hints,
     )
+
+
+def _worst_log(evidence: Evidence, hypothesis: Hypothesis) -> float:
+    """Squares per row of the validation log that the plant's effects explain worst, over those of the fitted ones."""
+    judged = evidence.judged(hypothesis.groups)
+    return max(judged.values()) / evidence.misfit_ratio(hypothesis.groups) if judged else 1.0
+
+
+def _spread(channels: _Channels, logs: Sequence[Recording], experiments: ExperimentSet) -> dict[str, float]:
+    """How far the spread of the late effects found may be from what they bring."""
+    controller = experiments.nominal.controller
+    if channels.actuation is None or controller is None:
+        return {}
+    return unlike(channels.actuation, logs, controller)
 
 
 def _late(name: str) -> bool:

@@ -8,12 +8,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.residuals import slip_state
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import lagged
 
+START = "start"
+"""Family of friction that depends on the way since a start and on the rest before it.
+
+It comes so near to some effects that it says nothing for a verdict; what it adds to an effect lowers the confidence.
+"""
 DESCRIPTIONS = {
     "position": "a torque that depends on position alone",
     "position friction": "friction that depends on position",
@@ -24,8 +30,15 @@ DESCRIPTIONS = {
     "time in a log": "a change within each recording",
     "acceleration": "friction that depends on acceleration",
     "torque": "a torque gain that depends on the torque",
+    START: "friction that depends on the way since a start and on the rest before",
     "travel": "a torque that builds up over a good part of the travel after a reversal",
 }
+WAYS_RAD = (5e-4, 2e-3, 8e-3)
+"""Ways within which a start may be forgotten."""
+REST_S = 0.1
+"""Rests count by their logarithm from about this length."""
+STILL_S = 0.08
+"""Time without motion that counts as a rest."""
 REACHES = (0.1, 0.25, 0.5)
 """Travels over which such a torque builds up, over the whole travel."""
 
@@ -77,7 +90,13 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
     def since_reversal(v: View) -> Array:
         return np.stack([slip_state(v.position_rad, 1.0 / max(r * (high - low), 1e-9)) for r in REACHES], axis=1)
 
+    def start(v: View) -> Array:
+        way, rest = since_start(v.position_rad, v.step_s, 2.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
+        fading = v.slip[:, None] * np.exp(-way[:, None] / np.array(WAYS_RAD))
+        return np.concatenate([fading, fading * np.log1p(rest / REST_S)[:, None]], axis=1)
+
     return {
+        START: [start(v) for v in views],
         "position": [place(v) for v in views],
         "position friction": [place(v) * v.slip[:, None] for v in views],
         "position viscous": [place(v) * v.velocity_rad_s[:, None] for v in views],
@@ -89,3 +108,39 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         "torque": [gain(v) for v in views],
         "travel": [since_reversal(v) for v in views],
     }
+
+
+@njit(cache=True)
+def since_start(position_rad: Array, step_s: float, least_rad: float) -> tuple[Array, Array]:
+    """(way since the motion last started or turned, rest before that) of every row, rad and s, shape (n,).
+
+    Args:
+        position_rad: measured, shape (n,).
+        step_s: sampling step.
+        least_rad: way that counts as motion.
+    """
+    way, rest = np.zeros(position_rad.size), np.zeros(position_rad.size)
+    moving, direction, rested = False, 1.0, 0.0
+    still = 1.0  # Before a recording begins, the joint has rested.
+    start = turn = mark = position_rad[0]
+    marked = 0
+    for k in range(position_rad.size):
+        q = position_rad[k]
+        if not moving:
+            still += step_s
+            if abs(q - start) > least_rad:
+                moving, direction, rested = True, 1.0 if q > start else -1.0, still
+                turn, mark, marked = q, q, k
+        else:
+            if direction * (q - turn) > 0.0:
+                turn = q
+            if direction * (turn - q) > least_rad:
+                start, turn, mark, marked = turn, q, q, k
+                direction, rested = -direction, 0.0
+            elif abs(q - mark) > least_rad:
+                mark, marked = q, k
+            elif (k - marked) * step_s > STILL_S:
+                moving, start, still = False, q, (k - marked) * step_s
+        way[k] = abs(q - start) if moving else 0.0
+        rest[k] = rested if moving else still
+    return way, rest

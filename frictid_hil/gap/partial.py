@@ -18,7 +18,7 @@ from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.residuals import Recording, rms
 from frictid_hil.gap.tracking import diagnose_tracking
 from frictid_hil.gap.where import where
-from frictid_hil.gap.which import best_family
+from frictid_hil.gap.which import best_family, families_beside
 from frictid_hil.simulation.effects import all_effects
 
 LEAST_IMPROVEMENT = 0.05
@@ -86,7 +86,7 @@ def diagnose_without_replay(
     chosen = _chosen(evidence, other, trials, as_stated=base.offset_nm == 0.0)
     nominal_nm = _judged_nm(evidence, ())
     after_nm = _judged_nm(evidence, chosen)
-    family = best_family(evidence, chosen)
+    family = best_family(families_beside(evidence, chosen))
     family_share = family[0] / max(
         1.0, 0.5 * evidence.misfit_ratio(chosen) * (evidence.fitted.rows if evidence.fitted else 1.0)
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
@@ -56,6 +56,10 @@ class Features:
         floor_nm: torque that noise and tolerances leave.
         probed: effect found by replay alone -> (log-likelihood it gained, the same of its best rival, that rival).
         hollow: plant effect -> part of what it closes that its shape closes without its strength.
+        generic: log-likelihood that the best family adds, those counted that are too near an effect for a verdict.
+        worst_log: misfit of the validation log that is explained worst, over the misfit of all.
+        spread: late effect of the drive -> how far its spread in time may be from what it brings, over its square.
+        position_left: squared position difference with the effects over that without, on the judged logs.
     """
 
     before: float
@@ -81,6 +85,10 @@ class Features:
     floor_nm: float
     probed: Mapping[str, tuple[float, float, str]]
     hollow: Mapping[str, float]
+    generic: float = 0.0
+    worst_log: float = 1.0
+    spread: Mapping[str, float] = field(default_factory=dict)
+    position_left: float = 1.0
 
 
 def verdict_of(f: Features) -> tuple[str, str]:

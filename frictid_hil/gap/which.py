@@ -7,10 +7,11 @@ as explain almost all that any of these models explains.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from frictid_hil.gap.evidence import FAMILY, Evidence, Group
+from frictid_hil.gap.generic import START
 
 LEAST_GAIN = 12.0
 """Log-likelihood, per misfit ratio, below which an effect is not looked at."""
@@ -87,8 +88,8 @@ def rank(evidence: Evidence) -> Ranking:
         misfit=max(1e-9, -2.0 * bare / rows),
         misfit_chosen=evidence.misfit_ratio(chosen.groups),
         replaced=replacements(evidence, chosen, effects, bare),
-        family=best_family(evidence, chosen.groups),
-        family_alone=best_family(evidence, ()),
+        family=best_family(families_beside(evidence, chosen.groups)),
+        family_alone=best_family(families_beside(evidence, ())),
         rows=rows,
     )
 
@@ -153,12 +154,16 @@ def replacements(evidence: Evidence, model: Model, effects: Sequence[str], bare:
     return result
 
 
-def best_family(evidence: Evidence, groups: Sequence[Group]) -> tuple[float, str]:
-    """(what the best generic family adds to a model, its name)."""
+def families_beside(evidence: Evidence, groups: Sequence[Group]) -> dict[str, float]:
+    """What each generic family adds to a model."""
     base = evidence.score(groups)
-    found = [
-        (evidence.score([*groups, group]) - base, group[0].removeprefix(FAMILY))
+    return {
+        group[0].removeprefix(FAMILY): evidence.score([*groups, group]) - base
         for group in evidence.groups
         if group[0].startswith(FAMILY)
-    ]
-    return max(found)
+    }
+
+
+def best_family(added: Mapping[str, float]) -> tuple[float, str]:
+    """(what the best of those families adds that a verdict may rest on, its name)."""
+    return max((gain, name) for name, gain in added.items() if name != START)
