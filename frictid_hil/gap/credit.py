@@ -19,6 +19,8 @@ from frictid_hil.gap.how_far import STANDS_ALONE, Hypothesis, Judge, clear, take
 
 BEYOND_CHANCE = 2.0
 """Standard errors from which a change counts."""
+NEXT_TO_NOTHING = 0.1
+"""Share of what a set closes below which an effect must be borne out otherwise."""
 OPENED = 0.2
 """Growth of the squared position difference from which, beyond chance, effects are refused that closed the torque's."""
 
@@ -79,13 +81,18 @@ def sound(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
 
 
 def _uncredited(judge: Judge, hypothesis: Hypothesis) -> str | None:
-    """The effect that closes least, where it opens the gap, or closes no more than chance and the plant denies it."""
+    """The effect that closes least, where it opens the gap, or closes next to nothing and the plant denies it.
+
+    What comes rarely but strongly (play, a break-away) lies in few stretches, so that its standard error is large:
+    a large share counts whatever that is.
+    """
     earned = credits(judge, hypothesis, hypothesis.names)
-    name = min(earned, key=lambda n: earned[n].deviations)
+    name = min(earned, key=lambda n: earned[n].share)
     credit = earned[name]
-    if credit.deviations < -BEYOND_CHANCE:
+    if credit.deviations < -BEYOND_CHANCE or credit.share < -NEXT_TO_NOTHING:
         return name
-    return name if credit.deviations < BEYOND_CHANCE and not _shows_in_plant(judge, hypothesis, name) else None
+    little = credit.share < NEXT_TO_NOTHING and credit.deviations < BEYOND_CHANCE
+    return name if little and not _shows_in_plant(judge, hypothesis, name) else None
 
 
 def _shows_in_plant(judge: Judge, hypothesis: Hypothesis, name: str) -> bool:
@@ -105,4 +112,4 @@ def _buys_torque_with_position(judge: Judge, hypothesis: Hypothesis) -> str | No
     if opened.share <= OPENED or opened.deviations <= BEYOND_CHANCE:
         return None
     earned = credits(judge, hypothesis, hypothesis.names, "position_rad")
-    return min(earned, key=lambda n: earned[n].deviations)
+    return min(earned, key=lambda n: earned[n].share)

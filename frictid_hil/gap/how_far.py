@@ -141,7 +141,11 @@ class Judge:
 
     def without(self, given: Hypothesis, name: str) -> Hypothesis:
         """``given`` without one effect, the rest fitted again."""
-        rest = self(tuple(g for g in given.groups if g[0] != name))
+        groups = tuple(g for g in given.groups if g[0] != name)
+        rest = self(groups)
+        if groups and set(groups) != set(rest.groups):
+            # Shapes that were refined beside the effect may be better than what the grid led to without it.
+            rest = self._known[frozenset(g[0] for g in groups)] = min(rest, self._refined(groups), key=lambda h: h.cost)
         for hidden in given.replayed:
             if hidden != name:
                 rest = replace(self.probed(rest, hidden) or rest, probe=given.probe)

@@ -96,7 +96,7 @@ def verdict_of(f: Features) -> tuple[str, str]:
     # Next to a fault of the drive that is explained, the finer points of its formula are no other fault.
     another = f.actuation_rest > DRIVE_DETAIL
     coloured = f.actuation_ratio > COLOURED or f.actuation_motion > FOLLOWS_MOTION
-    if f.actuation_left > 0.3 or (another and coloured):
+    if another and (f.actuation_left > 0.3 or coloured):
         return "unknown", "actuation"
     if f.held_share > HELD_SHARE:
         return "unknown", "kinematics: positions repeat while the joint moves"
