@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,6 +20,11 @@ from rich.console import Console
 from frictid_hil.errors import Defect, FrictidError
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
+
+READING = "profiles read anew for the store's index"
+"""What takes long where the index of a store was lost, or its baseline changed."""
+
+_COUNT_EVERY_S = 2.0
 
 NOTIFY_TIMEOUT_S = 60.0
 """A command of ``--notify`` may take this long."""
@@ -52,6 +58,18 @@ class Output:
         """For results, on stdout; silent with ``--json``."""
         width = None if sys.stdout.isatty() else 120
         return Console(quiet=self.as_json, highlight=False, width=width)
+
+    def counting(self, doing: str) -> Callable[[int, int], None]:
+        """Something to tell how many of how many are done: a line on stderr every two seconds, none for quick work."""
+        console, told_s = self.err, time.monotonic()
+
+        def count(done: int, of: int) -> None:
+            nonlocal told_s
+            if time.monotonic() - told_s >= _COUNT_EVERY_S:
+                told_s = time.monotonic()
+                console.print(f"{doing}: {done} of {of}")
+
+        return count
 
     def run(self, verb: str, job: Callable[[], Result], show: Callable[[Result], None] | None = None) -> NoReturn:
         """Call a job, print its result, leave with its exit code.

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from frictid_hil.cli.options import JsonOption, ProfileArgument, QuietOption, StoreOption
-from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.output import READING, Output, Result
 from frictid_hil.units import degrees
 
 RobotName = Annotated[
@@ -107,9 +107,10 @@ def promote(
     from frictid_hil.jobs.profiles import promote as job
 
     output = Output(as_json, quiet)
+    told = output.counting(READING)
     output.run(
         "profile_promote",
-        lambda: job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force),
+        lambda: job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force, told=told),
         lambda result: output.out.print(f"active: {result['active']}", soft_wrap=True),
     )
 
@@ -170,7 +171,9 @@ def history(
             output.out.print(f"{older} older profiles are not shown; see them with --last 0")
 
     shown = last if last is not None else 0 if as_json else _SHOWN
-    output.run("profile_history", lambda: job(ProfileStore(store), robot, last=shown or None), show)
+    output.run(
+        "profile_history", lambda: job(ProfileStore(store, output.counting(READING)), robot, last=shown or None), show
+    )
 
 
 def _cell(joint: Result | None) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from frictid_hil.cli.options import JsonOption, QuietOption, StoreOption
-from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.output import READING, Output, Result
 
 
 def register(app: typer.Typer) -> None:
@@ -41,4 +41,4 @@ def report(
             if key in result:
                 output.out.print(result[key], soft_wrap=True)
 
-    output.run("report", lambda: job(run, robot=robot, store=store), show)
+    output.run("report", lambda: job(run, robot=robot, store=store, told=output.counting(READING)), show)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from frictid_hil.config.profile import FrictionProfile, JointProfile
-from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.metrics import rms_and_mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,11 @@ def drift(older: FrictionProfile, newer: FrictionProfile) -> dict[str, JointDrif
 
 def joint_drift(older: JointProfile, newer: JointProfile) -> JointDrift:
     """One joint."""
-    top = min(older.velocity_rad_s[-1], newer.velocity_rad_s[-1])
-    distance = curve_distance(newer.curve(), older.curve(), top)
+    distance_nm, mean_nm = distance_and_mean_nm(older.curve(), newer.curve())
     before, after = older.coulomb_nm.value, newer.coulomb_nm.value
     return JointDrift(
-        distance_nm=distance.e_nm,
-        distance_percent=distance.e_percent,
+        distance_nm=distance_nm,
+        distance_percent=100.0 * distance_nm / mean_nm,
         coulomb_change_percent=None if before is None or after is None else 100.0 * (after - before) / abs(before),
         overlap_share=_overlap_share(older, newer),
         temperature_change_c=None
@@ -56,6 +56,12 @@ def joint_drift(older: JointProfile, newer: JointProfile) -> JointDrift:
             name: f"{was} -> {now}" for name, (was, now) in _circumstances(older, newer).items() if was != now
         },
     )
+
+
+def distance_and_mean_nm(older: FrictionCurve, newer: FrictionCurve) -> tuple[float, float]:
+    """E of (15) over [0, V], V the highest measured speed of both, and the older curve's mean there."""
+    top = min(older.velocity_rad_s[-1], newer.velocity_rad_s[-1])
+    return rms_and_mean(newer, older, 0.0, top)
 
 
 def _overlap_share(older: JointProfile, newer: JointProfile) -> float | None:

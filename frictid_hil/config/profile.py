@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -319,7 +318,7 @@ def load_profile(path: str | Path) -> FrictionProfile:
 def profile_from(document: Document) -> FrictionProfile:
     """A profile from a document already read; raises as ``load_profile``."""
     version = schema_version(document, KIND, NEWEST)
-    document = _with_rotary_names(document)
+    document = with_rotary_names(document)
     values = document.data
     for major in range(version, NEWEST):
         values = MIGRATIONS[major](values)
@@ -327,7 +326,7 @@ def profile_from(document: Document) -> FrictionProfile:
     return validated(document, FrictionProfile, values)
 
 
-def _with_rotary_names(document: Document) -> Document:
+def with_rotary_names(document: Document) -> Document:
     """The same document with the joints of linear axes under rotary names, every value keeping its place."""
     joints = document.root.content.get("joints")
     if joints is None or not joints.is_mapping:
@@ -340,7 +339,7 @@ def _with_rotary_names(document: Document) -> Document:
             return path
         return tuple(linear_name(key) if isinstance(key, str) else key for key in path)
 
-    root = replace(document.root, content={**document.root.content, "joints": replace(joints, content=renamed)})
+    root = document.root._replace(content={**document.root.content, "joints": joints._replace(content=renamed)})
     return Document(document.path, root, spelled)
 
 
@@ -354,8 +353,8 @@ def _renamed(node: Node) -> Node:
     for key, child in node.content.items():
         if isinstance(key, str) and linear_name(key) != key:
             raise ConfigError(f"{key}: a linear axis says {linear_name(key)}", where=str(child.key_place))
-    return replace(
-        node, content={rotary_name(k) if isinstance(k, str) else k: _renamed(v) for k, v in node.content.items()}
+    return node._replace(
+        content={rotary_name(k) if isinstance(k, str) else k: _renamed(v) for k, v in node.content.items()}
     )
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -25,11 +25,11 @@ from pathlib import Path
 import filelock
 
 from frictid_hil.config.journal import append_line, append_lines, journal_lines
-from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.profile import KIND, NEWEST, FrictionProfile, load_profile
 from frictid_hil.config.promotions import Promotion, active_stack, baseline_of, promotions_in
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.search import user_data_dir
-from frictid_hil.config.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary
+from frictid_hil.config.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary, summary_of_file
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
 
@@ -42,10 +42,12 @@ class ProfileStore:
 
     Args:
         root: the folder; the user's data folder unless told. It is made when something is added.
+        told: how many of how many profiles were read so far, where all of them have to be.
     """
 
-    def __init__(self, root: Path | None = None) -> None:
+    def __init__(self, root: Path | None = None, told: Callable[[int, int], None] | None = None) -> None:
         self.root = user_data_dir() / "store" if root is None else root
+        self._told = told or (lambda done, of: None)
 
     def robots(self) -> list[str]:
         """Names of the robots that have profiles here, sorted."""
@@ -106,13 +108,7 @@ class ProfileStore:
             ConfigError: its file is not what was added.
         """
         path = self.path(robot, identity)
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        if not path.stem.endswith(sha256[:12]):
-            raise ConfigError(
-                "the file was changed after it was stored",
-                where=str(path),
-                next_step="restore it from a backup, or roll back to another profile",
-            )
+        _unchanged_bytes(path)
         return load_profile(path)
 
     def active(self, robot: str) -> Promotion | None:
@@ -187,8 +183,7 @@ class ProfileStore:
         present = _profile_ids(folder)
         index = _index(folder, robot, present)
         if len(index) < len(present):
-            reference = self._reference(robot)
-            found = [summary(lost, self.load(robot, lost), reference) for lost in sorted(present - index.keys())]
+            found = self._measured(robot, present - index.keys())
             index |= {stored.id: stored for stored in found}
             self._note(robot, found)
         return [index[identity] for identity in sorted(index)]
@@ -200,25 +195,22 @@ class ProfileStore:
             ConfigError: a profile's file was changed.
         """
         with self._locked(robot) as folder:
-            reference = self._reference(robot)
-            every = [
-                summary(identity, self.load(robot, identity), reference) for identity in sorted(_profile_ids(folder))
-            ]
+            every = self._measured(robot, _profile_ids(folder))
             write_whole(folder / "index.jsonl", "".join(json.dumps(line_of(stored)) + "\n" for stored in every))
 
     def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
-        reference = self._reference(robot)
+        baseline = self.baseline(robot)
+        history = {stored.id: stored for stored in self.history(robot)}
+        stale = {stored.id for stored in history.values() if stored.baseline != baseline}
+        if stale:
+            measured_anew = self._measured(robot, stale)
+            history |= {stored.id: stored for stored in measured_anew}
+            self._note(robot, measured_anew)
         trends: dict[str, list[TrendPoint]] = {}
-        measured_anew = []
-        for stored in self.history(robot):
-            if stored.baseline != reference.id:
-                stored = summary(stored.id, self.load(robot, stored.id), reference)
-                measured_anew.append(stored)
+        for stored in history.values():
             for name, joint in stored.joints.items():
                 trends.setdefault(name, []).append(TrendPoint(stored.id, stored.created_utc, joint))
-        if measured_anew:
-            self._note(robot, measured_anew)
         return trends
 
     def _folder(self, robot: str) -> Path:
@@ -241,6 +233,18 @@ class ProfileStore:
     def _reference(self, robot: str) -> Reference:
         baseline = self.baseline(robot)
         return Reference(baseline, None if baseline is None else self.load(robot, baseline))
+
+    def _measured(self, robot: str, identities: Collection[str]) -> list[Stored]:
+        """Summaries from the profiles themselves, against the baseline of today, oldest first."""
+        reference, found = self._reference(robot), []
+        for identity in sorted(identities):
+            text = _unchanged_bytes(self.path(robot, identity)).decode()
+            if text.startswith(f"schema: {KIND}/{NEWEST}\n"):
+                found.append(summary_of_file(identity, robot, text, reference))
+            else:
+                found.append(summary(identity, self.load(robot, identity), reference))
+            self._told(len(found), len(identities))
+        return found
 
     def _note(self, robot: str, found: Sequence[Stored]) -> None:
         """Add lines to the index; it only saves time, so a store that may not be written stays as it is."""
@@ -273,6 +277,18 @@ def _index(folder: Path, robot: str, present: Set[str]) -> dict[str, Stored]:
         if stored is not None and stored.id in present:
             index[stored.id] = stored
     return index
+
+
+def _unchanged_bytes(path: Path) -> bytes:
+    """The bytes of a stored profile, seen to be those that were stored."""
+    raw = path.read_bytes()
+    if not path.stem.endswith(hashlib.sha256(raw).hexdigest()[:12]):
+        raise ConfigError(
+            "the file was changed after it was stored",
+            where=str(path),
+            next_step="restore it from a backup, or roll back to another profile",
+        )
+    return raw
 
 
 def _profile_path(folder: Path, identity: str) -> Path:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 import yamlcore
@@ -24,10 +24,14 @@ KeyPath = tuple[Key, ...]
 MAX_BYTES = 16_000_000
 MAX_DEPTH = 40
 MAX_NODES = 500_000
+_TEXT = "tag:yaml.org,2002:str"
+_SCALARS = {
+    f"tag:yaml.org,2002:{kind}": yamlcore.CCoreLoader.yaml_constructors[f"tag:yaml.org,2002:{kind}"]
+    for kind in ("bool", "int", "float", "null")
+}
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(NamedTuple):
     """Where in a file; line and column count from 1."""
 
     path: Path
@@ -38,8 +42,7 @@ class Place:
         return f"{self.path.name}:{self.line}:{self.column}"
 
 
-@dataclass(frozen=True, slots=True)
-class Node:
+class Node(NamedTuple):
     """One value of the file with its place.
 
     Attributes:
@@ -225,25 +228,25 @@ class _Builder:
 
     def __init__(self, text: str, path: Path) -> None:
         self._events = yamlcore.CCoreLoader(text)
+        self._next: Callable[[], Any] = self._events.get_event
         self._path = path
         self._anchors: dict[str, Node] = {}
         self._nodes = 0
 
     def document(self) -> Node:
-        events = self._events
-        events.get_event()  # stream start
-        if events.check_event(yaml.StreamEndEvent):
+        self._next()  # stream start
+        event = self._next()  # document start
+        if isinstance(event, yaml.StreamEndEvent):
             start = Place(self._path, 1, 1)
             return Node(start, start, None)
-        events.get_event()  # document start
-        root = self._node(None, 0)
-        events.get_event()  # document end
-        if not events.check_event(yaml.StreamEndEvent):
-            raise self._refused("a second document starts here; one file holds one", self._place(events.get_event()))
+        root = self._node(self._next(), None, 0)
+        self._next()  # document end
+        event = self._next()
+        if not isinstance(event, yaml.StreamEndEvent):
+            raise self._refused("a second document starts here; one file holds one", self._place(event))
         return root
 
-    def _node(self, key_place: Place | None, depth: int) -> Node:
-        event = self._events.get_event()
+    def _node(self, event: Any, key_place: Place | None, depth: int) -> Node:
         place = self._place(event)
         if depth > MAX_DEPTH:
             raise self._refused(f"nested deeper than {MAX_DEPTH} levels", place)
@@ -256,25 +259,20 @@ class _Builder:
         self._count(1, place)
         if event.tag is not None and event.tag != "!" and not event.tag.startswith("tag:yaml.org,2002:"):
             raise self._refused(f"tags like {event.tag} are not read", place)
-        node = self._collection_or_scalar(event, place, key_place or place, depth)
+        if isinstance(event, yaml.ScalarEvent):
+            node = Node(place, key_place or place, self._scalar(event, place))
+        else:
+            is_list = isinstance(event, yaml.SequenceStartEvent)
+            children = self._sequence(depth) if is_list else self._mapping(depth)
+            size = 1 + sum(child.size for child in children.values())
+            node = Node(place, key_place or place, children, is_list, size)
         if event.anchor:
             self._anchors[event.anchor] = node
         return node
 
-    def _collection_or_scalar(self, event: Any, place: Place, key_place: Place, depth: int) -> Node:
-        if isinstance(event, yaml.MappingStartEvent):
-            children = self._mapping(depth)
-        elif isinstance(event, yaml.SequenceStartEvent):
-            children = self._sequence(depth)
-        else:
-            return Node(place, key_place, self._scalar(event, place))
-        is_list = isinstance(event, yaml.SequenceStartEvent)
-        return Node(place, key_place, children, is_list, 1 + sum(child.size for child in children.values()))
-
     def _mapping(self, depth: int) -> dict[Key, Node]:
         children: dict[Key, Node] = {}
-        while not self._events.check_event(yaml.MappingEndEvent):
-            event = self._events.get_event()
+        while not isinstance(event := self._next(), yaml.MappingEndEvent):
             place = self._place(event)
             if not isinstance(event, yaml.ScalarEvent):
                 raise self._refused("a key must be plain text", place)
@@ -282,23 +280,23 @@ class _Builder:
             if key in children:
                 first = children[key].key_place
                 raise self._refused(f"key {key!r} appears twice; first on line {first.line}", place)
-            children[key] = self._node(place, depth + 1)
-        self._events.get_event()
+            children[key] = self._node(self._next(), place, depth + 1)
         return children
 
     def _sequence(self, depth: int) -> dict[Key, Node]:
         children: dict[Key, Node] = {}
-        while not self._events.check_event(yaml.SequenceEndEvent):
-            children[len(children)] = self._node(None, depth + 1)
-        self._events.get_event()
+        while not isinstance(event := self._next(), yaml.SequenceEndEvent):
+            children[len(children)] = self._node(event, None, depth + 1)
         return children
 
     def _scalar(self, event: Any, place: Place) -> Any:
-        tag = event.tag
+        tag, events = event.tag, self._events
         if tag is None or tag == "!":
-            tag = self._events.resolve(yaml.ScalarNode, event.value, event.implicit if tag is None else (False, True))
+            tag = events.resolve(yaml.ScalarNode, event.value, event.implicit if tag is None else (False, True))
+        if tag == _TEXT:
+            return event.value
         try:
-            return self._events.construct_object(yaml.ScalarNode(tag, event.value), deep=True)
+            return _SCALARS[tag](events, yaml.ScalarNode(tag, event.value))
         except (ValueError, KeyError, yaml.constructor.ConstructorError):
             raise self._refused(f"{event.value[:40]!r} is not a valid {tag.rpartition(':')[2]}", place) from None
 
@@ -308,7 +306,8 @@ class _Builder:
             raise self._refused(f"more than {MAX_NODES} values", place)
 
     def _place(self, event: Any) -> Place:
-        return Place(self._path, event.start_mark.line + 1, event.start_mark.column + 1)
+        mark = event.start_mark
+        return Place(self._path, mark.line + 1, mark.column + 1)
 
     @staticmethod
     def _refused(what: str, place: Place) -> ConfigError:

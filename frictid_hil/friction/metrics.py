@@ -41,19 +41,20 @@ def curve_distance(curve: FrictionCurve, reference: FrictionCurve, velocity_rad_
     """
     low, high = curve.measured_range_rad_s
     high = min(high, velocity_rad_s)
-    whole, whole_mean = _rms_and_mean(curve, reference, 0.0, velocity_rad_s)
-    inner, inner_mean = _rms_and_mean(curve, reference, low, high)
+    whole, whole_mean = rms_and_mean(curve, reference, 0.0, velocity_rad_s)
+    inner, inner_mean = rms_and_mean(curve, reference, low, high)
     return CurveDistance(whole, 100 * whole / whole_mean, inner, 100 * inner / inner_mean)
 
 
 def curve_mean(curve: FrictionCurve, low_rad_s: float, high_rad_s: float) -> float:
     """Mean of phi over [low, high], N m, exactly."""
-    return _rms_and_mean(curve, curve, low_rad_s, high_rad_s)[1]
+    return rms_and_mean(curve, curve, low_rad_s, high_rad_s)[1]
 
 
-def _rms_and_mean(
+def rms_and_mean(
     curve: FrictionCurve, reference: FrictionCurve, low_rad_s: float, high_rad_s: float
 ) -> tuple[float, float]:
+    """E of (15) over one interval and the reference's mean there, N m, exactly."""
     knots = np.concatenate([curve.velocity_rad_s, reference.velocity_rad_s])
     inner = knots[(knots > low_rad_s) & (knots < high_rad_s)]
     grid = np.unique(np.concatenate([[low_rad_s], inner, [high_rad_s]]))

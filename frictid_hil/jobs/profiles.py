@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,7 @@ def promote(
     reason: str = "",
     baseline: bool = False,
     force: bool = False,
+    told: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Make a profile the active one.
 
@@ -73,6 +75,7 @@ def promote(
         reason: for the history.
         baseline: drift is measured from it from now on, too.
         force: also with failed quality gates.
+        told: as ``ProfileStore``'s.
 
     Raises:
         GateFailed: a quality gate failed.
@@ -85,11 +88,13 @@ def promote(
         if any(not gate.passed for gate in one.gates)
     }
     if bad and not force:
-        told = "; ".join(f"joint {joint}: {', '.join(gates)}" for joint, gates in bad.items())
+        failed = "; ".join(f"joint {joint}: {', '.join(gates)}" for joint, gates in bad.items())
         raise GateFailed(
-            f"quality gates failed: {told}", where=name, next_step="measure again; or promote with --force, knowing why"
+            f"quality gates failed: {failed}",
+            where=name,
+            next_step="measure again; or promote with --force, knowing why",
         )
-    kept = ProfileStore(store)
+    kept = ProfileStore(store, told)
     identity = kept.add(profile)
     before = kept.active(profile.robot)
     promotion = kept.promote(profile.robot, identity, by=_person(), reason=reason)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,20 @@ from frictid_hil.report.pages import write_page
 from frictid_hil.runner.run_folder import load_manifest
 
 
-def report(run: Path | None = None, *, robot: str | None = None, store: Path | None = None) -> dict[str, Any]:
+def report(
+    run: Path | None = None,
+    *,
+    robot: str | None = None,
+    store: Path | None = None,
+    told: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
     """Write ``report.html`` into a run folder, or the index page of a robot.
 
     Args:
         run: folder. A run of compensation has its page since it ended, and is told where it is.
         robot: instead of a run: robot file, or name of a robot that the store knows.
         store: folder of the profile store; None for the user's own.
+        told: as ``ProfileStore``'s.
 
     Raises:
         UsageError: neither or both; not a run folder; nothing was identified in it; nothing known of the robot.
@@ -32,7 +40,7 @@ def report(run: Path | None = None, *, robot: str | None = None, store: Path | N
     if (run is None) == (robot is None):
         raise UsageError("name one: the folder of a run, or a robot with --robot")
     if robot is not None:
-        page = write_index_page(ProfileStore(store), _name_of(robot))
+        page = write_index_page(ProfileStore(store, told), _name_of(robot))
         return {"outcome": "ok", "report": str(page.resolve())}
     assert run is not None  # by the check above
     manifest = load_manifest(run)

@@ -10,12 +10,15 @@ from pathlib import Path
 
 import filelock
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from frictid_hil.config import store as store_module
 from frictid_hil.config.drift import drift
-from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile
+from frictid_hil.config.profile import DriveIdentity, Estimate, FrictionProfile, Gate, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.store import ProfileStore
+from frictid_hil.config.summary import Reference, summary, summary_of_file
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 
 V = (0.2, 0.4, 0.6, 1.9)
@@ -330,3 +333,45 @@ def test_ten_thousand_profiles_are_told_in_two_seconds(tmp_path: Path) -> None:
     took_s = time.process_time() - began
     assert len(history) == len(trends["5"]) == 10_000
     assert took_s < 2.0
+
+
+words = st.text("abc :#'\"\n-{}[]é", max_size=200)
+figures = st.floats(1.0, 9.0)
+
+
+@st.composite
+def stored_joints(draw: st.DrawFn) -> JointProfile:
+    count = draw(st.integers(2, 12))
+    torque = sorted(draw(st.lists(figures, min_size=count, max_size=count, unique=True)))
+    missing = draw(st.booleans())
+    return JointProfile(
+        method=draw(words),
+        prismatic=draw(st.booleans()),
+        velocity_rad_s=tuple(0.2 * (n + 1) for n in range(count)),
+        torque_nm=tuple(torque),
+        torque_interval_nm=draw(st.sampled_from([None, tuple((t - 0.1, t + 0.1) for t in torque)])),
+        coulomb_nm=Estimate.none("why: - not") if missing else Estimate(value=draw(figures)),
+        temperature_c=draw(st.one_of(st.none(), figures)),
+        torque_source=draw(words),
+        drive=DriveIdentity(settings={"a": {"joints": 1}, "gates": [{"name": draw(words)}]}),
+        gates=tuple(Gate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
+    )
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(joints=st.dictionaries(st.sampled_from(["0", "joints", "a: b", "- x", "é"]), stored_joints(), min_size=1))
+def test_a_summary_from_the_lines_it_needs_is_that_of_the_whole_profile(joints: dict[str, JointProfile]) -> None:
+    whole = FrictionProfile(robot="hp3j", joints=joints, provenance=Provenance(created_utc="2026-01-01T02:00:00Z"))
+    for reference in (Reference(None, None), Reference("first", profile(1.1, joints="0"))):
+        assert summary_of_file("id", "hp3j", whole.to_yaml(), reference) == summary("id", whole, reference)
+
+
+def test_reading_many_profiles_anew_is_told(store: ProfileStore) -> None:
+    for night in range(3):
+        store.add(profile(night=night))
+    (store.root / "hp3j" / "index.jsonl").unlink()
+    told: list[tuple[int, int]] = []
+    ProfileStore(store.root, lambda done, of: told.append((done, of))).history("hp3j")
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    ProfileStore(store.root, lambda done, of: told.append((done, of))).history("hp3j")
+    assert len(told) == 3, "the index was written"
