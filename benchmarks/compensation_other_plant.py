@@ -1,6 +1,6 @@
 """Compensation of a joint that was not simulated by this product's own plant (``other_plant``).
 
-    python benchmarks/compensation_other_plant.py [--joint 3] [--seed 0]
+    python benchmarks/compensation_other_plant.py [--joint 3] [--seed 0] [--kept runs/other]
 
 Calibrated and compensated by the product, through driver, bus and simulated drive; nothing is told of the plant but
 what a robot file says of a real joint (gear, limits, encoder).
@@ -12,24 +12,27 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from compensation_robots import variant
+from compensation_robots import JOINTS, variant
 from other_plant import OtherPlant
 
 from frictid_drivers.virtual import joint_drive
 from frictid_hil.config.profile import load_profile
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.jobs.watch import Silent
 
-JOINTS = ("0", "1", "2", "3", "4", "5")
 
-
-def calibrated(joint: str, folder: Path, bus: str, seed: int) -> tuple[Path, Path]:
-    """(Robot file, profile) of one joint of the other plant, identified by the product."""
+def calibrated(joint: str, kept: Path, bus: str, seed: int) -> tuple[Path, Path]:
+    """(Robot file, profile) of one joint of the other plant, identified by the product unless ``kept`` has them."""
     joint_drive.ServoLoop = OtherPlant  # type: ignore[attr-defined,assignment]
-    robot = variant(folder / "robot.yaml", joints=[joint])
-    result = calibrate(CalibrateOptions(str(robot), out=folder / "cal", bus=bus, seed=seed), Silent())
-    return robot, Path(result["profile"])
+    folder = kept / f"{joint}-seed-{seed}"
+    robot, profile = folder / "robot.yaml", folder / "calibration" / "profile.yaml"
+    if not profile.exists():
+        folder.mkdir(parents=True)
+        variant(robot, joints=[joint])
+        calibrate(CalibrateOptions(str(robot), out=profile.parent, bus=bus, seed=seed), Silent())
+    return robot, profile
 
 
 def main() -> None:
@@ -37,6 +40,7 @@ def main() -> None:
     parser.add_argument("--joint", action="append")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bus", default="virtual:other")
+    parser.add_argument("--kept", type=Path, help="folder of calibrations, used again where it has them")
     options = parser.parse_args()
     print(f"# LuGre, two masses, Runge-Kutta; setting ours, seed {options.seed}")
     print(
@@ -46,14 +50,14 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
         with tempfile.TemporaryDirectory() as folder:
-            path, profile = calibrated(joint, Path(folder), options.bus, options.seed)
+            path, profile = calibrated(joint, options.kept or Path(folder), options.bus, options.seed)
             robot, common = str(path), {"bus": options.bus, "seed": options.seed}
-            asked = CompensateOptions(robot, profile, joint, "hand", ("nc", "mop"), out=Path(folder) / "hand", **common)
-            hand = compensate(asked, Silent())
-            asked = CompensateOptions(
-                robot, profile, joint, "track", ("nc", "mop-reference"), out=Path(folder) / "track", **common
+            hand, track = (
+                compensate(
+                    CompensateOptions(robot, profile, joint, wanted, out=Path(folder) / wanted.task, **common), Silent()
+                )
+                for wanted in (Wanted("hand", ("nc", "mop")), Wanted("track", ("nc", "mop-reference")))
             )
-            track = compensate(asked, Silent())
             entry = load_profile(profile).joints[joint]
             presliding = entry.presliding_stiffness_nm_per_rad.value or float("nan")
         nc, mop = hand["modes"].get("nc"), hand["modes"].get("mop")

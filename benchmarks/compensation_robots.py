@@ -10,6 +10,8 @@ from typing import Any
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 
+JOINTS = ("0", "1", "2", "3", "4", "5")
+
 
 def variant(
     path: Path, *, joints: Sequence[str] = (), elastic_hz: float = 0.0, delay_cycles: int = 2, robot: str = "hp3j.yaml"

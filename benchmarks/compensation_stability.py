@@ -7,11 +7,12 @@
 With ``--elastic 30`` the links resonate at 30 Hz; the profile is then one identified on such joints (``calibrate
 --robot`` with the file that ``robot --elastic 30 --out FILE`` writes).
 
-With ``--other`` they are joints that this product did not simulate (``other_plant``), each calibrated first.
+With ``--other`` they are joints that this product did not simulate (``other_plant``), each calibrated first; with ``--kept FOLDER``
+once for all.
 
 ``bus``: R + 0.02 and K + 10 %, with 2 and 5 cycles of delay, through driver, bus and drive. ``free``: a person swings
 the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
-it.
+it; forwards and backwards.
 
 ``limits``: R and K upwards from our setting in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer
 comes to rest within 4 s; without the bus, by the product's own controller on the simulated joint. A joint stands where
@@ -31,7 +32,7 @@ from typing import Any
 
 import numpy as np
 from compensation_other_plant import calibrated
-from compensation_robots import variant
+from compensation_robots import JOINTS, variant
 from other_plant import OtherPlant
 
 from frictid_drivers.virtual import joint_drive
@@ -49,7 +50,6 @@ from frictid_hil.runner.run import run_plan
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
-JOINTS = ("0", "1", "2", "3", "4", "5")
 STILL_DEG_S = 0.01
 MORE_RATIO, MORE_STIFFNESS = 0.02, 1.1
 PUSHED_RAD_S, PUSHED_HZ = math.radians(20.0), 0.5
@@ -100,8 +100,7 @@ def of_joint(options: argparse.Namespace, joint: str, folder: Path, delay: int =
     robot = variant(folder / "robot.yaml", joints=[joint], elastic_hz=options.elastic, delay_cycles=delay)
     if not options.other:
         return robot, load_profile(options.profile).joints[joint], ServoLoop
-    (folder / "calibration").mkdir()
-    _, profile = calibrated(joint, folder / "calibration", options.bus, options.seed)
+    _, profile = calibrated(joint, options.kept or folder, options.bus, options.seed)
     return robot, load_profile(profile).joints[joint], OtherPlant
 
 
@@ -115,8 +114,10 @@ class Forgetful:
         """Ignore."""
 
 
-def on_the_bus(robot: Path, bus: str, entry: JointProfile, joint: str, hold: bool, seed: int) -> tuple[float, str]:
-    """(True speed of the last second, deg/s rms; what stopped it) at R + 0.02 and K + 10 %."""
+def on_the_bus(
+    robot: Path, bus: str, entry: JointProfile, joint: str, hold: bool, way: float, seed: int
+) -> tuple[float, str]:
+    """(True speed of the last second, deg/s rms; what stopped it) at R + 0.02 and K + 10 %, moved forwards or back."""
     loaded = load_robot(str(robot))
     setup = loaded.to_setup(bus, seed=seed)
     one = setup.joint(joint)
@@ -126,11 +127,13 @@ def on_the_bus(robot: Path, bus: str, entry: JointProfile, joint: str, hold: boo
     amplitude = PUSHED_RAD_S / (2 * math.pi * PUSHED_HZ)
     motions: list[Motion] = [Move.within(one.locked_position_rad, centre, math.radians(20.0)), Hold(centre, 0.3)]
     if hold:
-        there = Move.within(centre, centre + math.radians(5.0), math.radians(20.0))
-        motions.append(Compensated("there", there, law, wide))
-        motions.append(Compensated("rest", Hold(centre + math.radians(5.0), REST_S), law, wide))
+        goal = centre + way * math.radians(5.0)
+        motions.append(Compensated("there", Move.within(centre, goal, math.radians(20.0)), law, wide))
+        motions.append(Compensated("rest", Hold(goal, REST_S), law, wide))
     else:
-        motions.append(Compensated("swing", Swing(centre, amplitude, PUSHED_HZ, 2.0 / PUSHED_HZ), law, wide))
+        # Let go of in the middle of the travel, forwards after two periods, backwards half a period later.
+        swing = Swing(centre, amplitude, PUSHED_HZ, (2.0 if way > 0 else 2.5) / PUSHED_HZ)
+        motions.append(Compensated("swing", swing, law, wide))
         motions.append(Compensated("rest", Hold(centre, REST_S), law, wide))
     # The joint is looked at while it rests under the law; the run ends there.
     plan = Plan(loaded.name, setup.cycle_hz, (joint_plan(one, motions, {}, None),))
@@ -160,14 +163,18 @@ def on_the_bus(robot: Path, bus: str, entry: JointProfile, joint: str, hold: boo
 
 def bus(options: argparse.Namespace) -> None:
     print(f"# through the bus, R + 0.02, K + 10 %, {told_of(options)}")
-    print("| joint | R | K [N m/rad] | delay [cycles] | free [deg/s rms] | PD hold [deg/s rms] | stands |")
-    print("|---|---|---|---|---|---|---|")
+    print("| joint | R | K [N m/rad] | delay [cycles] | free: forwards [deg/s] | back | PD: forwards | back | stands |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
         for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
                 robot, entry, plant = of_joint(options, joint, Path(folder), delay)
                 joint_drive.ServoLoop = remembering(plant)  # type: ignore[attr-defined]
-                found = [on_the_bus(robot, options.bus, entry, joint, hold, options.seed) for hold in (False, True)]
+                found = [
+                    on_the_bus(robot, options.bus, entry, joint, hold, way, options.seed)
+                    for hold in (False, True)
+                    for way in (1.0, -1.0)
+                ]
                 friction = changed_law(
                     entry, load_robot(str(robot)).to_setup().joint(joint), False, MORE_RATIO, MORE_STIFFNESS
                 ).friction
@@ -176,7 +183,7 @@ def bus(options: argparse.Namespace) -> None:
             assert friction is not None
             print(
                 f"| {joint} | {friction.ratio:.2f} | {friction.stiffness_nm_per_rad:.0f} | {delay} "
-                f"| {found[0][0]:.5f} | {found[1][0]:.5f} | {stands} |",
+                f"| {' | '.join(f'{speed:.5f}' for speed, _ in found)} | {stands} |",
                 flush=True,
             )
 
@@ -299,6 +306,7 @@ def main() -> None:
     parser.add_argument("--joint", action="append")
     parser.add_argument("--elastic", type=float, default=0.0)
     parser.add_argument("--other", action="store_true")
+    parser.add_argument("--kept", type=Path, help="folder of the other plant's calibrations, used again")
     parser.add_argument("--delay", type=int, action="append")
     parser.add_argument("--ratio-only", action="store_true")
     parser.add_argument("--seed", type=int, default=0)

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compensation import JOINTS, call
+from command_line import call
+from compensation_robots import JOINTS
 
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot

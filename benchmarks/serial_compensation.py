@@ -12,9 +12,7 @@ counted.
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -22,11 +20,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from command_line import call
+
 from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.build import build
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan import Hold, JointPlan, Motion, Move
 
 LIMIT_POINTS = 3.0
@@ -41,50 +42,63 @@ cycle_hz: 250
 """
 
 
-def call(*arguments: str) -> dict[str, Any]:
-    """One call of the command line, its JSON."""
-    command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments, "--json", "--yes"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if not done.stdout.strip():
-        raise SystemExit(done.stderr)
-    result: dict[str, Any] = json.loads(done.stdout)
-    return result
+def felt_nm(
+    joint: str, motions: Sequence[Motion], curve: FrictionCurve, *, delay_ms: float, **table: float
+) -> list[float]:
+    """What the person gives at each tick of the emulated controller while the table is in force.
 
-
-def effort_nm(joint: str, entry: JointProfile, run: dict[str, Any], ratio: float, delay_ms: float) -> float:
-    """What the person needs with this table."""
+    Args:
+        joint: name.
+        motions: the last but one is guided.
+        curve: phi.
+        delay_ms: by which the table acts late.
+        table: ratio, stiffness and gravity, as ``download_table`` takes them.
+    """
     setup = load_robot("hp3j-serial.yaml").to_setup("serial:loopback")
     setup = replace(setup, options={**setup.options, "emulator": {"table_delay_ms": delay_ms}})
     emulator = build(setup)
     driver = MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
-    geometry = setup.joint(joint)
-    axis = emulator.axes[geometry.address]
-    felt_nm: list[float] = []
+    axis = emulator.axes[setup.joint(joint).address]
+    felt: list[float] = []
     move_on = axis.run
 
     def feel(duration_s: float) -> None:
         move_on(duration_s)
         if axis.floating:
-            felt_nm.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]
+            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]
 
     axis.run = feel  # type: ignore[method-assign]
     driver.open()
-    driver.download_table(
+    driver.download_table(joint, curve, **table)
+    driver.compensate_by_table([joint])
+    driver.run_batch(JointPlan(joint, tuple(motions), {}))
+    driver.close()
+    return felt
+
+
+def effort_nm(joint: str, entry: JointProfile, run: dict[str, Any], ratio: float, delay_ms: float) -> float:
+    """What the person needs with this table."""
+    geometry = load_robot("hp3j-serial.yaml").to_setup("serial:loopback").joint(joint)
+    home = geometry.locked_position_rad
+    centre = geometry.start_position_rad + (entry.procedure.amplitude_rad if entry.procedure else 0.0) / 2
+    motions: list[Motion] = [] if math.isclose(home, centre) else [Move.within(home, centre, 0.2)]
+    motions += [Hold(centre, 0.5), Hold(centre, SECONDS, name="guided"), Hold(centre, 0.1)]
+    felt = felt_nm(
         joint,
+        motions,
         entry.curve(),
+        delay_ms=delay_ms,
         ratio=ratio,
         stiffness_nm_per_rad=run["stiffness_nm_per_rad"],
         gravity_cos_nm=entry.gravity_cos_nm.value or 0.0,
         gravity_sin_nm=entry.gravity_sin_nm.value or 0.0,
     )
-    driver.compensate_by_table([joint])
-    home = geometry.locked_position_rad
-    centre = geometry.start_position_rad + (entry.procedure.amplitude_rad if entry.procedure else 0.0) / 2
-    motions: list[Motion] = [] if math.isclose(home, centre) else [Move.within(home, centre, 0.2)]
-    motions += [Hold(centre, 0.5), Hold(centre, SECONDS, name="guided"), Hold(centre, 0.1)]
-    driver.run_batch(JointPlan(joint, tuple(motions), {}))
-    driver.close()
-    counted = felt_nm[round(NOT_COUNTED_S / TICK_S) :]
+    return rms_nm(felt, NOT_COUNTED_S)
+
+
+def rms_nm(felt: Sequence[float], not_counted_s: float) -> float:
+    """F_s of (25) of what is felt once the swing has settled."""
+    counted = felt[round(not_counted_s / TICK_S) :]
     return math.sqrt(sum(torque * torque for torque in counted) / len(counted))
 
 

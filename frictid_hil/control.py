@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.driver import Mode
-from frictid_hil.friction.compensation import CompensationSettings
+from frictid_hil.friction.compensation import GRAVITY_MARGIN, CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan import Motion, Sine
@@ -29,15 +29,27 @@ class Gravity:
         cos_nm: of ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``.
         sin_nm: see there.
         bias_nm: constant part.
+        centre_rad: middle of the travel over which it was identified.
+        unsure_nm: half of the 95 % interval of the bias.
     """
 
     cos_nm: float = 0.0
     sin_nm: float = 0.0
     bias_nm: float = 0.0
+    centre_rad: float = 0.0
+    unsure_nm: float = 0.0
 
     def torque_nm(self, position_rad: float) -> float:
         """At one position."""
         return self.cos_nm * math.cos(position_rad) + self.sin_nm * math.sin(position_rad) + self.bias_nm
+
+    def doubt_nm(self, position_rad: float) -> float:
+        """By how much it may be wrong at one position, half of a 95 % interval.
+
+        Over a short travel a bias and the top of a cosine look alike. What the one got of the other changes nothing
+        there, and is missing elsewhere: ``unsure_nm (1 - cos(q - centre))``.
+        """
+        return self.unsure_nm * (1.0 - math.cos(position_rad - self.centre_rad))
 
     @property
     def largest_nm(self) -> float:
@@ -108,6 +120,18 @@ class ControlLaw:
     follows_reference: bool
     torque_limit_nm: float
     slew_nm_per_s: float
+
+    def friction_share(self, position_rad: float) -> float:
+        """Of friction compensation that is given at one position, 1 where gravity is as good as known.
+
+        1 - R of friction is left to stop a free joint, also where gravity is wrong by a share GRAVITY_MARGIN of F_0.
+        Where it may be wrong by more, that much less friction is given.
+        """
+        friction = self.friction
+        if friction is None:
+            return 1.0
+        beyond = self.gravity.doubt_nm(position_rad) / friction.coulomb_nm - GRAVITY_MARGIN
+        return 1.0 if beyond <= 0.0 else max(0.0, 1.0 - beyond / friction.ratio)
 
 
 @dataclass(frozen=True, slots=True)

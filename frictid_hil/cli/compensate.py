@@ -124,6 +124,7 @@ def compensate(
     from frictid_hil.cli.progress import print_plan, watching
     from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
     from frictid_hil.jobs.compensate import compensate as job
+    from frictid_hil.jobs.compensation_wanted import Wanted
     from frictid_hil.plan import described
 
     output = Output(as_json, quiet)
@@ -131,10 +132,7 @@ def compensate(
     def options() -> CompensateOptions:
         if drive_mode not in _DRIVE_MODES:
             raise UsageError(f"no drive mode {drive_mode!r}; there are {', '.join(_DRIVE_MODES)}")
-        return CompensateOptions(
-            robot=robot,
-            profile=profile,
-            joint=joint,
+        wanted = Wanted(
             task=task,
             modes=tuple(part.strip() for part in mode.split(",")) if mode else (),
             setting=setting,
@@ -146,11 +144,8 @@ def compensate(
             centre_rad=centre,
             drive_mode=_DRIVE_MODES[drive_mode],
             force=force,
-            bus=bus,
-            realtime=realtime,
-            seed=seed,
-            out=out,
         )
+        return CompensateOptions(robot, profile, joint, wanted, bus, realtime, seed, out)
 
     if dry_run:
 
@@ -175,8 +170,8 @@ def _show(output: Output, result: Result) -> None:
     for name, figures in result["modes"].items():
         table.add_row(name, *_row(figures, track=result["task"] == "track"))
     output.out.print(table)
-    for warning in result["warnings"]:
-        output.out.print(f"note: {warning}", soft_wrap=True, markup=False)
+    for told in (*result["warnings"], *result["remarks"]):
+        output.out.print(f"note: {told}", soft_wrap=True, markup=False)
     for key in ("run", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True, markup=False)

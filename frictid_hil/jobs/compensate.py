@@ -7,7 +7,6 @@ travel never seen on this robot rehearsed, the joint probed in position control,
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -44,17 +43,7 @@ class CompensateOptions:
         robot: robot file, by path or name.
         profile: file, or a run folder that holds one.
         joint: name.
-        task: ``hand`` or ``track``.
-        modes: () for all that the task has.
-        setting: ``ours`` or ``paper``.
-        ratio: R instead of the setting's.
-        stiffness_nm_per_rad: K instead of the setting's.
-        viscous_nm_s_per_rad: B_c of ``mol`` instead of the least-squares one.
-        speed_rad_s: peak speed of the task.
-        duration_s: of each mode; 0 for one mode until interrupted.
-        centre_rad: middle of the travel.
-        drive_mode: how the torque reaches the drive.
-        force: use a doubtful profile all the same.
+        wanted: task, modes, setting and the rest of what is to be run.
         bus: ``interface:channel``.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise.
@@ -64,17 +53,7 @@ class CompensateOptions:
     robot: str
     profile: Path
     joint: str
-    task: str
-    modes: tuple[str, ...] = ()
-    setting: str = "ours"
-    ratio: float | None = None
-    stiffness_nm_per_rad: float | None = None
-    viscous_nm_s_per_rad: float | None = None
-    speed_rad_s: float | None = None
-    duration_s: float = 10.0
-    centre_rad: float | None = None
-    drive_mode: Mode = Mode.TORQUE
-    force: bool = False
+    wanted: Wanted
     bus: str | None = None
     realtime: bool = False
     seed: int = 0
@@ -94,11 +73,11 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     joint = setup.joint(options.joint)
     profile_path = profile_file(options.profile)
     profile = load_profile(profile_path)
-    wanted = _wanted(options, simulated=driver_name == "virtual")
+    wanted = options.wanted.completed(simulated=driver_name == "virtual")
     doubts = doubts_of_file(profile, joint, robot.name, robot.policy)
-    if not options.force:
+    if not wanted.force:
         refuse(doubts, joint.name)
-    if options.task == "hand" and driver_name == "virtual" and "hand" not in joint.simulated:
+    if wanted.task == "hand" and driver_name == "virtual" and "hand" not in joint.simulated:
         raise UsageError(
             "this simulated joint has nobody to guide it",
             where=f"joint {joint.name}",
@@ -133,29 +112,6 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
     return result_of(asked, folder, progress)
 
 
-def _wanted(options: CompensateOptions, *, simulated: bool) -> Wanted:
-    endless = options.duration_s == 0.0
-    if options.duration_s < 0.0:
-        raise UsageError("the duration must not be negative")
-    modes = options.modes
-    if not modes and options.task == "hand":
-        modes = ("mop",) if endless else MODES[:4]
-    return Wanted(
-        task=options.task,
-        modes=modes or MODES,
-        setting=options.setting,
-        ratio=options.ratio,
-        stiffness_nm_per_rad=options.stiffness_nm_per_rad,
-        viscous_nm_s_per_rad=options.viscous_nm_s_per_rad,
-        speed_rad_s=options.speed_rad_s,
-        duration_s=math.inf if endless else options.duration_s,
-        centre_rad=options.centre_rad,
-        drive_mode=options.drive_mode,
-        force=options.force,
-        simulated=simulated,
-    )
-
-
 def _run(asked: Asked, folder: RunFolder, options: CompensateOptions, watcher: Watcher, live: Live | None) -> Progress:
     progress = Progress()
     hand = Hand(asked.joint, asked.planned, asked.wanted, watcher)
@@ -163,11 +119,11 @@ def _run(asked: Asked, folder: RunFolder, options: CompensateOptions, watcher: W
 
     def proceed(preflight: Preflight) -> bool:
         doubts = doubts_of_drive(asked.entry, preflight.identities[asked.joint])
-        if not options.force:
+        if not asked.wanted.force:
             refuse(doubts, asked.joint)
         for doubt in doubts:
             watcher.note(f"forced in spite of: {doubt}")
-        _refuse_mode(options.drive_mode, preflight)
+        _refuse_mode(asked.wanted.drive_mode, preflight)
         return watcher.confirm(asked.plan, preflight)
 
     def notify(event: Event) -> None:
@@ -193,7 +149,7 @@ def _run(asked: Asked, folder: RunFolder, options: CompensateOptions, watcher: W
                 figures_live if asked.wanted.endless else keeper,
                 notify=notify,
                 proceed=proceed,
-                care=Care(tolerated=frozenset({OWN_FRICTION_COMPENSATION} if options.force else ())),
+                care=Care(tolerated=frozenset({OWN_FRICTION_COMPENSATION} if asked.wanted.force else ())),
                 prepare=hand.take_driver,
             )
         except FrictidError as error:

@@ -16,6 +16,9 @@ from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.samples import Mark, Samples
 
+DOMINATED_PERCENT = 85.0
+"""Friction dominates a tracking error where giving it back exactly would take away this much of it."""
+
 _WIDTH_S = 0.004
 """Of the smoothing that is common to acceleration and torque: half power at 33 Hz."""
 
@@ -121,6 +124,16 @@ def figures(
     alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}
     base = alone.get("nc")
     return {mode: _against(figure, base, task, floors_rad.get(mode)) for mode, figure in alone.items()}
+
+
+def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
+    """Whether friction, not inertia under so weak a PD, makes the tracking error; None without nc and mop-reference.
+
+    Its measure is the ceiling of ``mop-reference``: what an ideal joint of this inertia, under these gains, would gain
+    if its friction were given back exactly and at once.
+    """
+    ceiling = found["mop-reference"].ceiling_percent if "mop-reference" in found else None
+    return None if ceiling is None else ceiling >= DOMINATED_PERCENT
 
 
 def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:

@@ -20,6 +20,8 @@ from frictid_hil.friction.compensation import (
     CompensationSettings,
     stiffness_with_margin,
 )
+from frictid_hil.friction.regression import BIAS_PRIOR
+from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.jobs.compensation_wanted import Wanted
 
 TRACK_SLACK_RAD = math.radians(5.0)
@@ -42,6 +44,8 @@ def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, wa
         _needed(entry.gravity_cos_nm, "gravity", where),
         _needed(entry.gravity_sin_nm, "gravity", where),
         _needed(entry.bias_nm, "bias", where),
+        calibrated_centre_rad(entry, joint),
+        _unsure_nm(entry.bias_nm, curve.coulomb_nm) if wanted.setting == "ours" else 0.0,
     )
     gains = None
     limit_nm = gravity.largest_nm + 1.2 * float(curve.magnitude(np.array(speed_bound_rad_s(wanted, joint))))
@@ -112,9 +116,22 @@ def friction_settings(
     return settings
 
 
+def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:
+    """Middle of the travel over which the profile was identified."""
+    travel_rad = entry.procedure.amplitude_rad if entry.procedure else 0.0
+    return joint.start_position_rad + travel_rad / 2
+
+
 def speed_bound_rad_s(wanted: Wanted, joint: JointSetup) -> float:
     """What the supervisor allows during the task."""
     return min(joint.max_velocity_rad_s, _SPEED_MARGIN * wanted.peak_rad_s + _SPEED_SLACK_RAD_S)
+
+
+def _unsure_nm(bias: Estimate, coulomb_nm: float) -> float:
+    """Half of its 95 % interval; where a profile has none, of the interval that the identification starts from."""
+    if bias.low is None or bias.high is None:
+        return COVERAGE * BIAS_PRIOR * coulomb_nm
+    return (bias.high - bias.low) / 2
 
 
 def _needed(figure: Estimate, what: str, where: str) -> float:

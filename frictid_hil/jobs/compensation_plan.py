@@ -7,6 +7,7 @@ a PD so weak that friction alone costs 2 deg, the same in all modes.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.control import Bounds, Compensated, ControlLaw, Probe, Swing
 from frictid_hil.driver import JointSetup, Mode, RobotSetup
-from frictid_hil.jobs.compensation_laws import TRACK_SLACK_RAD, law_of, speed_bound_rad_s
+from frictid_hil.jobs.compensation_laws import TRACK_SLACK_RAD, calibrated_centre_rad, law_of, speed_bound_rad_s
 from frictid_hil.jobs.compensation_wanted import Wanted, refuse_contradictions
 from frictid_hil.jobs.plans import APPROACH_RAD_S, rehearsal_note
 from frictid_hil.plan import REHEARSAL, Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
@@ -24,6 +25,8 @@ from frictid_hil.runner.rehearsals import Rehearsals
 _HAND_SLACK_RAD = math.radians(8.0)
 _STAND_SLACK_RAD = math.radians(1.0)
 _STAND_RAD_S = math.radians(5.0)
+_TOLD_SHARE = 0.995
+"""R is told to fall where it falls below this share of itself."""
 _POWER_SHARE = 0.8
 """Of the product of the bounds of torque and speed."""
 _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
@@ -37,12 +40,14 @@ class CompensationPlan:
         plan: frozen.
         centre_rad: middle of the travel.
         laws: by mode.
+        lowest_ratio: R where gravity is known least, within the task's travel; None without compensation.
         warnings: what speaks against it and is done all the same.
     """
 
     plan: Plan
     centre_rad: float
     laws: dict[str, ControlLaw]
+    lowest_ratio: float | None
     warnings: tuple[str, ...]
 
 
@@ -65,8 +70,7 @@ def compensation_plan(
     refuse_contradictions(wanted)
     centre_rad = wanted.centre_rad
     if centre_rad is None:
-        travel_rad = entry.procedure.amplitude_rad if entry.procedure else 0.0
-        centre_rad = joint.start_position_rad + travel_rad / 2
+        centre_rad = calibrated_centre_rad(entry, joint)
     warnings: list[str] = []
     laws = {mode: law_of(entry, joint, mode, wanted, warnings) for mode in wanted.modes}
     reach_rad = wanted.amplitude_rad
@@ -82,8 +86,33 @@ def compensation_plan(
     notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}"]
     if rehearse:
         notes.append(rehearsal_note([name]))
+    lowest_ratio = _lowest_ratio(joint, wanted, centre_rad, laws)
+    if lowest_ratio is not None and lowest_ratio < _TOLD_SHARE * _ratio(laws):
+        notes.append(
+            f"beyond the calibrated travel gravity is less certain: there R falls from {_ratio(laws):.3g} "
+            f"to {lowest_ratio:.3g}"
+        )
     plan = Plan(robot, setup.cycle_hz, (moved,), (*notes, *warnings))
-    return CompensationPlan(plan, centre_rad, laws, tuple(warnings))
+    return CompensationPlan(plan, centre_rad, laws, lowest_ratio, tuple(warnings))
+
+
+def _ratio(laws: Mapping[str, ControlLaw]) -> float:
+    return max((law.friction.ratio for law in laws.values() if law.friction is not None), default=0.0)
+
+
+def _lowest_ratio(joint: JointSetup, wanted: Wanted, centre_rad: float, laws: Mapping[str, ControlLaw]) -> float | None:
+    """Of the whole travel of the task; a service may be guided anywhere."""
+    reach_rad = wanted.amplitude_rad
+    low, high = centre_rad - reach_rad, centre_rad + reach_rad
+    if wanted.endless:
+        low, high = joint.position_min_rad, joint.position_max_rad
+    found = [
+        law.friction.ratio * law.friction_share(position)
+        for law in laws.values()
+        if law.friction is not None
+        for position in np.linspace(low, high, 41).tolist()
+    ]
+    return min(found, default=None)
 
 
 def _motions(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from frictid_hil.config.robot import Robot
 from frictid_hil.control import Compensated
 from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError, Interrupted
-from frictid_hil.jobs.compensation_figures import ModeRun, figures
+from frictid_hil.jobs.compensation_figures import DOMINATED_PERCENT, ModeFigures, ModeRun, figures, friction_dominates
 from frictid_hil.jobs.compensation_plan import CompensationPlan
 from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.jobs.tracking_floor import tracking_floor_rad
@@ -88,6 +89,7 @@ def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, 
         "task": wanted.task,
         "setting": wanted.setting,
         "compensation_ratio": friction.ratio if friction else None,
+        "compensation_ratio_lowest": asked.planned.lowest_ratio,
         "stiffness_nm_per_rad": friction.stiffness_nm_per_rad if friction else None,
         "inertia_kg_m2": inertia,
         "inertia_source": source,
@@ -99,6 +101,8 @@ def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, 
         "profile": str(asked.profile.resolve()),
         "run": str(folder.path.resolve()),
         "modes": modes,
+        "friction_dominates": friction_dominates(found),
+        "remarks": _remarks(found),
     }
     if ended is not None:
         result["error"] = {
@@ -117,11 +121,27 @@ def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, 
             progress.runs,
             modes,
             facts=_facts(result),
+            remarks=result["remarks"],
             outcome=str(result["outcome"]),
             error=ended.what if ended else "",
         )
         result["report"] = str(write_page(page, folder.path / "report.html").resolve())
     return result
+
+
+def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
+    """What the figures mean, in words."""
+    dominates = friction_dominates(found)
+    if dominates is None:
+        return []
+    left_percent = 100.0 - (found["mop-reference"].ceiling_percent or 0.0)
+    exact = f"given back exactly, friction would leave {left_percent:.1f} % of it"
+    if dominates:
+        return [f"friction dominates the tracking error: {exact}"]
+    return [
+        f"inertia has a large part in the tracking error: {exact}, more than {100.0 - DOMINATED_PERCENT:.0f} %; "
+        "at a lower --speed friction dominates"
+    ]
 
 
 def _inertia(asked: Asked) -> tuple[float | None, str]:
@@ -170,6 +190,14 @@ def _service_figures(wanted: Wanted, progress: Progress) -> dict[str, Any]:
 
 
 def _facts(result: dict[str, Any]) -> dict[str, str]:
-    names = ("setting", "compensation_ratio", "stiffness_nm_per_rad", "inertia_kg_m2", "inertia_source", "seed")
+    names = (
+        "setting",
+        "compensation_ratio",
+        "compensation_ratio_lowest",
+        "stiffness_nm_per_rad",
+        "inertia_kg_m2",
+        "inertia_source",
+        "seed",
+    )
     facts = {name: str(result[name]) for name in (*names, "rate_hz", "profile", "run")}
     return {**facts, "warnings": "; ".join(result["warnings"])}

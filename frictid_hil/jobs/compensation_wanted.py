@@ -1,9 +1,9 @@
-"""What a person asked of a compensation, defaults filled in: task, modes, setting, speed, travel."""
+"""What a person asks of a compensation: task, modes, setting, speed, travel."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from frictid_hil.driver import Mode
 from frictid_hil.errors import UsageError
@@ -20,25 +20,25 @@ TRACK_AMPLITUDE_RAD = math.radians(10.0)
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a person asked for, defaults filled in.
+    """What a person asks for.
 
     Attributes:
         task: ``hand`` or ``track``.
-        modes: in order.
+        modes: in order; () for all that the task has.
         setting: ``ours`` or ``paper``.
         ratio: R instead of the setting's.
         stiffness_nm_per_rad: K instead of the setting's.
         viscous_nm_s_per_rad: B_c instead of the least-squares one.
         speed_rad_s: of the triangle; of the hand at the middle of its travel.
-        duration_s: of one mode; infinite until interrupted.
+        duration_s: of one mode; 0 until interrupted.
         centre_rad: middle of the travel; None for that of the calibrated travel.
         drive_mode: TORQUE, or POSITION or VELOCITY with the torque as offset.
         force: doubts only warn.
-        simulated: the robot is simulated; the paper's K may then hunt.
+        simulated: the robot is, and the paper's K may then hunt; ``completed`` fills it in.
     """
 
     task: str
-    modes: tuple[str, ...]
+    modes: tuple[str, ...] = ()
     setting: str = "ours"
     ratio: float | None = None
     stiffness_nm_per_rad: float | None = None
@@ -49,6 +49,19 @@ class Wanted:
     drive_mode: Mode = Mode.TORQUE
     force: bool = False
     simulated: bool = False
+
+    def completed(self, *, simulated: bool) -> Wanted:
+        """With what follows from the robot and from what was left out.
+
+        Raises:
+            UsageError: a negative duration.
+        """
+        if self.duration_s < 0.0:
+            raise UsageError("the duration must not be negative")
+        modes = self.modes or MODES
+        if not self.modes and self.task == "hand":
+            modes = ("mop",) if self.endless else MODES[:4]
+        return replace(self, modes=modes, simulated=simulated)
 
     @property
     def amplitude_rad(self) -> float:
@@ -71,7 +84,7 @@ class Wanted:
     @property
     def endless(self) -> bool:
         """Until interrupted."""
-        return not math.isfinite(self.duration_s)
+        return self.duration_s == 0.0
 
     @property
     def cycles(self) -> int:

@@ -60,6 +60,7 @@ def compensation_page(
     facts: Mapping[str, str],
     outcome: str,
     error: str = "",
+    remarks: Sequence[str] = (),
 ) -> Page:
     """The page of one joint and task.
 
@@ -72,6 +73,7 @@ def compensation_page(
         facts: provenance.
         outcome: word of the run's JSON.
         error: why it ended early.
+        remarks: what the figures mean, a sentence each.
     """
     headline = _headline(joint, task, modes)
     if outcome != "ok":
@@ -84,9 +86,10 @@ def compensation_page(
     else:
         figures = (*_following(runs), _tracking_bars(names, modes))
     unknown = hand and all(run.external_torque_nm is None for run in runs.values())
+    words = ("No force sensor: the torque of the hand is not known.",) if unknown else ()
     section = Section(
         "Moved by hand" if hand else "Tracking a triangle",
-        words=("No force sensor: the torque of the hand is not known.",) if unknown else (),
+        words=(*words, *(f"{remark[:1].upper()}{remark[1:]}." for remark in remarks)),
         tables=(_table(names, modes, hand=hand),),
         figures=tuple(figure for figure in figures if figure.traces),
     )

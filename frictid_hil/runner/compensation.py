@@ -71,7 +71,7 @@ class Controller:
             friction = self._friction.step(increment, velocity, expected)
             if law.ripple is not None:
                 friction += law.ripple.torque_at_nm(position + _AHEAD_CYCLES * self._period_s * velocity)
-            torque += self.friction_share * friction
+            torque += self.friction_share * law.friction_share(position) * friction
         limit = law.torque_limit_nm
         torque = limit if torque > limit else -limit if torque < -limit else torque
         change, step = torque - self.torque_nm, self._step_nm

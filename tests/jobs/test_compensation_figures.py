@@ -10,7 +10,7 @@ import pytest
 
 from frictid_hil.control import PositionGains
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.jobs.compensation_figures import ModeRun, figures
+from frictid_hil.jobs.compensation_figures import ModeRun, figures, friction_dominates
 from frictid_hil.jobs.compensation_plan import triangle
 from frictid_hil.jobs.tracking_floor import tracking_floor_rad
 
@@ -80,3 +80,15 @@ def test_the_ceiling_of_tracking_stands_beside_the_reduction() -> None:
     assert found["mop"].reduction_percent == pytest.approx(50.0)
     assert found["mop"].ceiling_percent == pytest.approx(75.0)
     assert found["nc"].ceiling_percent is None
+
+
+@pytest.mark.parametrize(("floor_rad", "dominates"), [(0.0059, True), (0.0061, False)])
+def test_friction_dominates_where_giving_it_back_exactly_would_leave_little(floor_rad: float, dominates: bool) -> None:
+    run = guided(0.0)
+    nc, mop = (
+        replace(run, mode=mode, reference_rad=run.position_rad + e)
+        for mode, e in (("nc", 0.04), ("mop-reference", 0.02))
+    )
+    found = figures({"nc": nc, "mop-reference": mop}, "track", INERTIA, {"mop-reference": floor_rad})
+    assert friction_dominates(found) is dominates
+    assert friction_dominates(figures({"nc": nc}, "track", INERTIA)) is None

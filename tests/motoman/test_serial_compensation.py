@@ -9,20 +9,18 @@ person needs. Both laws see the joint once per 4 ms and hold their torque until 
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
-from frictid_drivers.motoman import MotomanDriver
-from frictid_drivers.motoman.emulator.build import build
-from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_hil.config.robot import load_robot
 from frictid_hil.friction.compensation import Compensation, CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan import Hold, JointPlan
+from frictid_hil.plan import Hold
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
@@ -31,6 +29,13 @@ pytestmark = pytest.mark.slow
 SETUP = load_robot("hp3j-serial").to_setup()
 SECONDS, SKIPPED_S, TICK_S = 8.0, 2.0, 0.004
 RATIO, SHARE_OF_PRESLIDING = 0.9, 0.9
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """``benchmarks/serial_compensation.py``."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    return importlib.import_module("serial_compensation")
 
 
 def model_of(joint: str) -> JointModel:
@@ -48,43 +53,24 @@ def curve_of(model: JointModel) -> FrictionCurve:
     return FrictionCurve.through(speed, model.true_curve_nm(speed))
 
 
-def effort(external_nm: list[float]) -> float:
-    """F_s of (25) once the swing has settled."""
-    return math.sqrt(float(np.mean(np.square(external_nm[round(SKIPPED_S / TICK_S) :]))))
-
-
-def by_table(joint: str, ratio: float) -> float:
-    emulator = build(SETUP)
-    driver = MotomanDriver(SETUP, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
-    model, entry = model_of(joint), SETUP.joint(joint)
-    axis = emulator.axes[entry.address]
-    felt: list[float] = []
-    run = axis.run
-
-    def feel(duration_s: float) -> None:
-        run(duration_s)
-        if axis.floating:
-            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]
-
-    axis.run = feel  # type: ignore[method-assign]
-    driver.open()
-    driver.download_table(
+def by_table(benchmark: ModuleType, joint: str, ratio: float) -> float:
+    model = model_of(joint)
+    at = SETUP.joint(joint).locked_position_rad
+    felt = benchmark.felt_nm(
         joint,
+        (Hold(at, 0.1), Hold(at, SECONDS, name="guided"), Hold(at, 0.1)),
         curve_of(model),
+        delay_ms=0.0,
         ratio=ratio,
         stiffness_nm_per_rad=SHARE_OF_PRESLIDING * model.presliding_stiffness_nm_per_rad,
         gravity_cos_nm=model.gravity_cos_nm,
         gravity_sin_nm=model.gravity_sin_nm,
     )
-    driver.compensate_by_table([joint])
-    at = entry.locked_position_rad
-    driver.run_batch(JointPlan(joint, (Hold(at, 0.1), Hold(at, SECONDS, name="guided"), Hold(at, 0.1)), {}))
-    driver.close()
     assert len(felt) == pytest.approx(SECONDS / TICK_S, abs=2)
-    return effort(felt)
+    return float(benchmark.rms_nm(felt, SKIPPED_S))
 
 
-def by_host(joint: str, ratio: float) -> float:
+def by_host(benchmark: ModuleType, joint: str, ratio: float) -> float:
     """The law of the host on torque mode, one exchange per tick, applied from the same tick on."""
     model, entry = model_of(joint), SETUP.joint(joint)
     at = entry.locked_position_rad
@@ -106,28 +92,23 @@ def by_host(joint: str, ratio: float) -> float:
         before = here
         loop.advance(TICK_S, torque_nm=torque)
         felt.append(loop.external_torque_nm)
-    return effort(felt)
+    return float(benchmark.rms_nm(felt, SKIPPED_S))
 
 
 @pytest.mark.parametrize("joint", ["0", "1", "4"])
-def test_the_table_does_what_the_host_does_within_three_points(joint: str) -> None:
+def test_the_table_does_what_the_host_does_within_three_points(benchmark: ModuleType, joint: str) -> None:
     reductions = {}
     for name, swing in (("table", by_table), ("host", by_host)):
-        reductions[name] = 100 * (1 - swing(joint, RATIO) / swing(joint, 0.0))
+        reductions[name] = 100 * (1 - swing(benchmark, joint, RATIO) / swing(benchmark, joint, 0.0))
     print(f"joint {joint}: " + ", ".join(f"{name} {points:.1f} %" for name, points in reductions.items()))
     assert reductions["host"] > 30
     assert reductions["table"] == pytest.approx(reductions["host"], abs=3.0)
 
 
 def test_the_table_does_what_a_can_run_with_the_same_delay_does_within_three_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    script = Path(__file__).parents[2] / "benchmarks" / "serial_compensation.py"
-    spec = importlib.util.spec_from_file_location(script.stem, script)
-    assert spec is not None and spec.loader is not None
-    benchmark = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(benchmark)
     profile = benchmark.profile_over_can(["4"], tmp_path)
     can, (late,) = benchmark.reductions("4", profile, tmp_path, (4.0,))
     assert can["rate_hz"] == 250.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,26 @@ def test_a_standing_joint_is_given_its_gravity_alone() -> None:
     for _ in range(3):
         torque = controller.update(moving(0.3, 0.0), (0.3, 0.0))
     assert torque == pytest.approx(10.0 * math.cos(0.3) + 2.0 * math.sin(0.3) + 0.5)
+
+
+def test_less_friction_is_given_where_gravity_may_be_wrong() -> None:
+    """Of 1 - R a hundredth of F_0 is there for gravity; R falls by what gravity may be wrong beyond that."""
+    f_0 = FRICTION.coulomb_nm
+    gravity = Gravity(10.0, 2.0, 0.5, centre_rad=0.4, unsure_nm=0.5 * f_0)
+    uncertain, known = law(gravity=gravity), law(gravity=Gravity(10.0, 2.0, 0.5))
+    assert uncertain.friction_share(0.4) == uncertain.friction_share(0.5) == known.friction_share(3.0) == 1.0
+    for away in (0.6, -0.6):
+        fallen = 0.9 - (0.5 * (1 - math.cos(away)) - 0.01)
+        assert 0.9 * uncertain.friction_share(0.4 + away) == pytest.approx(fallen)
+    assert law(gravity=Gravity(unsure_nm=3 * f_0)).friction_share(math.pi) == 0.0
+    torques = []
+    for one in (known, uncertain):
+        controller = Controller(replace(one, slew_nm_per_s=1e9), DT, 0.0)
+        for k in range(200):
+            torques.append(controller.update(moving(1.0 + k * DT, 1.0), (0.0, 0.0)))
+    friction = torques[199] - gravity.torque_nm(1.199)
+    assert torques[399] - gravity.torque_nm(1.199) == pytest.approx(uncertain.friction_share(1.199) * friction)
+    assert uncertain.friction_share(1.199) < 0.85
 
 
 def test_torque_is_clamped_and_changes_no_faster_than_it_may() -> None:
