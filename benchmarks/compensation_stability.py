@@ -7,8 +7,8 @@
 With ``--elastic 30`` the links resonate at 30 Hz; the profile is then one identified on such joints (``calibrate
 --robot`` with the file that ``robot --elastic 30 --out FILE`` writes).
 
-With ``--other`` they are joints that this product did not simulate (``other_plant``), each calibrated first; with ``--kept FOLDER``
-once for all.
+With ``--other`` they are joints that this product did not simulate (``other_plant``), each calibrated first; once for
+all with ``--kept FOLDER``.
 
 ``bus``: R + 0.02 and K + 10 %, with 2 and 5 cycles of delay, through driver, bus and drive. ``free``: a person swings
 the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
