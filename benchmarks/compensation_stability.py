@@ -15,8 +15,8 @@ the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the t
 it; forwards and backwards.
 
 ``limits``: R and K upwards from our setting in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer
-comes to rest within 4 s; without the bus, by the product's own controller on the simulated joint. A joint stands where
-its true speed in the last second is below 0.01 deg/s rms.
+comes to rest within 4 s, or gets faster than it was when let go; without the bus, by the product's own controller on
+the simulated joint. A joint stands where its true speed in the last second is below 0.01 deg/s rms.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ STILL_DEG_S = 0.01
 MORE_RATIO, MORE_STIFFNESS = 0.02, 1.1
 PUSHED_RAD_S, PUSHED_HZ = math.radians(20.0), 0.5
 REST_S = 5.0
+GROWTH = 1.05
+"""A joint that is faster than when it was let go by this factor runs away, wherever it stops."""
 
 
 def changed_law(entry: JointProfile, setup: JointSetup, hold: bool, ratio: float, stiffness: float) -> ControlLaw:
@@ -259,7 +261,10 @@ def largest(good: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, plant: Plant) -> float:
-    """True speed of the last of five seconds, deg/s rms, of one simulated joint pushed in the direction of ``push``."""
+    """True speed of the last of five seconds, deg/s rms, of one simulated joint pushed in the direction of ``push``.
+
+    Infinite where it gets faster than it was when let go.
+    """
     model = JointModel.from_mapping(
         setup.simulated,
         gear_ratio=setup.gear_ratio,
@@ -278,6 +283,7 @@ def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, pl
     assert law.friction is not None
     push_nm = 2.0 * push * law.friction.coulomb_nm
     report, velocities, pushing = Feedback(valid=True), [], True
+    free, fastest = 0, math.inf
     for k in range(5000):
         report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
         torque = controller.update(report, (centre, 0.0))
@@ -285,7 +291,10 @@ def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, pl
         queue.append(torque + (push_nm if pushing else 0.0))
         loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)
         velocities.append(loop.true_velocity_rad_s)
-        if abs(loop.true_velocity_rad_s) > 20.0:
+        free += not pushing
+        if free == 2 * delay_cycles:  # the last of the push has arrived
+            fastest = GROWTH * abs(loop.true_velocity_rad_s)
+        if abs(loop.true_velocity_rad_s) > fastest:
             return math.inf
     return math.degrees(float(np.sqrt(np.mean(np.square(velocities[4000:])))))
 
