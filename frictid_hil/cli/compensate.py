@@ -163,13 +163,32 @@ def compensate(
     output.run("compensate", run, lambda result: _show(output, result))
 
 
+_HAND: dict[str, tuple[str, str, float]] = {
+    "V_s": ("velocity_rms_rad_s", "deg/s", degrees(1.0)),
+    "F_s": ("torque_rms_nm", "N m", 1.0),
+    "less": ("reduction_percent", "%", 1.0),
+    "ceiling": ("ceiling_percent", "%", 1.0),
+    "inertia removed": ("torque_rms_inertia_removed_nm", "N m", 1.0),
+    "less of it": ("reduction_inertia_removed_percent", "%", 1.0),
+}
+_TRACK: dict[str, tuple[str, str, float]] = {
+    "E_s": ("tracking_rms_rad", "deg", degrees(1.0)),
+    "less": ("reduction_percent", "%", 1.0),
+    "ceiling": ("ceiling_percent", "%", 1.0),
+    "V_s": ("velocity_rms_rad_s", "deg/s", degrees(1.0)),
+}
+"""By heading of the table: key of the JSON, unit, factor."""
+
+
 def _show(output: Output, result: Result) -> None:
+    columns = _HAND if result["task"] == "hand" else _TRACK
     table = Table(title=f"Joint {result['joint']} of {result['robot']}: {result['task']}, setting {result['setting']}")
-    for heading in ("mode", "V_s", "F_s", "less", "inertia removed", "less", "ceiling", "E_s"):
+    for heading in ("mode", *columns):
         table.add_column(heading)
     for name, figures in result["modes"].items():
-        table.add_row(name, *_row(figures, track=result["task"] == "track"))
-    output.out.print(table)
+        table.add_row(name, *(_number(figures, *column) for column in columns.values()))
+    if table.row_count:
+        output.out.print(table)
     for told in (*result["warnings"], *result["remarks"]):
         output.out.print(f"note: {told}", soft_wrap=True, markup=False)
     for key in ("run", "report"):
@@ -177,18 +196,6 @@ def _show(output: Output, result: Result) -> None:
             output.out.print(f"{key}: {result[key]}", soft_wrap=True, markup=False)
 
 
-def _row(figures: dict[str, Any], *, track: bool) -> tuple[str, ...]:
-    def number(key: str, unit: str, scale: float = 1.0) -> str:
-        value = figures.get(key)
-        return "" if value is None else f"{value * scale:.4g} {unit}"
-
-    less = number("reduction_percent", "%")
-    return (
-        number("velocity_rms_rad_s", "deg/s", degrees(1.0)),
-        number("torque_rms_nm", "N m"),
-        less,
-        number("torque_rms_inertia_removed_nm", "N m"),
-        number("reduction_inertia_removed_percent", "%"),
-        number("ceiling_percent", "%"),
-        number("tracking_rms_rad", "deg", degrees(1.0)) if track else "",
-    )
+def _number(figures: dict[str, Any], key: str, unit: str, scale: float) -> str:
+    value = figures.get(key)
+    return "" if value is None else f"{value * scale:.4g} {unit}"
