@@ -2,6 +2,7 @@
 
     python benchmarks/compensation.py calibrate --out runs/benchmark
     python benchmarks/compensation_stability.py bus --profile runs/benchmark/profile.yaml
+    python benchmarks/compensation_stability.py pushes --profile runs/benchmark/profile.yaml
     python benchmarks/compensation_stability.py limits --profile runs/benchmark/profile.yaml
 
 With ``--elastic 30`` the links resonate at 30 Hz; the profile is then one identified on such joints (``calibrate
@@ -14,9 +15,14 @@ all with ``--kept FOLDER``.
 the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
 it; forwards and backwards.
 
+``pushes``: the same R and K, without the bus, by the product's own controller on the simulated joint: pushed to 3 to 20
+deg/s, forwards and backwards, and let go.
+
 ``limits``: R and K upwards from our setting in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer
-comes to rest within 4 s, or gets faster than it was when let go; without the bus, by the product's own controller on
-the simulated joint. A joint stands where its true speed in the last second is below 0.01 deg/s rms.
+comes to rest within 4 s, or gets faster than it was when let go; as ``pushes``.
+
+A joint stands where its true speed in the last second is below 0.01 deg/s rms. ``bus`` and ``pushes`` end with 1 where
+one does not.
 """
 
 from __future__ import annotations
@@ -53,6 +59,7 @@ from frictid_hil.simulation.servo_loop import ServoLoop
 STILL_DEG_S = 0.01
 MORE_RATIO, MORE_STIFFNESS = 0.02, 1.1
 PUSHED_RAD_S, PUSHED_HZ = math.radians(20.0), 0.5
+PUSHES_DEG_S = (3.0, 5.0, 8.0, 12.0, 20.0)
 REST_S = 5.0
 GROWTH = 1.05
 """A joint that is faster than when it was let go by this factor runs away, wherever it stops."""
@@ -167,6 +174,7 @@ def bus(options: argparse.Namespace) -> None:
     print(f"# through the bus, R + 0.02, K + 10 %, {told_of(options)}")
     print("| joint | R | K [N m/rad] | delay [cycles] | free: forwards [deg/s] | back | PD: forwards | back | stands |")
     print("|---|---|---|---|---|---|---|---|---|")
+    fell = False
     for joint in options.joint or JOINTS:
         for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
@@ -182,12 +190,42 @@ def bus(options: argparse.Namespace) -> None:
                 ).friction
             told = "; ".join(stopped for _, stopped in found if stopped)
             stands = "yes" if not told and all(speed < STILL_DEG_S for speed, _ in found) else f"NO {told}"
+            fell |= stands != "yes"
             assert friction is not None
             print(
                 f"| {joint} | {friction.ratio:.2f} | {friction.stiffness_nm_per_rad:.0f} | {delay} "
                 f"| {' | '.join(f'{speed:.5f}' for speed, _ in found)} | {stands} |",
                 flush=True,
             )
+    if fell:
+        raise SystemExit(1)
+
+
+# -- pushes -----------------------------------------------------------------------------------------------------------
+
+
+def pushes(options: argparse.Namespace) -> None:
+    print(f"# pushed to {', '.join(f'{v:g}' for v in PUSHES_DEG_S)} deg/s, R + 0.02, K + 10 %, {told_of(options)}")
+    print("| joint | delay [cycles] | forwards, fastest of all [deg/s rms] | backwards | stands |")
+    print("|---|---|---|---|---|")
+    fell = False
+    for joint in options.joint or JOINTS:
+        with tempfile.TemporaryDirectory() as folder:
+            robot, entry, plant = of_joint(options, joint, Path(folder))
+            setup = load_robot(str(robot)).to_setup().joint(joint)
+        law = changed_law(entry, setup, False, MORE_RATIO, MORE_STIFFNESS)
+        for delay in options.delay or (2, 5):
+            fastest = [
+                max(alone(law, setup, delay, way, plant, math.radians(speed)) for speed in PUSHES_DEG_S)
+                for way in (1.0, -1.0)
+            ]
+            stands = max(fastest) < STILL_DEG_S
+            fell |= not stands
+            print(
+                f"| {joint} | {delay} | {fastest[0]:.5f} | {fastest[1]:.5f} | {'yes' if stands else 'NO'} |", flush=True
+            )
+    if fell:
+        raise SystemExit(1)
 
 
 # -- limits ------------------------------------------------------------------------------------------------------------
@@ -260,7 +298,14 @@ def largest(good: Callable[[float], bool], low: float, high: float) -> float:
     return value
 
 
-def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, plant: Plant) -> float:
+def alone(
+    law: ControlLaw,
+    setup: JointSetup,
+    delay_cycles: int,
+    push: float,
+    plant: Plant,
+    pushed_rad_s: float = PUSHED_RAD_S,
+) -> float:
     """True speed of the last of five seconds, deg/s rms, of one simulated joint pushed in the direction of ``push``.
 
     Infinite where it gets faster than it was when let go.
@@ -287,7 +332,7 @@ def alone(law: ControlLaw, setup: JointSetup, delay_cycles: int, push: float, pl
     for k in range(5000):
         report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
         torque = controller.update(report, (centre, 0.0))
-        pushing = pushing and k < 1000 and abs(loop.true_velocity_rad_s) < PUSHED_RAD_S
+        pushing = pushing and k < 1000 and abs(loop.true_velocity_rad_s) < pushed_rad_s
         queue.append(torque + (push_nm if pushing else 0.0))
         loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)
         velocities.append(loop.true_velocity_rad_s)
@@ -303,7 +348,7 @@ def robot(options: argparse.Namespace) -> None:
     print(variant(Path(options.out), elastic_hz=options.elastic))
 
 
-VERBS = {"bus": bus, "limits": limits, "robot": robot}
+VERBS = {"bus": bus, "pushes": pushes, "limits": limits, "robot": robot}
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.driver import Mode
-from frictid_hil.friction.compensation import GRAVITY_MARGIN, CompensationSettings
+from frictid_hil.friction.compensation import CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan import Motion, Sine
@@ -30,6 +30,7 @@ class Gravity:
         sin_nm: see there.
         bias_nm: constant part.
         centre_rad: middle of the travel over which it was identified.
+        spread_rad: rms distance from there, over that travel.
         unsure_nm: half of the 95 % interval of the bias.
     """
 
@@ -37,6 +38,7 @@ class Gravity:
     sin_nm: float = 0.0
     bias_nm: float = 0.0
     centre_rad: float = 0.0
+    spread_rad: float = 0.0
     unsure_nm: float = 0.0
 
     def torque_nm(self, position_rad: float) -> float:
@@ -47,9 +49,10 @@ class Gravity:
         """By how much it may be wrong at one position, half of a 95 % interval.
 
         Over a short travel a bias and the top of a cosine look alike. What the one got of the other changes nothing
-        there, and is missing elsewhere: ``unsure_nm (1 - cos(q - centre))``.
+        there, and is missing elsewhere: ``unsure_nm (cos(spread) - cos(q - centre))``.
         """
-        return self.unsure_nm * (1.0 - math.cos(position_rad - self.centre_rad))
+        away = math.cos(self.spread_rad) - math.cos(position_rad - self.centre_rad)
+        return self.unsure_nm * away if away > 0.0 else 0.0
 
     @property
     def largest_nm(self) -> float:
@@ -124,14 +127,14 @@ class ControlLaw:
     def friction_share(self, position_rad: float) -> float:
         """Of friction compensation that is given at one position, 1 where gravity is as good as known.
 
-        1 - R of friction is left to stop a free joint, also where gravity is wrong by a share GRAVITY_MARGIN of F_0.
-        Where it may be wrong by more, that much less friction is given.
+        1 - R of F_0 is left to stop a free joint. Where gravity may be wrong, that much less friction is given, so that
+        as much is left in the worst case.
         """
         friction = self.friction
         if friction is None:
             return 1.0
-        beyond = self.gravity.doubt_nm(position_rad) / friction.coulomb_nm - GRAVITY_MARGIN
-        return 1.0 if beyond <= 0.0 else max(0.0, 1.0 - beyond / friction.ratio)
+        share = 1.0 - self.gravity.doubt_nm(position_rad) / (friction.ratio * friction.coulomb_nm)
+        return share if share > 0.0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)

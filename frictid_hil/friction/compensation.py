@@ -41,9 +41,6 @@ OUR_RATIO = 0.95
 RATIO_MARGIN = 0.02
 STIFFNESS_MARGIN = 0.1
 """The setting ``ours`` is to stand with R larger by the one and K larger by this share."""
-GRAVITY_MARGIN = 0.01
-"""What 1 - R of ``ours`` is there for, as shares of F_0: 0.02 are RATIO_MARGIN; 0.02 the curve below V_1, where it is
-extended and lies that much above a Stribeck dip; and by this share gravity may be wrong."""
 
 
 def stiffness_with_margin(

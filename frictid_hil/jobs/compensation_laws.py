@@ -45,6 +45,7 @@ def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, wa
         _needed(entry.gravity_sin_nm, "gravity", where),
         _needed(entry.bias_nm, "bias", where),
         calibrated_centre_rad(entry, joint),
+        _calibrated_travel_rad(entry) / math.sqrt(8.0),
         _unsure_nm(entry.bias_nm, curve.coulomb_nm) if wanted.setting == "ours" else 0.0,
     )
     gains = None
@@ -118,13 +119,16 @@ def friction_settings(
 
 def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:
     """Middle of the travel over which the profile was identified."""
-    travel_rad = entry.procedure.amplitude_rad if entry.procedure else 0.0
-    return joint.start_position_rad + travel_rad / 2
+    return joint.start_position_rad + _calibrated_travel_rad(entry) / 2
 
 
 def speed_bound_rad_s(wanted: Wanted, joint: JointSetup) -> float:
     """What the supervisor allows during the task."""
     return min(joint.max_velocity_rad_s, _SPEED_MARGIN * wanted.peak_rad_s + _SPEED_SLACK_RAD_S)
+
+
+def _calibrated_travel_rad(entry: JointProfile) -> float:
+    return entry.procedure.amplitude_rad if entry.procedure else 0.0
 
 
 def _unsure_nm(bias: Estimate, coulomb_nm: float) -> float:

@@ -25,7 +25,7 @@ from frictid_hil.runner.rehearsals import Rehearsals
 _HAND_SLACK_RAD = math.radians(8.0)
 _STAND_SLACK_RAD = math.radians(1.0)
 _STAND_RAD_S = math.radians(5.0)
-_TOLD_SHARE = 0.995
+_TOLD_SHARE = 0.999
 """R is told to fall where it falls below this share of itself."""
 _POWER_SHARE = 0.8
 """Of the product of the bounds of torque and speed."""

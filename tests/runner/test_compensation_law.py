@@ -55,13 +55,13 @@ def test_a_standing_joint_is_given_its_gravity_alone() -> None:
 
 
 def test_less_friction_is_given_where_gravity_may_be_wrong() -> None:
-    """Of 1 - R a hundredth of F_0 is there for gravity; R falls by what gravity may be wrong beyond that."""
+    """R falls by what gravity may be wrong, as a share of F_0."""
     f_0 = FRICTION.coulomb_nm
-    gravity = Gravity(10.0, 2.0, 0.5, centre_rad=0.4, unsure_nm=0.5 * f_0)
+    gravity = Gravity(10.0, 2.0, 0.5, centre_rad=0.4, spread_rad=0.15, unsure_nm=0.5 * f_0)
     uncertain, known = law(gravity=gravity), law(gravity=Gravity(10.0, 2.0, 0.5))
     assert uncertain.friction_share(0.4) == uncertain.friction_share(0.5) == known.friction_share(3.0) == 1.0
     for away in (0.6, -0.6):
-        fallen = 0.9 - (0.5 * (1 - math.cos(away)) - 0.01)
+        fallen = 0.9 - 0.5 * (math.cos(0.15) - math.cos(away))
         assert 0.9 * uncertain.friction_share(0.4 + away) == pytest.approx(fallen)
     assert law(gravity=Gravity(unsure_nm=3 * f_0)).friction_share(math.pi) == 0.0
     torques = []
