@@ -1,8 +1,8 @@
 """All six joints at once against one by one, joints on one arm: how far the curves differ, how long it takes.
 
-    python benchmarks/together.py [--seeds 1,2,3] [--out FOLDER]
+    python benchmarks/together.py [--seeds 1,2,3] [--rate HZ] [--fd DATA_BITRATE] [--out FOLDER]
 
-`profiles/hp3j-arm.yaml` is calibrated through the bus at its own rate, once with all joints together and once with each
+`profiles/hp3j-arm.yaml` is calibrated through the bus at its own rate or at another, on classical CAN or CAN FD, once with all joints together and once with each
 joint alone, first without torque noise - what then differs is of the method -, then with the shipped noise, for every
 seed. `repeat` is what two calibrations of one joint alone differ by when nothing but the seed of the noise changed;
 less than that cannot be seen in one pair of runs. `left in` is the distance with nothing taken off for other joints,
@@ -192,10 +192,21 @@ def inertia_error(run: Run) -> dict[str, float]:
     return worst
 
 
-def quiet(folder: Path) -> str:
+def on_wire(folder: Path, rate_hz: float | None, data_bitrate: int | None) -> str:
+    """The arm as shipped, at another rate or on another wire."""
+    if rate_hz is None and data_bitrate is None:
+        return ROBOT
+    path = folder / "wire.yaml"
+    rate = f"cycle_hz: {rate_hz}\n" if rate_hz else ""
+    options = f"options: {{fd: true, data_bitrate: {data_bitrate}}}\n" if data_bitrate else ""
+    path.write_text(f"schema: frictid.robot/1\nextends: {ROBOT}\n{rate}{options}")
+    return str(path)
+
+
+def quiet(folder: Path, robot: str) -> str:
     path = folder / "quiet.yaml"
     lines = "".join(f"  '{name}': {{simulated: {{drive: {{torque_noise_per_mille: 0}}}}}}\n" for name in NAMES)
-    path.write_text(f"schema: frictid.robot/1\nextends: {ROBOT}\nname: hp3j-arm-quiet\njoints:\n{lines}")
+    path.write_text(f"schema: frictid.robot/1\nextends: {robot}\nname: hp3j-arm-quiet\njoints:\n{lines}")
     return str(path)
 
 
@@ -223,10 +234,12 @@ def averaged(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def highest_rates_hz() -> None:
-    for bitrate in (1_000_000, 500_000):
+    wires: list[dict[str, object]] = [{"bitrate": 1_000_000}, {"bitrate": 500_000}]
+    wires += [{"fd": True, "data_bitrate": data} for data in (2_000_000, 4_000_000, 5_000_000, 8_000_000)]
+    for wire in wires:
         for joints, together in ((("0",), False), (NAMES[:3], True), (NAMES, True)):
             planned = plan_calibration(CalibrateOptions(ROBOT, joints=joints, together=together))
-            options = {**planned.setup.options, "bitrate": bitrate}
+            options = {**planned.setup.options, **wire}
             setup = replace(planned.setup, bus="virtual:bench-rates", options=options)
             driver = load_driver("virtual")(setup)  # type: ignore[call-arg]  # protocols carry no constructor
             driver.open(lambda *_: None)
@@ -235,23 +248,25 @@ def highest_rates_hz() -> None:
                 rate = driver.capabilities().max_cycle_hz
             finally:
                 driver.close()
-            print(f"{len(joints)} joints moving, {bitrate // 1000} kbit/s: at most {rate:.0f} Hz")
+            print(f"{len(joints)} joints moving, {wire}: at most {rate:.0f} Hz")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3")
+    parser.add_argument("--rate", type=float, help="Hz; the robot file's unless told")
+    parser.add_argument("--fd", type=int, help="CAN FD, data at so many bit/s")
     parser.add_argument("--out", type=Path, help="keep the runs here, and go on with those that are there")
     options = parser.parse_args()
     seeds = [int(seed) for seed in options.seeds.split(",")]
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.out or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        report(folder, seeds)
+        report(folder, seeds, on_wire(folder, options.rate, options.fd))
 
 
-def report(folder: Path, seeds: list[int]) -> None:
-    file = quiet(folder)
+def report(folder: Path, seeds: list[int], robot: str) -> None:
+    file = quiet(folder, robot)
     together = calibrated(file, folder / "quiet-together", 1, NAMES, together=True)
     alone = one_by_one(file, folder, "quiet", 1)
     gaps = {name: distance(together.profile[name], alone.profile[name]) for name in NAMES}
@@ -274,17 +289,21 @@ def report(folder: Path, seeds: list[int]) -> None:
     )
     print(f"\ntogether {together.duration_s:.1f} s; one by one {alone.duration_s:.1f} s")
 
-    all_together = [calibrated(ROBOT, folder / f"s{seed}-together", seed, NAMES, together=True) for seed in seeds]
-    all_alone = [one_by_one(ROBOT, folder, f"s{seed}", seed) for seed in seeds]
+    all_together = [calibrated(robot, folder / f"s{seed}-together", seed, NAMES, together=True) for seed in seeds]
+    all_alone = [one_by_one(robot, folder, f"s{seed}", seed) for seed in seeds]
     pairs = list(zip(all_together, all_alone, strict=True))
     repeats = [(a, b) for k, a in enumerate(all_alone) for b in all_alone[k + 1 :]]
 
     def measured(first: Run, second: Run) -> dict[str, float]:
         return {n: distance(first.profile[n], second.profile[n]).e_percent_measured_range for n in NAMES}
 
-    rows = {"together - one by one, mean of pairs": averaged([measured(a, b) for a, b in pairs])}
+    every = [measured(a, b) for a, b in pairs]
+    rows = {f"together - one by one, seed {seed}": row for seed, row in zip(seeds, every, strict=True)}
+    rows["together - one by one, mean of pairs"] = averaged(every)
     if repeats:
-        rows["repeat: one by one, other noise"] = averaged([measured(a, b) for a, b in repeats])
+        again = [measured(a, b) for a, b in repeats]
+        rows["repeat: one by one, other noise"] = averaged(again)
+        rows["repeat: the worst"] = {name: max(row[name] for row in again) for name in NAMES}
     rows["curves averaged over the seeds"] = mean_curves(all_together, all_alone)
     rows["truth - together"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_together])
     rows["truth - one by one"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_alone])

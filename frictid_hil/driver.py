@@ -298,8 +298,12 @@ class Finding:
     topic: str = ""
 
 
+FD_FRAME = 1 << 29
+"""Bit of an identifier, here and in bus logs, that says: a CAN FD frame, its data at the higher bit rate."""
+
 FrameSink = Callable[[int, int, bytes, bool], None]
-"""Called for every frame on the wire: run time in ns, CAN id (bit 31 set: extended), data, True when we sent it."""
+"""Called for every frame on the wire: run time in ns, CAN id (bit 31 set: extended, bit 29: CAN FD), data, True when we
+sent it."""
 
 
 class Clock(Protocol):

@@ -4,6 +4,7 @@ Layout, as python-can reads it: a file header of 144 bytes, then log containers,
 
     container: LOBJ | header 16, version 1, size, type 10 | method (2 = zlib), uncompressed size | data, padded
     frame:     LOBJ | header 32, version 1, size 48, type 1 | flags 2 (ns), time u64 | channel, flags, dlc, id, 8 bytes
+    FD frame:  LOBJ | header 32, version 1, size 120, type 100 | flags 2, time | channel, flags, dlc, id, ..., 64 bytes
 
 The start time in the file header stays zero, so a time read back is the run time written, to the nanosecond; the
 counts in the header are filled in at the end, and a file that was never closed is read by their absence.
@@ -18,36 +19,49 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from frictid_hil.driver import FD_FRAME
+
 FILE_HEADER = struct.Struct("<4sLBBBBBBBBQQLL8H8H")
 FILE_HEADER_SIZE = 144
 OBJECT_HEAD = struct.Struct("<4sHHLL")
 CONTAINER_HEAD = struct.Struct("<H6xL4x")
 CONTAINER, CAN_FRAME, CAN_FD_FRAME = 10, 1, 100
-SENT, EDL, REMOTE = 0x01, 0x1, 0x80
+SENT, REMOTE = 0x01, 0x80
+EDL, BRS = 0x1, 0x2
 
-FRAME = np.dtype(
-    [
-        ("signature", "S4"),
-        ("header_size", "<u2"),
-        ("header_version", "<u2"),
-        ("size", "<u4"),
-        ("type", "<u4"),
-        ("time_flags", "<u4"),
-        ("client", "<u2"),
-        ("version", "<u2"),
-        ("t_ns", "<u8"),
-        ("channel", "<u2"),
-        ("flags", "u1"),
-        ("dlc", "u1"),
-        ("can_id", "<u4"),
-        ("data", "u1", 8),
-    ]
-)
+_HEAD: list[tuple[str, str]] = [
+    ("signature", "S4"),
+    ("header_size", "<u2"),
+    ("header_version", "<u2"),
+    ("size", "<u4"),
+    ("type", "<u4"),
+    ("time_flags", "<u4"),
+    ("client", "<u2"),
+    ("version", "<u2"),
+    ("t_ns", "<u8"),
+    ("channel", "<u2"),
+    ("flags", "u1"),
+    ("dlc", "u1"),
+    ("can_id", "<u4"),
+]
+FRAME = np.dtype([*_HEAD, ("data", "u1", 8)])
 """A classic CAN frame, 48 bytes; bit 31 of the id says extended."""
 
-_FD_BODY = struct.Struct("<LHHQHBBLLBBB5x64s")
-_FD_SIZE = OBJECT_HEAD.size + _FD_BODY.size
-_DLC_OF_LENGTH = {12: 9, 16: 10, 20: 11, 24: 12, 32: 13, 48: 14, 64: 15}
+FD_FRAME_OBJECT = np.dtype(
+    [
+        *_HEAD,
+        ("frame_ns", "<u4"),
+        ("bit_count", "u1"),
+        ("fd_flags", "u1"),
+        ("length", "u1"),
+        ("reserved", "u1", 5),
+        ("data", "u1", 64),
+    ]
+)
+"""A CAN FD frame, 120 bytes."""
+
+_FD_LENGTHS = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64], np.uint8)
+"""By dlc."""
 
 
 def file_header(file_size: int, content_size: int, frames: int) -> bytes:
@@ -69,28 +83,80 @@ def frame_objects(
 
     Args:
         t_ns: run time, shape (n,).
-        can_id: bit 31 set for extended ids, shape (n,).
+        can_id: bit 31 set for extended ids, bit 29 (``FD_FRAME``) for CAN FD frames, shape (n,).
         length: bytes used, shape (n,).
         sent: by us, shape (n,).
         data: shape (n, 8 or more).
     """
-    if length.max(initial=0) > 8:
-        every = zip(t_ns.tolist(), can_id.tolist(), length.tolist(), sent.tolist(), data, strict=True)
-        return b"".join(_fd_object(*one) for one in every)
-    objects = np.zeros(t_ns.size, FRAME)
+    fd = ((can_id & FD_FRAME) != 0) | (length > 8)
+    classical = _objects(FRAME, CAN_FRAME, t_ns[~fd], can_id[~fd], sent[~fd])
+    classical["dlc"] = length[~fd]
+    classical["data"] = data[~fd, :8]
+    if not fd.any():
+        return classical.tobytes()
+    long = _objects(FD_FRAME_OBJECT, CAN_FD_FRAME, t_ns[fd], can_id[fd] & ~np.uint32(FD_FRAME), sent[fd])
+    long["dlc"] = np.searchsorted(_FD_LENGTHS, length[fd])
+    long["length"] = length[fd]
+    long["fd_flags"] = EDL | BRS
+    long["data"][:, : data.shape[1]] = data[fd]
+    ends = np.cumsum(np.where(fd, FD_FRAME_OBJECT.itemsize, FRAME.itemsize))
+    content = np.empty(ends[-1], np.uint8)
+    for objects, kind in ((classical, ~fd), (long, fd)):
+        size = objects.dtype.itemsize
+        content[ends[kind, None] - size + np.arange(size)] = objects.view(np.uint8).reshape(-1, size)
+    return content.tobytes()
+
+
+def frames_in(content: bytes) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.intp]] | None:
+    """Classical frames, CAN FD frames, and the place of each of these in the whole; None where other objects are.
+
+    An object that is cut off ends the content.
+    """
+    if len(content) % FRAME.itemsize == 0:  # as most logs are: classical frames alone
+        every = np.frombuffer(content, FRAME)
+        alike = (every["signature"] == b"LOBJ") & (every["type"] == CAN_FRAME) & (every["size"] == FRAME.itemsize)
+        if alike.all():
+            return every, np.zeros(0, FD_FRAME_OBJECT), np.arange(every.size)
+    sizes = {CAN_FRAME: FRAME.itemsize, CAN_FD_FRAME: FD_FRAME_OBJECT.itemsize}
+    begins: dict[int, list[int]] = {CAN_FRAME: [], CAN_FD_FRAME: []}
+    places: dict[int, list[int]] = {CAN_FRAME: [], CAN_FD_FRAME: []}
+    at = count = 0
+    while at + OBJECT_HEAD.size <= len(content):
+        signature, _, _, size, kind = OBJECT_HEAD.unpack_from(content, at)
+        if signature != b"LOBJ" or sizes.get(kind) != size:
+            return None
+        if at + size > len(content):
+            break
+        begins[kind].append(at)
+        places[kind].append(count)
+        at, count = at + size, count + 1
+    raw = np.frombuffer(content, np.uint8)
+    found = []
+    for kind, layout in ((CAN_FRAME, FRAME), (CAN_FD_FRAME, FD_FRAME_OBJECT)):
+        starts = np.array(begins[kind], np.intp)
+        found.append(raw[starts[:, None] + np.arange(layout.itemsize)].view(layout)[:, 0])
+    return found[0], found[1], np.array(places[CAN_FRAME] + places[CAN_FD_FRAME], np.intp)
+
+
+def _objects(
+    layout: np.dtype[np.void],
+    kind: int,
+    t_ns: NDArray[np.int64],
+    can_id: NDArray[np.uint32],
+    sent: NDArray[np.bool_],
+) -> NDArray[np.void]:
+    objects = np.zeros(t_ns.size, layout)
     objects["signature"] = b"LOBJ"
     objects["header_size"] = 32
     objects["header_version"] = 1
-    objects["size"] = FRAME.itemsize
-    objects["type"] = CAN_FRAME
+    objects["size"] = layout.itemsize
+    objects["type"] = kind
     objects["time_flags"] = 2
     objects["t_ns"] = t_ns
     objects["channel"] = 1
     objects["flags"] = sent
-    objects["dlc"] = length
     objects["can_id"] = can_id
-    objects["data"] = data[:, :8]
-    return objects.tobytes()
+    return objects
 
 
 def container(objects: bytes) -> bytes:
@@ -141,13 +207,3 @@ def _unpacked(body: bytes) -> tuple[bytes, bool]:
     except zlib.error:
         return b"", False
     return content, len(content) == size
-
-
-def _fd_object(t_ns: int, can_id: int, length: int, sent: bool, data: NDArray[np.uint8]) -> bytes:
-    flags = SENT if sent else 0
-    if length <= 8:
-        head = OBJECT_HEAD.pack(b"LOBJ", 32, 1, FRAME.itemsize, CAN_FRAME)
-        return head + struct.pack("<LHHQHBBL8s", 2, 0, 0, t_ns, 1, flags, length, can_id, data[:8].tobytes())
-    head = OBJECT_HEAD.pack(b"LOBJ", 32, 1, _FD_SIZE, CAN_FD_FRAME)
-    dlc = _DLC_OF_LENGTH[length]
-    return head + _FD_BODY.pack(2, 0, 0, t_ns, 1, flags, dlc, can_id, 0, 0, EDL, length, data[:64].tobytes())

@@ -16,6 +16,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import InputFileError
 from frictid_hil.recording import blf
 from frictid_hil.recording.growing_file import GrowingFile
@@ -35,9 +36,9 @@ class Frames:
 
     Attributes:
         t_ns: run time (since the start of the log, where it tells the time of day), shape (n,).
-        can_id: bit 31 set for extended ids, shape (n,).
+        can_id: bit 31 set for extended ids, bit 29 (``driver.FD_FRAME``) for CAN FD frames, shape (n,).
         length: bytes used, shape (n,).
-        data: shape (n, 8), or (n, 64) where a frame is longer.
+        data: shape (n, 8), or (n, 64) where a frame is a CAN FD one.
         sent: by the host; False throughout where the format does not tell, shape (n,).
         skipped: error and remote frames, which carry no data.
         damage: where the log ends before its end ("" for a whole one).
@@ -56,7 +57,7 @@ class Frames:
 
     def unknown_to(self, known: Collection[int]) -> dict[int, int]:
         """How many frames there are of each id that is not among ``known``, most frequent first."""
-        ids, counts = np.unique(self.can_id, return_counts=True)
+        ids, counts = np.unique(self.can_id & ~np.uint32(FD_FRAME), return_counts=True)
         unknown = Counter({int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in known})
         return dict(unknown.most_common())
 
@@ -168,7 +169,7 @@ def read_frames(path: Path) -> Frames:
 
 
 def _from_blf(path: Path) -> Frames | None:
-    """The fast way, for logs of classic frames alone (such as ours); None for others."""
+    """The fast way, for logs of data frames alone (such as ours); None for others."""
     data = path.read_bytes()
     if len(data) < blf.FILE_HEADER.size or not data.startswith(b"LOGG"):
         raise InputFileError("not a BLF file" if data else "the file is empty", where=f"{path}, byte 0")
@@ -177,19 +178,17 @@ def _from_blf(path: Path) -> Frames | None:
         contents.append(content)
         damage = wrong
     content = b"".join(contents)
-    if damage:
-        content = content[: len(content) // blf.FRAME.itemsize * blf.FRAME.itemsize]
-    if not content:
+    found = blf.frames_in(content)
+    if found is None:
+        return None
+    classical, long, places = found
+    if not places.size:
         raise InputFileError("holds no frames", where=str(path), cause=damage)
-    if len(content) % blf.FRAME.itemsize:
+    whole = _in_order(classical, long, places)
+    if whole is None:
         return None
-    objects = np.frombuffer(content, blf.FRAME)
-    plain = (objects["signature"] == b"LOBJ") & (objects["type"] == blf.CAN_FRAME)
-    plain &= (objects["size"] == blf.FRAME.itemsize) & (objects["time_flags"] == 2) & (objects["dlc"] <= 8)
-    if not plain.all():
-        return None
-    carries_data = (objects["flags"] & blf.REMOTE) == 0
-    objects = objects[carries_data]
+    carries_data = (whole["flags"] & blf.REMOTE) == 0
+    objects = whole[carries_data]
     if not objects.size:
         raise InputFileError("holds no frames that carry data", where=str(path))
     if int(objects["t_ns"].max()) > np.iinfo(np.int64).max:
@@ -197,12 +196,31 @@ def _from_blf(path: Path) -> Frames | None:
     return Frames(
         t_ns=objects["t_ns"].astype(np.int64),
         can_id=np.ascontiguousarray(objects["can_id"]),
-        length=np.ascontiguousarray(objects["dlc"]),
+        length=np.ascontiguousarray(objects["length"]),
         data=np.ascontiguousarray(objects["data"]),
         sent=(objects["flags"] & blf.SENT) != 0,
         skipped=int(np.count_nonzero(~carries_data)),
         damage=damage,
     )
+
+
+def _in_order(classical: NDArray[np.void], long: NDArray[np.void], places: NDArray[np.intp]) -> NDArray[np.void] | None:
+    """Frames of both kinds as they stood in the file; None where one is not as it should be."""
+    if not ((classical["time_flags"] == 2) & (classical["dlc"] <= 8)).all():
+        return None
+    if not ((long["time_flags"] == 2) & (long["length"] <= 64) & (long["fd_flags"] & blf.EDL != 0)).all():
+        return None
+    columns = ("t_ns", "can_id", "length", "flags")
+    kinds = ("<u8", "<u4", "u1", "u1")
+    width = 64 if long.size else 8
+    whole = np.zeros(places.size, [*zip(columns, kinds, strict=True), ("data", "u1", width)])
+    short_at, long_at = places[: classical.size], places[classical.size :]
+    for name in ("t_ns", "can_id", "flags"):
+        whole[name][short_at], whole[name][long_at] = classical[name], long[name]
+    whole["length"][short_at], whole["length"][long_at] = classical["dlc"], long["length"]
+    whole["can_id"][long_at] |= np.uint32(FD_FRAME)
+    whole["data"][short_at, :8], whole["data"][long_at] = classical["data"], long["data"][:, :width]
+    return whole
 
 
 def _from_python_can(path: Path) -> Frames:
@@ -229,16 +247,21 @@ def _from_python_can(path: Path) -> Frames:
     times_s = np.array([message.timestamp for message in messages], np.float64)
     if not np.all(np.isfinite(times_s)) or abs(times_s - start_s).max() > 9e9:
         raise InputFileError("a time is not finite, or out of range", where=str(path))
-    width = 64 if max(len(message.data) for message in messages) > 8 else 8
+    width = 64 if any(message.is_fd or len(message.data) > 8 for message in messages) else 8
     return Frames(
         t_ns=_run_time_ns(times_s, start_s),
-        can_id=np.array([m.arbitration_id | (EXTENDED if m.is_extended_id else 0) for m in messages], np.uint32),
+        can_id=np.array([_flagged_id(message) for message in messages], np.uint32),
         length=np.array([len(m.data) for m in messages], np.uint8),
         data=np.frombuffer(b"".join(bytes(m.data).ljust(width, b"\0") for m in messages), np.uint8).reshape(-1, width),
         sent=np.array([not m.is_rx for m in messages], np.bool_),
         skipped=skipped,
         damage=damage,
     )
+
+
+def _flagged_id(message: can.Message) -> int:
+    extended = EXTENDED if message.is_extended_id else 0
+    return int(message.arbitration_id | extended | (FD_FRAME if message.is_fd else 0))
 
 
 def _run_time_ns(times_s: NDArray[np.float64], start_s: float) -> NDArray[np.int64]:

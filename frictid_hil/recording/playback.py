@@ -12,6 +12,7 @@ from typing import Any
 
 import can
 
+from frictid_hil.driver import FD_FRAME
 from frictid_hil.recording.bus_log import EXTENDED, Frames
 
 
@@ -82,8 +83,9 @@ def _message(frame: tuple[int, int, bytes]) -> Any:
     t_ns, can_id, data = frame
     return can.Message(
         timestamp=t_ns * 1e-9,
-        arbitration_id=can_id & ~EXTENDED,
+        arbitration_id=can_id & ~(EXTENDED | FD_FRAME),
         is_extended_id=bool(can_id & EXTENDED),
-        is_fd=len(data) > 8,
+        is_fd=bool(can_id & FD_FRAME),
+        bitrate_switch=bool(can_id & FD_FRAME),
         data=data,
     )

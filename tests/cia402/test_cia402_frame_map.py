@@ -120,9 +120,9 @@ def test_absent_factors_stay_absent():
             "unknown meaning",
         ),
         (
-            lambda m: m["joints"]["1"]["reports"][0].update(objects=["6064:00 i32"] * 3),
+            lambda m: m["joints"]["1"]["reports"][0].update(objects=["6064:00 i32"] * 17),
             ("joints", "1", "reports", 0, "objects"),
-            "12 bytes",
+            "68 bytes",
         ),
         (lambda m: m["joints"]["1"]["reports"][0].update(cob_id=514), ("joints", "1"), "described twice"),
         (lambda m: m["joints"]["1"].update(reports="386"), ("joints", "1", "reports"), "list of frames"),

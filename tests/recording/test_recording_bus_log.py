@@ -16,8 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import FrictidError, InputFileError
 from frictid_hil.recording.bus_log import EXTENDED, BusLogWriter, Frames, read_frames
+from frictid_hil.recording.playback import LogBus, logged
 
 ROW = np.dtype([("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("sent", "u1"), ("pad", "<u2"), ("data", "V64")])
 
@@ -82,6 +84,88 @@ def test_any_frame_survives_and_python_can_reads_the_same(
         assert theirs[k].is_rx != sent
         assert bool(ours.sent[k]) == sent
         assert round(theirs[k].timestamp * 1e9) == t_ns
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 10**12),
+            st.integers(0, 0x7FF),
+            st.booleans(),
+            st.sampled_from([*range(9), 12, 16, 20, 24, 32, 48, 64]),
+            st.booleans(),
+        ),
+        min_size=1,
+        max_size=40,
+    ),
+    st.integers(0, 2**31),
+)
+@settings(max_examples=50, deadline=None)
+def test_can_fd_frames_stay_what_they_are(tmp_path_factory: pytest.TempPathFactory, frames: list, seed: int) -> None:
+    path = tmp_path_factory.mktemp("fd") / "fd.blf"
+    draw = random.Random(seed)
+    written = []
+    with BusLogWriter(path) as writer:
+        for t_ns, can_id, fd, size, sent in frames:
+            data = draw.randbytes(size if fd else min(size, 8))
+            written.append((t_ns, can_id | FD_FRAME if fd else can_id, data, sent))
+            writer.frame(*written[-1])
+    ours = read_frames(path)
+    assert list(logged(ours)) == [frame[:3] for frame in written]
+    assert ours.sent.tolist() == [sent for *_, sent in written]
+    with can.LogReader(path) as reader:
+        theirs = list(reader)
+    assert [(m.arbitration_id, m.is_fd, m.bitrate_switch, bytes(m.data)) for m in theirs] == [
+        (can_id & 0x7FF, bool(can_id & FD_FRAME), bool(can_id & FD_FRAME), data) for _, can_id, data, _ in written
+    ]
+    with LogBus(ours) as bus:
+        for _, can_id, data, _ in written:
+            message = bus.recv(0)
+            assert message is not None
+            assert (message.is_fd, message.bitrate_switch, bytes(message.data)) == (
+                bool(can_id & FD_FRAME),
+                bool(can_id & FD_FRAME),
+                data,
+            )
+
+
+@pytest.mark.parametrize("name", ["a.blf", "a.asc", "a.log"])
+def test_can_fd_logs_of_other_tools_are_read(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    with can.Logger(path) as log:
+        for k in range(50):
+            log(can.Message(timestamp=k * 0.002, arbitration_id=0x80, is_extended_id=False, data=bytes([k % 10])))
+            log(
+                can.Message(
+                    timestamp=k * 0.002 + 1e-4, arbitration_id=0x181, is_extended_id=False, is_fd=True,
+                    bitrate_switch=True, data=bytes(12 if k % 2 else 4),
+                )
+            )  # fmt: skip
+    frames = read_frames(path)
+    assert frames.can_id.tolist() == [0x80, 0x181 | FD_FRAME] * 50
+    assert frames.length.tolist() == [1, 4, 1, 12] * 25
+    assert frames.unknown_to({0x80}) == {0x181: 50}
+
+
+def test_a_log_of_fd_frames_cut_anywhere_gives_back_what_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "bus.blf"
+    with BusLogWriter(path) as writer:
+        for k in range(300):
+            writer.frame(k * 1000, 0x181 | FD_FRAME if k % 3 else 0x80, os.urandom(16 if k % 3 else 1), False)
+            if k % 100 == 99:
+                writer.flush()
+    whole, data = list(logged(read_frames(path))), path.read_bytes()
+    most = 0
+    for cut in range(144, len(data), 97):
+        path.write_bytes(data[:cut])
+        try:
+            found = list(logged(read_frames(path)))
+        except InputFileError:
+            found = []
+        assert found == whole[: len(found)]
+        assert len(found) >= most
+        most = len(found)
+    assert most > 200
 
 
 def test_long_frames_are_kept_among_short_ones(tmp_path: Path) -> None:

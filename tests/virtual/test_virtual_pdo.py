@@ -4,12 +4,57 @@ import struct
 
 import pytest
 
+from frictid_hil.driver import FD_FRAME
+
 CONTROL, MODE, TARGET, OFFSET = 0x60400010, 0x60600008, 0x607A0020, 0x60B20010
 STATUS, POSITION, TORQUE, DISPLAY, ERROR = 0x60410010, 0x60640020, 0x60770010, 0x60610008, 0x603F0010
 
 
 def operational(desk):
     return desk.send(0x000, "0105")
+
+
+class TestCanFd:
+    """2023h: PDOs of one kind only; everything else stays classical."""
+
+    def test_only_with_it_more_than_8_bytes_are_mapped(self, desk):
+        for sub in (1, 2, 3):
+            desk.write(0x1A00, sub, POSITION, 4)
+        assert desk.write(0x1A00, 0, 3, 1) == 0x06040042
+        assert desk.write(0x2023, 0, 1, 1) == 0
+        assert desk.write(0x1A00, 0, 3, 1) == 0
+        assert desk.write(0x2023, 0, 2, 1) == 0x06090031
+
+    def test_reports_are_padded_to_a_length_that_there_is(self, desk):
+        desk.write(0x2023, 0, 1, 1)
+        desk.map_pdo(False, 1, [POSITION, POSITION, STATUS], 1)
+        desk.map_pdo(False, 2, [POSITION, POSITION, POSITION, POSITION, STATUS], 1)
+        desk.map_pdo(False, 3, [STATUS], 1)
+        operational(desk)
+        said = {can_id: len(bytes.fromhex(data)) for can_id, data in desk.sync()}
+        assert said == {0x185 | FD_FRAME: 12, 0x285 | FD_FRAME: 20, 0x385 | FD_FRAME: 2}
+
+    def test_commands_of_the_other_kind_are_not_heard(self, desk):
+        desk.map_pdo(True, 1, [CONTROL, MODE], 255)
+        operational(desk)
+        desk.send(0x205 | FD_FRAME, "0600 09")
+        assert desk.read(0x6061) == 0
+        desk.send(0x205, "0600 08")
+        assert desk.read(0x6061) == 8
+        desk.send(0x000, "8005")
+        desk.write(0x2023, 0, 1, 1)
+        operational(desk)
+        desk.send(0x205, "0600 09")
+        assert desk.read(0x6061) == 8
+        desk.send(0x205 | FD_FRAME, "0600 09")
+        assert desk.read(0x6061) == 9
+
+    def test_long_pdos_fall_silent_without_it(self, desk):
+        desk.write(0x2023, 0, 1, 1)
+        desk.map_pdo(False, 1, [POSITION, POSITION, STATUS], 1)
+        desk.write(0x2023, 0, 0, 1)
+        operational(desk)
+        assert desk.sync() == []
 
 
 class TestMapping:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from frictid_drivers.virtual.rack_launcher import decode_setup, encode_setup
 from frictid_drivers.virtual.rack_process import SyncTime
 from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub, SocketBus, message_of, pack
+from frictid_hil.driver import FD_FRAME
 
 MS = 1_000_000
 
@@ -64,13 +65,40 @@ def test_registered_interface_joins_members(hub):
 
 
 @given(
-    can_id=st.integers(0, 0x1FFFFFFF), data=st.binary(max_size=8), extended=st.booleans(), stamp=st.integers(0, 1 << 62)
+    can_id=st.integers(0, 0x1FFFFFFF),
+    data=st.binary(max_size=8) | st.binary(min_size=64, max_size=64),
+    extended=st.booleans(),
+    fd=st.booleans(),
+    stamp=st.integers(0, 1 << 62),
 )
-def test_every_frame_survives_packing(can_id, data, extended, stamp):
+def test_every_frame_survives_packing(can_id, data, extended, fd, stamp):
     can_id = can_id if extended else can_id & 0x7FF
-    message = message_of(pack(can_id | (EXTENDED if extended else 0), data, stamp))
+    data = data if fd else data[:8]
+    message = message_of(pack(can_id | (EXTENDED if extended else 0), data, stamp, fd=fd))
     assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (can_id, data, extended)
+    assert (message.is_fd, message.bitrate_switch) == (fd, fd)
     assert message_of(pack(can_id & 0x7FF | REMOTE, b"", stamp)).is_remote_frame
+
+
+def test_can_fd_frames_pass_between_members_and_drives(hub):
+    first, second = connected(hub, 2)
+    assert first.protocol is can.CanProtocol.CAN_FD
+    first.send(
+        can.Message(arbitration_id=0x201, data=bytes(range(16)), is_extended_id=False, is_fd=True, bitrate_switch=True)
+    )
+    message = second.recv(2)
+    assert (message.arbitration_id, bytes(message.data), message.is_fd) == (0x201, bytes(range(16)), True)
+    assert hub.log == [(0x201 | FD_FRAME, bytes(range(16)))]
+    hub.send(0x181 | FD_FRAME, b"\7" * 12)
+    for bus in (first, second):
+        message = bus.recv(2)
+        assert (message.arbitration_id, message.is_fd, message.is_error_frame, len(message.data)) == (
+            0x181,
+            True,
+            False,
+            12,
+        )
+        bus.shutdown()
 
 
 def test_absent_bus_and_lost_bus_are_errors(runtime_folder):

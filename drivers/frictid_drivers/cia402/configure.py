@@ -22,8 +22,7 @@ _NO_REMOTE = 1 << 30
 _COB_ID_MASK = _NOT_VALID | 0x1FFFFFFF
 """Bit 30 (remote frames) is a drive's own business."""
 
-_UNUSED = ((False, 3), (False, 4), (True, 4))
-"""PDOs that we do not use and that would load the bus."""
+_ALL = tuple((transmit, number) for transmit in (False, True) for number in (1, 2, 3, 4))
 
 
 def refuse_if_powered(drive: Drive) -> None:
@@ -136,6 +135,25 @@ def configure_safety(drive: Drive, settings: BusSettings) -> None:
         drive.write(od.HEARTBEAT_CONSUMER, settings.host_node << 16 | settings.watchdog_ms)
 
 
+def configure_frame_format(drive: Drive, switch: od.Object | None, *, fd: bool) -> None:
+    """Classical or CAN FD frames for the PDOs, where the robot file or a known drive has an object that decides it.
+
+    Raises:
+        HardwareError: refused or not confirmed, or CAN FD is wanted of a drive that lacks the object.
+    """
+    if switch is None:
+        return  # the vendor's tool has set it; what comes in other frames is told while cycling
+    if drive.has(switch):
+        drive.write(switch, int(fd))
+    elif fd:
+        raise HardwareError(
+            f"the drive has no {switch.address}: it cannot be told to send its PDOs as CAN FD frames",
+            where=drive.where(switch.address),
+            cause="the drive or its firmware speaks classical CAN only",
+            next_step="leave `fd` out of the robot file's options, or correct this joint's `fd_object`",
+        )
+
+
 def release_watchdog(drive: Drive) -> None:
     """End the drive's watch over us (1016 = 0), so that it does not fault when we leave."""
     if drive.has(od.HEARTBEAT_CONSUMER):
@@ -197,8 +215,10 @@ def configure_pdos(drive: Drive, layout: Layout, joint: str) -> dict[tuple[bool,
     Raises:
         HardwareError: refused or not confirmed.
     """
-    for transmit, number in _UNUSED:
-        _switch_off(drive, transmit, number)
+    used = {(pdo.transmit, pdo.number) for pdo in layout.pdos[joint]}
+    for transmit, number in _ALL:
+        if (transmit, number) not in used:
+            _switch_off(drive, transmit, number)
     return {(pdo.transmit, pdo.number): _configure_pdo(drive, pdo) for pdo in layout.pdos[joint]}
 
 

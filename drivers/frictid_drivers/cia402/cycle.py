@@ -4,6 +4,9 @@
 
     drain what came late -> RPDOs -> SYNC -> receive until all awaited reports are here or the window ends -> checks
 
+Commands and reports are CAN FD frames where the layout says so; SYNC and heartbeats never are. A drive that answers in
+the other kind of frame ends the run: the bus load was computed for this one, and its set-points are not heard.
+
 A cycle never sends more than the layout's bus load allows for: every active joint's command, and at most one more
 frame, to whichever other joint or command changed.
 """
@@ -20,6 +23,7 @@ from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE, Command, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.layout import Layout
+from frictid_drivers.cia402.network import logged_id
 from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE
 from frictid_hil.driver import Clock, Feedback, FrameSink, Mode, SetPoint
@@ -56,13 +60,17 @@ class _Outgoing:
 
     __slots__ = ("cob_id", "command", "data", "message", "told")
 
-    def __init__(self, command: Command) -> None:
+    def __init__(self, command: Command, *, fd: bool) -> None:
         self.command = command
         self.cob_id = command.cob_id
         self.data = command.data
         # The message holds the command's own buffer: packing the command is all it takes to update it.
-        self.message = can.Message(arbitration_id=command.cob_id, is_extended_id=False, data=command.data)
+        self.message = _message(command.cob_id, command.data, fd=fd)
         self.told = b""
+
+
+def _message(cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> can.Message:
+    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=data, is_fd=fd, bitrate_switch=fd)
 
 
 class Cycle:
@@ -104,19 +112,18 @@ class Cycle:
         self._other = other
         self._timing = CycleTiming.of(layout, settings)
         self._active = [axis.joint in layout.active for axis in axes]
-        self._primary = [_Outgoing(axis.primary) for axis in axes]
-        self._secondary = [_Outgoing(axis.secondary) for axis in axes]
-        self._sync = can.Message(
-            arbitration_id=SYNC_COB_ID, is_extended_id=False, data=bytearray(1 if layout.sync_overflow else 0)
-        )
+        self._fd = layout.fd
+        self._primary = [_Outgoing(axis.primary, fd=layout.fd) for axis in axes]
+        self._secondary = [_Outgoing(axis.secondary, fd=layout.fd) for axis in axes]
+        self._sync = _message(SYNC_COB_ID, bytearray(1 if layout.sync_overflow else 0))
         self._overflow = layout.sync_overflow
         self._counter = 0
-        self._heartbeat = can.Message(
-            arbitration_id=HEARTBEAT_BASE + settings.host_node, is_extended_id=False, data=bytearray(_OPERATIONAL)
-        )
+        self._heartbeat = _message(HEARTBEAT_BASE + settings.host_node, bytearray(_OPERATIONAL))
         self._heartbeat_due_ns = 0
         self._healthy = [False] * len(self._axes)
         self._nodes = [joint.node for joint in frame_map.joints]
+        self._reporter = {frame.cob_id: at for at, joint in enumerate(frame_map.joints) for frame in joint.reports}
+        self._other_kind: int | None = None
         self._window_end_ns = -1
         self._late: list[tuple[int, bytearray, float]] = []
         self._turn = 0
@@ -129,7 +136,8 @@ class Cycle:
         Raises:
             SafetyAbort: a drive was reset, its heartbeat is missing, or a set-point is not a number. A quick stop has
                 been sent by then. Raised once; later exchanges go on, so that the stop can be watched.
-            HardwareError: frames cannot be sent, or a fault stays after its reset.
+            HardwareError: frames cannot be sent, a fault stays after its reset, or a drive reports in frames of the
+                other kind (classical instead of CAN FD).
         """
         decoder, clock = self._decoder, self._clock
         begun = False
@@ -172,7 +180,7 @@ class Cycle:
                     frames += [primary] if axis.mode is Mode.POSITION else [secondary, primary]
         for _ in range(2):
             for frame in frames:
-                self._send_whatever_happens(frame.cob_id, frame.data)
+                self._send_whatever_happens(frame.cob_id, frame.data, fd=self._fd)
             self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
 
     def cut_power(self) -> None:
@@ -180,7 +188,7 @@ class Cycle:
         for axis in self._axes:
             axis.primary.set("controlword", DISABLE_VOLTAGE)
             axis.primary.set("torque_offset", 0)
-            self._send_whatever_happens(axis.primary.cob_id, axis.primary.pack())
+            self._send_whatever_happens(axis.primary.cob_id, axis.primary.pack(), fd=self._fd)
         self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
 
     # -- sending ------------------------------------------------------------------------------------------------
@@ -227,16 +235,16 @@ class Cycle:
 
     def _send(self, message: can.Message, t_ns: int) -> None:
         if self._sink is not None:
-            self._sink(t_ns, message.arbitration_id, bytes(message.data), True)
+            self._sink(t_ns, logged_id(message), bytes(message.data), True)
         self._bus.send(message)
 
-    def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray) -> None:
-        message = can.Message(arbitration_id=cob_id, is_extended_id=False, data=bytes(data))
+    def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> None:
+        message = _message(cob_id, bytes(data), fd=fd)
         # Nothing may keep the next joint from being stopped, whatever this interface raises.
         with contextlib.suppress(Exception):
             self._bus.send(message)
             if self._sink is not None:
-                self._sink(self._clock.now_ns(), cob_id, bytes(data), True)
+                self._sink(self._clock.now_ns(), logged_id(message), bytes(data), True)
 
     def _wire_failed(self, error: can.CanError) -> None:
         """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
@@ -246,7 +254,8 @@ class Cycle:
             raise HardwareError(
                 f"{_WIRE_FAILURES} cycles in a row failed on the bus: {error}",
                 where="bus",
-                cause="bus-off, an unplugged adapter, or nobody left on the bus to acknowledge",
+                cause="bus-off, an unplugged adapter, or nobody left on the bus to acknowledge"
+                + ("; a device that knows classical CAN only destroys every CAN FD frame" if self._fd else ""),
                 next_step="check the wiring and termination; the drives stop by their own watchdogs",
             ) from error
 
@@ -274,7 +283,9 @@ class Cycle:
             return
         cob_id, data = message.arbitration_id, message.data
         if self._sink is not None:
-            self._sink(t_ns, cob_id, bytes(data), False)
+            self._sink(t_ns, logged_id(message), bytes(data), False)
+        if message.is_fd is not self._fd and self._other_kind is None:
+            self._other_kind = self._reporter.get(cob_id)
         if t_ns > self._window_end_ns:
             # Kept until the next row begins, as a replay of the log will.
             self._late.append((cob_id, data, message.timestamp))
@@ -297,6 +308,9 @@ class Cycle:
 
     def _check(self, now_ns: int) -> None:
         decoder, timing = self._decoder, self._timing
+        if self._other_kind is not None:
+            at, self._other_kind = self._other_kind, None
+            self._tell_other_kind(at)
         for at, axis in enumerate(self._axes):
             if decoder.restarted(at):
                 self._alarm(at, "booted up in the middle of the run: the drive was reset")
@@ -311,6 +325,20 @@ class Cycle:
             if axis.alarm is not None:
                 alarm, axis.alarm = axis.alarm, None
                 raise alarm
+
+    def _tell_other_kind(self, at: int) -> None:
+        if self._alarmed:
+            return
+        self._alarmed = True
+        self.quick_stop()
+        found, wanted = ("classical", "`fd: true`") if self._fd else ("CAN FD", "no `fd: true`")
+        raise HardwareError(
+            f"the drive reports in {found} frames, the robot file's options say {wanted}",
+            where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
+            cause="CAN FD is not switched on in this drive" if self._fd else "CAN FD is switched on in this drive",
+            next_step="switch it with the vendor's tool, name the object that does as `fd_object` in the joint's "
+            "options, or change `fd`",
+        )
 
     def _alarm(self, at: int, what: str) -> None:
         if self._alarmed:

@@ -101,11 +101,13 @@ class Fleet:
             sync_counter=self.sync_counter,
             host_heartbeat_s=self._settings.host_heartbeat_s,
             drive_heartbeat_s=self._settings.drive_heartbeat_ms * 1e-3,
+            rates=self._settings.rates,
+            pdo_bytes=self._settings.pdo_bytes,
         )
 
     def load(self, active: Sequence[str], cycle_hz: float) -> BusLoad:
         """Its load on this bus."""
-        return self.layout(active, cycle_hz).load(self._settings.bitrate)
+        return self.layout(active, cycle_hz).load()
 
     def highest_rate_hz(self, active: Sequence[str]) -> float:
         """The highest rate that fits."""
@@ -171,6 +173,7 @@ class Fleet:
         scale = self.scales[joint.name]
         configure.configure_timing(drive, layout.cycle_hz, layout.sync_overflow)
         configure.configure_safety(drive, self._settings)
+        configure.configure_frame_format(drive, settings.fd_object, fd=layout.fd)
         configure.configure_windows(drive, settings, scale.position_rad, active=joint.name in layout.active)
         configure.configure_set_points(drive, Mode.POSITION)
         frames = configure.configure_pdos(drive, layout, joint.name)

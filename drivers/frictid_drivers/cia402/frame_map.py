@@ -282,8 +282,8 @@ class _Reader:
                 except ValueError as error:
                     self._problem((*here, "objects", entry_at), str(error))
             frame = Frame(self._integer((*here, "cob_id"), item["cob_id"], 1, 0x7FF), tuple(entries))
-            if not 1 <= frame.size <= 8:
-                self._problem((*here, "objects"), f"{frame.size} bytes; a PDO carries 1..8")
+            if not 1 <= frame.size <= 64:
+                self._problem((*here, "objects"), f"{frame.size} bytes; a PDO carries 1..8, as a CAN FD frame 1..64")
             frames.append(frame)
         return tuple(frames)
 

@@ -11,6 +11,10 @@ TPDO3       6061 603F, temperature (3 to 5)      active joint: every 10 ms; lock
 TPDO4       60FD (4), where an interlock is on   at least every 10 ms
 ==========  ===================================  ==========================================================
 
+Where frames are CAN FD and the drives' PDOs are long enough, TPDO2's content follows TPDO1's in one frame: most of a
+short frame is its head, and that goes at the lower bit rate. PDOs are CAN FD frames then; SYNC, NMT, SDO, EMCY and
+heartbeats stay classical.
+
 The mapping is the same for every joint, active or locked, so that going on to the next joint changes transmission
 types only, and one frame map decodes a whole run. Reports that do not come on every SYNC are spread over the SYNCs by
 their start value (18xx:06, with the SYNC counter of 1019): transmission type 10 alone would let all of them answer the
@@ -20,11 +24,11 @@ same SYNC. Where a drive has no SYNC counter they do, and the load is computed s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.bus_load import BusLoad, SyncFrame, bus_load, frame_bits
+from frictid_drivers.cia402.bus_load import BitRates, BusLoad, SyncFrame, bus_load
 from frictid_drivers.cia402.frame_map import Entry, Frame
 
 REPORT_INTERVAL_S = 0.010
@@ -97,6 +101,7 @@ class Layout:
         interval_cycles: SYNCs between two reports of a locked joint.
         host_heartbeat_s: period of our own heartbeat.
         drive_heartbeat_s: period of every drive's heartbeat.
+        rates: of the bus; PDOs are CAN FD frames where it has a data rate.
     """
 
     cycle_hz: float
@@ -106,20 +111,27 @@ class Layout:
     interval_cycles: int
     host_heartbeat_s: float
     drive_heartbeat_s: float
+    rates: BitRates
 
-    def load(self, bitrate: int) -> BusLoad:
-        """Load of this layout on a bus."""
+    @property
+    def fd(self) -> bool:
+        """PDOs are CAN FD frames."""
+        return self.rates.data is not None
+
+    def load(self) -> BusLoad:
+        """Load of this layout on its bus."""
+        fd = self.fd
         frames = [SyncFrame(1 if self.sync_overflow else 0)]
         largest_command = 0
         for joint, pdos in self.pdos.items():
             commands = [pdo.frame.size for pdo in pdos if not pdo.transmit]
             largest_command = max(largest_command, *commands)
             if joint in self.active:
-                frames.append(SyncFrame(max(commands)))
-            frames += [SyncFrame(pdo.frame.size, pdo.every, pdo.start) for pdo in pdos if pdo.transmit]
+                frames.append(SyncFrame(max(commands), fd=fd))
+            frames += [SyncFrame(pdo.frame.size, pdo.every, pdo.start, fd) for pdo in pdos if pdo.transmit]
         timed = [(1, self.host_heartbeat_s)] + [(1, self.drive_heartbeat_s)] * len(self.pdos)
         # Besides the active joints' commands at most one more goes out per cycle, to whichever joint needs one.
-        return bus_load(frames, self.cycle_hz, bitrate, occasional=[largest_command], timed=timed)
+        return bus_load(frames, self.cycle_hz, self.rates, occasional=[SyncFrame(largest_command, fd=fd)], timed=timed)
 
 
 def plan_layout(
@@ -130,6 +142,8 @@ def plan_layout(
     sync_counter: bool,
     host_heartbeat_s: float,
     drive_heartbeat_s: float,
+    rates: BitRates,
+    pdo_bytes: int = 8,
 ) -> Layout:
     """Decide every PDO.
 
@@ -140,19 +154,23 @@ def plan_layout(
         sync_counter: every drive has 1019 and 18xx:06.
         host_heartbeat_s: period of our heartbeat.
         drive_heartbeat_s: period of the drives' heartbeats.
+        rates: of the bus.
+        pdo_bytes: how long the drives' PDOs may be.
     """
     interval = max(1, min(_MAX_TYPE, math.floor(REPORT_INTERVAL_S * cycle_hz + 1e-9)))
     slow = interval * max(1, min(_SLOW_FACTOR, _MAX_TYPE // interval))
-    starts = _starts(wishes, interval, slow) if sync_counter else {wish.joint: (0, 0) for wish in wishes}
+    starts = (
+        _starts(wishes, interval, slow, rates, pdo_bytes) if sync_counter else {wish.joint: (0, 0) for wish in wishes}
+    )
     pdos: dict[str, tuple[Pdo, ...]] = {}
     for wish in wishes:
         fast_start, slow_start = starts[wish.joint]
         if wish.joint in active:
             # The same SYNCs as when it is locked, more often: no other joint's start value has to change.
             slow_start = (slow_start - 1) % interval + 1 if interval > 1 and slow_start else 0
-            pdos[wish.joint] = _pdos(wish, every=1, start=0, slow_every=interval, slow_start=slow_start)
+            pdos[wish.joint] = _pdos(wish, pdo_bytes, 1, 0, slow_every=interval, slow_start=slow_start)
         else:
-            pdos[wish.joint] = _pdos(wish, every=interval, start=fast_start, slow_every=slow, slow_start=slow_start)
+            pdos[wish.joint] = _pdos(wish, pdo_bytes, interval, fast_start, slow_every=slow, slow_start=slow_start)
     return Layout(
         cycle_hz=cycle_hz,
         active=tuple(joint for joint in pdos if joint in active),
@@ -161,31 +179,34 @@ def plan_layout(
         interval_cycles=interval,
         host_heartbeat_s=host_heartbeat_s,
         drive_heartbeat_s=drive_heartbeat_s,
+        rates=rates,
     )
 
 
-def _starts(wishes: Sequence[NodeWish], interval: int, slow: int) -> dict[str, tuple[int, int]]:
+def _starts(
+    wishes: Sequence[NodeWish], interval: int, slow: int, rates: BitRates, pdo_bytes: int
+) -> dict[str, tuple[int, int]]:
     """Start values (reports, slow report) of every joint as if all were locked; 0 where each SYNC is answered."""
     slots = _Slots(slow)
+    fd = rates.data is not None
     fast_starts = {}
     for wish in wishes:
-        pdos = _pdos(wish, every=1, start=0, slow_every=1, slow_start=0)
-        bits = sum(frame_bits(pdo.frame.size).worst for pdo in pdos if pdo.transmit and pdo.number < 3)
+        pdos = _pdos(wish, pdo_bytes, 1, 0, slow_every=1, slow_start=0)
+        fast = [SyncFrame(pdo.frame.size, fd=fd) for pdo in pdos if pdo.transmit and pdo.number < 3]
+        bits = sum(frame.bits(rates).worst for frame in fast)
         fast_starts[wish.joint] = slots.take(interval, bits) if interval > 1 else 0
     # The slow ones go where the others left room.
-    return {
-        wish.joint: (fast_starts[wish.joint], slots.take(slow, frame_bits(5).worst) if slow > 1 else 0)
-        for wish in wishes
-    }
+    bits = SyncFrame(5, fd=fd).bits(rates).worst
+    return {wish.joint: (fast_starts[wish.joint], slots.take(slow, bits) if slow > 1 else 0) for wish in wishes}
 
 
 class _Slots:
     """SYNCs of one turn of the counter, and how full each is."""
 
     def __init__(self, count: int) -> None:
-        self._bits = [0] * count
+        self._bits = [0.0] * count
 
-    def take(self, every: int, bits: int) -> int:
+    def take(self, every: int, bits: float) -> int:
         """The start value, from 1, that leaves the fullest SYNC least full."""
         count = len(self._bits)
         start = min(range(every), key=lambda first: max(self._bits[first::every]))
@@ -194,7 +215,9 @@ class _Slots:
         return start + 1
 
 
-def _pdos(wish: NodeWish, *, every: int, start: int, slow_every: int, slow_start: int) -> tuple[Pdo, ...]:
+def _pdos(
+    wish: NodeWish, pdo_bytes: int, every: int, start: int, *, slow_every: int, slow_start: int
+) -> tuple[Pdo, ...]:
     command = [Entry.of(od.CONTROLWORD), Entry.of(od.TARGET_POSITION)]
     if wish.torque_offset:
         command.append(Entry.of(od.TORQUE_OFFSET))
@@ -207,20 +230,18 @@ def _pdos(wish: NodeWish, *, every: int, start: int, slow_every: int, slow_start
     velocity = [Entry.of(od.VELOCITY_ACTUAL)] + ([wish.external_torque] if wish.external_torque else [])
     display = [Entry.of(od.MODE_DISPLAY), Entry.of(od.ERROR_CODE)] + ([wish.temperature] if wish.temperature else [])
     node = wish.node
-    pdos = (
+    pdos: tuple[Pdo, ...] = (
         Pdo(False, 1, 0x200 + node, tuple(command)),
         Pdo(False, 2, 0x300 + node, tuple(other)),
         Pdo(True, 1, 0x180 + node, tuple(fast), every, start),
         Pdo(True, 2, 0x280 + node, tuple(velocity), every, start),
         Pdo(True, 3, 0x380 + node, tuple(display), slow_every, slow_start),
     )
+    whole = Pdo(True, 1, 0x180 + node, tuple(fast + velocity), every, start)
+    if whole.frame.size <= pdo_bytes:
+        pdos = (*pdos[:2], whole, pdos[4])
     if not wish.digital_inputs:
         return pdos
     # As often as a locked joint reports: an active joint's inputs go with its slow report, others with the fast ones.
     inputs_every, inputs_start = (slow_every, slow_start) if every == 1 else (every, start)
     return (*pdos, Pdo(True, 4, 0x480 + node, (Entry.of(od.DIGITAL_INPUTS),), inputs_every, inputs_start))
-
-
-def load_at(layout_at: Callable[[float], Layout], bitrate: int) -> Callable[[float], BusLoad]:
-    """The load as a function of the rate; the layout itself changes with it."""
-    return lambda cycle_hz: layout_at(cycle_hz).load(bitrate)

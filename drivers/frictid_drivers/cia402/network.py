@@ -21,14 +21,23 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 from filelock import FileLock, Timeout
 
-from frictid_hil.driver import FrameSink
+from frictid_hil.driver import FD_FRAME, FrameSink
 from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
 
 BusFactory = Callable[[], can.BusABC]
 
 DEFAULT_BITRATE = 1_000_000
+DEFAULT_DATA_BITRATE = 2_000_000
 FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host")
 """Robot-file options that are handed to python-can as they are, when given."""
+
+_FD_BY_LINK = ("socketcan", "udp_multicast", "frictid")
+_FD_BY_RATES = ("ixxat", "neovi")
+_FD_BY_TIMING = ("pcan", "kvaser", "vector", "slcan", "nixnet")
+_FD_CLOCK_HZ = 80_000_000
+_LINKS = Path("/sys/class/net")
+_CLASSICAL_MTU = 16
+"""Of a SocketCAN link; one with CAN FD has 72."""
 
 
 def split_bus(bus: str) -> tuple[str, str]:
@@ -51,19 +60,22 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
 
     Args:
         bus: ``interface:channel``.
-        options: of the robot file; ``bitrate`` and a few others go to the interface.
+        options: of the robot file; bit rates and a few others go to the interface.
 
     Raises:
         UsageError: not of that form.
-        HardwareError: interface unknown, channel absent, or no permission.
+        HardwareError: interface unknown or without CAN FD where that is wanted, channel absent, or no permission.
     """
     interface, channel = split_bus(bus)
     settings = {key: options[key] for key in FORWARDED if key in options}
     if interface not in ("socketcan", "virtual"):
         # A SocketCAN link carries its bitrate already; everybody else must be told.
         settings.setdefault("bitrate", DEFAULT_BITRATE)
+    fd = bool(options.get("fd"))
     try:
-        return can.Bus(interface=interface, channel=channel, **settings)
+        if fd:
+            settings = _fd_settings(bus, interface, settings, options)
+        opened = can.Bus(interface=interface, channel=channel, **settings)
     except can.CanInterfaceNotImplementedError as error:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise HardwareError(
@@ -85,17 +97,74 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
             where=bus,
             cause=_likely_cause(error),
             next_step=(
-                f"sudo ip link set {channel} up type can bitrate {options.get('bitrate', DEFAULT_BITRATE)}"
+                _link_command(channel, options)
                 if interface == "socketcan"
                 else "check the adapter, its driver and the channel's name"
             ),
         ) from error
+    # slcan calls itself classical whatever it was told.
+    classical = opened.protocol is can.CanProtocol.CAN_20 and interface != "slcan"
+    if fd and (classical or _classical_link(interface, channel)):
+        opened.shutdown()
+        raise HardwareError(
+            "the bus carries classical CAN frames only, but the robot file says `fd: true`",
+            where=bus,
+            cause="a link that was brought up without CAN FD, or an adapter that cannot do it",
+            next_step=(
+                f"sudo ip link set {channel} down; {_link_command(channel, options)}"
+                if interface == "socketcan"
+                else "leave `fd` out of the robot file's options, or use another adapter"
+            ),
+        )
+    return opened
+
+
+def _fd_settings(bus: str, interface: str, settings: dict[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """What makes an interface CAN FD; each family of python-can's has its own way of being told.
+
+    Raises:
+        HardwareError: an interface that python-can cannot make CAN FD.
+    """
+    bitrate = int(options.get("bitrate", DEFAULT_BITRATE))
+    data_bitrate = int(options.get("data_bitrate", max(DEFAULT_DATA_BITRATE, bitrate)))
+    if interface in _FD_BY_LINK:
+        return {**settings, "fd": True}
+    if interface in _FD_BY_RATES:
+        return {**settings, "bitrate": bitrate, "fd": True, "data_bitrate": data_bitrate}
+    if interface == "virtual":
+        return {**settings, "protocol": can.CanProtocol.CAN_FD}
+    if interface in _FD_BY_TIMING:
+        timing = can.BitTimingFd.from_sample_point(_FD_CLOCK_HZ, bitrate, 80.0, data_bitrate, 75.0)
+        return {**{key: value for key, value in settings.items() if key != "bitrate"}, "timing": timing}
+    raise HardwareError(
+        f"python-can's interface {interface!r} is not known to speak CAN FD",
+        where=bus,
+        next_step="leave `fd` out of the robot file's options, or use one of "
+        + ", ".join(sorted({*_FD_BY_LINK, *_FD_BY_RATES, *_FD_BY_TIMING})),
+    )
+
+
+def _classical_link(interface: str, channel: str) -> bool:
+    """A SocketCAN link whose frames hold 8 bytes; it would refuse the first CAN FD frame."""
+    size = _LINKS / channel / "mtu"
+    return interface == "socketcan" and size.exists() and int(size.read_text()) == _CLASSICAL_MTU
+
+
+def _link_command(channel: str, options: Mapping[str, Any]) -> str:
+    bitrate = options.get("bitrate", DEFAULT_BITRATE)
+    fd = f" dbitrate {options.get('data_bitrate', DEFAULT_DATA_BITRATE)} fd on" if options.get("fd") else ""
+    return f"sudo ip link set {channel} up type can bitrate {bitrate}{fd}"
 
 
 def _likely_cause(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno == 19:
         return "there is no such CAN interface on this machine"
     return "the adapter is absent, the link is down, or an option does not suit the interface"
+
+
+def logged_id(message: can.Message) -> int:
+    """The identifier as a ``FrameSink`` takes it."""
+    return message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
 
 
 class BusLock:
@@ -164,7 +233,7 @@ class Wire(canopen.Network):
         if message is None:
             return False
         if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-            self._tell(message.arbitration_id, message.data, False)
+            self._tell(logged_id(message), message.data, False)
             self.dispatch(message.arbitration_id, message.data, message.timestamp)
         return True
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 from frictid_drivers.cia402.codec import CommandDecoder, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
-from frictid_hil.driver import Feedback
+from frictid_hil.driver import FD_FRAME, Feedback
 
 LoggedFrame = tuple[int, int, bytes]
-"""Run time in ns, CAN id, data - in the order of the log."""
+"""Run time in ns, CAN id (bit 29: a CAN FD frame), data - in the order of the log."""
 
 _NMT, _SYNC, _TIME = 0x000, 0x080, 0x100
 _NMT_START = 0x01
@@ -76,7 +76,8 @@ class LogDecoder:
         last_ns = 0
         counter = b""
         answered = False
-        for t_ns, can_id, data in frames:
+        for t_ns, logged_id, data in frames:
+            can_id = logged_id & ~FD_FRAME  # the same PDO, whichever kind of frame carries it
             if t_ns < last_ns:
                 self.backwards += 1
             last_ns = t_ns

@@ -4,6 +4,9 @@
 options (robot)                         default   meaning
 ======================================  ========  =====================================================================
 bitrate                                 1000000   bit/s; also the base of the bus load
+fd                                      false     PDOs are CAN FD frames with bit-rate switch, all else classical
+data_bitrate                            2000000   bit/s of the data of CAN FD frames
+pdo_bytes                               64        how long the drives' PDOs may be where they are CAN FD frames
 sdo_timeout_s                           0.5       how long a drive may take to answer
 watchdog_ms                             150       the drive stops when our heartbeat is missing for this long (1016)
 drive_heartbeat_ms                      100       heartbeat period of the drives (1017); 2.5 of it missing is a stop
@@ -32,6 +35,7 @@ velocity_unit_rad_s                     -         joint side; where 60A9 does no
 rated_torque_side                       motor     6076 is ``motor`` or ``joint`` side
 torque_source                           -         what the reported torque is, for the profile
 timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s
+fd_object                               -         e.g. ``"2023:00 u8"``: 1 makes the drive's PDOs CAN FD frames, 0 not
 ======================================  ========  =====================================================================
 """
 
@@ -42,14 +46,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from frictid_drivers.cia402.bus_load import BitRates
 from frictid_drivers.cia402.frame_map import Entry
-from frictid_drivers.cia402.network import DEFAULT_BITRATE, FORWARDED
+from frictid_drivers.cia402.network import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, FORWARDED
+from frictid_drivers.cia402.objects import Object
 from frictid_hil.driver import JointSetup, RobotSetup, Timing, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
 
 BUS_OPTIONS = frozenset(
     {
         "bitrate",
+        "fd",
+        "data_bitrate",
+        "pdo_bytes",
         "sdo_timeout_s",
         "watchdog_ms",
         "drive_heartbeat_ms",
@@ -77,6 +86,7 @@ JOINT_OPTIONS = frozenset(
         "rated_torque_side",
         "torque_source",
         "timing",
+        "fd_object",
     }
 )
 
@@ -86,6 +96,8 @@ class BusSettings:
     """Robot-wide settings; see the module's table."""
 
     bitrate: int
+    data_bitrate: int | None
+    pdo_bytes: int
     sdo_timeout_s: float
     watchdog_ms: int
     drive_heartbeat_ms: int
@@ -94,6 +106,11 @@ class BusSettings:
     allow_torque_without_watchdog: bool
     quick_stop_option: int
     abort_option: int
+
+    @property
+    def rates(self) -> BitRates:
+        """Of the bus; its data rate only where PDOs are CAN FD frames."""
+        return BitRates(self.bitrate, self.data_bitrate)
 
     @property
     def host_heartbeat_s(self) -> float:
@@ -121,6 +138,7 @@ class JointSettings:
     digital_inputs: bool
     torque_source: str
     timing: Timing | None
+    fd_object: Object | None
 
 
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
@@ -145,8 +163,12 @@ class _Reader:
     def bus(self, options: Mapping[str, Any]) -> BusSettings:
         at: tuple[str, ...] = ("options",)
         self.problems += unknown_options(options, BUS_OPTIONS, at, "cia402")
+        bitrate = self._whole(at, options, "bitrate", DEFAULT_BITRATE, 10_000, 1_000_000)
+        data_bitrate, pdo_bytes = self._fd(at, options, bitrate)
         return BusSettings(
-            bitrate=self._whole(at, options, "bitrate", DEFAULT_BITRATE, 10_000, 1_000_000),
+            bitrate=bitrate,
+            data_bitrate=data_bitrate,
+            pdo_bytes=pdo_bytes,
             sdo_timeout_s=self._number(at, options, "sdo_timeout_s", 0.5, 0.01, 60.0),
             watchdog_ms=self._whole(at, options, "watchdog_ms", 150, 20, 1000),
             drive_heartbeat_ms=self._whole(at, options, "drive_heartbeat_ms", 100, 10, 1000),
@@ -156,6 +178,19 @@ class _Reader:
             quick_stop_option=self._whole(at, options, "quick_stop_option", 6, 5, 7),
             abort_option=self._whole(at, options, "abort_option", 3, 2, 3),
         )
+
+    def _fd(self, at: tuple[str, ...], options: Mapping[str, Any], bitrate: int) -> tuple[int | None, int]:
+        """Data bit rate and length of PDOs: None and 8 on a classical bus."""
+        if self._flag(at, options, "fd"):
+            default = max(DEFAULT_DATA_BITRATE, bitrate)
+            data_bitrate = self._whole(at, options, "data_bitrate", default, 10_000, 8_000_000)
+            if data_bitrate < bitrate:
+                self._problem((*at, "data_bitrate"), f"{data_bitrate} is below the bitrate of arbitration, {bitrate}")
+            return data_bitrate, self._whole(at, options, "pdo_bytes", 64, 8, 64)
+        for key in ("data_bitrate", "pdo_bytes"):
+            if key in options:
+                self._problem((*at, key), f"{key} without `fd: true`: classical CAN has one bit rate and 8 bytes")
+        return None, 8
 
     def joint(self, joint: JointSetup) -> JointSettings:
         options = joint.options
@@ -176,6 +211,7 @@ class _Reader:
             digital_inputs=self._flag(at, options, "digital_inputs"),
             torque_source=str(options.get("torque_source", "6077 actual torque")),
             timing=self._timing(at, options),
+            fd_object=self._fd_object(at, options),
         )
 
     def nodes(self, setup: RobotSetup, host_node: int) -> None:
@@ -209,6 +245,17 @@ class _Reader:
         here = (*at, "timing")
         values = {key: self._number(here, given, key, 0.0, -1.0, 1.0) for key in known if key in given}
         return Timing(**values, source="robot file")
+
+    def _fd_object(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Object | None:
+        text = options.get("fd_object")
+        if text is None:
+            return None
+        try:
+            entry = Entry.parse(str(text))
+        except ValueError:
+            self._problem((*at, "fd_object"), f"expected an object such as '2023:00 u8', found {text!r}")
+            return None
+        return Object(entry.index, entry.sub, entry.type, "frames of its PDOs: 0 classical, 1 CAN FD")
 
     def _object(
         self, at: tuple[str, ...], options: Mapping[str, Any], meaning: str, unit: str

@@ -201,12 +201,15 @@ def _told_to_host(setup: RobotSetup) -> RobotSetup:
     if problems:
         raise InvalidFields(problems)
     options = {name: value for name, value in setup.options.items() if name != "faults"}
-    joints = tuple(replace(joint, options={**_objects(joint), **joint.options}) for joint in setup.joints)
+    fd = bool(options.get("fd"))
+    joints = tuple(replace(joint, options={**_objects(joint, fd=fd), **joint.options}) for joint in setup.joints)
     return replace(setup, options=options, joints=joints)
 
 
-def _objects(joint: JointSetup) -> dict[str, str | float]:
+def _objects(joint: JointSetup, *, fd: bool) -> dict[str, str | float]:
     known: dict[str, str | float] = {"temperature_object": "2031:00 i16", "temperature_c_per_unit": 0.1}
+    if fd:
+        known["fd_object"] = "2023:00 u8"
     if "hand" in joint.simulated:
         known |= {"external_torque_object": "2030:00 i32", "external_torque_nm_per_unit": 0.001}
     return known

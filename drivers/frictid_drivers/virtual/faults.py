@@ -40,7 +40,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from frictid_hil.driver import RobotSetup
+from frictid_hil.driver import FD_FRAME, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.simulation.fields import Fields
 
@@ -157,7 +157,8 @@ def _cob_ids(service: str, nodes: list[int]) -> frozenset[int]:
         return frozenset(SERVICES[service])
     if service == "host_heartbeat":
         return frozenset(0x700 + node for node in _HOST_NODES)
-    return frozenset(base + node for base in SERVICES[service] for node in nodes)
+    kinds = (0, FD_FRAME) if "pdo" in service else (0,)
+    return frozenset(base + node | kind for base in SERVICES[service] for node in nodes for kind in kinds)
 
 
 def missing_objects(faults: Sequence[Fault]) -> Mapping[str, frozenset[int]]:

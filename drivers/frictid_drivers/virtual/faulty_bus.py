@@ -78,6 +78,8 @@ def _with_data(msg: can.Message, data: bytes) -> can.Message:
         is_extended_id=msg.is_extended_id,
         data=data,
         channel=msg.channel,
+        is_fd=msg.is_fd,
+        bitrate_switch=msg.bitrate_switch,
     )
 
 

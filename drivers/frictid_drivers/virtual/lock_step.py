@@ -15,6 +15,8 @@ from typing import Any, Protocol, cast
 import can
 from can.interfaces.virtual import VirtualBus
 
+from frictid_hil.driver import FD_FRAME
+
 
 class Drives(Protocol):
     """The drives behind the bus: a ``Rack``, or one with faults."""
@@ -45,6 +47,7 @@ class LockStepBus(VirtualBus):
     """
 
     def __init__(self, drives: Drives, channel: str = "frictid", **arguments: Any) -> None:
+        arguments.setdefault("protocol", can.CanProtocol.CAN_FD)
         super().__init__(channel=channel, preserve_timestamps=True, **arguments)
         self.channel_info = f"lock-step bus {channel}"
         # Same interface, a tenth of the cost; the old queue is this bus's entry in the channel's list.
@@ -61,9 +64,10 @@ class LockStepBus(VirtualBus):
         with self._lock:
             if len(self.channel) > 1:
                 super().send(msg, timeout)
-            if not (msg.is_extended_id or msg.is_error_frame or msg.is_fd):
+            if not (msg.is_extended_id or msg.is_error_frame):
                 # Bytes of its own: the caller may reuse the message.
-                self.drives.process(msg.arbitration_id, bytes(msg.data), remote=msg.is_remote_frame)
+                can_id = msg.arbitration_id | FD_FRAME if msg.is_fd else msg.arbitration_id
+                self.drives.process(can_id, bytes(msg.data), remote=msg.is_remote_frame)
 
     def advance(self, to_ns: int) -> None:
         """Let run time go on."""
@@ -86,10 +90,13 @@ class LockStepBus(VirtualBus):
         super().shutdown()
 
     def _deliver(self, can_id: int, data: bytes) -> None:
+        fd = can_id & FD_FRAME != 0
         message = can.Message(
             timestamp=self.drives.now_ns * 1e-9,
-            arbitration_id=can_id,
+            arbitration_id=can_id & ~FD_FRAME,
             is_extended_id=False,
+            is_fd=fd,
+            bitrate_switch=fd,
             dlc=len(data),
             data=data,
             channel=self.channel_id,

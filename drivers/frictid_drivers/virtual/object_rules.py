@@ -43,6 +43,7 @@ class Reactions:
         brake: the brake may have to move.
         network: SYNC, its supervision or the heartbeats listened for changed.
         counter: the SYNC counter changed.
+        frames: the kind of frame of PDOs changed.
         heartbeat: our own heartbeat changed.
         hand: the simulated hand changed.
         payload: the simulated payload changed.
@@ -54,6 +55,7 @@ class Reactions:
     brake: Effect
     network: Effect
     counter: Effect
+    frames: Effect
     heartbeat: Effect
     hand: Effect
     payload: Effect
@@ -104,6 +106,7 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         key(0x1016, 1): _consumer(dictionary, key(0x1016, 2)),
         key(0x1016, 2): _consumer(dictionary, key(0x1016, 1)),
         key(0x1019): sync_counter,
+        key(0x2023): while_off,
         key(0x6060): _one_of(0, *MODES),
         key(0x60A9): velocity_unit,
     }
@@ -114,6 +117,7 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         key(0x1011, 1): restore,
         key(0x1017): reactions.heartbeat,
         key(0x1019): reactions.counter,
+        key(0x2023): reactions.frames,
         key(0x2041): reactions.payload,
         key(0x60A9): reactions.units,
         key(0x60FE, 2): reactions.brake,

@@ -271,6 +271,7 @@ MANUFACTURER: tuple[Record, ...] = (
         ("Velocity low-pass time constant, us", U32, "ro", 0),
         ("Torque actual low-pass time constant, us", U32, "rw", 0, "", 0, 1_000_000),
     ),
+    _variable(0x2023, "Frames of PDOs: 0 classical, 1 CAN FD with bit-rate switch", U8, "rw", 0, low=0, high=1),
     _variable(0x2030, "External torque, mN m behind the gear", I32, "ro", 0, "T"),
     _variable(0x2031, "Temperature, 0.1 degC", I16, "ro", 250, "T"),
     _group(

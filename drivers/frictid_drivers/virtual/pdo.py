@@ -3,6 +3,9 @@
 The communication and mapping parameters live in the object dictionary and are written by SDO; this file guards that
 protocol (make the PDO invalid, set the count to zero, write the entries, set the count, make it valid again), compiles
 a valid PDO to one ``struct`` and keeps the counters and timers that decide when it is sent.
+
+With 2023h a drive's PDOs are CAN FD frames of up to 64 bytes, padded to the next length that there is; their COB-IDs
+then carry ``FD_FRAME``. It neither sends nor hears PDOs of the other kind.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from frictid_drivers.virtual.objects import (
     Key,
     key,
 )
+from frictid_hil.driver import FD_FRAME
 
 _CODES = {
     DataType.I8: "b",
@@ -46,6 +50,8 @@ _EXTENDED = 1 << 29
 _WAITING_FOR_START = -1
 _SYNC_MAX = 240
 _MS = 1_000_000
+_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+"""Of CAN FD frames above 8 bytes."""
 NEVER_NS = 1 << 62
 LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074, 0x6077, 0x60F4))
 """Actual values: what changes by itself from moment to moment."""
@@ -68,7 +74,7 @@ class ReceivePdo:
     """A valid RPDO, compiled.
 
     Attributes:
-        cob_id: of the frame.
+        cob_id: of the frame, with ``FD_FRAME`` where it is one.
         on_sync: values count from the next SYNC on; else at once.
         keys: objects in order; dummies have key 0.
         layout: of the frame.
@@ -87,7 +93,7 @@ class TransmitPdo:
     """A valid TPDO, compiled.
 
     Attributes:
-        cob_id: of the frame.
+        cob_id: of the frame, with ``FD_FRAME`` where it is one.
         kind: transmission type.
         keys: objects in order.
         layout: of the frame.
@@ -193,21 +199,26 @@ class ProcessData:
         number = self._dictionary.number
         compiled = _Compiled()
         counted = number(key(0x1019)) > 1
+        frame = FD_FRAME if self._fd else 0
+        longest = self._longest
         for i in range(PDO_COUNT):
             cob_id = number(key(0x1400 + i, 1))
             keys, layout = self._mapping(0x1600 + i)
-            if not cob_id & PDO_NOT_VALID and 0x1400 + i in self._dictionary.indices:
+            if not cob_id & PDO_NOT_VALID and 0x1400 + i in self._dictionary.indices and layout.size <= longest:
                 on_sync = number(key(0x1400 + i, 2)) <= _SYNC_MAX
-                compiled.receive.append(ReceivePdo(cob_id & 0x7FF, on_sync, keys, layout))
+                compiled.receive.append(ReceivePdo(cob_id & 0x7FF | frame, on_sync, keys, layout))
         for i in range(PDO_COUNT):
             com = 0x1800 + i
             cob_id = number(key(com, 1))
             keys, layout = self._mapping(0x1A00 + i)
-            if cob_id & PDO_NOT_VALID or com not in self._dictionary.indices:
+            if cob_id & PDO_NOT_VALID or com not in self._dictionary.indices or layout.size > longest:
                 continue
+            padding = next((length for length in _FD_LENGTHS if length >= layout.size), 8) - layout.size
+            if layout.size > 8 and padding:
+                layout = struct.Struct(f"{layout.format}{padding}x")
             kind = number(key(com, 2))
             pdo = TransmitPdo(
-                cob_id & 0x7FF, kind, keys, layout,
+                cob_id & 0x7FF | frame, kind, keys, layout,
                 start=number(key(com, 6)) if counted else 0,
                 inhibit_ns=number(key(com, 3)) * 100_000,
                 event_ns=number(key(com, 5)) * _MS if kind >= 254 else 0,
@@ -223,6 +234,15 @@ class ProcessData:
         self.acyclic = any(pdo.kind == 0 for pdo in compiled.event)
         self.live = any(pdo.kind >= 254 and LIVE.intersection(pdo.keys) for pdo in compiled.event)
         self.next_timer_ns = NEVER_NS
+
+    @property
+    def _fd(self) -> bool:
+        return self._dictionary.number(key(0x2023)) == 1
+
+    @property
+    def _longest(self) -> int:
+        """Bytes of a PDO."""
+        return 64 if self._fd else 8
 
     def _mapping(self, index: int) -> tuple[tuple[Key, ...], struct.Struct]:
         keys: list[Key] = []
@@ -335,7 +355,7 @@ class ProcessData:
             for sub in range(1, value + 1):
                 mapped(number(key(mapping, sub)))
                 bits += number(key(mapping, sub)) & 0xFF
-            if bits > 64:
+            if bits > 8 * self._longest:
                 raise SdoAbort(MAPPING_TOO_LONG)
 
         def entry(value: int) -> None:

@@ -85,7 +85,7 @@ class Rack:
             servo.boot(self.now_ns)
 
     def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """A frame with an 11-bit identifier arrives at every drive, now."""
+        """A frame with an 11-bit identifier (``FD_FRAME`` set: a CAN FD one) arrives at every drive, now."""
         if self._stale_routes:
             self._renew_routes()
         if remote:

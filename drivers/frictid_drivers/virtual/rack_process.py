@@ -26,7 +26,8 @@ from frictid_drivers.virtual.faults import Fault, faults_of, missing_objects
 from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import DISMISSAL, READY, decode_setup
-from frictid_drivers.virtual.socket_bus import ERROR, EXTENDED, REMOTE, Hub
+from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub
+from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import FrictidError
 
 SYNC_ID = 0x80
@@ -115,7 +116,7 @@ class RackProcess:
         hub.heard = self._heard
 
     def _heard(self, can_id: int, data: bytes, stamp_ns: int) -> None:
-        if can_id & (EXTENDED | ERROR):
+        if can_id & EXTENDED:
             return
         wall_ns = stamp_ns - self._origin_ns
         if can_id == SYNC_ID:
@@ -123,7 +124,7 @@ class RackProcess:
             self._drives.advance(self._time.sync_ns(wall_ns))
         else:
             self._drives.advance(self._time.time_ns(wall_ns))
-        self._drives.process(can_id & 0x7FF, data, remote=bool(can_id & REMOTE))
+        self._drives.process(can_id & (0x7FF | FD_FRAME), data, remote=bool(can_id & REMOTE))
 
     def serve_until(self, now_ns: int) -> int:
         """Deal with what was sent until a moment of the monotonic clock, then let run time reach it; returns it."""

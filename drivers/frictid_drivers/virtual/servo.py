@@ -106,6 +106,7 @@ class Servo:
                 brake=self.power.apply_brake,
                 network=self._network_changed,
                 counter=self._counter_changed,
+                frames=self._pdo_changed,
                 heartbeat=self._heartbeat_changed,
                 hand=self._hand_changed,
                 payload=self._payload_changed,

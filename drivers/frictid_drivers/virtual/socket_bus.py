@@ -22,18 +22,20 @@ from typing import Any
 import can
 
 from frictid_drivers.virtual.channel import runtime_folder, socket_path
+from frictid_hil.driver import FD_FRAME
 
-FRAME = struct.Struct("<IB3x8sQ")
-"""Identifier with flags as in SocketCAN, length, data, and when it was sent on the machine's monotonic clock, ns."""
+FRAME = struct.Struct("<IBB2x64sQ")
+"""Identifier with flags as in SocketCAN, length, 1 for a CAN FD frame, data, and when it was sent on the machine's
+monotonic clock, ns."""
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 _BUFFER_BYTES = 1 << 20
 _CONNECT_S = 0.2
 
 
-def pack(can_id: int, data: bytes, stamp_ns: int) -> bytes:
+def pack(can_id: int, data: bytes, stamp_ns: int, *, fd: bool = False) -> bytes:
     """One frame as a packet."""
-    return FRAME.pack(can_id, len(data), data, stamp_ns)
+    return FRAME.pack(can_id, len(data), fd, data, stamp_ns)
 
 
 class SocketBus(can.BusABC):
@@ -64,6 +66,7 @@ class SocketBus(can.BusABC):
         self._poll.register(self._socket, select.POLLIN)
         self.channel_info = f"simulated bus {channel}"
         super().__init__(channel=channel, can_filters=can_filters)
+        self._can_protocol = can.CanProtocol.CAN_FD
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Put a frame on the bus.
@@ -78,7 +81,7 @@ class SocketBus(can.BusABC):
             can_id |= REMOTE
         if msg.is_error_frame:
             can_id |= ERROR
-        packet = pack(can_id, bytes(msg.data), time.monotonic_ns())
+        packet = pack(can_id, bytes(msg.data), time.monotonic_ns(), fd=msg.is_fd)
         deadline_s = time.monotonic() + (timeout if timeout else 0.0)
         while True:
             try:
@@ -126,13 +129,15 @@ class SocketBus(can.BusABC):
 
 def message_of(packet: bytes, channel: str | None = None) -> can.Message:
     """A packet as python-can's message."""
-    can_id, size, data, stamp_ns = FRAME.unpack(packet)
+    can_id, size, fd, data, stamp_ns = FRAME.unpack(packet)
     return can.Message(
         timestamp=(time.time_ns() - time.monotonic_ns() + stamp_ns) * 1e-9,
         arbitration_id=can_id & 0x1FFFFFFF,
         is_extended_id=bool(can_id & EXTENDED),
         is_remote_frame=bool(can_id & REMOTE),
         is_error_frame=bool(can_id & ERROR),
+        is_fd=bool(fd),
+        bitrate_switch=bool(fd),
         dlc=size,
         data=None if can_id & REMOTE else data[:size],
         channel=channel,
@@ -146,7 +151,8 @@ class Hub:
         path: of the socket; an old one that nobody listens on is replaced.
 
     Attributes:
-        heard: called as (identifier with flags, data, when it was sent) for every frame of a member.
+        heard: called as (identifier with ``EXTENDED``, ``REMOTE`` and ``FD_FRAME``, data, when it was sent) for every
+            frame of a member but error frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -169,7 +175,8 @@ class Hub:
 
     def send(self, can_id: int, data: bytes) -> None:
         """A frame of the drives, to all members."""
-        self._spread(pack(can_id, data, time.monotonic_ns()), -1)
+        fd = can_id & FD_FRAME != 0
+        self._spread(pack(can_id & ~FD_FRAME, data, time.monotonic_ns(), fd=fd), -1)
 
     def wait(self, longest_s: float) -> None:
         """Return when there is something to serve, or after so long."""
@@ -216,8 +223,9 @@ class Hub:
                 return
             if len(packet) == FRAME.size:
                 self._spread(packet, number)
-                can_id, size, data, stamp_ns = FRAME.unpack(packet)
-                self.heard(can_id, data[: min(size, 8)], stamp_ns)
+                can_id, size, fd, data, stamp_ns = FRAME.unpack(packet)
+                if not can_id & ERROR:
+                    self.heard(can_id | FD_FRAME if fd else can_id, data[: min(size, 64 if fd else 8)], stamp_ns)
 
     def _spread(self, packet: bytes, sender: int) -> None:
         for number, member in list(self._members.items()):
