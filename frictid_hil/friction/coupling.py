@@ -8,6 +8,11 @@ In the cycles themselves every joint's acceleration is that of every other one, 
 the *coupling* stretch each joint shakes at a frequency of its own on top of a slow common cycle: least squares on the
 other joints' accelerations gives one row of M per joint, a symmetric matrix is the mean of its two triangles weighed by
 what is known of each, and M_ij a_j, a_j as measured, is taken off the torque of the cycles.
+
+Gravity is the same both ways only at the same positions, and the two windows of a cycle do not cover quite the same.
+Of an arm that moves as a whole more weight turns than of a joint alone, so that what is left of it shows: gravity as
+the least-squares model finds it, posture beside it, is taken off before the windows are averaged. The posture's own
+columns (inertia that changes along the travel, velocity products) are known too poorly one by one to do the same.
 """
 
 from __future__ import annotations
@@ -19,11 +24,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.linalg import block_diag
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.filtering import Gaussian, uniform
 from frictid_hil.friction.recording import Companion, CycleRecording, Motion, synchronised
-from frictid_hil.friction.regression import hat_functions, ripple_waves
+from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.trajectory import Array
 
 _WIDTH_S = 0.008
@@ -38,12 +44,12 @@ _POSTURE = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pull:
-    """What the other joints' accelerations take of this joint's torque.
+    """What the other joints' accelerations take of this joint's torque, and gravity where it was taken off, too.
 
     Attributes:
-        inertia_kg_m2: M_ij of every other joint, shape (m,).
-        columns: their accelerations at the instants of the motion, rad/s2, shape (n, m).
-        covariance: of the inertias, shape (m, m).
+        inertia_kg_m2: M_ij of every other joint (then gravity, N m), shape (m,).
+        columns: their accelerations at the instants of the motion, rad/s2 (then cos q and sin q), shape (n, m).
+        covariance: of these, shape (m, m).
     """
 
     inertia_kg_m2: Array
@@ -65,6 +71,30 @@ def pull(recording: CycleRecording, motion: Motion) -> Pull | None:
     inertia = np.array([other.inertia_kg_m2 for other in others])
     deviation = np.hypot([other.deviation_kg_m2 for other in others], _POSTURE * inertia)
     return Pull(inertia, accelerations(others, motion), np.diag(deviation**2))
+
+
+def without_gravity(motion: Motion, solved: Fit, others: Pull | None) -> tuple[Motion, Pull | None]:
+    """A motion freed of the gravity of the combined motion, and what was taken off it so far with its uncertainty.
+
+    Args:
+        motion: with the other joints' accelerations taken off already.
+        solved: the model of the same motion.
+        others: what these took; None where that is not known.
+    """
+    first = solved.blocks.gravity
+    if first is None:
+        return motion, others
+    block = slice(first, first + 2)
+    columns = np.column_stack([np.cos(motion.position_rad), np.sin(motion.position_rad)])
+    freed = replace(motion, torque_nm=motion.torque_nm - columns @ solved.values[block])
+    if others is None:
+        return freed, None
+    taken = Pull(
+        np.concatenate([others.inertia_kg_m2, solved.values[block]]),
+        np.column_stack([others.columns, columns]),
+        block_diag(others.covariance, solved.covariance[block, block]),
+    )
+    return freed, taken
 
 
 def posture(motion: Motion) -> Array:

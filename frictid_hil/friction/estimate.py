@@ -20,7 +20,7 @@ import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
-from frictid_hil.friction.coupling import Pull, posture, pull
+from frictid_hil.friction.coupling import Pull, posture, pull, without_gravity
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
@@ -132,6 +132,10 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         slow = ", ".join(f"{speed:.3g}" for speed in solved.unobserved)
         notes.append(f"too few samples at {slow} rad/s: the curve is extended to there from faster ones")
 
+    weighed = taken
+    if recording.coupled and solved is not None and method != "least-squares":
+        freed, weighed = without_gravity(motion, solved, others)
+        windows = intervals.aligned_pairs(recording, freed)
     pairs = windows
     if method == "least-squares":
         assert solved is not None
@@ -140,7 +144,7 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         terms = intervals.least_squares_terms(recording, motion, solved, kept, drift, taken)
         half = terms.half_width_nm
     else:
-        terms = intervals.window_terms(recording, motion, windows, solved, drift, taken)
+        terms = intervals.window_terms(recording, motion, windows, solved, drift, weighed)
         half = terms.half_width_nm
         if method == "function-a":
             assert published is not None

@@ -3,13 +3,40 @@
 from __future__ import annotations
 
 import math
+import os
 
+import yaml
 from cia402_wire import HandClock, ScriptedDrive, WireBus, robot
 
 from frictid_drivers.cia402 import Cia402Driver
-from frictid_hil.driver import JointState, Mode, SetPoint
+from frictid_hil.config.search import find
+from frictid_hil.driver import JointSetup, JointState, Mode, RobotSetup, SetPoint
 
 RAD = 2 * math.pi / (4096 * 50)
+
+
+PROFILE = find("hp3j.yaml").resolve()
+FIELDS = (
+    "gear_ratio",
+    "direction",
+    "max_velocity_rad_s",
+    "max_torque_nm",
+    "rated_torque_nm",
+    "position_min_rad",
+    "position_max_rad",
+    "start_position_rad",
+    "locked_position_rad",
+    "simulated",
+)
+
+
+def hp3j(**changes):
+    plain = yaml.safe_load(PROFILE.read_text())
+    joints = tuple(
+        JointSetup(name=name, address=joint["node"], **{key: joint[key] for key in FIELDS}, **changes)
+        for name, joint in plain["joints"].items()
+    )
+    return RobotSetup("hp3j", f"virtual:cia402-test-{os.getpid()}", float(plain["cycle_hz"]), joints)
 
 
 class Bench:

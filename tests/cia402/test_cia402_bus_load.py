@@ -208,16 +208,13 @@ def test_no_fd_frame_is_longer_than_its_worst_case(data, identifier):
     assert found.least + slow + fast / 5 <= found.worst + 1e-9
 
 
-def test_six_joints_with_can_fd():
-    six = list("012345")
-    found = {}
-    for data in (None, 2_000_000, 4_000_000, 5_000_000, 8_000_000):
-        rates = BitRates(1_000_000, data)
-        pdo_bytes = 8 if data is None else 64
-        found[data] = highest_rate_hz(
-            lambda hz, rates=rates, pdo_bytes=pdo_bytes: layout(six, hz, rates, pdo_bytes=pdo_bytes).load(), 4000.0
-        )
-    assert found == {None: 327, 2_000_000: 588, 4_000_000: 870, 5_000_000: 965, 8_000_000: 1143}
+@pytest.mark.parametrize(
+    ("data", "pdo_bytes", "highest_hz"),
+    [(None, 8, 327), (2_000_000, 64, 588), (4_000_000, 64, 870), (5_000_000, 64, 965), (8_000_000, 64, 1143)],
+)
+def test_six_joints_with_can_fd(data, pdo_bytes, highest_hz):
+    six, rates = list("012345"), BitRates(1_000_000, data)
+    assert highest_rate_hz(lambda hz: layout(six, hz, rates, pdo_bytes=pdo_bytes).load(), 4000.0) == highest_hz
 
 
 def test_velocity_goes_with_position_where_pdos_are_long_enough():
