@@ -177,6 +177,13 @@ def test_what_the_wire_cannot_carry_is_refused(options, cycle_hz):
     assert "CAN FD" in caught.value.what or not options
 
 
+def test_faults_of_the_wire_meet_fd_frames_too():
+    fault = {"kind": "drop", "frames": "tpdo1", "joint": "2", "at_s": 0.1, "count": 3}
+    (whole, *_), (lossy, *_) = (session({**FD, "faults": faults}, cycles=100) for faults in ([], [fault]))
+    counts = [sum(can_id == 0x183 | FD_FRAME for _, can_id, _, _ in log) for log in (whole, lossy)]
+    assert counts[0] - counts[1] == 3
+
+
 def test_a_drive_that_cannot_be_switched_is_named():
     fault = {"kind": "missing", "joint": "3", "index": 0x2023}
     with pytest.raises(HardwareError, match="cannot be told to send its PDOs as CAN FD frames") as caught:

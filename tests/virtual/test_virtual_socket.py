@@ -81,15 +81,16 @@ def test_every_frame_survives_packing(can_id, data, extended, fd, stamp):
 
 
 def test_can_fd_frames_pass_between_members_and_drives(hub):
-    first, second = connected(hub, 2)
+    wire, log = hub
+    first, second = connected(wire, 2)
     assert first.protocol is can.CanProtocol.CAN_FD
     first.send(
         can.Message(arbitration_id=0x201, data=bytes(range(16)), is_extended_id=False, is_fd=True, bitrate_switch=True)
     )
     message = second.recv(2)
     assert (message.arbitration_id, bytes(message.data), message.is_fd) == (0x201, bytes(range(16)), True)
-    assert hub.log == [(0x201 | FD_FRAME, bytes(range(16)))]
-    hub.send(0x181 | FD_FRAME, b"\7" * 12)
+    assert log == [(0x201 | FD_FRAME, bytes(range(16)))]
+    wire.send(0x181 | FD_FRAME, b"\7" * 12)
     for bus in (first, second):
         message = bus.recv(2)
         assert (message.arbitration_id, message.is_fd, message.is_error_frame, len(message.data)) == (

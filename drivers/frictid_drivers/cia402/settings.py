@@ -189,7 +189,9 @@ class _Reader:
             return data_bitrate, self._whole(at, options, "pdo_bytes", 64, 8, 64)
         for key in ("data_bitrate", "pdo_bytes"):
             if key in options:
-                self._problem((*at, key), "means nothing without `fd: true`: classical CAN has one bit rate and 8 bytes")
+                self._problem(
+                    (*at, key), "means nothing without `fd: true`: classical CAN has one bit rate and 8 bytes"
+                )
         return None, 8
 
     def joint(self, joint: JointSetup) -> JointSettings:

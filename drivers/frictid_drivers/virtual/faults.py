@@ -157,8 +157,7 @@ def _cob_ids(service: str, nodes: list[int]) -> frozenset[int]:
         return frozenset(SERVICES[service])
     if service == "host_heartbeat":
         return frozenset(0x700 + node for node in _HOST_NODES)
-    kinds = (0, FD_FRAME) if "pdo" in service else (0,)
-    return frozenset(base + node | kind for base in SERVICES[service] for node in nodes for kind in kinds)
+    return frozenset(base + node for base in SERVICES[service] for node in nodes)
 
 
 def missing_objects(faults: Sequence[Fault]) -> Mapping[str, frozenset[int]]:
@@ -191,7 +190,8 @@ class FrameFaults:
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._faults = [_FrameFault(fault) for fault in faults if fault.kind in FRAME_KINDS]
-        self.cob_ids = frozenset(cob_id for state in self._faults for cob_id in state.fault.cob_ids)
+        plain = {cob_id for state in self._faults for cob_id in state.fault.cob_ids}
+        self.cob_ids = frozenset(plain | {cob_id | FD_FRAME for cob_id in plain})
 
     def through(self, now_ns: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
         """The frames that come out, each with the time at which it does.
@@ -203,7 +203,7 @@ class FrameFaults:
         """
         frames = [(now_ns, can_id, data)]
         for state in self._faults:
-            if can_id in state.fault.cob_ids:
+            if can_id & ~FD_FRAME in state.fault.cob_ids:
                 frames = [out for frame in frames for out in _spoil(state, frame)]
         return frames
 
