@@ -11,11 +11,14 @@ import pytest
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
+from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import PlanRefused, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.identify import IdentifyOptions, identify
+from frictid_hil.jobs.replay import ReplayOptions, replay
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.recording.bus_log import read_frames
 from frictid_hil.simulation.arm_model import ArmModel
 from frictid_hil.simulation.rigid_bodies import RigidBodies
 
@@ -101,6 +104,28 @@ def test_the_recording_identifies_to_the_same_profile(together: tuple[Path, dict
     alone = identify(IdentifyOptions((out,), joints=("2",), robot="hp3j-arm.yaml", out=out.parent / "one"))
     assert alone["outcome"] == "ok"  # the others' columns are in the recording all the same
     assert load_profile(out.parent / "one" / "profile.yaml").joint("2") == first.joint("2")
+
+
+def test_can_fd_carries_them_faster_and_its_log_replays(tmp_path: Path, site: str) -> None:
+    """At 500 Hz, twice what the classical wire takes with six joints; PDOs are FD frames, in the log as well."""
+    path = tmp_path / "fd.yaml"
+    path.write_text(f"schema: frictid.robot/1\nextends: {site}\ncycle_hz: 500\noptions: {{fd: true}}\n")
+    run, bus, every = tmp_path / "run", "virtual:test-together-fd", tuple("012345")
+    wanted = CalibrateOptions(str(path), bus=bus, out=run, joints=every, together=True, program="quick")
+    result = calibrate(wanted, Silent())
+    assert result["outcome"] == "ok", result
+    assert {entry["rate_hz"] for entry in result["joints"].values()} == {500.0}
+    frames = read_frames(run / "bus.blf")
+    fd = (frames.can_id & FD_FRAME) != 0
+    assert set((frames.can_id[fd] & 0x780).tolist()) == {0x180, 0x380, 0x200, 0x300}
+    assert set((frames.can_id[~fd] & 0x780).tolist()) == {0x000, 0x080, 0x580, 0x600, 0x700}
+    assert np.count_nonzero(frames.can_id == 0x181 | FD_FRAME) == np.count_nonzero(frames.can_id == 0x80)
+    again = replay(ReplayOptions(run, robot=str(path)))
+    assert again["identical"] is True
+    classical = tmp_path / "classical.yaml"
+    classical.write_text(f"schema: frictid.robot/1\nextends: {site}\ncycle_hz: 500\n")
+    with pytest.raises(PlanRefused, match="bus load"):
+        calibrate(CalibrateOptions(str(classical), bus=bus, out=tmp_path / "no", joints=every, together=True), Silent())
 
 
 def test_different_timing_is_refused(tmp_path: Path) -> None:
