@@ -1,6 +1,7 @@
 """Do the 95 % intervals hold the truth, and are they narrow enough to mean something?
 
     python benchmarks/interval_coverage.py [--amplitudes 20,10,5] [--methods aligned,least-squares] [--draws 3]
+        [--measured] [--held-out SEED] [--exact]
 
 The plants are written for the tests, share nothing with the product's simulation, and have effects that no estimator
 contains: Maxwell slip, a ripple that multiplies the friction with a rectified sine in it, friction that grows with the
@@ -13,7 +14,9 @@ other noise, another starting angle (the phase of the ripple) and a true timing 
 
 Both are of a plant kind as a whole. One recording alone says little: where its errors happen to be small, ``width`` is
 large without any interval being wrong. ``flagged`` is the share of recordings that fail a gate and would not be
-promoted; they count all the same.
+promoted; they count all the same. ``--measured`` lets every joint shake as `calibrate --measure-skew` does, with the
+torque still drawn late by the declared uncertainty; ``--exact`` draws no lateness. ``--held-out`` takes the joints of
+`held_out_plant.py`, drawn with this seed, in place of all of these.
 """
 
 from __future__ import annotations
@@ -22,20 +25,25 @@ import argparse
 import math
 import sys
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "friction"))
 
+from held_out_plant import HeldOutJoint, drawn_arm
+from held_out_plant import drive as drive_held_out
 from maxwell import ARM, Joint, record
+from maxwell import drive as drive_maxwell
 
 from frictid_hil.errors import FrictidError
+from frictid_hil.friction import trajectory
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
-from frictid_hil.friction.recording import CycleRecording, Skew
+from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.skew_stretch import shaking
 
 KINDS = {
     "rigid": {},
@@ -52,16 +60,75 @@ UNCERTAINTY_S = 0.0002
 """Declared one standard deviation of the timing, as the CiA-402 driver declares it of a drive with known filters."""
 
 
-def drawn(joint: Joint, amplitude_deg: float, seed: int) -> CycleRecording:
-    """One measurement: its noise, its place on the motor's turn and its true timing drawn anew."""
-    rng = np.random.default_rng(seed)
-    joint = replace(joint, start=joint.start + rng.uniform(0.0, 0.06))
-    amplitude = math.radians(amplitude_deg)
-    needed = joint.steady(V_RAD_S) + math.hypot(joint.gravity_cos, joint.gravity_sin)
-    fastest = math.sqrt((TORQUE_SHARE * joint.max_torque - needed) * amplitude / (2 * joint.inertia))
-    recording: CycleRecording = record(joint, Procedure(amplitude, min(V_RAD_S, fastest)), seed=seed)
-    off_s = rng.normal() * UNCERTAINTY_S
-    return replace(recording, skew=Skew(torque_delay_s=5e-4 + off_s, uncertainty_s=UNCERTAINTY_S))
+STEP_S = 0.001
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What is drawn anew for every measurement."""
+
+    measured: bool
+    exact: bool
+
+    def of(
+        self, joint: Joint | HeldOutJoint, amplitude_deg: float, seed: int
+    ) -> tuple[Joint | HeldOutJoint, CycleRecording]:
+        """One measurement: its noise, its place on the motor's turn and its true timing drawn anew."""
+        rng = np.random.default_rng(seed)
+        joint = replace(joint, start=joint.start + rng.uniform(0.0, 0.06))
+        procedure = within_torque(joint, math.radians(amplitude_deg))
+        off_s = 0.0 if self.exact else rng.normal() * UNCERTAINTY_S
+        skew = Skew(torque_delay_s=STEP_S / 2 + off_s, uncertainty_s=UNCERTAINTY_S)
+        plain = record if isinstance(joint, Joint) else held_out
+        recording = replace(plain(joint, procedure, seed=seed), skew=skew)
+        return joint, replace(recording, shaken=shaken(joint, recording, seed)) if self.measured else recording
+
+
+def within_torque(joint: Joint | HeldOutJoint, amplitude_rad: float) -> Procedure:
+    """V, or the highest speed that leaves a tenth of the torque."""
+    if isinstance(joint, Joint):
+        needed = joint.steady(V_RAD_S) + math.hypot(joint.gravity_cos, joint.gravity_sin)
+    else:
+        needed = joint.steady(V_RAD_S, joint.start) * (1 + joint.asymmetry) + joint.gravity
+    fastest = math.sqrt((TORQUE_SHARE * joint.max_torque - needed) * amplitude_rad / (2 * joint.inertia))
+    return Procedure(amplitude_rad, min(V_RAD_S, fastest))
+
+
+def held_out(joint: HeldOutJoint, procedure: Procedure, *, seed: int) -> CycleRecording:
+    """A hold, the cycles, the third again, a hold."""
+    lead, starts = 300, procedure.cycle_starts_s
+    again_s = float(starts[3] - starts[2])
+    time_s = (np.arange(2 * lead + math.ceil((procedure.duration_s + again_s) / STEP_S)) - lead) * STEP_S
+    after = time_s - procedure.duration_s
+    path = np.where(after < 0, time_s, np.where(after < again_s, after + starts[2], -1.0))
+    command = joint.start + trajectory.position(procedure, path)
+    q, v, f = drive_held_out(joint, command, trajectory.velocity(procedure, path), seed=seed)
+    return CycleRecording(
+        time_s, q, f, procedure, velocity_rad_s=v, command_rad=command, gear_ratio=joint.gear_ratio,
+        torque_limit_nm=joint.max_torque, repeat=Repeat(3, procedure.duration_s),
+    )  # fmt: skip
+
+
+def shaken(joint: Joint | HeldOutJoint, recording: CycleRecording, seed: int) -> CycleRecording:
+    """The stretch that `calibrate --measure-skew` adds."""
+    moving = [
+        motion.position_rad(np.arange(round(motion.duration_s / STEP_S)) * STEP_S)
+        for motion in shaking(joint.start, recording.procedure)
+    ]
+    command = np.concatenate([still := np.full(300, joint.start), *moving, still])
+    drive = drive_maxwell if isinstance(joint, Joint) else drive_held_out
+    q, _, f = drive(joint, command, np.gradient(command, STEP_S), seed=seed + 1)
+    time_s = (np.arange(command.size) - still.size) * STEP_S
+    return replace(
+        recording, time_s=time_s, position_rad=q, torque_nm=f, velocity_rad_s=None, command_rad=None, repeat=None
+    )
+
+
+def truth_nm(joint: Joint | HeldOutJoint, amplitude_rad: float, speed_rad_s: np.ndarray) -> np.ndarray:
+    """What the intervals must hold."""
+    if isinstance(joint, Joint):
+        return joint.steady(speed_rad_s)
+    return joint.steady(speed_rad_s, joint.start + amplitude_rad / 2)
 
 
 def main() -> None:
@@ -71,20 +138,23 @@ def main() -> None:
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--terms", action="store_true", help="print what the intervals are made of, in percent")
+    parser.add_argument("--measured", action="store_true", help="every joint shakes, and the delay is measured")
+    parser.add_argument("--exact", action="store_true", help="the declared timing happens to be right")
+    parser.add_argument("--held-out", type=int, metavar="SEED", help="joints of held_out_plant.py instead")
     arguments = parser.parse_args()
+    draws = Draws(arguments.measured, arguments.exact)
+    arm = ARM if arguments.held_out is None else drawn_arm(arguments.held_out)
+    kinds = arguments.kinds.split(",") if arguments.held_out is None else ["held out"]
     print("| plant | A | method | cover | width | rms error [%] | flagged |\n|---|---|---|---|---|---|---|")
-    whole: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
-    for kind in arguments.kinds.split(","):
+    whole: dict[str, tuple[list, list]] = defaultdict(lambda: ([], []))
+    for kind in kinds:
         for amplitude in map(float, arguments.amplitudes.split(",")):
-            errors: dict[str, list[float]] = defaultdict(list)
-            widths: dict[str, list[float]] = defaultdict(list)
-            flagged: dict[str, list[bool]] = defaultdict(list)
-            terms: dict[str, list[list[float]]] = defaultdict(list)
-            for index, base in enumerate(ARM):
+            errors, widths, flagged, terms = defaultdict(list), defaultdict(list), defaultdict(list), defaultdict(list)
+            for index, base in enumerate(arm):
                 for draw in range(arguments.draws):
-                    joint = replace(base, **KINDS[kind])
+                    joint = replace(base, **KINDS.get(kind, {}))
                     seed = 1000 * draw + 10 * index + len(kind) + int(100 * amplitude)
-                    recording = drawn(joint, amplitude, seed)
+                    joint, recording = draws.of(joint, amplitude, seed)
                     for method in arguments.methods.split(","):
                         try:
                             found = estimate(recording, method)
@@ -93,7 +163,9 @@ def main() -> None:
                             flagged[method].append(True)
                             continue
                         knots, level = np.array(found.curve.velocity_rad_s), float(np.mean(found.curve.torque_nm))
-                        errors[method].extend((np.array(found.curve.torque_nm) - joint.steady(knots)) / level)
+                        errors[method].extend(
+                            (np.array(found.curve.torque_nm) - truth_nm(joint, math.radians(amplitude), knots)) / level
+                        )
                         widths[method].extend(found.half_width_nm / level)
                         flagged[method].append(not all(gate.passed for gate in gates(recording, found)))
                         if arguments.terms and found.terms is not None:

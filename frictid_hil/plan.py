@@ -20,6 +20,8 @@ from frictid_hil.friction.trajectory import Array, Procedure
 
 COUPLING = "coupling"
 """Name of the motion that shows how much joints that move together drive each other."""
+SKEW = "skew"
+"""Name of the motions that show by how much the torque is late."""
 REHEARSAL = "rehearsal"
 """Name of the motion that shows a joint's whole travel slowly, with the torque watched."""
 
@@ -154,17 +156,17 @@ class Sine:
 
 @dataclass(frozen=True, slots=True)
 class Shake:
-    """A slow cycle from ``start_rad`` to start + A and back, shaking most in the middle of the travel.
+    """Slow cycles from ``start_rad`` to start + A and back, shaking most in the middle of the travel.
 
-    Each of several joints has its own frequency, which tells their accelerations apart. Shaking never reverses the
-    motion nor leaves the travel.
+    Shaking never reverses the motion nor leaves the travel.
 
     Attributes:
         start_rad: where it begins and ends.
         amplitude_rad: peak-to-peak travel.
-        duration_s: of the cycle.
+        duration_s: of all cycles.
         periods: of shaking within the duration.
-        shake_rad: zero-to-peak.
+        shake_rad: zero-to-peak; negative shakes in antiphase.
+        turns: slow cycles within the duration.
     """
 
     start_rad: float
@@ -173,12 +175,14 @@ class Shake:
     periods: int
     shake_rad: float
     name: str = COUPLING
+    turns: int = 1
 
     @staticmethod
     def beside(start_rad: float, procedure: Procedure, place: int) -> Shake:
         """The shaking of the joint that is ``place``-th of those that move together, 0 the first.
 
-        It asks for at most half of the procedure's highest acceleration, 2 V^2 / A.
+        Each has its own frequency, which tells their accelerations apart. It asks for at most half of the procedure's
+        highest acceleration, 2 V^2 / A.
         """
         a, v = procedure.amplitude_rad, procedure.velocity_rad_s
         duration_s = max(_SHORTEST_SHAKE_S, 4 * math.pi * a / v)
@@ -190,8 +194,9 @@ class Shake:
     def position_rad(self, time_s: Array) -> Array:
         """start + A/2 (1 - cos) + shake sin^2 sin."""
         phase = 2.0 * math.pi * np.asarray(time_s) / self.duration_s
-        shaking = self.shake_rad * np.sin(phase) ** 2 * np.sin(self.periods * phase)
-        moved: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase)) + shaking
+        slow = self.turns * phase
+        shaking = self.shake_rad * np.sin(slow) ** 2 * np.sin(self.periods * phase)
+        moved: Array = self.amplitude_rad / 2 * (1.0 - np.cos(slow)) + shaking
         return self.start_rad + moved
 
     def details(self) -> Mapping[str, Any]:
@@ -201,6 +206,7 @@ class Shake:
             "amplitude_rad": self.amplitude_rad,
             "periods": self.periods,
             "shake_rad": self.shake_rad,
+            **({"turns": self.turns} if self.turns > 1 else {}),
         }
 
 

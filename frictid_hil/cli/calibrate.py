@@ -88,6 +88,15 @@ def calibrate(
         bool,
         typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
     ] = False,
+    measure_skew: Annotated[
+        bool | None,
+        typer.Option(
+            "--measure-skew/--declared-skew",
+            help="Each joint also shakes for 8 s, which measures by how much its torque is late; without, the declared "
+            "timing alone counts. Default: the robot file's `procedure: measure_skew`, else declared.",
+            show_default=False,
+        ),
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
@@ -126,6 +135,7 @@ def calibrate(
         method=method,
         program=program,
         together=together,
+        measure_skew=measure_skew,
         rate_hz=rate,
         realtime=realtime,
         seed=seed,

@@ -49,10 +49,23 @@ def show(
                     f"{interval[0]:.4g} .. {interval[1]:.4g}" if interval else "",
                 )
             output.out.print(table)
+            output.out.print(_timing(joint), highlight=False)
         provenance = result["provenance"]
         output.out.print(f"{result['robot']}, {provenance['created_utc']}, frictid-hil {provenance['tool_version']}")
 
     output.run("profile_show", lambda: job(profile), print_profile)
+
+
+def _timing(joint: Result) -> str:
+    """By how much torque was taken to lag position, and why."""
+    used = f"torque taken {1e3 * joint.get('time_skew_s', 0.0):.3f} ms later than position"
+    skew = joint.get("time_skew")
+    if not skew:
+        return f"{used}, as declared"
+    measured, declared = (
+        f"{1e3 * skew[f'{name}_s']:.3f} +- {2e3 * skew[f'{name}_deviation_s']:.3f}" for name in ("measured", "declared")
+    )
+    return f"{used} (+- {2e3 * skew['used_deviation_s']:.3f}): measured {measured} ms, declared {declared} ms"
 
 
 @app.command("diff")

@@ -109,6 +109,26 @@ class ProcedureUsed(Strict):
     together: Names | None = None
 
 
+class TimeSkew(Strict):
+    """By how much torque lags position, where it was measured: each with one standard deviation.
+
+    Attributes:
+        declared_s: by the drive or its robot file.
+        declared_deviation_s: of it.
+        measured_s: by the shaking.
+        measured_deviation_s: of it.
+        used_s: of both, weighed by their precision; the measured one alone where they disagree.
+        used_deviation_s: of it.
+    """
+
+    declared_s: float
+    declared_deviation_s: float = Field(ge=0)
+    measured_s: float
+    measured_deviation_s: float = Field(ge=0)
+    used_s: float
+    used_deviation_s: float = Field(ge=0)
+
+
 class DriveIdentity(Strict):
     """The drive the torque was read from: a curve is good only with the same one.
 
@@ -159,7 +179,8 @@ class JointProfile(Strict):
         published: what Function A gives untouched, beside the chosen method.
         ripple: by position, where identified.
         torque_source: what the torque is (``6077 actual torque``).
-        time_skew_s: by which torque was taken to lag velocity.
+        time_skew_s: by which torque was taken to lag position.
+        time_skew: where that was measured: declared, measured and used, with their uncertainty.
         temperature_c: during the cycles.
         procedure: V, A, N, c.
         drive: that measured.
@@ -188,6 +209,7 @@ class JointProfile(Strict):
     ripple: Ripple | None = None
     torque_source: str = ""
     time_skew_s: float = 0.0
+    time_skew: TimeSkew | None = None
     temperature_c: float | None = None
     procedure: ProcedureUsed | None = None
     drive: DriveIdentity = DriveIdentity()
@@ -226,7 +248,7 @@ class JointProfile(Strict):
             update={"measured_range_rad_s": self.curve().measured_range_rad_s, "slopes_nm_s_per_rad": self._slopes()}
         )
         values: dict[str, Any] = plain(filled.model_dump())
-        for name in ("torque_interval_nm", "forward", "backward", "published", "ripple", "procedure", "temperature_c"):
+        for name in _LEFT_OUT:
             if values[name] is None:
                 del values[name]
         if self.procedure is not None:
@@ -245,6 +267,12 @@ class JointProfile(Strict):
             return values
         renamed: dict[str, Any] = linear_names(values)
         return renamed
+
+
+_LEFT_OUT = (
+    "torque_interval_nm", "forward", "backward", "published", "ripple", "time_skew", "procedure", "temperature_c",
+)  # fmt: skip
+"""Not written where there is nothing of it."""
 
 
 class FrictionProfile(Strict):

@@ -39,12 +39,13 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class ProcedureFile(Strict):
-    """V, A, N, c of the paper's procedure; A is peak-to-peak."""
+    """V, A, N, c of the paper's procedure; A is peak-to-peak. ``measure_skew``: ``calibrate --measure-skew`` always."""
 
     amplitude_rad: Positive = 0.3490658503988659
     velocity_rad_s: Positive = 2.007128639793479
     cycles: int = Field(default=10, ge=2, le=1000)
     ratio: float = Field(default=0.8, ge=0, lt=1)
+    measure_skew: bool = False
 
 
 class JointProcedureFile(Strict):

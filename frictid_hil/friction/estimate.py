@@ -14,21 +14,22 @@ The published result always stands beside the chosen one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
-from frictid_hil.friction.coupling import Pull, posture, pull, without_gravity
+from frictid_hil.friction.cleaned import Cleaned, cleaned
+from frictid_hil.friction.coupling import posture, without_gravity
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.delay import SeenDelay, seen_delay
+from frictid_hil.friction.delay import SeenDelay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.least_squares import RippleTable
-from frictid_hil.friction.link import Link, soft_link, without
-from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
+from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import Fit, fit
 from frictid_hil.friction.rigid_body import COVERAGE, Measured, RigidBody, rigid_body
+from frictid_hil.friction.skew import TimeSkew
 from frictid_hil.friction.trajectory import Array
 
 METHODS = ("function-a", "aligned", "least-squares")
@@ -52,6 +53,7 @@ class Estimate:
         rigid_body: inertia, gravity, bias; None where they could not be separated, or are not of this joint alone.
         ripple: over one motor revolution; None where it is unknown or lost in its uncertainty.
         link_resonance_hz: of a soft joint; None where the joint looks rigid.
+        time_skew: declared, measured and used; None where the joint did not shake.
         drift: the repeated cycle against its first run; None without one.
         terms: what the intervals are made of.
         notes: what a person should know (unobserved speeds, what could not be formed and why).
@@ -68,6 +70,7 @@ class Estimate:
     rigid_body: RigidBody | None = None
     ripple: RippleTable | None = None
     link_resonance_hz: Measured | None = None
+    time_skew: TimeSkew | None = None
     drift: intervals.Drift | None = None
     terms: intervals.Terms | None = None
     notes: tuple[str, ...] = ()
@@ -89,6 +92,48 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         UsageError: no such method, or ``function-a`` without a drive velocity.
         IdentificationError: an empty window, F_0 <= 0, or (``least-squares``) a model that cannot be solved.
     """
+    _refuse(recording, method)
+    notes: list[str] = []
+    published = _published(recording, notes, required=method == "function-a")
+    clean = cleaned(recording, notes)
+    solved = _solved(clean, notes, required=method == "least-squares")
+    drift = intervals.repeated(clean.recording, clean.motion, clean.windows)
+    if method == "least-squares":
+        assert solved is not None
+        found = _by_least_squares(clean, solved, drift, notes)
+    elif method == "function-a":
+        assert published is not None
+        found = _as_published(_by_windows(clean, solved, drift), published, recording.where)
+    else:
+        found = _by_windows(clean, solved, drift)
+    body = None if solved is None else rigid_body(clean.recording, solved)
+    speeds = np.asarray(found.curve.velocity_rad_s)
+    even = asymmetry(found.pairs, speeds) if solved is None else solved.even_nm(speeds)
+    if recording.coupled:
+        even, body = np.zeros_like(even), None
+        notes.append(
+            "other joints moved with this one: inertia, gravity, asymmetry and a soft link cannot be told from theirs"
+        )
+    return Estimate(
+        method=method,
+        curve=found.curve,
+        half_width_nm=found.half_width_nm,
+        coulomb_nm=Measured(found.curve.coulomb_nm, intervals.coulomb_half_width_nm(found.curve, found.half_width_nm)),
+        asymmetry_nm=even,
+        pairs=found.pairs,
+        published=published,
+        rigid_body=body,
+        ripple=_ripple(clean.recording, clean.motion, clean.level_nm, notes),
+        link_resonance_hz=None if clean.link is None else clean.link.resonance_hz,
+        time_skew=clean.time_skew,
+        drift=drift,
+        terms=found.terms,
+        notes=tuple(notes),
+        figures=_figures(solved, clean.seen),
+    )
+
+
+def _refuse(recording: CycleRecording, method: str) -> None:
     if method not in METHODS:
         raise UsageError(f"no estimator {method!r}; there are {', '.join(METHODS)}")
     if method == "function-a" and recording.velocity_rad_s is None:
@@ -97,87 +142,64 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
             where=recording.where,
             next_step="use --method aligned, which takes the velocity from the position",
         )
-    notes: list[str] = []
-    motion = synchronised(recording)
-    published = _published(recording, notes, required=method == "function-a")
-    others = pull(recording, motion)
-    if others is not None:
-        motion = replace(motion, torque_nm=motion.torque_nm - others.torque_nm)
-    elif recording.coupled:
-        notes.append("how much the joints that moved along drove this one is not known; nothing was taken off")
-    windows = intervals.aligned_pairs(recording, motion)
-    level = float(np.mean(windows.torque_nm))
-    link = _link(recording, motion, level, notes)
-    if link is not None:
-        motion = without(motion, link)
-        windows = intervals.aligned_pairs(recording, motion)
-    unknown_pull = recording.coupled and others is None  # what it leaves looks like a delay
-    seen = None if unknown_pull else _seen_delay(recording, motion, level, notes)
-    if seen is not None:
-        open_s = seen.open_s(recording.skew.uncertainty_s)
-        recording = replace(recording, skew=replace(recording.skew, uncertainty_s=open_s))
-    drift = intervals.repeated(recording, motion, windows)
-    solved: Fit | None = None
-    taken: Link | Pull | None = link or others
-    doubtful = None if taken is None else taken.columns
+
+
+def _solved(clean: Cleaned, notes: list[str], *, required: bool) -> Fit | None:
+    """The least-squares model of the whole recording; None where it cannot be solved."""
+    recording, motion, taken = clean.recording, clean.motion, clean.taken
     try:
-        knots = least_squares.curve_knots(recording)
-        extra = posture(motion) if recording.coupled else None
-        solved = fit(recording, motion, knots, level, extra=extra, doubtful=doubtful)
+        return fit(
+            recording,
+            motion,
+            least_squares.curve_knots(recording),
+            clean.level_nm,
+            extra=posture(motion) if recording.coupled else None,
+            doubtful=None if taken is None else taken.columns,
+        )
     except IdentificationError as problem:
-        if method == "least-squares":
+        if required:
             raise
         notes.append(f"inertia, gravity and bias are not known: {problem.what}")
-    if method == "least-squares" and solved is not None and solved.unobserved.size:
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """The curve by one method, and how well its knots are known."""
+
+    curve: FrictionCurve
+    half_width_nm: Array
+    pairs: IdentifiedPairs
+    terms: intervals.Terms
+
+
+def _by_least_squares(clean: Cleaned, solved: Fit, drift: intervals.Drift | None, notes: list[str]) -> _Found:
+    recording = clean.recording
+    if solved.unobserved.size:
         slow = ", ".join(f"{speed:.3g}" for speed in solved.unobserved)
         notes.append(f"too few samples at {slow} rad/s: the curve is extended to there from faster ones")
+    kept = least_squares.trusted(recording, solved, clean.level_nm)
+    terms = intervals.least_squares_terms(recording, clean.motion, solved, kept, drift, clean.taken)
+    curve = least_squares.curve_of(solved, kept, recording.where)
+    return _Found(curve, terms.half_width_nm, clean.windows, terms)
 
-    weighed = taken
-    if recording.coupled and solved is not None and method != "least-squares":
-        freed, weighed = without_gravity(motion, solved, others)
-        windows = intervals.aligned_pairs(recording, freed)
-    pairs = windows
-    if method == "least-squares":
-        assert solved is not None
-        kept = least_squares.trusted(recording, solved, level)
-        curve = least_squares.curve_of(solved, kept, recording.where)
-        terms = intervals.least_squares_terms(recording, motion, solved, kept, drift, taken)
-        half = terms.half_width_nm
-    else:
-        terms = intervals.window_terms(recording, motion, windows, solved, drift, weighed)
-        half = terms.half_width_nm
-        if method == "function-a":
-            assert published is not None
-            pairs = published
-            off = published.torque_nm - windows.curve(where=recording.where).magnitude(published.velocity_rad_s)
-            half = np.hypot(half, COVERAGE * off)
-        curve = pairs.curve(where=recording.where)
-        half = half[np.argsort(pairs.velocity_rad_s, kind="stable")]
 
-    speeds = np.asarray(curve.velocity_rad_s)
-    even = asymmetry(pairs, speeds) if solved is None else solved.even_nm(speeds)
-    body = None if solved is None else rigid_body(recording, solved)
-    if recording.coupled:
-        even, body = np.zeros_like(even), None
-        notes.append(
-            "other joints moved with this one: inertia, gravity, asymmetry and a soft link cannot be told from theirs"
-        )
-    return Estimate(
-        method=method,
-        curve=curve,
-        half_width_nm=half,
-        coulomb_nm=Measured(curve.coulomb_nm, intervals.coulomb_half_width_nm(curve, half)),
-        asymmetry_nm=even,
-        pairs=pairs,
-        published=published,
-        rigid_body=body,
-        ripple=_ripple(recording, motion, level, notes),
-        link_resonance_hz=None if link is None else link.resonance_hz,
-        drift=drift,
-        terms=terms,
-        notes=tuple(notes),
-        figures=_figures(solved, seen),
-    )
+def _by_windows(clean: Cleaned, solved: Fit | None, drift: intervals.Drift | None) -> _Found:
+    recording, pairs, weighed = clean.recording, clean.windows, clean.taken
+    if recording.coupled and solved is not None:
+        freed, weighed = without_gravity(clean.motion, solved, clean.others)
+        pairs = intervals.aligned_pairs(recording, freed)
+    terms = intervals.window_terms(recording, clean.motion, pairs, solved, drift, weighed)
+    rising = np.argsort(pairs.velocity_rad_s, kind="stable")
+    return _Found(pairs.curve(where=recording.where), terms.half_width_nm[rising], pairs, terms)
+
+
+def _as_published(aligned: _Found, published: IdentifiedPairs, where: str) -> _Found:
+    """Function A's own pairs; how far they lie from the aligned ones is one more term."""
+    off = published.torque_nm - aligned.curve.magnitude(published.velocity_rad_s)
+    half = np.hypot(aligned.terms.half_width_nm, COVERAGE * off)
+    rising = np.argsort(published.velocity_rad_s, kind="stable")
+    return _Found(published.curve(where=where), half[rising], published, aligned.terms)
 
 
 def asymmetry(pairs: IdentifiedPairs, speed_rad_s: Array) -> Array:
@@ -208,41 +230,6 @@ def _published(recording: CycleRecording, notes: list[str], *, required: bool) -
         if required:
             raise
         notes.append(f"the published Function A fails: {problem.what}")
-        return None
-
-
-_GAP_STEPS = 3.0
-"""Between two samples, in sample periods: a longer one has jerked the joint."""
-
-
-def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> Link | None:
-    if recording.coupled:
-        return None
-    steps_s = np.diff(recording.time_s)
-    if steps_s.size and steps_s.max() > _GAP_STEPS * np.median(steps_s):
-        notes.append(
-            f"whether the link swings is not known: {1e3 * steps_s.max():.1f} ms passed between two samples, and a "
-            "joint that jumps after its missing set-points looks like a swinging link"
-        )
-        return None
-    try:
-        link = soft_link(recording, motion, level)
-    except IdentificationError as problem:
-        notes.append(f"whether the link swings is not known: {problem.what}")
-        return None
-    if link is not None:
-        notes.append(
-            f"a soft joint: the link swings at {link.resonance_hz.value:.1f} Hz; its torque was computed from the "
-            "position and taken off"
-        )
-    return link
-
-
-def _seen_delay(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> SeenDelay | None:
-    try:
-        return seen_delay(recording, motion, level)
-    except IdentificationError as problem:
-        notes.append(f"the declared timing could not be tested: {problem.what}")
         return None
 
 

@@ -78,6 +78,17 @@ def swinging(motion: Motion, frequency_hz: float, damping: float) -> Array:
     return moved
 
 
+def by_parameter(motion: Motion, frequency_hz: float, damping: float) -> Array:
+    """``swinging``, and how it changes with log w and with log z, shape (n, 3)."""
+
+    def column(log_frequency: float, log_damping: float) -> Array:
+        return swinging(motion, frequency_hz * float(np.exp(log_frequency)), damping * float(np.exp(log_damping)))
+
+    by_frequency = (column(0.01, 0.0) - column(-0.01, 0.0)) / 0.02
+    by_damping = (column(0.0, 0.05) - column(0.0, -0.05)) / 0.1
+    return np.column_stack([column(0.0, 0.0), by_frequency, by_damping])
+
+
 def soft_link(recording: CycleRecording, motion: Motion, level_nm: float) -> Link | None:
     """The link of a soft joint; None where the recording shows a rigid one.
 
@@ -111,10 +122,7 @@ def soft_link(recording: CycleRecording, motion: Motion, level_nm: float) -> Lin
     if np.sqrt(found.fun) > _GAIN:
         return None
     x, y = found.x.tolist()
-    a = column(x, y)[:, 0]
-    by_frequency = (column(x + 0.01, y) - column(x - 0.01, y))[:, 0] / 0.02
-    by_damping = (column(x, y + 0.05) - column(x, y - 0.05))[:, 0] / 0.1
-    extra = np.column_stack([a, by_frequency, by_damping])
+    extra = by_parameter(motion, float(np.exp(x)), float(np.exp(y)))
     solved = fit(recording, motion, knots, level_nm, width_rad=0.0, extra=np.column_stack([extra, delayed]))
     block = slice(solved.blocks.extra.start, solved.blocks.extra.start + 3)
     whole = float(solved.values[solved.blocks.inertia])

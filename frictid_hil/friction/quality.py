@@ -16,6 +16,7 @@ from scipy.ndimage import uniform_filter1d
 from frictid_hil.friction.estimate import Estimate
 from frictid_hil.friction.intervals import Drift
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
+from frictid_hil.friction.skew import MOST_APART, TimeSkew
 from frictid_hil.friction.trajectory import Array
 
 LEAST_TRACKING = 0.95
@@ -68,6 +69,8 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
         asked.append(_asymmetry(result))
     if math.isfinite(recording.torque_limit_nm):
         asked.append(_saturation(recording))
+    if result.time_skew is not None:
+        asked.append(_time_skew(result.time_skew))
     if result.drift is not None:
         asked.append(_drift(recording, result.drift))
     if result.link_resonance_hz is not None:
@@ -214,6 +217,19 @@ def _saturation(recording: CycleRecording) -> Gate:
         MOST_SATURATED,
         said if passed else f"{said}: raise the travel (peak torque grows as V^2/A) or lower the peak speed",
     )
+
+
+def _time_skew(skew: TimeSkew) -> Gate:
+    said = (
+        f"the torque lags the position by {1e3 * skew.measured_s:.3f} +- {2e3 * skew.measured_deviation_s:.3f} ms as "
+        f"measured, {1e3 * skew.declared_s:.3f} +- {2e3 * skew.declared_deviation_s:.3f} ms as declared: "
+        f"{skew.apart:.1f} standard deviations apart (allowed {MOST_APART:g})"
+    )
+    cause = (
+        f"{said}: an undeclared filter or a wrong `options: timing` (the measured one was used), or what shook was not "
+        "the joint's own inertia"
+    )
+    return Gate("time_skew", skew.agree, skew.apart, MOST_APART, said if skew.agree else cause)
 
 
 def _drift(recording: CycleRecording, drift: Drift) -> Gate:

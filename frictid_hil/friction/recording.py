@@ -88,6 +88,7 @@ class CycleRecording:
         coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
             combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
         companions: those joints, as far as it is known how much they take.
+        shaken: the stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
         where: what to name in errors (``joint 1``).
     """
 
@@ -106,6 +107,7 @@ class CycleRecording:
     late_cycles: int = 0
     coupled: bool = False
     companions: tuple[Companion, ...] = ()
+    shaken: CycleRecording | None = None
     where: str = ""
 
 

@@ -23,6 +23,7 @@ from frictid_hil.jobs.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import calibration_plan, expected_of, rehearsal_note
 from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
+from frictid_hil.jobs.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan import Plan
 from frictid_hil.plan_limits import refuse_beyond_limits
@@ -53,6 +54,7 @@ class CalibrateOptions:
         method: estimator; None for the programme's.
         program: ``thorough``, ``standard`` or ``quick``.
         together: all joints move at once, in phase.
+        measure_skew: every joint also shakes to show by how much its torque is late; None for the robot file's choice.
         rate_hz: rate of set-points.
         realtime: wall clock for the virtual robot.
         seed: of simulated noise.
@@ -74,6 +76,7 @@ class CalibrateOptions:
     method: str | None = None
     program: str = "thorough"
     together: bool = False
+    measure_skew: bool | None = None
     rate_hz: float | None = None
     realtime: bool = False
     seed: int = 0
@@ -143,6 +146,9 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         if name not in kept
     }
     expected = expected_of(robot)
+    measure_skew = robot.file.procedure.measure_skew if options.measure_skew is None else options.measure_skew
+    if measure_skew:
+        refuse_where_the_bus_is_too_slow(setup, quantum_s, together=options.together)
     rehearsals = Rehearsals(robot, options.bus)
     rehearse = _unseen(rehearsals, setup, procedures, together=options.together)
     notes = [chosen.note(procedure) for procedure in list(procedures.values())[:1]]
@@ -151,6 +157,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     notes += _notes(procedures, expected, rehearse)
     if options.together:
         notes += _together_notes(setup)
+    if measure_skew:
+        notes.append(shaking_note())
     plan = calibration_plan(
         robot,
         setup,
@@ -160,6 +168,7 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         notes=notes,
         warm_up=options.warm_up,
         together=options.together,
+        measure_skew=measure_skew,
     )
     refuse_beyond_limits(plan, setup, expected)
     return Planned(robot, setup, plan, method, resumed)

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import DriveIdentity, Gate, JointProfile, PairList, ProcedureUsed, Ripple
+from frictid_hil.config.profile import DriveIdentity, Gate, JointProfile, PairList, ProcedureUsed, Ripple, TimeSkew
 from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.driver import JointSetup
 from frictid_hil.errors import IdentificationError, UsageError
@@ -27,6 +27,7 @@ from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.companions import with_companions
 from frictid_hil.jobs.declared import declared_skew
+from frictid_hil.jobs.skew_stretch import wanted_note, with_shaking
 from frictid_hil.recording.samples import Mark, Samples
 
 _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
@@ -95,6 +96,8 @@ def joint_result(profile: JointProfile) -> dict[str, Any]:
         "torque_interval_nm": [list(pair) for pair in profile.torque_interval_nm or ()],
         "coulomb_nm": profile.coulomb_nm.value,
         "inertia_kg_m2": profile.inertia_kg_m2.value,
+        "time_skew_s": profile.time_skew_s,
+        "time_skew": None if profile.time_skew is None else profile.time_skew.model_dump(),
         "presliding_stiffness_nm_per_rad": profile.presliding_stiffness_nm_per_rad.value,
         "prismatic": profile.prismatic,
         "remarks": [gate.message for gate in failed],
@@ -112,7 +115,7 @@ def _from_cycles(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> JointProfile:
-    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    recording = with_shaking(_recording(samples, procedure, start_s, joint, late_cycles), samples)
     notes: list[str] = []
     if len(together) > 1:
         recording = replace(recording, coupled=True)
@@ -122,6 +125,8 @@ def _from_cycles(
             notes.append(problem.what)
     result = estimate(recording, method)
     gates = quality.gates(recording, result)
+    if recording.shaken is None and not recording.coupled and result.terms is not None:
+        notes += filter(None, [wanted_note(result.terms, float(np.mean(result.curve.torque_nm)))])
     body = result.rigid_body
     curve = result.curve
     temperature = samples.temperature_c
@@ -148,7 +153,10 @@ def _from_cycles(
         if result.ripple
         else None,
         torque_source=str(samples.meta.get("torque_source", "")),
-        time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s,
+        time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s
+        if result.time_skew is None
+        else result.time_skew.used_s,
+        time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
         temperature_c=None if temperature is None else round(float(np.nanmean(temperature)), 2),
         procedure=ProcedureUsed(
             amplitude_rad=procedure.amplitude_rad,

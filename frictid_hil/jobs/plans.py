@@ -13,6 +13,7 @@ from frictid_hil.config.robot import Robot
 from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.skew_stretch import shaking
 from frictid_hil.plan import (
     REHEARSAL,
     Corners,
@@ -44,6 +45,7 @@ def calibration_motions(
     rehearse: bool,
     warm_up: policy.WarmUp | None = None,
     place: int | None = None,
+    measure_skew: bool = False,
 ) -> list[Motion]:
     """What one joint does in a calibration, from its locked position and back to it.
 
@@ -53,6 +55,7 @@ def calibration_motions(
         rehearse: its travel was never seen slowly.
         warm_up: before it is measured.
         place: among the joints that move together; None where it moves alone.
+        measure_skew: it shakes to show by how much its torque is late.
     """
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
@@ -74,6 +77,8 @@ def calibration_motions(
     ]
     if place is not None:
         motions += [Shake.beside(start, procedure, place), Hold(start, 0.2)]
+    if measure_skew:
+        motions += [*shaking(start, procedure), Hold(start, 0.2)]
     motions += [
         slow_reversal(start),
         Move.within(start, home, APPROACH_RAD_S, name="return"),
@@ -104,6 +109,7 @@ def calibration_plan(
     notes: Sequence[str] = (),
     warm_up: policy.WarmUp | None = None,
     together: bool = False,
+    measure_skew: bool = False,
 ) -> Plan:
     """The plan of a calibration: joint by joint in the order of ``procedures``, or all of them at once.
 
@@ -122,6 +128,7 @@ def calibration_plan(
             rehearse=name in rehearse,
             warm_up=warm_up,
             place=place if together and len(procedures) > 1 else None,
+            measure_skew=measure_skew,
         )
         for place, (name, procedure) in enumerate(procedures.items())
     }

@@ -33,7 +33,7 @@ def test_without_the_link_the_same_windows_are_several_times_worse(plants, monke
     joint = replace(plants.arm[1], **SOFT)
     recording = plants.record(joint, plants.procedure(10))
     with_link = error(joint, recording, "aligned")
-    monkeypatch.setattr("frictid_hil.friction.estimate.soft_link", lambda *_: None)
+    monkeypatch.setattr("frictid_hil.friction.cleaned.soft_link", lambda *_: None)
     assert error(joint, recording, "aligned") > 3 * with_link
 
 
