@@ -26,7 +26,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.recording import CycleRecording, Skew
-from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.watch import Silent
@@ -95,48 +95,68 @@ def errors_of(robot: Mapping[str, Any], amplitude_deg: float, folder: Path) -> d
     return found
 
 
-def mujoco_errors(amplitude_deg: float) -> tuple[float, float, float]:
-    """The same figures for a joint simulated by MuJoCo: dry friction, damping, gravity; 10 kHz, logged at 1 kHz."""
-    import mujoco
+class MujocoJoint:
+    """A joint simulated by MuJoCo: dry friction, damping, gravity; 10 kHz, logged at 1 kHz; a position loop of its own.
 
-    inertia, dry, viscous, weight = 0.8, 6.0, 3.0, 12.0
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option timestep="0.0001" integrator="implicitfast" gravity="0 0 -9.81"/>
-        <worldbody><body><joint name="j" axis="0 -1 0" armature="{inertia * 0.5}" solreffriction="0.0005 1"
-        damping="{viscous}" frictionloss="{dry}"/>
-        <inertial pos="0.4 0 0" mass="{weight / 9.81 / 0.4}" diaginertia="0.05 0.05 0.05"/>
-        </body></worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
+    Args:
+        seed: of the noise on the reported torque.
+    """
+
+    DRY_NM, VISCOUS_NM_S_PER_RAD = 6.0, 3.0
+
+    def __init__(self, seed: int = 1) -> None:
+        import mujoco
+
+        inertia, weight = 0.8, 12.0
+        self._step = mujoco.mj_step
+        self._weight_nm = weight
+        self._model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><option timestep="0.0001" integrator="implicitfast" gravity="0 0 -9.81"/>
+            <worldbody><body><joint name="j" axis="0 -1 0" armature="{inertia * 0.5}" solreffriction="0.0005 1"
+            damping="{self.VISCOUS_NM_S_PER_RAD}" frictionloss="{self.DRY_NM}"/>
+            <inertial pos="0.4 0 0" mass="{weight / 9.81 / 0.4}" diaginertia="0.05 0.05 0.05"/>
+            </body></worldbody></mujoco>"""
+        )
+        self._data = mujoco.MjData(self._model)
+        self._rng = np.random.default_rng(seed)
+
+    def driven(self, command: Array) -> tuple[Array, Array]:
+        """Position and torque, a row per millisecond; the torque of a row acted during the step before it."""
+        data, rate = self._data, np.gradient(command, 1e-3)
+        quantum = 2 * math.pi / 131072 / 100
+        rows = np.empty((command.size, 2))
+        data.qpos[0] = command[0]
+        torque = integral = self._weight_nm
+        for k in range(command.size):
+            measured = round(float(data.qpos[0]) / quantum) * quantum
+            rows[k] = measured, torque + self._rng.normal(0.0, 0.2)
+            error = command[k] - measured
+            integral += 160e3 * 1e-3 * error
+            torque = 8000.0 * error + 130.0 * (rate[k] - float(data.qvel[0])) + integral
+            data.qfrc_applied[0] = torque
+            for _ in range(10):
+                self._step(self._model, data)
+        return rows[:, 0], rows[:, 1]
+
+
+def mujoco_errors(amplitude_deg: float) -> tuple[float, float, float]:
+    """The same figures for a joint simulated by MuJoCo."""
     procedure = Procedure(amplitude_deg * DEG, 115 * DEG)
     times = np.arange(-0.5, procedure.duration_s + 0.5, 1e-3)
     command = trajectory.position(procedure, times)
-    rate = np.gradient(command, 1e-3)
-    rng = np.random.default_rng(1)
-    quantum = 2 * math.pi / 131072 / 100
-    rows = np.empty((times.size, 2))
-    torque = integral = weight
-    for k in range(times.size):
-        measured = round(float(data.qpos[0]) / quantum) * quantum
-        rows[k] = measured, torque + rng.normal(0.0, 0.2)
-        error = command[k] - measured
-        integral += 160e3 * 1e-3 * error
-        torque = 8000.0 * error + 130.0 * (rate[k] - float(data.qvel[0])) + integral
-        data.qfrc_applied[0] = torque
-        for _ in range(10):
-            mujoco.mj_step(model, data)
+    position, torque = MujocoJoint().driven(command)
     # The torque of row k acted during the step before it; half a step of zero-order hold.
     recording = CycleRecording(
         time_s=times,
-        position_rad=rows[:, 0],
-        torque_nm=rows[:, 1],
+        position_rad=position,
+        torque_nm=torque,
         procedure=procedure,
-        velocity_rad_s=np.gradient(rows[:, 0], 1e-3),
+        velocity_rad_s=np.gradient(position, 1e-3),
         command_rad=command,
         skew=Skew(torque_delay_s=0.0005),
     )
     speeds = np.linspace(0.0, procedure.velocity_rad_s, 2001)[1:]
-    truth = FrictionCurve.through(speeds, dry + viscous * speeds)
+    truth = FrictionCurve.through(speeds, MujocoJoint.DRY_NM + MujocoJoint.VISCOUS_NM_S_PER_RAD * speeds)
     published = curve_distance(estimate(recording, "function-a").curve, truth, procedure.velocity_rad_s)
     aligned = curve_distance(estimate(recording, "aligned").curve, truth, procedure.velocity_rad_s)
     return published.e_percent, aligned.e_percent, aligned.e_percent_measured_range

@@ -267,11 +267,11 @@ def hat_functions(speed: Array, knots: Array) -> Array:
     return hats
 
 
-def ripple_waves(recording: CycleRecording, position_rad: Array) -> Array:
+def ripple_waves(recording: CycleRecording, position_rad: Array, orders: tuple[float, ...] = RIPPLE_ORDERS) -> Array:
     """cos of every order of the motor angle, then sin, shape (n, 2 * orders); no columns without a gear ratio."""
     if recording.prismatic or not np.isfinite(recording.gear_ratio):
         return np.zeros((position_rad.size, 0))
-    angle = recording.gear_ratio * position_rad[:, None] * np.array(RIPPLE_ORDERS)
+    angle = recording.gear_ratio * position_rad[:, None] * np.array(orders)
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 

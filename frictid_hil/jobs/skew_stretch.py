@@ -22,8 +22,8 @@ _SWEEP = 0.5
 """Peak speed of the slow motion as a share of V: friction is then far from its rise towards standstill."""
 _SHAKE = 0.7
 """Speed of the shaking as a share of the slow motion's, so that it never reverses it."""
-_ACCELERATION = 0.5
-"""Of the shaking at most, as a share of what the fastest cycle takes."""
+_ACCELERATION = 0.75
+"""Of the shaking at most, as a share of what the fastest cycle takes; a quarter of that is the slow motion's."""
 _LEAST_RATE_HZ = 200.0
 _WIDE = 0.01
 """Of the friction: an interval that is narrower needs nothing."""
