@@ -19,9 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numba import njit
+
+from frictid_hil.friction.trajectory import Array
 
 _SUBSTEP_S = 2e-5
 
@@ -57,11 +60,14 @@ class HeldOutJoint:
         """Gravity at a place."""
         return self.gravity * math.cos(q + self.gravity_phase)
 
-    def steady(self, v, middle: float):
+    def steady(self, v: Array, middle: float) -> Array:
         """Odd part of the friction at constant speed, mean over the motor's turn, cold."""
         rubbing = self.coulomb * (1 + self.rise / (1 + (v / self.rise_velocity) ** 2))
         rubbing = rubbing + self.eyring * np.arcsinh(v / self.eyring_velocity)
-        return rubbing * (1 + self.place * math.sin(self.place_wave * middle)) + self.loss * abs(self.holding(middle))
+        odd: Array = rubbing * (1 + self.place * math.sin(self.place_wave * middle)) + self.loss * abs(
+            self.holding(middle)
+        )
+        return odd
 
 
 def drawn_arm(seed: int) -> list[HeldOutJoint]:
@@ -104,7 +110,7 @@ def drawn_arm(seed: int) -> list[HeldOutJoint]:
 
 
 @njit(cache=True)
-def _rates(j, wear, torque, q, v, z):
+def _rates(j: Any, wear: float, torque: float, q: float, v: float, z: float) -> tuple[float, float, float]:
     angle = j.gear_ratio * q
     waves = math.sin(angle) + 0.6 * math.sin(3 * angle + 1.0) + 0.4 * math.cos(5 * angle)
     scale = wear * (1.0 + j.place * math.sin(j.place_wave * q)) * (1.0 + j.ripple * waves)
@@ -123,7 +129,9 @@ def _rates(j, wear, torque, q, v, z):
 
 
 @njit(cache=True)
-def _simulate(j, command, rate, step_s, substeps, noise):
+def _simulate(
+    j: Any, command: Array, rate: Array, step_s: float, substeps: int, noise: Array
+) -> tuple[Array, Array, Array]:
     n = command.size
     out_q, out_v, out_f = np.empty(n), np.empty(n), np.empty(n)
     h = step_s / substeps
@@ -157,7 +165,9 @@ def _simulate(j, command, rate, step_s, substeps, noise):
     return out_q, out_v, out_f
 
 
-def drive(joint: HeldOutJoint, command, rate, *, step_s: float = 0.001, seed: int = 1):
+def drive(
+    joint: HeldOutJoint, command: Array, rate: Array, *, step_s: float = 0.001, seed: int = 1
+) -> tuple[Array, Array, Array]:
     """Position, drive velocity and drive torque under position control; rows as a bus reports them.
 
     The torque of row k was applied during the step that ends there.
@@ -166,4 +176,5 @@ def drive(joint: HeldOutJoint, command, rate, *, step_s: float = 0.001, seed: in
     values = tuple(float(getattr(joint, name)) for name in names)
     numbers = np.array([values], dtype=[(name, "f8") for name in names])[0]
     white = np.random.default_rng(seed).normal(size=(command.size, 2))
-    return _simulate(numbers, command, rate, step_s, round(step_s / _SUBSTEP_S), white)
+    columns: tuple[Array, Array, Array] = _simulate(numbers, command, rate, step_s, round(step_s / _SUBSTEP_S), white)
+    return columns

@@ -89,7 +89,7 @@ def within_torque(joint: Joint | HeldOutJoint, amplitude_rad: float) -> Procedur
     if isinstance(joint, Joint):
         needed = joint.steady(V_RAD_S) + math.hypot(joint.gravity_cos, joint.gravity_sin)
     else:
-        needed = joint.steady(V_RAD_S, joint.start) * (1 + joint.asymmetry) + joint.gravity
+        needed = float(joint.steady(np.array(V_RAD_S), joint.start)) * (1 + joint.asymmetry) + joint.gravity
     fastest = math.sqrt((TORQUE_SHARE * joint.max_torque - needed) * amplitude_rad / (2 * joint.inertia))
     return Procedure(amplitude_rad, min(V_RAD_S, fastest))
 
@@ -126,9 +126,9 @@ def shaken(joint: Joint | HeldOutJoint, recording: CycleRecording, seed: int) ->
 
 def truth_nm(joint: Joint | HeldOutJoint, amplitude_rad: float, speed_rad_s: np.ndarray) -> np.ndarray:
     """What the intervals must hold."""
-    if isinstance(joint, Joint):
-        return joint.steady(speed_rad_s)
-    return joint.steady(speed_rad_s, joint.start + amplitude_rad / 2)
+    middle = () if isinstance(joint, Joint) else (joint.start + amplitude_rad / 2,)
+    truth: np.ndarray = joint.steady(speed_rad_s, *middle)
+    return truth
 
 
 def main() -> None:
@@ -146,10 +146,13 @@ def main() -> None:
     arm = ARM if arguments.held_out is None else drawn_arm(arguments.held_out)
     kinds = arguments.kinds.split(",") if arguments.held_out is None else ["held out"]
     print("| plant | A | method | cover | width | rms error [%] | flagged |\n|---|---|---|---|---|---|---|")
-    whole: dict[str, tuple[list, list]] = defaultdict(lambda: ([], []))
+    whole: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for kind in kinds:
         for amplitude in map(float, arguments.amplitudes.split(",")):
-            errors, widths, flagged, terms = defaultdict(list), defaultdict(list), defaultdict(list), defaultdict(list)
+            errors: dict[str, list[float]] = defaultdict(list)
+            widths: dict[str, list[float]] = defaultdict(list)
+            flagged: dict[str, list[bool]] = defaultdict(list)
+            terms: dict[str, list[list[float]]] = defaultdict(list)
             for index, base in enumerate(arm):
                 for draw in range(arguments.draws):
                     joint = replace(base, **KINDS.get(kind, {}))

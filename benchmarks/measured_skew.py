@@ -42,6 +42,7 @@ from frictid_hil.friction.recording import CycleRecording, Skew, synchronised
 from frictid_hil.friction.skew import measured_skew
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.skew_stretch import shaking
+from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
 STEP_S = 0.001
@@ -52,43 +53,47 @@ Driven = Callable[[Array, int], tuple[Array, Array]]
 """From set-points and a seed to position and torque, the torque being that of the step before."""
 
 
-def looped(loop_class: Callable[..., ServoLoop | OtherPlant], model, command: Array, seed: int) -> tuple[Array, Array]:
+def looped(loop_class: type[ServoLoop] | type[OtherPlant], model: JointModel) -> Driven:
     """A simulated servo, one period after the other."""
-    loop = loop_class(model, period_s=STEP_S, seed=seed, position_rad=float(command[0]))
-    loop.brake(False)
-    loop.power(True)
-    quantum = model.drive.torque_quantum_per_mille * 1e-3 * model.drive.rated_torque_nm
-    rows = np.empty((command.size, 2))
-    for k, target in enumerate(command.tolist()):
-        loop.advance(STEP_S, position_rad=target)
-        rows[k] = loop.measured_position_rad, round(loop.torque_nm / quantum) * quantum
-    return rows[:, 0], rows[:, 1]
+
+    def driven(command: Array, seed: int) -> tuple[Array, Array]:
+        loop = loop_class(model, period_s=STEP_S, seed=seed, position_rad=float(command[0]))
+        loop.brake(False)
+        loop.power(True)
+        quantum = model.drive.torque_quantum_per_mille * 1e-3 * model.drive.rated_torque_nm
+        rows = np.empty((command.size, 2))
+        for k, target in enumerate(command.tolist()):
+            loop.advance(STEP_S, position_rad=target)
+            rows[k] = loop.measured_position_rad, round(loop.torque_nm / quantum) * quantum
+        return rows[:, 0], rows[:, 1]
+
+    return driven
 
 
-def plants(kind: str) -> Iterator[tuple[str, float, float, float, Driven]]:
-    """Name, start, gear ratio, its own lateness, and how it is driven."""
-    if kind in ("rigid", "flexible", "other"):
-        loop_class = OtherPlant if kind == "other" else ServoLoop
-        for name, (model, start) in joints().items():
-            plant = softened(model, 28.0) if kind == "flexible" else model
+def compiled(drive: Callable[..., tuple[Array, Array, Array]], joint: object) -> Driven:
+    """A plant that takes all set-points at once."""
 
-            def driven(command: Array, seed: int, plant=plant) -> tuple[Array, Array]:
-                return looped(loop_class, plant, command, seed)
+    def driven(command: Array, seed: int) -> tuple[Array, Array]:
+        position, _, torque = drive(joint, command, np.gradient(command, STEP_S), seed=seed)
+        return position, torque
 
-            yield name, start, model.gear_ratio, 0.0, driven
-    elif kind == "mujoco":
-        yield "0", 0.0, 100.0, 5e-5, lambda command, seed: MujocoJoint(seed).driven(command)
+    return driven
+
+
+def plants(kind: str) -> Iterator[tuple[float, float, float, Driven]]:
+    """Start, gear ratio, its own lateness, and how it is driven."""
+    if kind == "mujoco":
+        yield 0.0, 100.0, 5e-5, lambda command, seed: MujocoJoint(seed).driven(command)
+    elif kind == "held-out":
+        for joint in drawn_arm(7):
+            yield joint.start, joint.gear_ratio, 0.0, compiled(drive_held_out, joint)
+    elif kind == "maxwell":
+        for other in maxwell.ARM:
+            yield other.start, other.gear_ratio, 25e-6, compiled(maxwell.drive, replace(other, ripple=0.1))
     else:
-        arm = drawn_arm(7) if kind == "held-out" else [replace(joint, ripple=0.1) for joint in maxwell.ARM]
-        drive = drive_held_out if kind == "held-out" else maxwell.drive
-        for name, joint in enumerate(arm):
-
-            def driven(command: Array, seed: int, joint=joint) -> tuple[Array, Array]:
-                position, _, torque = drive(joint, command, np.gradient(command, STEP_S), seed=seed)
-                return position, torque
-
-            late_s = 25e-6 if kind == "maxwell" else 0.0
-            yield str(name), joint.start, joint.gear_ratio, late_s, driven
+        for model, start in joints().values():
+            plant = softened(model, 28.0) if kind == "flexible" else model
+            yield start, model.gear_ratio, 0.0, looped(OtherPlant if kind == "other" else ServoLoop, plant)
 
 
 def recorded(command: Array, gear_ratio: float, procedure: Procedure, driven: Driven, seed: int) -> CycleRecording:
@@ -106,7 +111,7 @@ def recorded(command: Array, gear_ratio: float, procedure: Procedure, driven: Dr
 def measured(kind: str, amplitude_deg: float, draws: int, wrong_s: list[float]) -> str:
     """One row of the table."""
     procedure, cells = Procedure(math.radians(amplitude_deg), V_RAD_S), []
-    for _, start, gear_ratio, late_s, driven in plants(kind):
+    for start, gear_ratio, late_s, driven in plants(kind):
         errors, stated, refused = [], [], 0
         for draw in range(draws):
             here = start + np.random.default_rng(draw).uniform(0.0, 0.06)
