@@ -64,9 +64,8 @@ class HeldOutJoint:
         """Odd part of the friction at constant speed, mean over the motor's turn, cold."""
         rubbing = self.coulomb * (1 + self.rise / (1 + (v / self.rise_velocity) ** 2))
         rubbing = rubbing + self.eyring * np.arcsinh(v / self.eyring_velocity)
-        odd: Array = rubbing * (1 + self.place * math.sin(self.place_wave * middle)) + self.loss * abs(
-            self.holding(middle)
-        )
+        here = 1 + self.place * math.sin(self.place_wave * middle)
+        odd: Array = rubbing * here + self.loss * abs(self.holding(middle))
         return odd
 
 
