@@ -12,11 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from serial_bench import START_RAD, make_bench
 
+from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_messages import BlockCollector, JobOrder
 from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold
 from frictid_drivers.motoman.emulator import jobs
 from frictid_drivers.motoman.emulator.compensation import Compensator, Table
+from frictid_drivers.motoman.emulator.loopback import LoopbackPort
+from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import motion_segments
 from frictid_drivers.motoman.stream_frames import crc16
@@ -229,6 +232,79 @@ def test_a_job_does_not_start_from_elsewhere_or_against_a_hold() -> None:
         driver.run_batch(plan(Move(START_RAD, 1.5, 2.0)))
     with pytest.raises(PlanRefused, match="velocity"):
         driver.run_batch(plan(Move(START_RAD, 0.9, 0.1)))
+
+
+# -- a bad line while a job runs -------------------------------------------------------------------------------------
+
+
+class DamagedByte(LoopbackPort):
+    """A wire that damages one byte, counted over all that went this way."""
+
+    def __init__(self, emulator: Emulator, baud: int, parity: str, way: str, at: int) -> None:
+        super().__init__(emulator, baud, parity)
+        self._way, self._at = way, at
+        self.passed = {"to the controller": 0, "to the host": 0}
+
+    def _damaged(self, way: str, data: bytes) -> bytes:
+        begin, damaged = self.passed[way], bytearray(data)
+        self.passed[way] += len(data)
+        if way == self._way and begin <= self._at < begin + len(data):
+            damaged[self._at - begin] ^= 0x10
+        return bytes(damaged)
+
+    def write(self, data: bytes) -> None:
+        super().write(self._damaged("to the controller", data))
+
+    def read(self, timeout_s: float) -> bytes:
+        return self._damaged("to the host", super().read(timeout_s))
+
+
+def a_watched_job(way: str = "", at: int = -1) -> list[dict[str, int]]:
+    """Run a job of nine seconds over such a wire; bytes that had passed at every answer to a question."""
+    bench = make_bench(layer="batch", stream_baud=0)
+    ports: list[DamagedByte] = []
+    passed: list[dict[str, int]] = []
+
+    def port(path: str, baud: int, parity: str) -> DamagedByte:
+        ports.append(DamagedByte(bench.emulator, baud, parity, way, at))
+        return ports[-1]
+
+    driver = MotomanDriver(bench.setup, port_factory=port)
+    driver.open()
+    driver.start_cycling()
+    columns = driver.run_batch(
+        JointPlan("0", (Hold(START_RAD, 9.0),), {}),
+        progress=lambda stage, share: passed.append(dict(ports[0].passed)) if stage == "motion" else None,
+        look=lambda reports: None,
+    )
+    driver.close()
+    assert len(columns["time_ns"]) == 2251
+    return passed
+
+
+@pytest.mark.parametrize("way", ["to the controller", "to the host"])
+def test_a_damaged_byte_while_a_job_runs_costs_less_than_its_watchdog(way: str) -> None:
+    passed = a_watched_job()
+    for at in range(passed[3][way], passed[4][way], 5):
+        a_watched_job(way, at)
+
+
+@pytest.mark.parametrize("at", range(100, 116, 3))  # every kind of utterance of one round of questions
+def test_four_seconds_of_silence_are_less_than_the_watchdog(at: int) -> None:
+    bench = make_bench(layer="batch", stream_baud=0, faults=[f"silence@{at}:4"])
+    driver = bench.driver()
+    driver.open()
+    driver.start_cycling()
+    begun_s, looks = bench.emulator.now_s, []
+    columns = driver.run_batch(
+        JointPlan("0", (Hold(START_RAD, 9.0),), {}),
+        progress=lambda stage, share: None,
+        look=lambda reports: looks.append(bench.emulator.now_s),
+    )
+    assert max(np.diff([begun_s, *looks])) > 3.9, "the silence fell into the job"
+    assert len(columns["time_ns"]) == 2251
+    assert driver.standing()[0].valid, "no reply of then is taken for one of now"
+    driver.close()
 
 
 # -- the friction table ----------------------------------------------------------------------------------------------

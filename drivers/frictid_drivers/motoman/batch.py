@@ -21,7 +21,7 @@ from frictid_drivers.motoman.batch_messages import (
 )
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError, ManipulatorOperating
 from frictid_drivers.motoman.host_control import HostControl
-from frictid_hil.errors import HardwareError, Interrupted, SafetyAbort
+from frictid_hil.errors import FrictidError, HardwareError, Interrupted, SafetyAbort
 
 SAMPLES_PER_BLOCK: Final = 18
 _BLOCKS_PER_REQUEST: Final = 32
@@ -88,9 +88,9 @@ class BatchClient:
             if self.state(number).state != 2:
                 raise
 
-    def state(self, number: int) -> JobState:
+    def state(self, number: int, *, within_s: float | None = None) -> JobState:
         """FSTAT."""
-        reply = self._host.ask(f"FSTAT 1,{number}")
+        reply = self._host.ask(f"FSTAT 1,{number}", within_s=within_s)
         try:
             state = JobState(*map(int, reply.split(",")))
         except (ValueError, TypeError):
@@ -109,16 +109,24 @@ class BatchClient:
         duration_s: float,
         stop: Callable[[], bool],
         progress: Callable[[float], None],
-        look: Callable[[], None] = lambda: None,
+        look: Callable[[float], None] = lambda within_s: None,
+        *,
+        watchdog_s: float = 5.0,
     ) -> JobState:
         """Wait for the end of a running job; asking is also what keeps its watchdog quiet.
+
+        Our own timers are shorter meanwhile, and what was not answered is asked again: a byte that the line damages
+        must not cost the time after which the watchdog stops the job. No answer is taken for that of another question,
+        since each names itself (a job's state by its number, the others by how many figures they have).
 
         Args:
             number: of the job.
             duration_s: planned.
             stop: asked often; True ends the job.
             progress: told the share that is done.
-            look: called once per question; a ``SafetyAbort`` of it ends the job and is raised once the joint stands.
+            look: called once per question with how long it may take; its ``SafetyAbort`` ends the job and is raised
+                once the joint stands.
+            watchdog_s: the job stops when it hears nothing for so long.
 
         Returns:
             The state of the finished job.
@@ -126,48 +134,43 @@ class BatchClient:
         Raises:
             Interrupted: ``stop`` asked for it.
             SafetyAbort: the controller stopped it.
-            HardwareError: it does not come to an end.
+            HardwareError: it does not come to an end, or the line is dead.
         """
-        patience_s = duration_s * 1.2 + 10.0
+        within_s, patience_s = watchdog_s / 3, duration_s * 1.2 + 10.0
         until_s = self._now_s() + patience_s
-        stopping = False
+        answered_s, stopping, told = self._now_s(), False, False
         wrong: SafetyAbort | None = None
-        while True:
-            state = self.state(number)
-            progress(state.done_ticks / max(1, state.total_ticks))
-            if state.state not in (_FINISHED, _STOPPED) and not stopping:
+        with self._host.impatient(watchdog_s / 6):
+            while True:
+                stopping = stopping or stop()
                 try:
-                    look()
+                    if stopping and not told:
+                        self.stop(number, within_s=within_s)
+                        told = True
+                    state = self.state(number, within_s=within_s)
+                    if not stopping and state.state not in (_FINISHED, _STOPPED):
+                        look(within_s)
+                    answered_s = self._now_s()
                 except SafetyAbort as seen:
                     wrong, stopping = seen, True
-                    self.stop(number)
                     continue
-            if state.state == _FINISHED:
-                return state
-            if state.state == _STOPPED:
-                if wrong is not None:
-                    raise wrong
-                if stopping:
-                    raise Interrupted("stopped on request; the joint was brought to rest")
-                why, next_step = _STOP_REASONS.get(state.reason, (f"reason {state.reason}", ""))
-                alarm = f", alarm {state.alarm}" if state.alarm else ""
-                raise SafetyAbort(
-                    f"the controller stopped the job at tick {state.done_ticks} of {state.total_ticks}: {why}{alarm}",
-                    where=f"job {number}",
-                    next_step=next_step,
-                )
-            if self._now_s() > until_s:
-                self.stop(number)
-                raise HardwareError(
-                    f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s", where=f"job {number}"
-                )
-            poll_until_s = self._now_s() + _POLL_S
-            while self._now_s() < poll_until_s:
-                if stop() and not stopping:
-                    stopping = True
+                except (LinkError, BadReply):
+                    if self._now_s() > answered_s + self._host.patience_s:
+                        raise
+                    continue
+                progress(state.done_ticks / max(1, state.total_ticks))
+                if state.state == _FINISHED:
+                    return state
+                if state.state == _STOPPED:
+                    raise wrong or _why_stopped(state, number, asked=stopping)
+                if self._now_s() > until_s:
                     self.stop(number)
-                    break
-                self._host.listen(min(0.05, poll_until_s - self._now_s()))
+                    raise HardwareError(
+                        f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s", where=f"job {number}"
+                    )
+                pause_until_s = self._now_s() + _POLL_S
+                while self._now_s() < pause_until_s and (stopping or not stop()):
+                    self._host.listen(min(0.05, pause_until_s - self._now_s()))
 
     def fetch(
         self,
@@ -225,3 +228,16 @@ class BatchClient:
 
 def _first_missing(rows: Rows, samples: int) -> int:
     return next(k for k in range(samples) if k not in rows)
+
+
+def _why_stopped(state: JobState, number: int, *, asked: bool) -> FrictidError:
+    """What a job that ended before its end is told as."""
+    if asked:
+        return Interrupted("stopped on request; the joint was brought to rest")
+    why, next_step = _STOP_REASONS.get(state.reason, (f"reason {state.reason}", ""))
+    alarm = f", alarm {state.alarm}" if state.alarm else ""
+    return SafetyAbort(
+        f"the controller stopped the job at tick {state.done_ticks} of {state.total_ticks}: {why}{alarm}",
+        where=f"job {number}",
+        next_step=next_step,
+    )

@@ -87,7 +87,7 @@ class BatchRun:
         power_on: Callable[[], None],
         stop: Callable[[], bool],
         progress: Callable[[str, float], None],
-        look: Callable[[], None],
+        look: Callable[[float], None],
     ) -> None:
         """The whole job; see ``MotomanDriver.run_batch``."""
         motion = motion_segments(plan.motions, self._units, self._tick_s)
@@ -99,7 +99,10 @@ class BatchRun:
         try:
             self._batch.start(self.number)
             self._started_ns = self._now_ns()
-            self._batch.watch(self.number, duration_s, stop, lambda share: progress("motion", share), look)
+            self._batch.watch(
+                *(self.number, duration_s, stop, lambda share: progress("motion", share), look),
+                watchdog_s=self._bounds.watchdog_s,
+            )
         except HardwareError:
             # The line failed: the controller stops by its watchdog, and whoever closes the line tries to stop it too.
             raise

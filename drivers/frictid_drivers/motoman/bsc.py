@@ -51,6 +51,10 @@ class BscLink:
         self._sender = Sender(timing, self._output)
         self._receiver = Receiver(timing, self._output, self._events)
 
+    def retime(self, timing: BscTiming) -> None:
+        """Other timers and retries from the next wait on."""
+        self._sender.timing = self._receiver.timing = timing
+
     @property
     def idle(self) -> bool:
         """Nothing is being sent or received, and nothing waits to be."""

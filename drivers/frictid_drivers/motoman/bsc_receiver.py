@@ -15,12 +15,13 @@ class Receiver:
         events: what happens is appended here.
 
     Attributes:
+        timing: as given; may be exchanged.
         deadline_s: when ``expire`` must be called at the latest.
         over: the line is free again.
     """
 
     def __init__(self, timing: BscTiming, output: bytearray, events: list[Event]) -> None:
-        self._timing = timing
+        self.timing = timing
         self._output = output
         self._events = events
         self._reader = BlockReader()
@@ -63,7 +64,7 @@ class Receiver:
             # A byte that belongs to no block follows an accepted one: that block's end may have been a damaged byte.
             self._give_up("bytes outside any block in the middle of a message")
         elif not self._complete:
-            self._block_due_s = now_s + self._timing.text_end_s
+            self._block_due_s = now_s + self.timing.text_end_s
             self._break(byte, now_s)
 
     def expire(self, now_s: float) -> None:
@@ -88,7 +89,7 @@ class Receiver:
 
     def _read(self, byte: int, now_s: float) -> None:
         if not self._reader.open:
-            self.deadline_s = self._block_due_s = now_s + self._timing.text_end_s
+            self.deadline_s = self._block_due_s = now_s + self.timing.text_end_s
         try:
             raw = self._reader.take(byte)
         except ValueError:
@@ -104,7 +105,7 @@ class Receiver:
         """
         self._broken = True
         self._last_broken_byte = byte
-        self.deadline_s = min(now_s + self._timing.quiet_s, self._block_due_s)
+        self.deadline_s = min(now_s + self.timing.quiet_s, self._block_due_s)
 
     def _take_block(self, raw: bytes, now_s: float) -> None:
         block = decode_block(raw)
@@ -132,7 +133,7 @@ class Receiver:
 
     def _reject(self, now_s: float) -> None:
         self._rejections += 1
-        if self._rejections > self._timing.text_retries + 1:
+        if self._rejections > self.timing.text_retries + 1:
             self._give_up(f"a block was unreadable {self._rejections} times")
         else:
             self._answer(bytes([NAK]), now_s)
@@ -146,7 +147,7 @@ class Receiver:
 
     def _repeat_answer(self, now_s: float) -> None:
         self._repeats += 1
-        if self._repeats > self._timing.response_retries + 1:
+        if self._repeats > self.timing.response_retries + 1:
             self._give_up(f"the other side asked for the same answer {self._repeats} times")
         else:
             self._answer(self._last_answer, now_s)
@@ -155,7 +156,7 @@ class Receiver:
         self._last_answer = answer
         self._output += answer
         # A sender that misses this answer asks after its own timer A; being still here then costs nothing.
-        self.deadline_s = now_s + (2 * self._timing.sequence_s if self._complete else self._timing.text_end_s)
+        self.deadline_s = now_s + (2 * self.timing.sequence_s if self._complete else self.timing.text_end_s)
         self._reader.clear()
         self._broken = False
 

@@ -24,12 +24,13 @@ class Sender:
         output: what goes on the wire is appended here.
 
     Attributes:
+        timing: as given; may be exchanged.
         deadline_s: when ``expire`` must be called at the latest.
         contended: the other side bid at the same moment.
     """
 
     def __init__(self, timing: BscTiming, output: bytearray) -> None:
-        self._timing = timing
+        self.timing = timing
         self._output = output
         self._blocks: Sequence[bytes] = ()
         self._index = -1
@@ -68,7 +69,7 @@ class Sender:
     def expire(self, now_s: float) -> Outcome:
         """No answer in time."""
         self._response_retries += 1
-        if self._response_retries > self._timing.response_retries:
+        if self._response_retries > self.timing.response_retries:
             what = "ENQ" if self._bidding else "a block"
             return self._give_up(f"no answer to {what}, asked {self._response_retries} times")
         return self._ask_again(now_s)
@@ -88,7 +89,7 @@ class Sender:
             return self._garbled(now_s)
         # Asked again, the other side repeats the acknowledgement of the block before: this one never arrived.
         self._response_retries += 1
-        if self._response_retries > self._timing.response_retries:
+        if self._response_retries > self.timing.response_retries:
             return self._give_up(f"a block was never acknowledged, sent {self._response_retries} times")
         return self._send_block(now_s)
 
@@ -109,7 +110,7 @@ class Sender:
             # An acknowledgement damaged into a NAK would double a continuation block, which carries no number.
             return self._ask_again(now_s)
         self._text_retries += 1
-        if self._text_retries > self._timing.text_retries:
+        if self._text_retries > self.timing.text_retries:
             return self._give_up(f"a block was rejected (NAK) {self._text_retries} times")
         return self._send_block(now_s)
 
@@ -124,7 +125,7 @@ class Sender:
 
     def _garbled(self, now_s: float) -> Outcome:
         """An answer that is none, or half of one: wait until the line is quiet, then ask again."""
-        self.deadline_s = min(now_s + self._timing.quiet_s, self._answer_due_s)
+        self.deadline_s = min(now_s + self.timing.quiet_s, self._answer_due_s)
         return None
 
     def _ask_again(self, now_s: float) -> Outcome:
@@ -140,7 +141,7 @@ class Sender:
         return None
 
     def _await_answer(self, now_s: float) -> None:
-        self.deadline_s = self._answer_due_s = now_s + self._timing.sequence_s
+        self.deadline_s = self._answer_due_s = now_s + self.timing.sequence_s
         self._dle_seen = False
 
     def _give_up(self, reason: str) -> Failed:

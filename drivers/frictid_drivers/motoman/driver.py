@@ -319,7 +319,8 @@ class MotomanDriver:
         self.batch_columns = {}
         try:
             self._job.run(
-                plan, self._power.on, stop, progress, (lambda: look(self.standing())) if look else (lambda: None)
+                *(plan, self._power.on, stop, progress),
+                (lambda within_s: look(self.standing(within_s=within_s))) if look else (lambda within_s: None),
             )
         finally:
             self.batch_columns = self._job.columns
@@ -327,10 +328,14 @@ class MotomanDriver:
             self._power.off()
         return self.batch_columns
 
-    def standing(self) -> Sequence[Feedback]:
-        """Every joint as stock host control sees it: position and state, no velocity and no torque; about 0.1 s."""
+    def standing(self, *, within_s: float | None = None) -> Sequence[Feedback]:
+        """Every joint as stock host control sees it: position and state, no velocity and no torque; about 0.1 s.
+
+        Args:
+            within_s: give up after this time for each of the two instead of the link's own.
+        """
         host = self._open_line().host
-        status, pulses = host.status(), host.pulses()
+        status, pulses = host.status(within_s=within_s), host.pulses(within_s=within_s)
         state = JointState.ENABLED if status.servo_on else JointState.DISABLED
         return [
             Feedback(

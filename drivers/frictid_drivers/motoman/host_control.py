@@ -8,8 +8,9 @@ From public documents, untested on hardware.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Final
 
 from frictid_drivers.motoman.bsc import BlockReceived, BscLink, BscTiming, Event, Failed, Received, Sent
@@ -123,13 +124,14 @@ class HostControl:
         self._reply_s = reply_s
         self._sink = sink
         self._link = BscLink(self._timing)
-        self._owed_reply = False
+        self._owed = 0
+        """Replies that may still come. They carry no name: a late one must not be taken for that of another command."""
 
     # -- commands ----------------------------------------------------------------------------------------------
 
-    def status(self) -> Status:
+    def status(self, *, within_s: float | None = None) -> Status:
         """RSTATS."""
-        figures = self._figures("RSTATS", 2)
+        figures = self._figures("RSTATS", 2, within_s)
         return decode_status(self._profile, *figures)
 
     def pulses(self, *, within_s: float | None = None) -> list[int]:
@@ -151,6 +153,27 @@ class HostControl:
     def alarms(self) -> str:
         """RALARM, as sent: the layout of its reply is not public, so it is shown and not interpreted."""
         return self.ask("RALARM")
+
+    # -- how patient it is -------------------------------------------------------------------------------------
+
+    @property
+    def patience_s(self) -> float:
+        """How long one exchange may take at the very most, by the link's own timers."""
+        timing = self._timing
+        return self._reply_s + 2 * (timing.response_retries + 1) * timing.sequence_s + timing.text_end_s
+
+    @contextmanager
+    def impatient(self, longest_s: float) -> Iterator[None]:
+        """Inside, no timer of ours runs for longer than this; the controller keeps its own."""
+        timing = self._timing
+        brief = replace(
+            timing, sequence_s=min(timing.sequence_s, longest_s), text_end_s=min(timing.text_end_s, longest_s)
+        )
+        self._link.retime(brief)
+        try:
+            yield
+        finally:
+            self._link.retime(timing)
 
     # -- the exchange ------------------------------------------------------------------------------------------
 
@@ -203,16 +226,13 @@ class HostControl:
         self, text: str, on_text: Callable[[str, int], None] | None = None, *, within_s: float | None = None
     ) -> Message:
         where = text if len(text) <= 24 else f"{text[:21]}..."
-        if self._owed_reply and within_s is None:
-            # Replies carry no name: one that comes late must not be taken for the answer to this command.
-            self.listen(self._timing.sequence_s)
+        self._settle(within_s)
         if self._link.busy_sending:
             # The port failed in the middle of the message before this one.
             self._link.abort()
-        self._owed_reply = True
+        self._owed += 1
         self._link.send(Message(_COMMAND, text), self._port.now_s())
         reply = self._await_reply(where, on_text, within_s)
-        self._owed_reply = False
         if reply.header == _RESULT and reply.text.strip() != "0000":
             number = reply.text.strip()
             if not (number.isdecimal() and len(number) == 4):
@@ -222,10 +242,9 @@ class HostControl:
 
     def _await_reply(self, where: str, on_text: Callable[[str, int], None] | None, within_s: float | None) -> Message:
         """Until the reply is here, the link gives up, or the controller has thought too long about it."""
-        timing, sent = self._timing, False
+        sent = False
         # The link's own timers end every wait; this ends a controller that keeps it busy with something else.
-        patience_s = self._reply_s + 2 * (timing.response_retries + 1) * timing.sequence_s + timing.text_end_s
-        give_up_s = self._port.now_s() + (patience_s if within_s is None else within_s)
+        give_up_s = self._port.now_s() + (self.patience_s if within_s is None else within_s)
         thinking_until_s = give_up_s
         while True:
             limit_s = thinking_until_s if sent and self._link.idle else give_up_s
@@ -245,6 +264,14 @@ class HostControl:
                     case Received(message) if sent:
                         return message
 
+    def _settle(self, within_s: float | None) -> None:
+        """Take late replies off the line; in a hurry only for a quarter of the time that the next one may take."""
+        until_s = self._port.now_s() + (self._timing.sequence_s if within_s is None else within_s / 4)
+        while self._owed and self._port.now_s() < until_s:
+            self._step(until_s)
+        if within_s is None:
+            self._owed = 0  # what has not come by now never will
+
     def listen(self, duration_s: float) -> None:
         """Serve the link and drop whatever it brings."""
         until_s = self._port.now_s() + duration_s
@@ -257,7 +284,7 @@ class HostControl:
         while not self._link.idle and self._port.now_s() < until_s:
             self._step(until_s)
         self._link = BscLink(self._timing)
-        self._owed_reply = False
+        self._owed = 0
 
     def _step(self, until_s: float) -> list[Event]:
         """Write what the link wants, wait for bytes or its next timer, and return what happened."""
@@ -271,7 +298,9 @@ class HostControl:
             link.receive(data, port.now_s())
         link.advance(port.now_s())
         self._flush()
-        return link.take_events()
+        events = link.take_events()
+        self._owed = max(0, self._owed - sum(isinstance(event, Received) for event in events))
+        return events
 
     def _flush(self) -> None:
         output = self._link.take_output()
