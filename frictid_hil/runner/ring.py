@@ -11,8 +11,10 @@ find no rows, or those of long ago.
 
 from __future__ import annotations
 
+import mmap
 import struct
 from multiprocessing import shared_memory
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +41,8 @@ FRAME_ROW = np.dtype(
 PACK_SAMPLE = struct.Struct("<q7dIHH")
 PACK_FRAME = struct.Struct("<qIBBH64s")
 
+_SHARED = Path("/dev/shm")
+"""Where Linux keeps shared memory by name."""
 _HEADER_BYTES = 64
 _HEAD, _TAIL, _DROPPED = range(3)
 
@@ -61,13 +65,20 @@ class Ring:
     ) -> None:
         assert row.itemsize == pack.size, f"row of {row.itemsize} bytes, packed {pack.size}"
         size = _HEADER_BYTES + capacity * row.itemsize
-        self._memory: shared_memory.SharedMemory | None = None
-        if shared or name is not None:
-            self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=0 if name else size)
-        whole = memoryview(bytearray(size)) if self._memory is None else self._memory.buf
-        assert whole is not None, "shared memory is open"
+        self._own: shared_memory.SharedMemory | None = None
+        self._attached: mmap.mmap | None = None
+        if name is not None:
+            # Not by SharedMemory: it would have the memory removed when the process that attached to it ends.
+            with (_SHARED / name).open("r+b") as file:
+                self._attached = mmap.mmap(file.fileno(), size)
+            whole = memoryview(self._attached)
+        elif shared:
+            self._own = shared_memory.SharedMemory(create=True, size=size)
+            assert self._own.buf is not None, "shared memory is open"
+            whole = self._own.buf
+        else:
+            whole = memoryview(bytearray(size))
         self._buffer: memoryview[int] = whole
-        self._owner = name is None
         self._pack_into = pack.pack_into
         self._row = row
         self._capacity = capacity
@@ -77,8 +88,8 @@ class Ring:
     @property
     def name(self) -> str:
         """Name of the shared memory."""
-        assert self._memory is not None, "this ring is private to its process"
-        return self._memory.name
+        assert self._own is not None, "this ring is private to its process, or another's"
+        return self._own.name
 
     @property
     def dropped(self) -> int:
@@ -109,16 +120,25 @@ class Ring:
         self._counters[_TAIL] = head
         return taken
 
+    def __enter__(self) -> Ring:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
-        """Let go of the memory; the creator also removes it."""
-        if self._memory is None:
+        """Let go of the memory; the creator also removes it. Safe to call twice; leaving a ``with`` does it."""
+        own, attached = self._own, self._attached
+        self._own = self._attached = None
+        if own is None and attached is None:
             return
         self._counters.release()
         self._buffer.release()
-        self._memory.close()
-        if self._owner:
-            self._memory.unlink()
-        self._memory = None
+        if attached is not None:
+            attached.close()
+        if own is not None:
+            own.close()
+            own.unlink()
 
 
 def sample_ring(capacity: int = 1 << 16, *, shared: bool = False, name: str | None = None) -> Ring:

@@ -92,52 +92,49 @@ def run_plan(
     care = care or Care()
     driver: Driver = load_driver(driver_name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
     own_process = not driver.clock.lock_step
-    samples, frames = sample_ring(shared=own_process), frame_ring(shared=own_process)
-    recorder = Recorder(samples, frames)
+    with sample_ring(shared=own_process) as samples, frame_ring(shared=own_process) as frames:
+        recorder = Recorder(samples, frames)
 
-    def drain() -> None:
-        rows = samples.drain()
-        if rows.size:
-            keeper.samples(rows)
-        rows = frames.drain()
-        if rows.size:
-            keeper.frames(rows)
+        def drain() -> None:
+            rows = samples.drain()
+            if rows.size:
+                keeper.samples(rows)
+            rows = frames.drain()
+            if rows.size:
+                keeper.frames(rows)
 
-    def after_draining(event: Event) -> None:
-        drain()
-        notify(event)
-
-    if prepare is not None:
-        prepare(driver)
-    with Interrupts() as interrupts:
-        try:
-            if own_process:
-                run_in_own_process(
-                    driver_name,
-                    setup,
-                    plan,
-                    recorder,
-                    notify=after_draining,
-                    proceed=proceed,
-                    stop_level=lambda: interrupts.level,
-                    drain=drain,
-                    care=care,
-                )
-            else:
-                Scheduler(
-                    driver,
-                    setup,
-                    plan,
-                    recorder,
-                    notify=after_draining,
-                    proceed=proceed,
-                    stop=interrupts,
-                    pump=drain,
-                    care=care,
-                ).run()
-        finally:
+        def after_draining(event: Event) -> None:
             drain()
-            lost = samples.dropped + frames.dropped
-            samples.close()
-            frames.close()
-    return lost
+            notify(event)
+
+        if prepare is not None:
+            prepare(driver)
+        with Interrupts() as interrupts:
+            try:
+                if own_process:
+                    run_in_own_process(
+                        driver_name,
+                        setup,
+                        plan,
+                        recorder,
+                        notify=after_draining,
+                        proceed=proceed,
+                        stop_level=lambda: interrupts.level,
+                        drain=drain,
+                        care=care,
+                    )
+                else:
+                    Scheduler(
+                        driver,
+                        setup,
+                        plan,
+                        recorder,
+                        notify=after_draining,
+                        proceed=proceed,
+                        stop=interrupts,
+                        pump=drain,
+                        care=care,
+                    ).run()
+            finally:
+                drain()
+        return samples.dropped + frames.dropped

@@ -1,10 +1,14 @@
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from frictid_hil.runner.ring import FRAME_ROW, PACK_FRAME, PACK_SAMPLE, SAMPLE_ROW, Ring, frame_ring
+from frictid_hil.errors import UsageError
+from frictid_hil.runner import run
+from frictid_hil.runner.ring import FRAME_ROW, PACK_FRAME, PACK_SAMPLE, SAMPLE_ROW, Ring, frame_ring, sample_ring
 
 
 def fill(ring: Ring, first: int, count: int) -> None:
@@ -54,6 +58,40 @@ def test_another_process_could_attach_by_name() -> None:
         Ring(SAMPLE_ROW, PACK_SAMPLE, 16, name="psm_no_such_ring")
 
 
+def test_leaving_a_with_by_an_error_lets_go_of_shared_memory() -> None:
+    with pytest.raises(OSError, match="disk full"), sample_ring(8, shared=True) as ring:
+        name = ring.name
+        fill(ring, 0, 3)
+        raise OSError("disk full")
+    with pytest.raises(FileNotFoundError):
+        sample_ring(name=name)
+    ring.close()
+
+
+def test_a_run_that_ends_before_its_first_cycle_lets_go_of_its_rings(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def noted(*, shared: bool) -> Ring:
+        ring = sample_ring(8, shared=shared)
+        made.append(ring.name)
+        return ring
+
+    def absent_hand(driver: object) -> None:
+        raise UsageError("no hand")
+
+    wall_clock = SimpleNamespace(clock=SimpleNamespace(lock_step=False))
+    monkeypatch.setattr(run, "load_driver", lambda name: lambda setup: wall_clock)
+    monkeypatch.setattr(run, "sample_ring", noted)
+    monkeypatch.setattr(run, "frame_ring", noted)
+    nothing: Any = None
+    with pytest.raises(UsageError, match="no hand"):
+        run.run_plan("x", nothing, nothing, nothing, notify=nothing, proceed=nothing, prepare=absent_hand)
+    assert len(made) == 2
+    for name in made:
+        with pytest.raises(FileNotFoundError):
+            sample_ring(name=name)
+
+
 def test_frames_keep_their_bytes() -> None:
     ring = frame_ring(4)
     ring.append(5, 0x181, 3, True, 0, b"\x01\x02\x03")
@@ -76,7 +114,11 @@ ring.close()
 def test_a_reader_in_another_process_gets_every_row_once_and_in_order() -> None:
     """The reader looks as often as it can, also in the midst of a write."""
     rows = 250_000
-    ring = frame_ring(shared=True)
+    with frame_ring(shared=True) as ring:
+        read_while_another_writes(ring, rows)
+
+
+def read_while_another_writes(ring: Ring, rows: int) -> None:
     writer = subprocess.Popen([sys.executable, "-c", APPEND_MANY, ring.name, str(rows)])
     expected = 0
     while True:
@@ -89,5 +131,3 @@ def test_a_reader_in_another_process_gets_every_row_once_and_in_order() -> None:
         elif ended:
             break
     assert (writer.returncode, expected, ring.dropped) == (0, rows, 0)
-    del taken
-    ring.close()
