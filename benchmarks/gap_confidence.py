@@ -101,7 +101,7 @@ def clues_of_joint(task: tuple[int, int, Assignment]) -> dict[str, Any]:
     causes, verdicts = [], []
     for left_out, right in runs:
         library = [n for n in all_effects() if n != left_out]
-        answer = diagnose(experiments, library=library)
+        answer = diagnose(experiments, library=library, least_chance=0.0)
         verdicts.append(answer.verdict)
         for rank, cause in enumerate(answer.causes):
             if answer.verdict in ("explained", "ambiguous") and cause.clues is not None:

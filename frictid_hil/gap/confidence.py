@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from frictid_hil.gap.confidence_fit import WEIGHTS
+from frictid_hil.gap.spread import Unlike
 from frictid_hil.gap.verdict import Features
 from frictid_hil.simulation.effects import all_effects
 
@@ -44,6 +45,7 @@ SIGNS: Mapping[str, int] = {
     "generic_share": -1,
     "worst_log": -1,
     "spread": -1,
+    "unresolved": -1,
     "position": -1,
 }
 """Which way a term may move the chance: 1 up, -1 down, 0 either."""
@@ -67,7 +69,7 @@ class Clues:
         generic: log-likelihood, per misfit ratio, that the best family without a cause adds to the plant's effects.
         generic_share: the same over what those effects gain.
         worst_log: misfit of the validation log that is explained worst, over the misfit of all.
-        spread: for a late torque, how far its spread in time may be from what the effect brings, over its square.
+        spread: for a late torque, how far its spread in time is from what the effect brings.
         position: squared position difference left on held-out logs, over what there was.
     """
 
@@ -84,7 +86,7 @@ class Clues:
     generic: float
     generic_share: float
     worst_log: float
-    spread: float
+    spread: Unlike
     position: float
 
     def terms(self) -> dict[str, float]:
@@ -104,7 +106,8 @@ class Clues:
             "generic": math.log1p(_within(self.generic, 0.0, 3000.0)),
             "generic_share": math.log1p(1e3 * _within(self.generic_share, 0.0, 1.0)),
             "worst_log": math.log(_within(self.worst_log, 1.0, 5.0)),
-            "spread": _within(self.spread, 0.0, 1.5),
+            "spread": _within(self.spread.shown, 0.0, 1.5),
+            "unresolved": _within(self.spread.hidden, 0.0, 1.0),
             "position": _within(self.position, 0.0, 1.5),
         }
 
@@ -155,7 +158,7 @@ def clues_of(name: str, features: Features, own: float, values: Mapping[str, flo
         generic=generic / max(1.0, features.misfit),
         generic_share=generic / max(1.0, features.gain),
         worst_log=features.worst_log if plant else 1.0,
-        spread=features.spread.get(name, 0.0),
+        spread=features.spread.get(name, Unlike()),
         position=features.position_left,
     )
     near = bool(rival) and (lead < CONFUSABLE_LEAD or share > CONFUSABLE_SHARE)

@@ -30,6 +30,7 @@ WEIGHTS: dict[str, float] = {
     "generic": 0.0,
     "position": 0.0,
     "spread": 0.0,
+    "unresolved": 0.0,
     "worst_log": 0.0,
     "generic_share": 0.0,
 }

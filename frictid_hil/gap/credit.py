@@ -105,7 +105,9 @@ def _shows_in_plant(judge: Judge, hypothesis: Hypothesis, name: str) -> bool:
 
 
 def _buys_torque_with_position(judge: Judge, hypothesis: Hypothesis) -> str | None:
-    """The effect that opens the position's gap most, where all together open it beyond chance."""
+    """The effect that opens the position's gap most, where all open it beyond chance and the plant is not clear."""
+    if clear(judge, hypothesis):
+        return None
     before = by_stretch(judge.judged(judge.drive), "position_rad")
     after = by_stretch(judge.judged(hypothesis.effects), "position_rad")
     opened = change(before, after)

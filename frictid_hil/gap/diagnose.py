@@ -24,7 +24,7 @@ from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
-from frictid_hil.gap.spread import unlike
+from frictid_hil.gap.spread import Unlike, unlike
 from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.gap.where import lives, where
 from frictid_hil.gap.which import Model, Ranking, best_family, families_beside, rank, replacements
@@ -32,6 +32,8 @@ from frictid_hil.simulation.effects import all_effects
 
 QUIET = 1.25
 """Noise of the judged logs over that of the median log, at most; more is a fault of the drive in those logs."""
+UNLIKELY = 0.2
+"""Chance of the likeliest cause below which none is named: the answer is ``unknown``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +44,15 @@ class _Channels:
     unexplained_actuation: float
 
 
-def diagnose(experiments: ExperimentSet, *, library: Collection[str] | None = None) -> Diagnosis:
+def diagnose(
+    experiments: ExperimentSet, *, library: Collection[str] | None = None, least_chance: float = UNLIKELY
+) -> Diagnosis:
     """Diagnose one joint; deterministic.
 
     Args:
         experiments: nominal joint and recordings.
         library: names of the effects that may be used; all of them unless given.
+        least_chance: of the likeliest cause, below which the answer is ``unknown``.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     reason = why_not(experiments)
@@ -60,11 +65,15 @@ def diagnose(experiments: ExperimentSet, *, library: Collection[str] | None = No
     usable = [r for r in logs if r.plant_nm is not None]
     if reason is not None or not usable or not any(not r.experiment.validation for r in usable):
         return diagnose_without_replay(experiments, logs, allowed, reason, hints)
-    return _full(experiments, logs, allowed, hints)
+    return _full(experiments, logs, allowed, hints, least_chance)
 
 
 def _full(
-    experiments: ExperimentSet, logs: Sequence[Recording], allowed: tuple[str, ...], hints: Mapping[str, str]
+    experiments: ExperimentSet,
+    logs: Sequence[Recording],
+    allowed: tuple[str, ...],
+    hints: Mapping[str, str],
+    least_chance: float,
 ) -> Diagnosis:
     nominal = experiments.nominal
     channels = drive_channels(experiments, logs, allowed)
@@ -148,6 +157,7 @@ def _full(
         low_pass,
         channels,
         hints,
+        least_chance,
     )
 
 
@@ -157,8 +167,8 @@ def _worst_log(evidence: Evidence, hypothesis: Hypothesis) -> float:
     return max(judged.values()) / evidence.misfit_ratio(hypothesis.groups) if judged else 1.0
 
 
-def _spread(channels: _Channels, logs: Sequence[Recording], experiments: ExperimentSet) -> dict[str, float]:
-    """How far the spread of the late effects found may be from what they bring."""
+def _spread(channels: _Channels, logs: Sequence[Recording], experiments: ExperimentSet) -> dict[str, Unlike]:
+    """How far the spread of the late effects found is from what they bring."""
     controller = experiments.nominal.controller
     if channels.actuation is None or controller is None:
         return {}
@@ -275,6 +285,7 @@ def _conclude(
     low_pass: LowPass,
     channels: _Channels,
     hints: Mapping[str, str],
+    least_chance: float,
 ) -> Diagnosis:
     verdict, place = verdict_of(features)
     names = features.names
@@ -296,17 +307,22 @@ def _conclude(
     if before.forward_torque_nm and before.forward_torque_nm > noise_nm:
         rest = pooled(after, "torque_nm") ** 2 - noise_nm**2
         closed = 100.0 * (1.0 - max(0.0, rest) / max(1e-30, before.forward_torque_nm**2 - noise_nm**2))
+    values_of = {name: _values(name, hypothesis, channels, drive) for name in names}
+    clues_by_name = {
+        name: clues_of(name, features, shapley[name], {p: value.value for p, value in values_of[name].items()})
+        for name in names
+    }
+    if verdict == "explained" and max(clues.chance() for clues, _ in clues_by_name.values()) < least_chance:
+        verdict, place = "unknown", features.family_name
     causes = []
     for name in names:
-        values = _values(name, hypothesis, channels, drive)
-        plain = {parameter: value.value for parameter, value in values.items()}
-        clues, confusable = clues_of(name, features, shapley.get(name, 0.0), plain)
+        clues, confusable = clues_by_name[name]
         chance = round(clues.chance(), 3)
         causes.append(
             Cause(
                 effect=name,
                 confidence=chance if verdict == "explained" else min(chance, 0.4),
-                parameters=values,
+                parameters=values_of[name],
                 confusable_with=confusable,
                 gap_closed_percent=round(closed * shapley.get(name, 0.0), 2),
                 clues=clues,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,21 +24,30 @@ RESOLVED = 2.0
 """Standard errors by which a spread must be known."""
 
 
-def unlike(fit: ActuationFit, logs: Sequence[Recording], controller: Controller) -> dict[str, float]:
-    """By late effect found: how far the spread may be from the one it brings, over the square of its delay.
+@dataclass(frozen=True, slots=True)
+class Unlike:
+    """How far the spread is from the one that a named effect brings, over the square of its delay.
 
-    A lag named for a delay, or a delay for a lag, is off by about 1; an error that the recordings do not resolve counts
-    as large as they allow. 0 where nothing speaks against the effect.
+    A lag named for a delay, or a delay for a lag, is off by about 1.
+
+    Attributes:
+        shown: what is off beyond doubt; 0 where nothing speaks against the effect.
+        hidden: what may be off besides, for all that the recordings resolve.
     """
+
+    shown: float = 0.0
+    hidden: float = 0.0
+
+
+def unlike(fit: ActuationFit, logs: Sequence[Recording], controller: Controller) -> dict[str, Unlike]:
+    """By late effect found, how unlike its response is."""
     names = [name for name in fit.found if late_s({name: fit.drive.effects[name]}) > 0.0]
     if not names:
         return {}
     moment, error = _free_spread(fit, logs, controller, late_s(fit.drive.effects))
-    return {name: _at_most(moment, error) / late_s({name: fit.drive.effects[name]}) ** 2 for name in names}
-
-
-def _at_most(moment: float, error: float) -> float:
-    return abs(moment) + RESOLVED * error
+    shown = max(0.0, abs(moment) - RESOLVED * error)
+    squares = {name: late_s({name: fit.drive.effects[name]}) ** 2 for name in names}
+    return {name: Unlike(shown / square, RESOLVED * error / square) for name, square in squares.items()}
 
 
 def _free_spread(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from frictid_hil.gap.spread import Unlike
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 
@@ -58,7 +59,7 @@ class Features:
         hollow: plant effect -> part of what it closes that its shape closes without its strength.
         generic: log-likelihood that the best family adds, those counted that are too near an effect for a verdict.
         worst_log: misfit of the validation log that is explained worst, over the misfit of all.
-        spread: late effect of the drive -> how far its spread in time may be from what it brings, over its square.
+        spread: late effect of the drive -> how far its spread in time is from what it brings.
         position_left: squared position difference with the effects over that without, on the judged logs.
     """
 
@@ -87,7 +88,7 @@ class Features:
     hollow: Mapping[str, float]
     generic: float = 0.0
     worst_log: float = 1.0
-    spread: Mapping[str, float] = field(default_factory=dict)
+    spread: Mapping[str, Unlike] = field(default_factory=dict)
     position_left: float = 1.0
 
 
