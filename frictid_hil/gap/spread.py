@@ -31,7 +31,7 @@ class Unlike:
     A lag named for a delay, or a delay for a lag, is off by about 1.
 
     Attributes:
-        shown: what is off beyond doubt; 0 where nothing speaks against the effect.
+        shown: what is off beyond doubt and beyond what sampling spreads; 0 where nothing speaks against the effect.
         hidden: what may be off besides, for all that the recordings resolve.
     """
 
@@ -47,7 +47,9 @@ def unlike(fit: ActuationFit, logs: Sequence[Recording], controller: Controller)
     moment, error = _free_spread(fit, logs, controller, late_s(fit.drive.effects))
     shown = max(0.0, abs(moment) - RESOLVED * error)
     squares = {name: late_s({name: fit.drive.effects[name]}) ** 2 for name in names}
-    return {name: Unlike(shown / square, RESOLVED * error / square) for name, square in squares.items()}
+    # Held and averaged over a sample, any response is spread by a part of a step.
+    sampled = 0.5 * logs[0].step_s ** 2
+    return {name: Unlike(shown / (square + sampled), RESOLVED * error / square) for name, square in squares.items()}
 
 
 def _free_spread(

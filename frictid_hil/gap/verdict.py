@@ -21,6 +21,8 @@ UNEXPLAINED = 3.0
 """Held-out squares per row of a plant that cannot be called healthy, whatever its replay shows."""
 DRIVE_DETAIL = 0.12
 """Part of the actuation residual, in its worst log, that the formula of a fault of the drive may leave."""
+UNLIKE = 0.5
+"""Spread of a late torque over that between delay and lag from which it is nearer to the other one's."""
 COLOURED = 3.0
 """Low-passed actuation residual over what its white part leaves; slow noise of a healthy drive reaches 2."""
 HARDLY_CLOSED = 0.75
@@ -99,6 +101,8 @@ def verdict_of(f: Features) -> tuple[str, str]:
     coloured = f.actuation_ratio > COLOURED or f.actuation_motion > FOLLOWS_MOTION
     if another and (f.actuation_left > 0.3 or coloured):
         return "unknown", "actuation"
+    if any(late.shown > UNLIKE for late in f.spread.values()):
+        return "unknown", "actuation: the torque is late in another way"
     if f.held_share > HELD_SHARE:
         return "unknown", "kinematics: positions repeat while the joint moves"
     if not f.names:
