@@ -91,6 +91,10 @@ def _uncredited(judge: Judge, hypothesis: Hypothesis) -> str | None:
     credit = earned[name]
     if credit.deviations < -BEYOND_CHANCE or credit.share < -NEXT_TO_NOTHING:
         return name
+    # What only a replay shows may be what a formula of the drive leaves.
+    hidden = [n for n in hypothesis.replayed if judge.drive and earned[n].deviations < BEYOND_CHANCE]
+    if hidden:
+        return hidden[0]
     little = credit.share < NEXT_TO_NOTHING and credit.deviations < BEYOND_CHANCE
     return name if little and not _shows_in_plant(judge, hypothesis, name) else None
 
