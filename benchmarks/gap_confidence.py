@@ -63,9 +63,8 @@ def main() -> None:
         print(f"{name}: {weight:.3f}")
     print("\n".join(table))
     if arguments.write:
-        seeds = sorted({json.loads(line)["seed"] for line in kept.read_text().splitlines()})
-        joints = len(kept.read_text().splitlines())
-        FIT.write_text(page(weights, table, joints, seeds))
+        joints = [json.loads(line) for line in kept.read_text().splitlines()]
+        FIT.write_text(page(weights, table, joints))
         print(f"written: {FIT}")
 
 
@@ -116,7 +115,13 @@ def clues_of_joint(task: tuple[int, int, Assignment]) -> dict[str, Any]:
                     }
                 )
     about = {"kind": truth["kind"], "truth": names, "visible": truth["visible"], "verdicts": verdicts}
-    return {"seed": seed, "case": index, **about, "causes": causes}
+    return {"seed": seed, "case": index, "commit": commit(), **about, "causes": causes}
+
+
+def commit() -> str:
+    """The commit that diagnoses, shortened; empty outside a checkout."""
+    asked = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.run(asked, capture_output=True, text=True, cwd=FIT.parent).stdout.strip()
 
 
 def fitted(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -167,15 +172,17 @@ def calibration(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def page(weights: Mapping[str, float], table: Sequence[str], joints: int, seeds: Sequence[int]) -> str:
+def page(weights: Mapping[str, float], table: Sequence[str], joints: Sequence[Mapping[str, Any]]) -> str:
     """The product's file of weights."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=FIT.parent)
     numbers = "\n".join(f'    "{name}": {weight},' for name, weight in weights.items())
-    asked = ", ".join(str(seed) for seed in seeds)
+    seeds = ", ".join(str(seed) for seed in sorted({joint["seed"] for joint in joints}))
+    commits = ", ".join(sorted({joint["commit"] for joint in joints}))
     return (
         '"""Weights of the confidence\'s logistic map; written by ``benchmarks/gap_confidence.py --write``.\n\n'
-        f"{joints} joints of seeds {asked}, diagnosed at commit {commit.stdout.strip()}. Causes named in joints that "
-        "did\nnot fit the weights they are judged by (ten folds):\n\n" + "\n".join(table) + '\n"""\n\n'
+        f"{len(joints)} joints of seeds {seeds}, diagnosed at commits {commits}.\n"
+        "Causes named in joints that did not fit the weights they are judged by (ten folds):\n\n"
+        + "\n".join(table)
+        + '\n"""\n\n'
         f"from __future__ import annotations\n\nWEIGHTS: dict[str, float] = {{\n{numbers}\n}}\n"
     )
 
