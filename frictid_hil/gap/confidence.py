@@ -22,6 +22,8 @@ CONFUSABLE_SHARE = 0.97
 """Gain of a rival over the winner's above which it is named, however long the recordings."""
 LEAST, MOST = 0.05, 0.99
 """Bounds of what is ever claimed."""
+LATE_EITHER_WAY = 0.85
+"""Most that is claimed of a late torque whose recordings do not resolve whether it is delayed or lags."""
 SEEN_DIRECTLY = 1e5
 """Log-likelihood of what is read from the reported positions and velocities themselves."""
 COLOUR = 1.6
@@ -114,7 +116,8 @@ class Clues:
     def chance(self) -> float:
         """The chance that the effect is there."""
         logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
-        return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, MOST)
+        most = MOST if self.spread.hidden < 1.0 else LATE_EITHER_WAY
+        return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, most)
 
 
 def clues_of(name: str, features: Features, own: float, values: Mapping[str, float]) -> tuple[Clues, tuple[str, ...]]:

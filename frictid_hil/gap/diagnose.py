@@ -32,6 +32,11 @@ from frictid_hil.simulation.effects import all_effects
 
 QUIET = 1.25
 """Noise of the judged logs over that of the median log, at most; more is a fault of the drive in those logs."""
+COARSE = 0.5
+"""Torque that the steps of the position make, over the noise or the floor, from which they matter.
+
+A lattice of positions is seen for sure; what it does to the acceleration beyond our low-pass is not.
+"""
 UNLIKELY = 0.2
 """Chance of the likeliest cause below which none is named: the answer is ``unknown``."""
 
@@ -255,7 +260,7 @@ def _needed_drive(
             inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2
             noise = inertia * step_rad / math.sqrt(12.0) * acceleration_gain(low_pass)
             stuck = view.stiffness_nm_per_rad * step_rad / math.sqrt(12.0) * 0.2
-            if math.hypot(noise, stuck) > 0.8 * min(noise_nm, 0.75 * floor):
+            if math.hypot(noise, stuck) > COARSE * min(noise_nm, 0.75 * floor):
                 kept[name] = values
         else:
             assert channels.actuation is not None and controller is not None
