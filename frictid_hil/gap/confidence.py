@@ -22,7 +22,9 @@ CONFUSABLE_SHARE = 0.97
 """Gain of a rival over the winner's above which it is named, however long the recordings."""
 LEAST, MOST = 0.05, 0.99
 """Bounds of what is ever claimed."""
-LATE_EITHER_WAY = 0.85
+DECISIVE = 10.0
+"""Log-likelihood, per misfit ratio, that counts as one: samples are not independent, and models wrong beyond noise."""
+LATE_EITHER_WAY = 0.6
 """Most that is claimed of a late torque whose recordings do not resolve whether it is delayed or lags."""
 SEEN_DIRECTLY = 1e5
 """Log-likelihood of what is read from the reported positions and velocities themselves."""
@@ -116,8 +118,9 @@ class Clues:
     def chance(self) -> float:
         """The chance that the effect is there."""
         logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
-        most = MOST if self.spread.hidden < 1.0 else LATE_EITHER_WAY
-        return _within(1.0 / (1.0 + math.exp(-logit)), LEAST, most)
+        # Against one rival alone, a lead in log-likelihood says this much; where there is none, it is a toss.
+        most = LATE_EITHER_WAY if self.spread.hidden >= 1.0 else _logistic(max(0.0, self.lead) / DECISIVE)
+        return _within(_logistic(logit), LEAST, min(most, MOST))
 
 
 def clues_of(name: str, features: Features, own: float, values: Mapping[str, float]) -> tuple[Clues, tuple[str, ...]]:
@@ -181,6 +184,10 @@ def _at_edge(name: str, values: Mapping[str, float]) -> bool:
         if near_low or near_high:
             return True
     return False
+
+
+def _logistic(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-_within(logit, -500.0, 500.0)))
 
 
 def _within(value: float, low: float, high: float) -> float:
