@@ -25,9 +25,9 @@ STANDS_BESIDE = 0.45
 CLEAR = 1.15
 """Fall of the plant's held-out squares from which a lone effect needs to take off no more than one beside others.
 
-A trace of a third of the noise floor adds a tenth to the squares at most; healthy joints show 1.07.
+What such an effect leaves must have been unhealthy before; single traces take 1.07 off such joints at most.
 """
-UNHEALTHY = 2.2
+UNHEALTHY = 2.1
 """Held-out squares per row that traces below the floor do not reach."""
 FAINT = 0.02
 """Part of an effect's strength that is next to nothing."""
@@ -191,9 +191,7 @@ class Judge:
 def choose(judge: Judge, ranking: Ranking, floor_nm: float) -> Hypothesis:
     """The hypothesis that replays best with as few effects as it takes."""
     current = judge(())
-    seen = [judge.evidence.misfit_ratio(m.groups) for m in ranking.singles[:1]]
-    healthy = current.misfit < UNHEALTHY and not any(current.misfit > CLEAR * misfit for misfit in seen)
-    if current.judged_nm <= NO_GAP * floor_nm and healthy:
+    if current.judged_nm <= NO_GAP * floor_nm and current.misfit < UNHEALTHY:
         return current
     return _with_probed(judge, _chosen_by_plant(judge, ranking, current, floor_nm), floor_nm)
 
@@ -326,7 +324,7 @@ def needed(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
 
 def clear(judge: Judge, hypothesis: Hypothesis) -> bool:
     """Whether held-out inverse dynamics shows the effects beyond doubt, though a quick controller hides them."""
-    return judge.evidence.misfit_ratio(()) > CLEAR * hypothesis.misfit
+    return judge.evidence.misfit_ratio(()) > max(UNHEALTHY, CLEAR * hypothesis.misfit)
 
 
 def gap_figures(differences: Mapping[str, Replayed]) -> tuple[float, float]:
