@@ -58,6 +58,9 @@ class ScriptedPort:
     def set_line(self, baud: int, parity: str) -> None:
         raise AssertionError("host control changes no line settings")
 
+    def reopen(self) -> None:
+        raise AssertionError("host control loses no port here")
+
     def close(self) -> None:
         pass
 

@@ -307,6 +307,36 @@ def test_four_seconds_of_silence_are_less_than_the_watchdog(at: int) -> None:
     driver.close()
 
 
+@pytest.mark.parametrize("gone_s", [1, 7, 12])
+def test_what_a_job_recorded_is_fetched_once_a_lost_port_is_back(gone_s: int) -> None:
+    bench = make_bench(layer="batch", stream_baud=0, faults=[f"unplug@400:{gone_s}"])
+    driver = bench.driver()
+    driver.open()
+    driver.start_cycling()
+    with pytest.raises(HardwareError, match="port is gone"):
+        driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 10)), look=lambda reports: None)
+    job = bench.emulator.batch._job
+    assert job is not None and job.state == jobs.STOPPED
+    assert job.done >= 400
+    kept = driver.batch_columns
+    pulses = np.rint(kept["position_rad"] * UNITS.pulses_per_rad).astype(int)
+    assert pulses.tolist() == [sample[0] for sample in job.samples]
+    driver.close()
+    assert not bench.emulator.panel.servo_on
+    assert not bench.still_moving()
+
+
+def test_a_port_that_never_comes_back_is_not_waited_for_long() -> None:
+    bench = make_bench(layer="batch", stream_baud=0, faults=["unplug@400"])
+    driver = bench.driver()
+    driver.open()
+    with pytest.raises(HardwareError, match="port is gone"):
+        driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 10)))
+    assert driver.batch_columns == {}
+    assert bench.emulator.now_s < 400 * TICK_S + 25.0
+    driver.close()
+
+
 # -- the friction table ----------------------------------------------------------------------------------------------
 
 CURVE = FrictionCurve.through(np.linspace(0.2, 2.0, 10), 5.0 + 2.0 * np.sqrt(np.linspace(0.2, 2.0, 10)))

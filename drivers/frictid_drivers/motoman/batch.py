@@ -50,7 +50,7 @@ class BatchClient:
 
     def __init__(self, host: HostControl, now_s: Callable[[], float]) -> None:
         self._host = host
-        self._now_s = now_s
+        self.now_s = now_s
 
     def hello(self) -> BatchHello:
         """FHELLO.
@@ -137,8 +137,8 @@ class BatchClient:
             HardwareError: it does not come to an end, or the line is dead.
         """
         within_s, patience_s = watchdog_s / 3, duration_s * 1.2 + 10.0
-        until_s = self._now_s() + patience_s
-        answered_s, stopping, told = self._now_s(), False, False
+        until_s = self.now_s() + patience_s
+        answered_s, stopping, told = self.now_s(), False, False
         wrong: SafetyAbort | None = None
         with self._host.impatient(watchdog_s / 6):
             while True:
@@ -150,12 +150,12 @@ class BatchClient:
                     state = self.state(number, within_s=within_s)
                     if not stopping and state.state not in (_FINISHED, _STOPPED):
                         look(within_s)
-                    answered_s = self._now_s()
+                    answered_s = self.now_s()
                 except SafetyAbort as seen:
                     wrong, stopping = seen, True
                     continue
                 except (LinkError, BadReply):
-                    if self._now_s() > answered_s + self._host.patience_s:
+                    if self.now_s() > answered_s + self._host.patience_s:
                         raise
                     continue
                 progress(state.done_ticks / max(1, state.total_ticks))
@@ -163,14 +163,14 @@ class BatchClient:
                     return state
                 if state.state == _STOPPED:
                     raise wrong or _why_stopped(state, number, asked=stopping)
-                if self._now_s() > until_s:
+                if self.now_s() > until_s:
                     self.stop(number)
                     raise HardwareError(
                         f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s", where=f"job {number}"
                     )
-                pause_until_s = self._now_s() + _POLL_S
-                while self._now_s() < pause_until_s and (stopping or not stop()):
-                    self._host.listen(min(0.05, pause_until_s - self._now_s()))
+                pause_until_s = self.now_s() + _POLL_S
+                while self.now_s() < pause_until_s and (stopping or not stop()):
+                    self._host.listen(min(0.05, pause_until_s - self.now_s()))
 
     def fetch(
         self,

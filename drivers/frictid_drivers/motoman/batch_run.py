@@ -15,11 +15,14 @@ from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
 from frictid_hil.driver import JointSetup
-from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
+from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.plan import JointPlan
 from frictid_hil.units import degrees
 
 _AT_START_RAD = 0.005
+_ANSWERS_WITHIN_S = 2.0
+_COMES_BACK_S = 10.0
+"""How long after the job's watchdog a lost port may be there again; the record is fetched then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +107,31 @@ class BatchRun:
                 watchdog_s=self._bounds.watchdog_s,
             )
         except HardwareError:
-            # The line failed: the controller stops by its watchdog, and whoever closes the line tries to stop it too.
+            # The controller stops by its watchdog, and keeps what it recorded.
+            with contextlib.suppress(FrictidError):
+                self._come_back(motion, stop, progress)
             raise
         except FrictidError:
             self.running = False
             with contextlib.suppress(FrictidError):
                 self._fetch(motion, progress)
             raise
+        self.running = False
+        self._fetch(motion, progress)
+
+    def _come_back(self, motion: JobMotion, stop: Callable[[], bool], progress: Callable[[str, float], None]) -> None:
+        """After a lost port: if it is there again soon, see that the joint stands, and fetch its record."""
+        until_s = self._batch.now_s() + self._bounds.watchdog_s + _COMES_BACK_S
+        while True:
+            try:
+                self._host.reconnect()
+                self._batch.state(self.number, within_s=_ANSWERS_WITHIN_S)
+                break
+            except FrictidError:
+                if stop() or self._batch.now_s() > until_s:
+                    raise
+        with contextlib.suppress(Interrupted, SafetyAbort):
+            self._batch.watch(self.number, 0.0, lambda: True, lambda share: None)
         self.running = False
         self._fetch(motion, progress)
 

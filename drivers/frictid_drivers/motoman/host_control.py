@@ -278,6 +278,16 @@ class HostControl:
         while self._port.now_s() < until_s:
             self._step(until_s)
 
+    def reconnect(self) -> None:
+        """On a port that was lost: have it back, with nothing under way.
+
+        Raises:
+            HardwareError: it is not there (yet).
+        """
+        self._port.reopen()
+        self._link = BscLink(self._timing)
+        self._owed = 1  # what the controller still says of before belongs to no command of ours
+
     def leave(self) -> None:
         """Let the link finish, then forget it: the port goes to another protocol."""
         until_s = self._port.now_s() + _FAREWELL_S

@@ -15,6 +15,8 @@ import serial
 
 from frictid_hil.errors import HardwareBusy, HardwareError
 
+_REOPEN_EVERY_S = 0.5
+
 
 class BytePort(Protocol):
     """Bytes both ways, and the clock they run on."""
@@ -33,6 +35,14 @@ class BytePort(Protocol):
 
     def set_line(self, baud: int, parity: str) -> None:
         """Change speed and parity; bytes under way are sent first."""
+        ...
+
+    def reopen(self) -> None:
+        """Try to have a port back that was lost; takes half a second at least where it is not there.
+
+        Raises:
+            HardwareError: it is not there (yet).
+        """
         ...
 
     def close(self) -> None:
@@ -55,8 +65,13 @@ class SerialPort:
 
     def __init__(self, path: str, baud: int, parity: str) -> None:
         self._path = path
+        self._line = (baud, parity)
+        self._serial: serial.Serial | None = None
+        self._connect(path, baud, parity)
+
+    def _connect(self, path: str, baud: int, parity: str) -> None:
         try:
-            self._serial: serial.Serial | None = serial.Serial(
+            self._serial = serial.Serial(
                 path, baud, bytesize=8, parity=parity, stopbits=1, timeout=0, write_timeout=1.0, exclusive=True
             )
             self._verify(baud, parity)
@@ -104,6 +119,12 @@ class SerialPort:
             raise self._gone(error) from None
         except (termios.error, ValueError) as error:
             raise _bad_line(self._path, baud, parity, str(error)) from None
+
+    def reopen(self) -> None:
+        """Open the same device again, at the speed that it was opened with."""
+        self.close()
+        time.sleep(_REOPEN_EVERY_S)
+        self._connect(self._path, *self._line)
 
     def close(self) -> None:
         """Release the port and its lock."""

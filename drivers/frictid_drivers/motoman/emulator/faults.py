@@ -16,7 +16,7 @@ silence        all utterances           says nothing for ``value`` seconds
 enq            ENQs heard               bids against it; ``value`` 1: and does not yield
 split          all utterances           from here on, byte by byte
 merge          all utterances           from here on, utterances within ``value`` seconds arrive together
-close          all utterances           the port disappears
+close          all utterances           the port disappears, for good or for ``value`` seconds
 bad_crc        stream frames said       falsifies the CRC
 lost_frame     stream frames said       swallows it
 deaf           stream frames heard      does not hear it
@@ -25,7 +25,7 @@ late           ticks of motion          the feedback of this tick comes ``value`
 alarm          ticks of motion          alarm number ``value``: servo power off
 hold           ticks of motion          somebody presses hold on the pendant
 drop           ticks of motion          the speed limiter drops ``value`` pulses of every moving axis
-unplug         ticks of motion          the port disappears
+unplug         ticks of motion          the port disappears, for good or for ``value`` seconds
 =============  =======================  ====================================================================
 """
 

@@ -46,6 +46,13 @@ class LoopbackPort:
         self._check()
         self._line = (baud, parity)
 
+    def reopen(self) -> None:
+        """Try to have it back; half a second passes where it is still gone."""
+        self.open = True
+        if self.emulator.gone:
+            self.emulator.advance(self.emulator.now_s + 0.5)
+        self._check()
+
     def close(self) -> None:
         """Hang up."""
         self.open = False

@@ -65,7 +65,6 @@ class Emulator:
     Attributes:
         panel: what a person sees; tests press its buttons.
         line: speed and parity now.
-        gone: the port has disappeared; the controller behind it has not.
         now_s: time of this controller.
     """
 
@@ -96,7 +95,7 @@ class Emulator:
         self.stream: StreamApplication | None = None
         self._on_stream_line = False
         self.line = (self.settings.baud, self.settings.parity)
-        self.gone = False
+        self._gone_until_s = -math.inf
         self.now_s = 0.0
         self._incoming: deque[tuple[float, bytes]] = deque()
         self._outgoing: deque[tuple[float, bytes, Line]] = deque()
@@ -108,6 +107,17 @@ class Emulator:
         self._physics_s = 0.0
         self._mute_until_s = 0.0
         self._hold_back_s = 0.0
+
+    @property
+    def gone(self) -> bool:
+        """The port has disappeared; the controller behind it has not."""
+        return self.now_s < self._gone_until_s
+
+    def _lose_port(self, for_s: float) -> None:
+        """For good where no time is told; a port that comes back finds a line on which nothing is under way."""
+        self._gone_until_s = self.now_s + for_s if for_s else math.inf
+        self._incoming.clear()
+        self._outgoing.clear()
 
     # -- what the wire sees ------------------------------------------------------------------------------------
 
@@ -234,7 +244,7 @@ class Emulator:
         if "hold" in struck:
             self.panel.press_hold("pendant")
         if "unplug" in struck:
-            self.gone = True
+            self._lose_port(struck["unplug"].value)
         late_s = struck["late"].value or 0.05 if "late" in struck else 0.0
         dropped = round(struck["drop"].value) or 50 if "drop" in struck else 0
         return late_s, dropped
@@ -314,7 +324,7 @@ class Emulator:
         if kind in ("ack", "block"):
             struck |= self.faults.occasion(kind)
         if "close" in struck:
-            self.gone = True
+            self._lose_port(struck["close"].value)
         if self.gone:
             return
         if "silence" in struck:
