@@ -7,7 +7,7 @@ all joints together and once with each joint alone, first without torque noise -
 then with the shipped noise, for every seed. `repeat` is what two calibrations of one joint alone differ by when nothing
 but the seed of the noise changed; less than that cannot be seen in one pair of runs. `left in` is the distance with
 nothing taken off for other joints, the rows below it say what MuJoCo's own terms would leave if they were known and
-taken off instead.
+taken off instead (least squares' gravity is taken off in every row).
 Distances are (15) in percent of the curve's mean, over the measured range [V_1, V_N] and, without noise, over [0, V].
 `M found` is the largest error of a row of the off-diagonal inertia against MuJoCo's, in percent of the joint's own.
 """
