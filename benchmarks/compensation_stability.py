@@ -63,6 +63,8 @@ PUSHES_DEG_S = (3.0, 5.0, 8.0, 12.0, 20.0)
 REST_S = 5.0
 GROWTH = 1.05
 """A joint that is faster than when it was let go by this factor runs away, wherever it stops."""
+RINGING_CYCLES = 100
+"""After it was let go: the last of the push arrives, and an elastic link rings."""
 
 
 def changed_law(entry: JointProfile, setup: JointSetup, hold: bool, ratio: float, stiffness: float) -> ControlLaw:
@@ -328,7 +330,7 @@ def alone(
     assert law.friction is not None
     push_nm = 2.0 * push * law.friction.coulomb_nm
     report, velocities, pushing = Feedback(valid=True), [], True
-    free, fastest = 0, math.inf
+    free, fastest = 0, 0.0
     for k in range(5000):
         report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
         torque = controller.update(report, (centre, 0.0))
@@ -337,9 +339,10 @@ def alone(
         loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)
         velocities.append(loop.true_velocity_rad_s)
         free += not pushing
-        if free == 2 * delay_cycles:  # the last of the push has arrived
-            fastest = GROWTH * abs(loop.true_velocity_rad_s)
-        if abs(loop.true_velocity_rad_s) > fastest:
+        speed = abs(loop.true_velocity_rad_s)
+        if free <= RINGING_CYCLES:
+            fastest = max(fastest, GROWTH * speed)
+        elif speed > fastest:
             return math.inf
     return math.degrees(float(np.sqrt(np.mean(np.square(velocities[4000:])))))
 
