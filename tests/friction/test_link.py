@@ -63,6 +63,39 @@ def test_a_rigid_joint_has_no_link(plants, effects, amplitude):
     assert estimate(plants.record(joint, plants.procedure(amplitude))).link_resonance_hz is None
 
 
+SHORT = {"thorough": (), "standard": (12 / 115, 60 / 115, 1.0), "quick": (30 / 115, 1.0)}
+
+
+def programme(plants, name):
+    procedure = plants.procedure(20)
+    shares = SHORT[name]
+    return replace(procedure, cycles=len(shares) or 10, shares=shares)
+
+
+@pytest.mark.parametrize(
+    ("name", "step_s"),
+    [("thorough", 0.004), ("standard", 0.004), ("quick", 0.004), ("standard", 0.001), ("quick", 0.001)],
+)
+def test_a_rigid_joint_has_no_link_in_short_programmes_or_at_250_hz(plants, name, step_s):
+    """Few samples leave much to chance; the cases here once looked soft, or nearly."""
+    procedure = programme(plants, name)
+    for index in range(6):
+        for seed, effects in enumerate(({}, {"ripple": 0.1}, {"load": 0.05})):
+            joint = replace(plants.arm[index], start=plants.arm[index].start + 0.01 * seed, **effects)
+            recording = plants.record(joint, procedure, seed=10 * seed + seed, step_s=step_s)
+            assert link.soft_link(recording, synchronised(recording), 20.0) is None, (index, effects)
+
+
+@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("step_s", [0.004, 0.001])
+@pytest.mark.parametrize(("index", "frequency_hz"), [(0, 25.0), (1, 30.0), (2, 35.0)])
+def test_a_soft_joint_is_found_in_every_programme_at_any_rate(plants, name, step_s, index, frequency_hz):
+    joint = replace(plants.arm[index], link_share=0.5, link_frequency_hz=frequency_hz)
+    recording = plants.record(joint, programme(plants, name), seed=index, step_s=step_s)
+    found = link.soft_link(recording, synchronised(recording), 20.0)
+    assert found.resonance_hz.value == pytest.approx(frequency_hz, rel=0.04)
+
+
 def test_undeclared_delay_is_not_taken_for_a_link(plants):
     recording = plants.record(plants.arm[1], plants.procedure(20))
     assert estimate(replace(recording, skew=Skew(torque_delay_s=-0.0015))).link_resonance_hz is None
