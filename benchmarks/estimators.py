@@ -27,6 +27,7 @@ from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.simulation.steady import true_curve_nm
 
 STEP_S = 0.001
 ROBOT = find("hp3j.yaml")
@@ -105,7 +106,7 @@ def record(model: JointModel, start_rad: float, procedure: Procedure, *, seed: i
 def truth(model: JointModel, procedure: Procedure, start_rad: float) -> FrictionCurve:
     speed = np.concatenate([np.geomspace(1e-4, 0.2, 200), np.linspace(0.201, 1.3 * procedure.velocity_rad_s, 400)])
     middle = start_rad + procedure.amplitude_rad / 2
-    return FrictionCurve.through(speed, model.true_curve_nm(speed, position_rad=middle))
+    return FrictionCurve.through(speed, true_curve_nm(model, speed, position_rad=middle))
 
 
 def main() -> None:

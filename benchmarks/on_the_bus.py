@@ -19,6 +19,7 @@ from frictid_hil.friction.metrics import CurveDistance, curve_distance
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.steady import true_curve_nm
 
 SHIPPED = find("hp3j.yaml")
 V_RAD_S = math.radians(115.0)
@@ -51,7 +52,7 @@ class Variant:
         """Odd part of the steady sliding friction in the middle of the travel."""
         speed = np.concatenate([np.geomspace(1e-4, 0.2, 200), np.linspace(0.201, 1.3 * V_RAD_S, 400)])
         middle = self.values["joints"][joint]["start_position_rad"] + amplitude_rad / 2
-        return FrictionCurve.through(speed, self.model(joint).true_curve_nm(speed, position_rad=middle))
+        return FrictionCurve.through(speed, true_curve_nm(self.model(joint), speed, position_rad=middle))
 
 
 def shipped() -> dict[str, Any]:

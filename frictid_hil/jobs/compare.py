@@ -13,6 +13,7 @@ from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.simulation.steady import true_curve_nm
 
 _TRUTH_POINTS = 4000
 
@@ -79,7 +80,7 @@ def true_curve(robot: Robot, name: str, velocity_rad_s: float) -> FrictionCurve:
     with robot.document.locating():
         model = JointModel.of(robot.file.joints[name], name)
     speeds = np.linspace(0.0, velocity_rad_s, _TRUTH_POINTS + 1)[1:]
-    return FrictionCurve.through(speeds, model.true_curve_nm(speeds), where=f"truth of joint {name}")
+    return FrictionCurve.through(speeds, true_curve_nm(model, speeds), where=f"truth of joint {name}")
 
 
 def _true_curves(robot: Robot, profile: FrictionProfile) -> dict[str, FrictionCurve]:

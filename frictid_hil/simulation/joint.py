@@ -15,7 +15,6 @@ import numpy as np
 
 from frictid_hil.errors import FieldProblem, IdentificationError, InvalidFields
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.fields import Fields
 
@@ -276,35 +275,6 @@ class JointModel:
         complete = _read_effects(fields)
         fields.finish()
         return replace(self, effects=complete)
-
-    def steady_friction_nm(self, velocity_rad_s: Array, *, position_rad: float = 0.0) -> Array:
-        """Friction of steady sliding with all effects, cold, without ripple, N m.
-
-        Args:
-            velocity_rad_s: signed, any shape; 0 gives 0.
-            position_rad: where the joint slides; matters where friction depends on load.
-        """
-        from frictid_hil.simulation import packing
-        from frictid_hil.simulation.compose import kernel
-
-        velocity = np.ascontiguousarray(velocity_rad_s, dtype=np.float64)
-        torque = np.zeros(velocity.size)
-        kernel().steady(packing.parameters(self), packing.state(), velocity.ravel(), torque, float(position_rad))
-        return torque.reshape(velocity.shape)
-
-    def true_curve_nm(self, speed_rad_s: Array, *, position_rad: float = 0.0) -> Array:
-        """The odd part of steady sliding friction: what a symmetric curve can know of this joint, N m.
-
-        Args:
-            speed_rad_s: positive, any shape.
-            position_rad: see ``steady_friction_nm``.
-        """
-        speed = np.abs(np.asarray(speed_rad_s, dtype=np.float64))
-        # At standstill the curve continues its limit from motion.
-        speed = np.maximum(speed, 1e-9)
-        forward = self.steady_friction_nm(speed, position_rad=position_rad)
-        backward = self.steady_friction_nm(-speed, position_rad=position_rad)
-        return (forward - backward) / 2
 
 
 def _read_friction(fields: Fields, *, required: bool, top: Fields) -> FrictionCurve | CoulombViscous:

@@ -19,6 +19,7 @@ from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.steady import true_curve_nm
 
 STEP_S = 1e-4
 """Time step of the model; the slip spring asks for it."""
@@ -140,7 +141,7 @@ def _body(inertia_kg_m2: float, cos_nm: float, sin_nm: float) -> str:
 def _level_and_slope(model: JointModel) -> tuple[float, float]:
     """Coulomb level and viscosity that fit the odd part of steady sliding best, all effects included."""
     speed = np.linspace(0.02, 2.0, 100)
-    torque = model.true_curve_nm(speed)
+    torque = true_curve_nm(model, speed)
     columns = np.stack([np.ones_like(speed), speed], axis=1)
     level, slope = np.linalg.lstsq(columns, torque, rcond=None)[0]
     return max(0.0, float(level)), max(0.0, float(slope))

@@ -16,6 +16,7 @@ from frictid_hil.friction.compensation import OUR_RATIO, RATIO_MARGIN, Compensat
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.simulation.steady import true_curve_nm
 
 SETUP = load_robot("hp3j").to_setup().joint("1")
 MODEL = JointModel.from_mapping(
@@ -39,7 +40,7 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def law(wrong_nm: float, unsure_nm: float) -> ControlLaw:
     """Compensation with R + 0.02 and gravity that is wrong by ``wrong_nm (1 - cos(q - centre))``."""
     speeds = 0.932 * np.arange(1, 11) * math.radians(11.5)
-    curve = FrictionCurve.through(speeds, MODEL.true_curve_nm(speeds))
+    curve = FrictionCurve.through(speeds, true_curve_nm(MODEL, speeds))
     gravity = Gravity(
         MODEL.gravity_cos_nm - wrong_nm * math.cos(CENTRE_RAD),
         MODEL.gravity_sin_nm - wrong_nm * math.sin(CENTRE_RAD),

@@ -13,6 +13,7 @@ from frictid_hil.config.write import dump
 from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.replay import Controller, closed_loop
+from frictid_hil.simulation.steady import true_curve_nm
 
 HZ = 500
 
@@ -52,7 +53,7 @@ def a_set(folder: Path, effects: dict[str, dict[str, float]]) -> Path:
             "gear_ratio": joint.gear_ratio,
             "friction": {
                 "velocity_rad_s": [0.2, 1.0, 2.0],
-                "torque_nm": bare.true_curve_nm(np.array([0.2, 1.0, 2.0])).tolist(),
+                "torque_nm": true_curve_nm(bare, np.array([0.2, 1.0, 2.0])).tolist(),
                 "presliding_stiffness_nm_per_rad": bare.presliding_stiffness_nm_per_rad,
             },
         },

@@ -26,6 +26,7 @@ from frictid_hil.runner.events import Event, JointRun
 from frictid_hil.runner.ring import frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
 from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.steady import true_curve_nm
 
 pytestmark = pytest.mark.slow
 
@@ -65,7 +66,7 @@ def error_percent(setup: RobotSetup, joint: str, result: Estimate) -> float:
         max_torque_nm=entry.max_torque_nm,
     )
     speed = np.linspace(*result.curve.measured_range_rad_s, 400)
-    truth = model.true_curve_nm(speed)
+    truth = true_curve_nm(model, speed)
     return 100 * math.sqrt(float(np.mean((result.curve.torque(speed) - truth) ** 2))) / float(truth.mean())
 
 

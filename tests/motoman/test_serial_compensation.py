@@ -23,6 +23,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan import Hold
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.simulation.steady import true_curve_nm
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +51,7 @@ def model_of(joint: str) -> JointModel:
 
 def curve_of(model: JointModel) -> FrictionCurve:
     speed = 0.932 * np.arange(1, 11) * math.radians(11.5)
-    return FrictionCurve.through(speed, model.true_curve_nm(speed))
+    return FrictionCurve.through(speed, true_curve_nm(model, speed))
 
 
 def by_table(benchmark: ModuleType, joint: str, ratio: float) -> float:

@@ -14,6 +14,7 @@ from frictid_hil.friction.identify import function_a
 from frictid_hil.friction.trajectory import Procedure, peak_acceleration, position, sample_times
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.simulation.steady import steady_friction_nm, true_curve_nm
 
 FILE = yaml.safe_load(find("hp3j.yaml").read_text(encoding="utf-8"))
 JOINTS = FILE["joints"]
@@ -66,7 +67,7 @@ def record(joint: str, amplitude_deg: float, seed: int | None = None):
 def error_percent(model: JointModel, procedure: Procedure, time: np.ndarray, rows: np.ndarray) -> float:
     curve = function_a(time, rows[:, 1], rows[:, 2], procedure).curve()
     speed = np.linspace(0.0, V, 2001)
-    truth = model.true_curve_nm(speed)
+    truth = true_curve_nm(model, speed)
     return 100 * float(np.sqrt(np.mean((curve.magnitude(speed) - truth) ** 2)) / truth.mean())
 
 
@@ -84,17 +85,17 @@ def test_every_joint_is_as_unkind_as_announced(joint: str) -> None:
     entry, model = JOINTS[joint], model_of(joint)
     coulomb = model.friction.coulomb_nm
     v = np.array([1e-6, 2 * DEGREE, 0.5, 1.0, 2.0])
-    curve = model.true_curve_nm(v)
+    curve = true_curve_nm(model, v)
     assert curve[0] == pytest.approx(1.2 * coulomb, rel=1e-3)
     assert (curve[4] - curve[3]) < 0.8 * (curve[3] - curve[2]) / 0.5, "viscosity saturates"
-    even = (model.steady_friction_nm(v) + model.steady_friction_nm(-v)) / 2
+    even = (steady_friction_nm(model, v) + steady_friction_nm(model, -v)) / 2
     np.testing.assert_allclose(even, 0.05 * curve, rtol=1e-6)
     assert model.effects["torque_ripple"]["cycles_per_motor_revolution"] == 2
     assert model.effects["torque_ripple"]["amplitude_nm"] > 0.02 * coulomb
     assert model.effects["torque_delay"]["delay_s"] == 1 / FILE["cycle_hz"]
     assert (model.drive.torque_quantum_per_mille, model.drive.torque_noise_per_mille) == (1, 5)
     assert model.encoder.counts_per_revolution == 2**17 and model.drive.velocity_filter_s == 0.001
-    assert 0.05 < model.true_curve_nm(np.array([V]))[0] / entry["max_torque_nm"] < 0.16
+    assert 0.05 < true_curve_nm(model, np.array([V]))[0] / entry["max_torque_nm"] < 0.16
     assert model.hand is not None and model.payload is not None
 
 
@@ -109,7 +110,7 @@ def test_every_place_leaves_room_for_the_longest_travel(joint: str) -> None:
 def test_joint_1_cannot_do_five_degrees_but_can_do_ten() -> None:
     entry, model = JOINTS["1"], model_of("1")
     assert model.inertia_kg_m2 >= 1.8
-    others = math.hypot(model.gravity_cos_nm, model.gravity_sin_nm) + model.true_curve_nm(np.array([V]))[0]
+    others = math.hypot(model.gravity_cos_nm, model.gravity_sin_nm) + true_curve_nm(model, np.array([V]))[0]
     needed = {a: model.inertia_kg_m2 * peak_acceleration(Procedure(a * DEGREE, V)) + others for a in (5, 10)}
     assert needed[10] < entry["max_torque_nm"] < needed[5]
     assert record("1", 5)[-1] and not record("1", 10)[-1]
@@ -120,7 +121,7 @@ def test_expectations_in_the_file_cover_the_simulated_joint(joint: str) -> None:
     expected, model = JOINTS[joint]["expected"], model_of(joint)
     assert expected["inertia_kg_m2"] == pytest.approx(model.inertia_kg_m2)
     assert expected["gravity_nm"] >= 0.99 * math.hypot(model.gravity_cos_nm, model.gravity_sin_nm)
-    assert expected["friction_nm"] == pytest.approx(model.steady_friction_nm(np.array([V]))[0], rel=0.1)
+    assert expected["friction_nm"] == pytest.approx(steady_friction_nm(model, np.array([V]))[0], rel=0.1)
 
 
 @pytest.mark.parametrize("joint", "012345")

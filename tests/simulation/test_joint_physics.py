@@ -12,6 +12,7 @@ from sim_joints import CONTROLLER, COULOMB, GRAVITY, INERTIA, STIFFNESS, VISCOUS
 from frictid_hil.simulation.joint import HandImpedance
 from frictid_hil.simulation.replay import Controller, closed_loop, open_loop
 from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.simulation.steady import steady_friction_nm, true_curve_nm
 
 LEVEL = {"gravity_cos_nm": 0.0}
 
@@ -126,7 +127,7 @@ def test_any_presliding_stiffness_is_stable(stiffness: float) -> None:
 def test_stribeck_raises_slow_sliding_by_its_share() -> None:
     model = bare(effects={"stribeck": {"share": 0.2, "stribeck_velocity_rad_s": 0.05, "exponent": 2.0}})
     v = np.array([0.0001, 0.05, 0.5])
-    raised = (model.steady_friction_nm(v) - bare().steady_friction_nm(v)) / COULOMB
+    raised = (steady_friction_nm(model, v) - steady_friction_nm(bare(), v)) / COULOMB
     np.testing.assert_allclose(raised, [0.2, 0.2 / math.e, 0.0], atol=1e-5)
 
 
@@ -134,25 +135,25 @@ def test_stribeck_raises_slow_sliding_by_its_share() -> None:
 def test_a_bend_of_one_is_plain_viscosity(share: float) -> None:
     model = bare(effects={"viscous_nonlinearity": {"share": share, "knee_rad_s": 0.4, "bend": 1.0}})
     v = np.linspace(-2, 2, 9)
-    added = model.steady_friction_nm(v) - bare().steady_friction_nm(v)
+    added = steady_friction_nm(model, v) - steady_friction_nm(bare(), v)
     np.testing.assert_allclose(added, share * COULOMB / 0.4 * v, atol=1e-12)
     logarithm = bare(effects={"viscous_nonlinearity": {"share": 0.5, "knee_rad_s": 0.4, "bend": 0.0}})
     nearly = bare(effects={"viscous_nonlinearity": {"share": 0.5, "knee_rad_s": 0.4, "bend": 1e-5}})
-    np.testing.assert_allclose(logarithm.steady_friction_nm(v), nearly.steady_friction_nm(v), rtol=1e-3)
+    np.testing.assert_allclose(steady_friction_nm(logarithm, v), steady_friction_nm(nearly, v), rtol=1e-3)
 
 
 def test_asymmetry_is_even_and_leaves_the_odd_curve_alone() -> None:
     model = bare(effects={"direction_asymmetry": {"coulomb_share": 0.1, "viscous_share": 0.2}})
     v = np.array([0.2, 1.0])
-    forward, backward = model.steady_friction_nm(v), model.steady_friction_nm(-v)
+    forward, backward = steady_friction_nm(model, v), steady_friction_nm(model, -v)
     np.testing.assert_allclose((forward + backward) / 2, 0.1 * COULOMB + 0.2 * VISCOUS * v)
-    np.testing.assert_allclose(model.true_curve_nm(v), bare().true_curve_nm(v))
+    np.testing.assert_allclose(true_curve_nm(model, v), true_curve_nm(bare(), v))
 
 
 def test_load_raises_friction_where_gravity_is_large() -> None:
     model = bare(effects={"load_dependent_friction": {"linear_share": 0.2, "quadratic_per_nm": 0.01}})
     v = np.array([0.5])
-    added = model.steady_friction_nm(v, position_rad=0.0) - model.steady_friction_nm(v, position_rad=math.pi / 2)
+    added = steady_friction_nm(model, v, position_rad=0.0) - steady_friction_nm(model, v, position_rad=math.pi / 2)
     assert added[0] == pytest.approx(0.2 * GRAVITY + 0.01 * GRAVITY**2)
 
 
@@ -329,4 +330,4 @@ def test_warmth_lowers_friction_and_carries_over_to_the_next_recording() -> None
     early = (time > 0.3) & (time < 0.9)
     drop = first.torque_nm[early].mean() - second.torque_nm[early].mean()
     assert drop == pytest.approx(0.3 * heat * (COULOMB + VISCOUS * 0.6), rel=0.25)
-    assert model.true_curve_nm(np.array([1.0]))[0] == pytest.approx(COULOMB + VISCOUS)
+    assert true_curve_nm(model, np.array([1.0]))[0] == pytest.approx(COULOMB + VISCOUS)
