@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from frictid_hil.driver import JointSetup
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
+from frictid_hil.robot_setup import JointSetup
 
 COUPLING = "coupling"
 """Name of the motion that shows how much joints that move together drive each other."""

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan import Expected, Plan
+from frictid_hil.robot_setup import RobotSetup
 
 _TOGETHER_STEP = (
     "; what other joints add is bounded by `expected: link_inertia_kg_m2` (the inertia behind the gear); without "

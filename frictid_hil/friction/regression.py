@@ -192,7 +192,7 @@ class Unexplained:
     @property
     def free(self) -> float:
         """How many independent samples the model leaves to chance."""
-        return max(self._rest.size / self._chosen.rows_alike - self._basis.shape[1], 1.0)
+        return float(max(self._rest.size / self._chosen.rows_alike - self._basis.shape[1], 1.0))
 
     def _smoothed(self, columns: Array) -> Array:
         return _smoothed_rows(columns, self._chosen.rows, self._chosen.width)
