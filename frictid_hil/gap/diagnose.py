@@ -317,8 +317,11 @@ def _conclude(
         name: clues_of(name, features, shapley[name], {p: value.value for p, value in values_of[name].items()})
         for name in names
     }
-    if verdict == "explained" and max(clues.chance() for clues, _ in clues_by_name.values()) < least_chance:
-        verdict, place = "unknown", features.family_name
+    if verdict == "explained":
+        likeliest, partners = max(clues_by_name.values(), key=lambda found: found[0].chance())
+        # Where two can hardly be told apart, each is unlikely and yet one of them may well be there.
+        if likeliest.chance() < least_chance and not partners:
+            verdict, place = "unknown", features.family_name
     causes = []
     for name in names:
         clues, confusable = clues_by_name[name]
