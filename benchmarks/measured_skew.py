@@ -1,7 +1,7 @@
 """How well does a short shaking measure by how much torque is late, and does a wrong declaration matter then?
 
     python benchmarks/measured_skew.py [--plants rigid,flexible,other,maxwell,held-out,mujoco] [--amplitudes 20,5]
-        [--draws 3] [--wrong-ms -2,0,4]
+        [--draws 3] [--wrong-ms=-2,0,4]
 
 Every joint is driven without a bus through the stretch that `calibrate --measure-skew` adds. The declared delay is
 wrong by ``--wrong-ms``; the truth is known. Every cell is the mean error of the measured delay +- its spread over the
