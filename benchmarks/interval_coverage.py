@@ -51,6 +51,7 @@ KINDS = {
     "load": {"load": 0.05},
     "flexible": {"link_share": 0.5, "link_frequency_hz": 28.0},
     "drift": {"drift": -0.03},
+    "small drift, ripple, load": {"drift": -0.01, "ripple": 0.06, "load": 0.05},
     "all at once": {"ripple": 0.06, "load": 0.05, "link_share": 0.5, "link_frequency_hz": 32.0},
 }
 V_RAD_S = math.radians(115.0)
@@ -135,7 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--amplitudes", default="20,10,5")
     parser.add_argument("--methods", default="aligned,least-squares")
-    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--kinds", default=";".join(KINDS), help="parted by ;")
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--terms", action="store_true", help="print what the intervals are made of, in percent")
     parser.add_argument("--measured", action="store_true", help="every joint shakes, and the delay is measured")
@@ -144,7 +145,7 @@ def main() -> None:
     arguments = parser.parse_args()
     draws = Draws(arguments.measured, arguments.exact)
     arm = ARM if arguments.held_out is None else drawn_arm(arguments.held_out)
-    kinds = arguments.kinds.split(",") if arguments.held_out is None else ["held out"]
+    kinds = arguments.kinds.split(";") if arguments.held_out is None else ["held out"]
     print("| plant | A | method | cover | width | rms error [%] | flagged |\n|---|---|---|---|---|---|---|")
     whole: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for kind in kinds:
