@@ -119,7 +119,7 @@ class Clues:
         """The chance that the effect is there."""
         logit = sum(WEIGHTS[name] * value for name, value in self.terms().items())
         # Against one rival alone, a lead in log-likelihood says this much; where there is none, it is a toss.
-        most = LATE_EITHER_WAY if self.spread.hidden >= 1.0 else _logistic(max(0.0, self.lead) / DECISIVE)
+        most = LATE_EITHER_WAY if self.spread.undecided else _logistic(max(0.0, self.lead) / DECISIVE)
         return _within(_logistic(logit), LEAST, min(most, MOST))
 
 

@@ -1,6 +1,6 @@
 """Weights of the confidence's logistic map; written by ``benchmarks/gap_confidence.py --write``.
 
-350 joints of seeds 5101, 5303, diagnosed at commits 43ab14c, 7670463.
+350 joints of seeds 5101, 5303, diagnosed at commits 43ab14c, 2f98714 (not those with a late torque).
 Causes named in joints that did not fit the weights they are judged by (ten folds):
 
 | confidence | whole library: right | own effect taken away: right |

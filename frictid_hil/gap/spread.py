@@ -20,6 +20,8 @@ from frictid_hil.gap.residuals import LowPass, Recording, demand_of
 
 EDGE_ROWS = 10
 THINNED = 4
+UNDECIDED = 0.75
+"""How far off a spread may be that could be the other form's; second poles of real drives are off by a quarter."""
 RESOLVED = 2.0
 """Standard errors by which a spread must be known."""
 
@@ -37,6 +39,11 @@ class Unlike:
 
     shown: float = 0.0
     hidden: float = 0.0
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the recordings leave it open that the torque is late in the other way."""
+        return self.shown + 2.0 * self.hidden >= UNDECIDED
 
 
 def unlike(fit: ActuationFit, logs: Sequence[Recording], controller: Controller) -> dict[str, Unlike]:
