@@ -11,6 +11,7 @@ import numpy as np
 
 from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_messages import JobOrder, Record, record
+from frictid_drivers.motoman.controller_errors import BadReply, LinkError
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
@@ -121,19 +122,22 @@ class BatchRun:
 
     def _come_back(self, motion: JobMotion, stop: Callable[[], bool], progress: Callable[[str, float], None]) -> None:
         """After a lost port: if it is there again soon, see that the joint stands, and fetch its record."""
+        self._reconnect(stop)
+        with contextlib.suppress(Interrupted, SafetyAbort):
+            self._batch.watch(self.number, 0.0, lambda: True, lambda share: None)
+        self.running = False
+        self._fetch(motion, progress)
+
+    def _reconnect(self, stop: Callable[[], bool]) -> None:
         until_s = self._batch.now_s() + self._bounds.watchdog_s + _COMES_BACK_S
         while True:
             try:
                 self._host.reconnect()
                 self._batch.state(self.number, within_s=_ANSWERS_WITHIN_S)
-                break
+                return
             except FrictidError:
                 if stop() or self._batch.now_s() > until_s:
                     raise
-        with contextlib.suppress(Interrupted, SafetyAbort):
-            self._batch.watch(self.number, 0.0, lambda: True, lambda share: None)
-        self.running = False
-        self._fetch(motion, progress)
 
     def _order(self, motion: JobMotion) -> JobOrder:
         units, bounds, where = self._units, self._bounds, f"joint {self._joint.name}"
@@ -171,8 +175,18 @@ class BatchRun:
         if state.done_ticks == 0:
             return
         rows: dict[int, tuple[int, int, int]] = {}
-        try:
+
+        def fetch() -> None:
             self._batch.fetch(self.number, state, state.done_ticks, lambda share: progress("transfer", share), rows)
+
+        try:
+            try:
+                fetch()
+            except (LinkError, BadReply):
+                raise
+            except HardwareError:
+                self._reconnect(lambda: False)
+                fetch()  # from the first sample that is missing
         finally:
             # A transfer that broke for good leaves what came before it.
             if 0 in rows:
