@@ -27,6 +27,7 @@ from numba import njit
 from frictid_hil.friction.trajectory import Array
 
 _SUBSTEP_S = 2e-5
+_WARM_UP_S = 8.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class HeldOutJoint:
         here = 1 + self.place * math.sin(self.place_wave * middle)
         odd: Array = rubbing * here + self.loss * abs(self.holding(middle))
         return odd
+
+    def warm(self, run_s: float) -> float:
+        """Mean share of the cold friction that is left over a run of this length."""
+        return 1.0 - self.cooling * (1.0 - _WARM_UP_S / run_s * (1.0 - math.exp(-run_s / _WARM_UP_S)))
 
 
 def drawn_arm(seed: int) -> list[HeldOutJoint]:
@@ -154,7 +159,7 @@ def _simulate(
         if abs(u) < j.max_torque:
             integral += 0.35 * bandwidth**2 * j.inertia * gap * step_s
         applied, waiting = waiting, min(max(u, -j.max_torque), j.max_torque)
-        wear = 1.0 - j.cooling * (1.0 - math.exp(-k * step_s / 8.0))
+        wear = 1.0 - j.cooling * (1.0 - math.exp(-k * step_s / _WARM_UP_S))
         for _ in range(substeps):
             a, b, c = _rates(j, wear, applied, q, v, z)
             d, e, f = _rates(j, wear, applied, q + h * a, v + h * b, z + h * c)
