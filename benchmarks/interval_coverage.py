@@ -1,7 +1,7 @@
 """Do the 95 % intervals hold the truth, and are they narrow enough to mean something?
 
     python benchmarks/interval_coverage.py [--amplitudes 20,10,5] [--methods aligned,least-squares] [--draws 3]
-        [--measured] [--held-out SEED] [--exact]
+        [--measured] [--held-out SEEDS] [--exact]
 
 The plants are written for the tests, share nothing with the product's simulation, and have effects that no estimator
 contains: Maxwell slip, a ripple that multiplies the friction with a rectified sine in it, friction that grows with the
@@ -15,8 +15,8 @@ other noise, another starting angle (the phase of the ripple) and a true timing 
 Both are of a plant kind as a whole. One recording alone says little: where its errors happen to be small, ``width`` is
 large without any interval being wrong. ``flagged`` is the share of recordings that fail a gate and would not be
 promoted; they count all the same. ``--measured`` lets every joint shake as `calibrate --measure-skew` does, with the
-torque still drawn late by the declared uncertainty; ``--exact`` draws no lateness. ``--held-out`` takes the joints of
-`held_out_plant.py`, drawn with this seed, in place of all of these.
+torque still drawn late by the declared uncertainty; ``--exact`` draws no lateness. ``--held-out`` takes arms of
+`held_out_plant.py`, one drawn with each seed, in place of all of these.
 """
 
 from __future__ import annotations
@@ -125,19 +125,19 @@ def shaken(joint: Joint | HeldOutJoint, recording: CycleRecording, seed: int) ->
     )
 
 
-def truth_nm(
-    joint: Joint | HeldOutJoint, procedure: Procedure, speed_rad_s: np.ndarray, *, cold: bool = False
-) -> np.ndarray:
+def truth_nm(joint: Joint | HeldOutJoint, procedure: Procedure, speed_rad_s: np.ndarray) -> np.ndarray:
     """What the intervals must hold.
 
-    A held-out joint warms up with a time constant of its own. What it was before it moved no cycle can tell, and most
-    of its fall comes before the third cycle, whose repetition tells of drift: the truth is that of the run, on average.
+    Friction of a held-out joint depends on the place and falls while it warms up: one curve can only be the mean over
+    the travel and over the run.
     """
     if isinstance(joint, Joint):
         steady: np.ndarray = joint.steady(speed_rad_s)
         return steady
-    left = 1.0 if cold else joint.warm(procedure.duration_s)
-    return left * joint.steady(speed_rad_s, joint.start + procedure.amplitude_rad / 2)
+    places = joint.start + procedure.amplitude_rad * np.linspace(0.0, 1.0, 21)
+    here = np.mean([joint.steady(speed_rad_s, place) for place in places], axis=0)
+    truth: np.ndarray = joint.warm(procedure.duration_s) * here
+    return truth
 
 
 def main() -> None:
@@ -149,12 +149,15 @@ def main() -> None:
     parser.add_argument("--terms", action="store_true", help="print what the intervals are made of, in percent")
     parser.add_argument("--measured", action="store_true", help="every joint shakes, and the delay is measured")
     parser.add_argument("--exact", action="store_true", help="the declared timing happens to be right")
-    parser.add_argument("--cold", action="store_true", help="judge held-out joints by their friction before they moved")
-    parser.add_argument("--held-out", type=int, metavar="SEED", help="joints of held_out_plant.py instead")
+    parser.add_argument("--held-out", metavar="SEEDS", help="arms of held_out_plant.py instead")
     arguments = parser.parse_args()
     draws = Draws(arguments.measured, arguments.exact)
-    arm = ARM if arguments.held_out is None else drawn_arm(arguments.held_out)
-    kinds = arguments.kinds.split(";") if arguments.held_out is None else ["held out"]
+    arm = (
+        [joint for seed in arguments.held_out.split(",") for joint in drawn_arm(int(seed))]
+        if arguments.held_out
+        else ARM
+    )
+    kinds = arguments.kinds.split(";") if not arguments.held_out else ["held out"]
     print("| plant | A | method | cover | width | rms error [%] | flagged |\n|---|---|---|---|---|---|---|")
     whole: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for kind in kinds:
@@ -177,11 +180,7 @@ def main() -> None:
                             continue
                         knots, level = np.array(found.curve.velocity_rad_s), float(np.mean(found.curve.torque_nm))
                         errors[method].extend(
-                            (
-                                np.array(found.curve.torque_nm)
-                                - truth_nm(joint, recording.procedure, knots, cold=arguments.cold)
-                            )
-                            / level
+                            (np.array(found.curve.torque_nm) - truth_nm(joint, recording.procedure, knots)) / level
                         )
                         widths[method].extend(found.half_width_nm / level)
                         flagged[method].append(not all(gate.passed for gate in gates(recording, found)))
