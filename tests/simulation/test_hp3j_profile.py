@@ -32,7 +32,7 @@ def model_of(joint: str, seed: int | None = None) -> JointModel:
         friction = [simulated["friction"], effects["stribeck"], effects["viscous_nonlinearity"]]
         friction += [effects["direction_asymmetry"], effects["torque_ripple"]]
         for part in friction:
-            for key in part.keys() - {"cycles_per_motor_revolution", "phase_rad"}:
+            for key in sorted(part.keys() - {"cycles_per_motor_revolution", "phase_rad"}):
                 part[key] *= random.uniform(0.7, 1.3)
         simulated["presliding_stiffness_nm_per_rad"] *= random.uniform(0.7, 1.3)
     return JointModel.from_mapping(
