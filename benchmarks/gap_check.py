@@ -77,7 +77,8 @@ def summary(result: Mapping[str, Any]) -> list[str]:
     lines.append(
         f"closed share of {closed['joints']} correct singles: median {_number(closed['median'])}, p10 "
         f"{_number(closed['p10'])}, worst {_number(closed['worst'])}; aims {CLOSED_AIMS['median']} and "
-        f"{CLOSED_AIMS['p10']} ({closed['without_figure']} joints without a torque gap on the validation logs)"
+        f"{CLOSED_AIMS['p10']} ({closed['without_figure']} joints without a torque gap on the validation logs; "
+        f"with {closed['ambiguous']} ambiguous as nothing closed p10 {_number(closed['p10_ambiguous_as_nothing'])})"
     )
     seconds = scores["seconds"]
     lines.append(

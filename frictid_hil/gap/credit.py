@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.forward import settled_nm
 from frictid_hil.gap.held_out import by_stretch, change, deviations, in_stretches
 from frictid_hil.gap.how_far import STANDS_ALONE, Hypothesis, Judge, clear, taken_off
 
@@ -21,6 +22,8 @@ BEYOND_CHANCE = 2.0
 """Standard errors from which a change counts."""
 NEXT_TO_NOTHING = 0.1
 """Share of what a set closes below which an effect must be borne out otherwise."""
+MUCH = 3.0
+"""Torque over the floor, taken off the replay, from which it is not next to nothing, however much others close."""
 OPENED = 0.2
 """Growth of the squared position difference from which, beyond chance, effects are refused that closed the torque's."""
 
@@ -69,7 +72,7 @@ def _shapley(name: str, others: Sequence[str], left: Callable[[frozenset[str]], 
 def sound(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
     """The hypothesis without effects that held-out recordings do not bear out; the rest is fitted again."""
     while hypothesis.names:
-        doubtful = _uncredited(judge, hypothesis) or _buys_torque_with_position(judge, hypothesis)
+        doubtful = _uncredited(judge, hypothesis, floor_nm) or _buys_torque_with_position(judge, hypothesis)
         if doubtful is None:
             break
         hypothesis = judge.without(hypothesis, doubtful)
@@ -80,7 +83,7 @@ def sound(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> Hypothesis:
     return bare if taken_off(bare, hypothesis, floor_nm) < STANDS_ALONE**2 else hypothesis
 
 
-def _uncredited(judge: Judge, hypothesis: Hypothesis) -> str | None:
+def _uncredited(judge: Judge, hypothesis: Hypothesis, floor_nm: float) -> str | None:
     """The effect that closes least, where it opens the gap, or closes next to nothing and the plant denies it.
 
     What comes rarely but strongly (play, a break-away) lies in few stretches, so that its standard error is large:
@@ -95,7 +98,9 @@ def _uncredited(judge: Judge, hypothesis: Hypothesis) -> str | None:
     hidden = [n for n in hypothesis.replayed if judge.drive and earned[n].deviations < BEYOND_CHANCE]
     if hidden:
         return hidden[0]
-    little = credit.share < NEXT_TO_NOTHING and credit.deviations < BEYOND_CHANCE
+    closed = settled_nm(judge.judged(judge.drive)) ** 2 - hypothesis.judged_nm**2
+    little = credit.share < NEXT_TO_NOTHING and credit.share * closed < (MUCH * floor_nm) ** 2
+    little = little and credit.deviations < BEYOND_CHANCE
     return name if little and not _shows_in_plant(judge, hypothesis, name) else None
 
 

@@ -27,6 +27,8 @@ COLOURED = 3.0
 """Low-passed actuation residual over what its white part leaves; slow noise of a healthy drive reaches 2."""
 HARDLY_CLOSED = 0.75
 """Share of a large squared gap above the floor that effects may leave and still be said to explain it."""
+CLOSES_ALL = 0.1
+"""Share of the squared gap above the floor that a play or a soft gear may leave and still be all that swings."""
 HELD_SHARE = 0.002
 """Share of repeated positions in motion from which the position itself is in doubt."""
 
@@ -113,6 +115,9 @@ def verdict_of(f: Features) -> tuple[str, str]:
         return "explained", ""
     # A velocity curve that fits better than a velocity effect's formula is still that effect.
     same_kind = f.family_name == "velocity" and any(_shapes_the_curve(name) for name in f.names)
+    # Inverse dynamics loses a link that swings, even where its effect is known: the trace stays, the replay closes.
+    swings = f.family_name == "lagged motion" and bool(f.probed)
+    same_kind = same_kind or (swings and f.after**2 - 1.0 < CLOSES_ALL * (f.before**2 - 1.0))
     plant_alone = bool(f.rivals) and set(f.rivals) == set(f.names)
     if plant_alone and f.family_alone > 1.0 + FAMILY_AHEAD and f.family_share > 0.1 and not same_kind:
         return "unknown", f.family_name

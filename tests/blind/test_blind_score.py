@@ -134,9 +134,11 @@ def test_closed_share_uses_the_floor_of_the_truth() -> None:
         (truth("a", "single", "stribeck"), answer("explained", ("stribeck", 0.9), before=0.5, after=0.14)),
         (truth("b", "single", "stribeck"), answer("explained", ("backlash", 0.9), before=0.5, after=0.5)),
         (truth("c", "single", "stribeck"), answer("explained", ("stribeck", 0.9), before=0.11, after=0.1)),
+        (truth("d", "single", "stribeck"), answer("ambiguous", ("stribeck", 0.5), before=0.5, after=0.5)),
     )["closed"]["forward_torque_nm"]
     assert s["median"] == pytest.approx(0.9)
-    assert (s["joints"], s["without_figure"]) == (1, 1)
+    assert (s["joints"], s["ambiguous"], s["without_figure"]) == (1, 1, 1)
+    assert s["p10_ambiguous_as_nothing"] == pytest.approx(0.09)
 
 
 def test_a_gap_larger_than_the_logs_contain_is_reported_as_a_defect() -> None:

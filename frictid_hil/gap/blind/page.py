@@ -129,13 +129,15 @@ def _closed(scores: Mapping[str, Any]) -> list[str]:
         "",
         "On validation logs, for single effects named first: (before - after) / (before - floor), before and after as "
         f"the tool reports them, the floor from the truth. Aim for the torque: median {CLOSED_AIMS['median']}, "
-        f"10 % quantile {CLOSED_AIMS['p10']}.",
+        f"10 % quantile {CLOSED_AIMS['p10']}. Nothing is applied where the verdict is `ambiguous`: such joints are not "
+        "among these; the last column counts them as nothing closed.",
         "",
-        "| figure | median | 10 % quantile | worst | joints | |",
-        "|---|---|---|---|---|---|",
+        "| figure | median | 10 % quantile | worst | joints | | ambiguous | 10 % quantile with them |",
+        "|---|---|---|---|---|---|---|---|",
         *(
             f"| `{figure}` | {_number(row['median'])} | {_number(row['p10'])} | {_number(row['worst'])} "
-            f"| {row['joints']} | {_closed_met(row) if figure == 'forward_torque_nm' else ''} |"
+            f"| {row['joints']} | {_closed_met(row) if figure == 'forward_torque_nm' else ''} "
+            f"| {row['ambiguous']} | {_number(row['p10_ambiguous_as_nothing'])} |"
             for figure, row in scores["closed"].items()
         ),
         "",

@@ -295,8 +295,12 @@ def _figure(answer: Answer, when: str, figure: str) -> float | None:
 
 
 def _closed(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-    """Share of the closable gap that was closed on validation logs, from the tool's own figures and truth's floor."""
-    shares, without = [], 0
+    """Share of the closable gap that was closed on validation logs, from the tool's own figures and truth's floor.
+
+    Nothing is applied on the verdict ``ambiguous``, so that nothing can close: such joints are counted apart, and
+    once more as if nothing had been closed of them.
+    """
+    shares, undecided, without = [], 0, 0
     for truth, answer in cases:
         before, after = _figure(answer, "before", figure), _figure(answer, "after", figure)
         ideal = _held_out(truth, "ideal_residual", figure)
@@ -304,12 +308,17 @@ def _closed(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> d
         if before is None or after is None or before - ideal < 0.15 * ideal:
             without += 1
             continue
-        shares.append((before - after) / (before - ideal))
+        if answer.verdict == "ambiguous":
+            undecided += 1
+        else:
+            shares.append((before - after) / (before - ideal))
     return {
         "joints": len(shares),
+        "ambiguous": undecided,
         "without_figure": without,
         "median": float(np.median(shares)) if shares else None,
         "p10": float(np.quantile(shares, 0.1)) if shares else None,
+        "p10_ambiguous_as_nothing": float(np.quantile([*shares, *[0.0] * undecided], 0.1)) if shares else None,
         "worst": float(min(shares)) if shares else None,
     }
 
