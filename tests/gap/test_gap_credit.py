@@ -9,11 +9,12 @@ import gap_sets
 import numpy as np
 import pytest
 
-from frictid_hil.gap.credit import credits
+from frictid_hil.gap.credit import credits, sound
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.forward import Replayed
+from frictid_hil.gap.forward import Replayed, settled_nm
 from frictid_hil.gap.generic import since_start
 from frictid_hil.gap.held_out import change, deviations, in_stretches
+from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.simulation.effects import all_effects
 
 
@@ -38,6 +39,42 @@ def test_an_effect_that_opens_what_another_closes_too_far_gets_a_negative_share(
     assert sum(credit.share for credit in earned.values()) == pytest.approx(1.0)
     assert earned["true"].share > 1.0 and earned["true"].deviations > 5.0
     assert earned["false"].share < 0.0 and earned["false"].deviations < -5.0
+
+
+@pytest.mark.parametrize(("floor_nm", "kept"), [(0.01, True), (0.3, False)])
+def test_what_stands_far_out_of_the_floor_is_kept_beside_a_strong_effect(floor_nm: float, kept: bool) -> None:
+    strong = 5.0 * np.sin(np.linspace(0.0, 60.0, 4000))
+    rare = np.zeros(4000)
+    rare[1000:1040] = 4.0  # so much in so few stretches that chance could have made it
+    closed = Closed(strong + rare, {"strong": strong, "rare": rare})
+    judge = SimpleNamespace(
+        judged=closed.judged,
+        drive={},
+        evidence=SimpleNamespace(misfit_ratio=lambda groups: 9.0),
+        without=lambda given, name: hypothesis_of(closed, tuple(n for n in given.names if n != name)),
+    )
+    whole = hypothesis_of(closed, ("strong", "rare"))
+    assert sound(judge, whole, floor_nm).names == (("strong", "rare") if kept else ("strong",))  # type: ignore[arg-type]
+
+
+def hypothesis_of(judge: Closed, names: tuple[str, ...]) -> SimpleNamespace:
+    """Effects of which only the replay tells."""
+    left = settled_nm(judge.judged(dict.fromkeys(names)))
+    effects: dict[str, dict[str, float]] = {name: {} for name in names}
+    return SimpleNamespace(names=names, groups=(), replayed=names, effects=effects, judged_nm=left, misfit=1.0)
+
+
+@pytest.mark.parametrize(("after", "verdict"), [(4.6, "explained"), (12.0, "unknown")])
+def test_a_swinging_link_leaves_its_trace_in_inverse_dynamics(after: float, verdict: str) -> None:
+    features = Features(
+        before=24.4, after=after, misfit=647.0, misfit_before=1195.0, family_share=0.5, family_gain=7e5,
+        family_name="lagged motion", family_alone=0.95, actuation_left=0.0, held_share=0.0,
+        names=("encoder_offset", "backlash"), gain=1.2e6, rivals={"encoder_offset": (1.1e6, "torque_bias")},
+        rival_drive={}, drive_gain={}, actuation_ratio=1.4, actuation_motion=1.0, actuation_rest=1.0,
+        actuation_worst=1.4, coarse=1.0, floor_nm=0.1, probed={"backlash": (3476.0, 0.0, "")},
+        hollow={"backlash": 0.0},
+    )  # fmt: skip
+    assert verdict_of(features)[0] == verdict
 
 
 def test_a_change_that_chance_makes_is_within_its_standard_error() -> None:
