@@ -77,13 +77,13 @@ def exchange_us(active: list[str], cycle_hz: float) -> tuple[float, float]:
 
 def codec_ratio() -> float:
     """Time of writing three mapped values by canopen's variables, in units of one struct packing."""
-    dictionary: Any = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]
+    dictionary: Any = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]  # canopen is only partly typed
     for index, kind in ((0x6040, 6), (0x607A, 4), (0x60B2, 3)):
         variable = ODVariable(f"{index:04X}", index)
         variable.data_type = kind
         dictionary.add_object(variable)
     node = canopen.RemoteNode(1, dictionary)
-    frame: Any = canopen.pdo.base.PdoMap(node.rpdo, None, None)  # type: ignore[no-untyped-call]
+    frame: Any = canopen.pdo.base.PdoMap(node.rpdo, None, None)  # type: ignore[no-untyped-call]  # the same
     variables = [frame.add_variable(index) for index in (0x6040, 0x607A, 0x60B2)]
     buffer, pack = bytearray(8), struct.Struct("<Hih").pack_into
 

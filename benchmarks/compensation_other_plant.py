@@ -25,7 +25,7 @@ from frictid_hil.jobs.watch import Silent
 
 def calibrated(joint: str, kept: Path, bus: str, seed: int) -> tuple[Path, Path]:
     """(Robot file, profile) of one joint of the other plant, identified by the product unless ``kept`` has them."""
-    joint_drive.ServoLoop = OtherPlant  # type: ignore[attr-defined,assignment]
+    joint_drive.ServoLoop = OtherPlant  # type: ignore[attr-defined,assignment]  # another plant behind the drive
     folder = kept / f"{joint}-seed-{seed}"
     robot, profile = folder / "robot.yaml", folder / "calibration" / "profile.yaml"
     if not profile.exists():

@@ -181,7 +181,7 @@ def bus(options: argparse.Namespace) -> None:
         for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
                 robot, entry, plant = of_joint(options, joint, Path(folder), delay)
-                joint_drive.ServoLoop = remembering(plant)  # type: ignore[attr-defined]
+                joint_drive.ServoLoop = remembering(plant)  # type: ignore[attr-defined]  # a tap
                 found = [
                     on_the_bus(robot, options.bus, entry, joint, hold, way, options.seed)
                     for hold in (False, True)

@@ -65,7 +65,7 @@ def felt_nm(
     def feel(duration_s: float) -> None:
         move_on(duration_s)
         if axis.floating:
-            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]
+            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]  # a tap
 
     axis.run = feel  # type: ignore[method-assign]
     driver.open()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
+from typing import cast
 
 import gap_sets
 import numpy as np
@@ -14,6 +15,7 @@ from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.forward import Replayed, settled_nm
 from frictid_hil.gap.generic import since_start
 from frictid_hil.gap.held_out import change, deviations, in_stretches
+from frictid_hil.gap.how_far import Hypothesis, Judge
 from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.simulation.effects import all_effects
 
@@ -35,7 +37,7 @@ def test_an_effect_that_opens_what_another_closes_too_far_gets_a_negative_share(
     wave = np.sin(np.linspace(0.0, 60.0, 4000))
     judge = Closed(gap, {"true": wave, "false": 0.1 * random.standard_normal(4000)})
     hypothesis = SimpleNamespace(effects={"true": {}, "false": {}})
-    earned = credits(judge, hypothesis, ("true", "false"))  # type: ignore[arg-type]
+    earned = credits(cast(Judge, judge), cast(Hypothesis, hypothesis), ("true", "false"))
     assert sum(credit.share for credit in earned.values()) == pytest.approx(1.0)
     assert earned["true"].share > 1.0 and earned["true"].deviations > 5.0
     assert earned["false"].share < 0.0 and earned["false"].deviations < -5.0
@@ -54,7 +56,8 @@ def test_what_stands_far_out_of_the_floor_is_kept_beside_a_strong_effect(floor_n
         without=lambda given, name: hypothesis_of(closed, tuple(n for n in given.names if n != name)),
     )
     whole = hypothesis_of(closed, ("strong", "rare"))
-    assert sound(judge, whole, floor_nm).names == (("strong", "rare") if kept else ("strong",))  # type: ignore[arg-type]
+    found = sound(cast(Judge, judge), cast(Hypothesis, whole), floor_nm)
+    assert found.names == (("strong", "rare") if kept else ("strong",))
 
 
 def hypothesis_of(judge: Closed, names: tuple[str, ...]) -> SimpleNamespace:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -16,8 +17,8 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan import SKEW, Plan
 
 
-def planned(robot: str = "hp3j", **options: object) -> Plan:
-    return plan_calibration(CalibrateOptions(robot, joints=("1",), **options)).plan  # type: ignore[arg-type]
+def planned(robot: str = "hp3j", **options: Any) -> Plan:
+    return plan_calibration(CalibrateOptions(robot, joints=("1",), **options)).plan
 
 
 def test_shaking_is_planned_only_where_it_is_asked_for_and_asks_for_no_more_than_the_cycles() -> None:
