@@ -358,7 +358,7 @@ class FrameMapped(Protocol):
 
 @runtime_checkable
 class Batched(Protocol):
-    """A driver whose controller runs whole motions by itself and hands its recording over afterwards (``batch_only``).
+    """A driver whose controller runs whole motions by itself and hands over what it recorded (``batch_only``).
 
     Its ``start_cycling`` and ``stop_cycling`` begin and end a stretch under power; in between there are ``standing``
     and ``run_batch`` instead of ``exchange``, and all joints but the one that runs are held by the controller.
@@ -380,6 +380,7 @@ class Batched(Protocol):
         stop: Callable[[], bool],
         progress: Callable[[str, float], None],
         look: Callable[[Sequence[Feedback]], None],
+        arrived: Callable[[Mapping[str, Any]], None],
     ) -> Mapping[str, Any]:
         """One joint's motions as one job; blocks until the joint stands again and its recording is here.
 
@@ -388,6 +389,8 @@ class Batched(Protocol):
             stop: asked often; True brings the joint to rest and raises ``Interrupted``.
             progress: told ``motion`` or ``transfer`` and the share that is done.
             look: given ``standing`` several times while the joint moves; its ``SafetyAbort`` brings the joint to rest.
+            arrived: given every portion of samples as it comes (the first five columns below), in order and without
+                a gap: all that ``batch_columns`` hold in the end.
 
         Returns:
             Columns of shape (n,): ``time_ns`` (run time), ``position_rad``, ``velocity_rad_s``, ``torque_nm``,

@@ -4,8 +4,8 @@
 
     reference       every joint where the plan expects it; then power, and all of them seen to stand
     job             the rehearsal first and alone, so that nothing fast runs before its torque was looked at
-        while it runs     all other joints are read, and must not have moved
-        once it stands    its recording is fetched, kept, and passed through the supervisor
+        while it runs     all other joints are read, and must not have moved; samples are kept as they come
+        once it stands    the rest of its recording is fetched, and all of it passed through the supervisor
     power off
 
 The controller keeps travel, step and torque within the job's own bounds meanwhile, and stops when it hears nothing.
@@ -158,10 +158,11 @@ class BatchRunner:
                 stop=lambda: self._stop.level > 0,
                 progress=_EverySecond(lambda stage, done: self._notify(JobProgress(joint.name, stage, done))),
                 look=lambda reports: self._look(held, reports),
+                arrived=lambda samples: self._keep(index, samples),
             )
         finally:
-            # Kept also where the job was stopped, or its transfer broke for good.
-            marks = self._keep(index, motions, driver.batch_columns)
+            # Also where the job was stopped, or its transfer broke for good.
+            marks = self._marks(motions, driver.batch_columns)
             for mark in marks:
                 self._notify(Marked(joint.name, mark))
         columns = driver.batch_columns
@@ -176,21 +177,24 @@ class BatchRunner:
             self._notify(Warned(f"joint {joint.name}: the controller's speed limiter dropped {dropped} pulses"))
         return marks
 
-    def _keep(self, index: int, motions: Sequence[Motion], columns: Mapping[str, Any]) -> list[Mark]:
-        """Every fetched sample into the ring; the marks of the motions that are there as a whole."""
-        if not columns:
-            return []
-        times_ns = columns["time_ns"] + self._offset_ns
-        nan = float("nan")
-        for time_ns, position, velocity, torque, command in zip(times_ns.tolist(), *_rows(columns), strict=True):
+    def _keep(self, index: int, samples: Mapping[str, Any]) -> None:
+        """Into the ring, and from there to disk, before anything else is asked of the controller."""
+        times_ns, nan = samples["time_ns"] + self._offset_ns, float("nan")
+        for time_ns, position, velocity, torque, command in zip(times_ns.tolist(), *_rows(samples), strict=True):
             self._samples.append(time_ns, position, velocity, torque, command, 0.0, nan, nan, 0, index, 0)
         self._pump()
         self._count += len(times_ns)
+
+    def _marks(self, motions: Sequence[Motion], columns: Mapping[str, Any]) -> list[Mark]:
+        """Of the motions that are there as a whole."""
+        if not columns:
+            return []
+        end_of_all_ns = int(columns["time_ns"][-1]) + self._offset_ns
         bounds_ns = (columns["motion_starts_ns"] + self._offset_ns).tolist()
         return [
             Mark(motion.name, start_ns, end_ns, motion.details())
             for motion, (start_ns, end_ns) in zip(motions, pairwise(bounds_ns), strict=True)
-            if end_ns <= int(times_ns[-1])
+            if end_ns <= end_of_all_ns
         ]
 
     def _pass_on(self, index: int, columns: Mapping[str, Any]) -> None:

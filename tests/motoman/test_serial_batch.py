@@ -14,8 +14,9 @@ from serial_bench import START_RAD, make_bench
 
 from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import BlockCollector, JobOrder
-from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold
+from frictid_drivers.motoman.batch_messages import JobOrder
+from frictid_drivers.motoman.batch_record import BlockCollector, JobRecord
+from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold, WrongMode
 from frictid_drivers.motoman.emulator import jobs
 from frictid_drivers.motoman.emulator.compensation import Compensator, Table
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
@@ -168,33 +169,141 @@ def test_a_broken_transfer_goes_on_where_it_broke() -> None:
     assert np.array_equal(resumed["position_rad"], whole["position_rad"])
 
 
-@given(st.binary(max_size=60), st.integers(0, 200), st.integers(0, 255))
-def test_damaged_blocks_never_become_samples(garbage: bytes, position: int, replaced: int) -> None:
-    raw = (7).to_bytes(2, "little") + (0).to_bytes(4, "little") + b"\x02" + bytes(range(20))
+@given(st.binary(max_size=60), st.integers(0, 200), st.integers(0, 255), st.booleans())
+def test_damaged_blocks_never_become_samples(garbage: bytes, position: int, replaced: int, shifted: bool) -> None:
+    head = (7).to_bytes(2, "little") + (0).to_bytes(4, "little") + b"\x02" + (b"\x03\x01" if shifted else b"")
+    raw = head + bytes(range(20))
     coded = bytearray(base64.b64encode(raw + crc16(raw).to_bytes(2, "little")))
     clean = bytes(coded)
     coded[position % len(coded)] = replaced
     rows: dict[int, tuple[int, int, int]] = {}
-    collector = BlockCollector(7, 0, 0, rows)
+    collector = BlockCollector(7, rows, None if shifted else (3, 1))
     collector.take(coded.decode("latin-1") + ",", 0)
     collector.take(base64.b64encode(garbage).decode(), 1)
     collector.finish()
     assert bool(rows) == (bytes(coded) == clean)
+    if rows:
+        assert rows[0] == (0x03020100, 0x060504 << 3, 0x090807 << 1)
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.data())
+def test_a_reply_cut_anywhere_gives_the_same_samples(data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, 60))
+    figure = st.integers(-(2**31), 2**31 - 1)
+    samples = data.draw(st.lists(st.tuples(figure, figure, figure), min_size=count, max_size=count))
+    bench = make_bench()
+    bench.emulator.batch._job = jobs.Job(9, 0, [0], [False], 0, 1, state=jobs.RUNNING, samples=samples)
+    _, text = bench.emulator.batch.obey(f"FREAD 2,9,0,{count}")
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(text)), max_size=5)))
+    rows: dict[int, tuple[int, int, int]] = {}
+    collector = BlockCollector(9, rows, None)
+    for index, (begin, end) in enumerate(zip([0, *cuts], [*cuts, len(text)], strict=True)):
+        collector.take(text[begin:end], index)
+    collector.finish()
+    assert sorted(rows) == list(range(count))
+    for k, (pulses, speed, torque) in enumerate(samples):
+        assert rows[k][0] == pulses
+        assert 0 <= speed - rows[k][1] < 2**9
+        assert 0 <= torque - rows[k][2] < 2**9
+
+
+@pytest.mark.parametrize("while_running", [False, True])
 @pytest.mark.parametrize(("speed", "torque"), [(1_000, 500_000), (90_000_000, -12_000_000)])
-def test_figures_beyond_24_bits_are_shifted_and_come_back(speed: int, torque: int) -> None:
+def test_figures_beyond_24_bits_are_shifted_and_come_back(speed: int, torque: int, while_running: bool) -> None:
     job = jobs.Job(1, 0, [0], [False], 0, 1, samples=[(-5, speed, torque), (2**31 - 1, -speed, -torque)])
     velocity_shift, torque_shift = job.shifts()
     assert abs(speed) >> velocity_shift < 2**23
     bench = make_bench()
-    job.state = jobs.FINISHED
+    job.state, job.done = jobs.FINISHED, 2
     bench.emulator.batch._job = job
-    client = BatchClient(bench.host(), lambda: bench.emulator.now_s)
-    record = client.fetch(1, client.state(1), 2, lambda share: None)
-    assert list(record.pulses) == [-5, 2**31 - 1]
-    assert record.speed_tenths[1] == pytest.approx(-speed, abs=2**velocity_shift)
-    assert record.torque_micro[0] == pytest.approx(torque, abs=2**torque_shift)
+    host = bench.host()
+    record = JobRecord(host, 1, while_running=while_running)
+    record.complete(BatchClient(host, lambda: bench.emulator.now_s).state(1), lambda share: None)
+    kept = record.samples()
+    assert list(kept.pulses) == [-5, 2**31 - 1]
+    assert kept.speed_tenths[1] == pytest.approx(-speed, abs=2**velocity_shift)
+    assert kept.torque_micro[0] == pytest.approx(torque, abs=2**torque_shift)
+
+
+# -- the record, while the job runs ----------------------------------------------------------------------------------
+
+
+def test_samples_arrive_in_order_while_the_job_runs_and_their_end_afterwards() -> None:
+    bench = make_bench(layer="batch", stream_baud=0)
+    driver = bench.driver()
+    driver.open()
+    driver.start_cycling()
+    portions: list[tuple[bool, dict[str, np.ndarray]]] = []
+    whole = driver.run_batch(
+        plan(Sine(START_RAD, 0.3, 1.0, 8)),
+        look=lambda reports: None,
+        arrived=lambda samples: portions.append((bench.emulator.batch.moving, dict(samples))),
+    )
+    driver.close()
+    for name in ("time_ns", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad"):
+        assert np.array_equal(np.concatenate([portion[name] for _, portion in portions]), whole[name])
+    early = sum(len(portion["time_ns"]) for moving, portion in portions if moving)
+    # The line carries some 70 samples a second beside the questions; the job makes 250.
+    assert 0.2 < early / len(whole["time_ns"]) < 0.3
+
+
+def fetched_of(*, knows: bool) -> dict[str, np.ndarray]:
+    """A job on a controller that knows FREAD 2, or does not: what its driver says of it must be what happens."""
+    bench = make_bench(layer="batch", stream_baud=0, settings={"reads_while_running": knows})
+    driver = bench.driver()
+    driver.open()
+    (told,) = (finding.message for finding in driver.check(None) if finding.subject == "transfer")
+    assert ("while the job runs" in told) == knows
+    moving: list[bool] = []
+    columns = driver.run_batch(
+        plan(Sine(START_RAD, 0.3, 1.0, 4)), arrived=lambda samples: moving.append(bench.emulator.batch.moving)
+    )
+    driver.close()
+    assert any(moving) == knows
+    return dict(columns)
+
+
+def test_a_controller_that_hands_nothing_over_while_it_runs_is_asked_afterwards() -> None:
+    old, new = fetched_of(knows=False), fetched_of(knows=True)
+    for name in ("position_rad", "velocity_rad_s", "torque_nm"):
+        assert np.array_equal(old[name], new[name])
+
+
+def test_a_portion_that_cannot_be_had_while_the_job_runs_is_fetched_afterwards() -> None:
+    bench = make_bench(layer="batch", stream_baud=0)
+    obey, asked = bench.emulator.batch._read_so_far, []
+
+    def refuse_at_first(text: str, operands: list[str]) -> tuple[str, str]:
+        asked.append(bench.emulator.now_s)
+        return ("90,000", "2080") if len(asked) < 12 else obey(text, operands)
+
+    bench.emulator.batch._read_so_far = refuse_at_first
+    driver = bench.driver()
+    driver.open()
+    asked.clear()
+    with pytest.raises(WrongMode):
+        # Five refusals end the asking while it runs; afterwards a refusal is the run's end.
+        driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 4)))
+    assert len(asked) == 6
+    assert not bench.emulator.batch.moving
+    asked.extend([0.0] * 2)  # three more refusals: the job runs on
+    assert len(driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 4)))["time_ns"]) > 500
+    driver.close()
+
+
+def test_a_stop_is_heard_within_one_block_of_the_record() -> None:
+    bench = make_bench(layer="batch", stream_baud=0)
+    driver, stopped_s = bench.driver(), []
+    driver.open()
+    stop_at_s = bench.emulator.now_s + 4.0
+    stop = bench.emulator.batch.stop
+    bench.emulator.batch.stop = lambda reason: (stopped_s.append(bench.emulator.now_s), stop(reason))  # type: ignore[method-assign]
+    with pytest.raises(Interrupted):
+        driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 8)), stop=lambda: bench.emulator.now_s > stop_at_s)
+    # A block of the record takes 0.2 s, FSTOP itself less than 0.1 s.
+    assert stopped_s[0] - stop_at_s < 0.35
+    driver.close()
 
 
 def test_a_long_job_runs_on_a_controller_that_could_stream_as_well() -> None:
@@ -285,11 +394,12 @@ def a_watched_job(way: str = "", at: int = -1) -> list[dict[str, int]]:
 @pytest.mark.parametrize("way", ["to the controller", "to the host"])
 def test_a_damaged_byte_while_a_job_runs_costs_less_than_its_watchdog(way: str) -> None:
     passed = a_watched_job()
-    for at in range(passed[3][way], passed[4][way], 5):
+    # One round of questions and the part of the record that comes with it; mostly the latter on the way to the host.
+    for at in range(passed[3][way], passed[4][way], 5 if way == "to the controller" else 37):
         a_watched_job(way, at)
 
 
-@pytest.mark.parametrize("at", range(100, 116, 3))  # every kind of utterance of one round of questions
+@pytest.mark.parametrize("at", range(100, 130, 4))  # every kind of utterance of one round of questions
 def test_four_seconds_of_silence_are_less_than_the_watchdog(at: int) -> None:
     bench = make_bench(layer="batch", stream_baud=0, faults=[f"silence@{at}:4"])
     driver = bench.driver()
@@ -348,14 +458,24 @@ def test_a_port_that_is_lost_during_the_transfer_and_comes_back_costs_nothing() 
     assert np.array_equal(kept["torque_nm"], whole["torque_nm"])
 
 
-def test_a_port_that_never_comes_back_is_not_waited_for_long() -> None:
-    bench = make_bench(layer="batch", stream_baud=0, faults=["unplug@400"])
+def test_a_port_that_never_comes_back_is_not_waited_for_long_and_leaves_what_had_come() -> None:
+    bench = make_bench(layer="batch", stream_baud=0, faults=["unplug@1500"])
     driver = bench.driver()
     driver.open()
+    arrived: list[float] = []
     with pytest.raises(HardwareError, match="port is gone"):
-        driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 10)))
-    assert driver.batch_columns == {}
-    assert bench.emulator.now_s < 400 * TICK_S + 25.0
+        driver.run_batch(
+            plan(Sine(START_RAD, 0.3, 1.0, 10)),
+            look=lambda reports: None,
+            arrived=lambda samples: arrived.extend(samples["position_rad"].tolist()),
+        )
+    job = bench.emulator.batch._job
+    assert job is not None
+    pulses = np.rint(np.array(arrived) * UNITS.pulses_per_rad).astype(int).tolist()
+    assert 0.2 * 1500 < len(pulses) < 0.3 * 1500
+    assert pulses == [sample[0] for sample in job.samples[: len(pulses)]]
+    assert driver.batch_columns["position_rad"].tolist() == arrived
+    assert bench.emulator.now_s < 1500 * TICK_S + 25.0
     driver.close()
 
 

@@ -1,7 +1,6 @@
 """Layer B, batch: one job sent as one message, run and recorded by the controller, fetched in CRC-checked blocks.
 
-Fits 9600 and 19200 baud: 4000 samples of 10 bytes are 40 kB, about half a minute at 19200. A broken transfer goes on
-with the first sample that is missing.
+Fits 9600 and 19200 baud: 4000 samples of 10 bytes are 40 kB, about half a minute at 19200.
 """
 
 from __future__ import annotations
@@ -9,23 +8,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from frictid_drivers.motoman.batch_messages import (
-    BatchHello,
-    BlockCollector,
-    FrictionTable,
-    JobOrder,
-    JobState,
-    Record,
-    Rows,
-    record,
+from frictid_drivers.motoman.batch_messages import BatchHello, FrictionTable, JobOrder, JobState
+from frictid_drivers.motoman.controller_errors import (
+    BadReply,
+    ControllerError,
+    LinkError,
+    ManipulatorOperating,
+    NoSuchJob,
 )
-from frictid_drivers.motoman.controller_errors import BadReply, LinkError, ManipulatorOperating
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, SafetyAbort
 
-SAMPLES_PER_BLOCK: Final = 18
-_BLOCKS_PER_REQUEST: Final = 32
-_FETCH_ATTEMPTS: Final = 5
 _POLL_S: Final = 0.5
 
 _FINISHED, _STOPPED = 3, 4
@@ -53,7 +46,7 @@ class BatchClient:
         self.now_s = now_s
 
     def hello(self) -> BatchHello:
-        """FHELLO.
+        """FHELLO, and whether FREAD 2 is known.
 
         Raises:
             ControllerError: 1010 where there is no such application.
@@ -71,9 +64,20 @@ class BatchClient:
                 averaging_ms=None if int(averaging) < 0 else int(averaging),
                 table_points=int(points),
                 name=name,
+                reads_while_running=self._reads_while_running(),
             )
         except ValueError:
             raise self._host.bad_reply(f"{reply!r} instead of a greeting", "FHELLO") from None
+
+    def _reads_while_running(self) -> bool:
+        """Asked for a job that cannot be: who knows the command finds the job missing, anybody else the command."""
+        try:
+            self._host.ask("FREAD 2,0,0,1")
+        except NoSuchJob:
+            return True
+        except ControllerError:
+            return False
+        raise BadReply("a record of no job", where="FREAD 2,0,0,1")
 
     def send(self, order: JobOrder) -> None:
         """FJOB. ``ControllerError`` where the controller refuses it."""
@@ -110,6 +114,7 @@ class BatchClient:
         stop: Callable[[], bool],
         progress: Callable[[float], None],
         look: Callable[[float], None] = lambda within_s: None,
+        follow: Callable[[JobState, float], bool] = lambda state, within_s: False,
         *,
         watchdog_s: float = 5.0,
     ) -> JobState:
@@ -126,6 +131,8 @@ class BatchClient:
             progress: told the share that is done.
             look: called once per question with how long it may take; its ``SafetyAbort`` ends the job and is raised
                 once the joint stands.
+            follow: called between two rounds of questions with the state and how long it may take, for as long as it
+                says that it did something; the line is free then.
             watchdog_s: the job stops when it hears nothing for so long.
 
         Returns:
@@ -168,47 +175,10 @@ class BatchClient:
                     raise HardwareError(
                         f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s", where=f"job {number}"
                     )
-                pause_until_s = self.now_s() + _POLL_S
+                pause_until_s = self.now_s() + min(_POLL_S, watchdog_s / 10)
                 while self.now_s() < pause_until_s and (stopping or not stop()):
-                    self._host.listen(min(0.05, pause_until_s - self.now_s()))
-
-    def fetch(
-        self,
-        number: int,
-        state: JobState,
-        samples: int,
-        progress: Callable[[float], None],
-        rows: Rows | None = None,
-    ) -> Record:
-        """FREAD until every sample is here; goes on after a broken transfer.
-
-        Args:
-            number: of the job.
-            state: of the job, which is over.
-            samples: how many to fetch.
-            progress: told the share that is here.
-            rows: filled as they come, by number; what is in it after an error may be kept (``record``).
-
-        Raises:
-            LinkError: a part cannot be transferred in several attempts.
-            BadReply: what arrives instead is not this job's record.
-        """
-        rows = {} if rows is None else rows
-        failures = 0
-        while len(rows) < samples:
-            before, first = len(rows), _first_missing(rows, samples)
-            collector = BlockCollector(number, state.velocity_shift, state.torque_shift, rows)
-            failure: HardwareError = BadReply("no intact block in the reply", where=f"FREAD from sample {first} on")
-            try:
-                self._host.ask(f"FREAD 1,{number},{first},{_BLOCKS_PER_REQUEST * SAMPLES_PER_BLOCK}", collector.take)
-                collector.finish()
-            except (LinkError, BadReply) as error:
-                failure = error
-            failures = 0 if len(rows) > before else failures + 1
-            if failures >= _FETCH_ATTEMPTS:
-                raise failure
-            progress(len(rows) / samples)
-        return record(rows, state.dropped_pulses)
+                    if not follow(state, within_s):
+                        self._host.listen(min(0.05, pause_until_s - self.now_s()))
 
     def download(self, table: FrictionTable) -> None:
         """FTABLE, read back and compared.
@@ -224,10 +194,6 @@ class BatchClient:
     def compensate(self, axis_mask: int) -> None:
         """FCOMP: apply the tables of these axes from now on; 0 ends it."""
         self._host.order(f"FCOMP 1,{axis_mask}")
-
-
-def _first_missing(rows: Rows, samples: int) -> int:
-    return next(k for k in range(samples) if k not in rows)
 
 
 def _why_stopped(state: JobState, number: int, *, asked: bool) -> FrictidError:

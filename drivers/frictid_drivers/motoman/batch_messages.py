@@ -1,7 +1,6 @@
-"""What host and batch application tell each other: greeting, job, its state, its recording, friction table.
+"""What host and batch application tell each other: greeting, job, its state, friction table.
 
-The data of a BSC block may hold no control codes, so binary travels as base64 text; every block of a recording carries
-its own place and CRC.
+The data of a BSC block may hold no control codes, so binary travels as base64 text.
 """
 
 from __future__ import annotations
@@ -12,17 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from frictid_drivers.motoman.stream_frames import crc16
 
 TABLE_POINTS: Final = 21
-_SAMPLE_BYTES: Final = 10
-_BLOCK_HEAD: Final = struct.Struct("<HIB")
-
-Rows = dict[int, tuple[int, int, int]]
-"""Samples by number: pulses, 0.1 pulse/s, uN m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +28,7 @@ class BatchHello:
         averaging_ms: moving average on the command, None where it does not know.
         table_points: points of a friction table, 0 where it cannot compensate.
         name: of the application.
+        reads_while_running: it hands over what is recorded already while the job runs.
     """
 
     tick_us: int
@@ -46,6 +38,7 @@ class BatchHello:
     averaging_ms: int | None
     table_points: int
     name: str
+    reads_while_running: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,23 +91,6 @@ class JobState:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """What a job recorded; arrays of shape (n,), one row per tick from the first.
-
-    Attributes:
-        pulses: encoder position.
-        speed_tenths: 0.1 pulse/s.
-        torque_micro: uN m at the motor shaft.
-        dropped_pulses: how many pulses the speed limiter dropped on the way.
-    """
-
-    pulses: NDArray[np.int64]
-    speed_tenths: NDArray[np.int64]
-    torque_micro: NDArray[np.int64]
-    dropped_pulses: int
-
-
-@dataclass(frozen=True, slots=True)
 class FrictionTable:
     """One axis's compensation: the curve at equal steps of speed from standstill, and how to apply it.
 
@@ -147,50 +123,3 @@ class FrictionTable:
         )
         raw += struct.pack(f"<{len(self.points_micro)}i", *self.points_micro)
         return base64.b64encode(raw + crc16(raw).to_bytes(2, "little")).decode("ascii")
-
-
-def record(rows: Rows, dropped_pulses: int) -> Record:
-    """The samples from the first on, up to the first that is missing."""
-    count = next(k for k in range(len(rows) + 1) if k not in rows)
-    table = np.array([rows[k] for k in range(count)], dtype=np.int64).reshape(count, 3)
-    return Record(table[:, 0], table[:, 1], table[:, 2], dropped_pulses)
-
-
-class BlockCollector:
-    """Cuts the text of a reply into base64 blocks as it comes, and keeps the rows of every intact one."""
-
-    def __init__(self, number: int, velocity_shift: int, torque_shift: int, rows: Rows) -> None:
-        self._number = number
-        self._velocity_shift = velocity_shift
-        self._torque_shift = torque_shift
-        self._rows = rows
-        self._text = ""
-
-    def take(self, text: str, index: int) -> None:
-        """The text of one BSC block."""
-        self._text = text if index == 0 else self._text + text
-        *whole, self._text = self._text.split(",")
-        for coded in whole:
-            self._keep(coded)
-
-    def finish(self) -> None:
-        """The reply is over: what is left is the last block."""
-        self._keep(self._text)
-
-    def _keep(self, coded: str) -> None:
-        try:
-            raw = base64.b64decode(coded, validate=True)
-        except ValueError:
-            return
-        if len(raw) < _BLOCK_HEAD.size + 2 or crc16(raw[:-2]) != int.from_bytes(raw[-2:], "little"):
-            return
-        number, first, count = _BLOCK_HEAD.unpack_from(raw)
-        if number != self._number or len(raw) != _BLOCK_HEAD.size + count * _SAMPLE_BYTES + 2:
-            return
-        for k in range(count):
-            at = _BLOCK_HEAD.size + k * _SAMPLE_BYTES
-            self._rows[first + k] = (
-                int.from_bytes(raw[at : at + 4], "little", signed=True),
-                int.from_bytes(raw[at + 4 : at + 7], "little", signed=True) << self._velocity_shift,
-                int.from_bytes(raw[at + 7 : at + 10], "little", signed=True) << self._torque_shift,
-            )

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder, Record, record
-from frictid_drivers.motoman.controller_errors import BadReply, LinkError
+from frictid_drivers.motoman.batch_messages import JobOrder
+from frictid_drivers.motoman.batch_record import JobRecord
+from frictid_drivers.motoman.controller_errors import BadReply, ControllerError, LinkError
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
@@ -55,11 +56,12 @@ class BatchRun:
         tick_s: interpolation clock.
         number: of the job.
         now_ns: run time.
+        while_running: the controller application hands samples over while the job runs.
 
     Attributes:
         number: of the job.
         running: the controller may be moving the arm for this job.
-        columns: what was recorded; filled in also where the job was stopped.
+        columns: what was fetched; filled in also where the job was stopped, or its transfer broke.
     """
 
     def __init__(
@@ -72,6 +74,8 @@ class BatchRun:
         tick_s: float,
         number: int,
         now_ns: Callable[[], int],
+        *,
+        while_running: bool,
     ) -> None:
         self._batch = batch
         self._host = host
@@ -80,6 +84,7 @@ class BatchRun:
         self._bounds = bounds
         self._tick_s = tick_s
         self._now_ns = now_ns
+        self._while_running = while_running
         self._started_ns = 0
         self.number = number
         self.running = False
@@ -92,6 +97,7 @@ class BatchRun:
         stop: Callable[[], bool],
         progress: Callable[[str, float], None],
         look: Callable[[float], None],
+        arrived: Callable[[Mapping[str, Any]], None],
     ) -> None:
         """The whole job; see ``MotomanDriver.run_batch``."""
         motion = motion_segments(plan.motions, self._units, self._tick_s)
@@ -99,34 +105,59 @@ class BatchRun:
         self._stand_at(motion.start)
         power_on()
         self.running = True
-        duration_s = len(motion.command) * self._tick_s
+
+        def pass_on(first: int, last: int) -> None:
+            arrived(self._samples(motion, record, first, last))
+
+        record = JobRecord(self._host, self.number, while_running=self._while_running, arrived=pass_on)
+        try:
+            self._run(record, len(motion.command) * self._tick_s, stop, progress, look)
+        finally:
+            if record.count:
+                tick_ns = round(self._tick_s * 1e9)
+                starts_ns = self._started_ns + np.array(motion.motion_ticks, dtype=np.int64) * tick_ns
+                self.columns = {
+                    **self._samples(motion, record, 0, record.count),
+                    "motion_starts_ns": starts_ns,
+                    "dropped_pulses": record.dropped_pulses,
+                }
+
+    def _run(
+        self,
+        record: JobRecord,
+        duration_s: float,
+        stop: Callable[[], bool],
+        progress: Callable[[str, float], None],
+        look: Callable[[float], None],
+    ) -> None:
+        """Start it, see it end, and have its record, also where it was stopped."""
         try:
             self._batch.start(self.number)
             self._started_ns = self._now_ns()
             self._batch.watch(
-                *(self.number, duration_s, stop, lambda share: progress("motion", share), look),
+                *(self.number, duration_s, stop, lambda share: progress("motion", share), look, record.follow),
                 watchdog_s=self._bounds.watchdog_s,
             )
         except HardwareError:
             # The controller stops by its watchdog, and keeps what it recorded.
             with contextlib.suppress(FrictidError):
-                self._come_back(motion, stop, progress)
+                self._come_back(record, stop, progress)
             raise
         except FrictidError:
             self.running = False
             with contextlib.suppress(FrictidError):
-                self._fetch(motion, progress)
+                self._fetch(record, progress)
             raise
         self.running = False
-        self._fetch(motion, progress)
+        self._fetch(record, progress)
 
-    def _come_back(self, motion: JobMotion, stop: Callable[[], bool], progress: Callable[[str, float], None]) -> None:
+    def _come_back(self, record: JobRecord, stop: Callable[[], bool], progress: Callable[[str, float], None]) -> None:
         """After a lost port: if it is there again soon, see that the joint stands, and fetch its record."""
         self._reconnect(stop)
         with contextlib.suppress(Interrupted, SafetyAbort):
             self._batch.watch(self.number, 0.0, lambda: True, lambda share: None)
         self.running = False
-        self._fetch(motion, progress)
+        self._fetch(record, progress)
 
     def _reconnect(self, stop: Callable[[], bool]) -> None:
         until_s = self._batch.now_s() + self._bounds.watchdog_s + _COMES_BACK_S
@@ -170,41 +201,30 @@ class BatchRun:
                 next_step="bring it there first, or let the plan begin with a move from where it stands",
             )
 
-    def _fetch(self, motion: JobMotion, progress: Callable[[str, float], None]) -> None:
+    def _fetch(self, record: JobRecord, progress: Callable[[str, float], None]) -> None:
         state = self._batch.state(self.number)
-        if state.done_ticks == 0:
-            return
-        rows: dict[int, tuple[int, int, int]] = {}
 
         def fetch() -> None:
-            self._batch.fetch(self.number, state, state.done_ticks, lambda share: progress("transfer", share), rows)
+            record.complete(state, lambda share: progress("transfer", share))
 
         try:
-            try:
-                fetch()
-            except (LinkError, BadReply):
-                raise
-            except HardwareError:
-                self._reconnect(lambda: False)
-                fetch()  # from the first sample that is missing
-        finally:
-            # A transfer that broke for good leaves what came before it.
-            if 0 in rows:
-                self.columns = self._columns(motion, record(rows, state.dropped_pulses))
+            fetch()
+        except (LinkError, BadReply, ControllerError):
+            raise
+        except HardwareError:
+            self._reconnect(lambda: False)
+            fetch()  # from the first sample that is missing
 
-    def _columns(self, motion: JobMotion, kept: Record) -> dict[str, Any]:
-        units = self._units
-        n = len(kept.pulses)
+    def _samples(self, motion: JobMotion, record: JobRecord, first: int, last: int) -> dict[str, Any]:
+        """Columns of the samples [first, last), joint side."""
+        units, kept = self._units, record.samples(first, last)
+        numbers = np.arange(first, last, dtype=np.int64)
         # A job that was stopped early goes on recording while it decelerates: its command ends before its samples.
-        command = np.concatenate([motion.command[:n], np.full(max(0, n - len(motion.command)), motion.command[-1])])
-        tick_ns = round(self._tick_s * 1e9)
-        sign = units.direction
+        command = motion.command[np.minimum(numbers, len(motion.command) - 1)]
         return {
-            "time_ns": self._started_ns + np.arange(n, dtype=np.int64) * tick_ns,
+            "time_ns": self._started_ns + numbers * round(self._tick_s * 1e9),
             "position_rad": kept.pulses / units.pulses_per_rad,
             "velocity_rad_s": kept.speed_tenths * 0.1 / units.pulses_per_rad,
-            "torque_nm": kept.torque_micro * (1e-6 * units.gear_ratio * sign),
+            "torque_nm": kept.torque_micro * (1e-6 * units.gear_ratio * units.direction),
             "position_command_rad": command / units.pulses_per_rad,
-            "motion_starts_ns": self._started_ns + np.array(motion.motion_ticks, dtype=np.int64) * tick_ns,
-            "dropped_pulses": kept.dropped_pulses,
         }

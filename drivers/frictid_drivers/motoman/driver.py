@@ -278,6 +278,7 @@ class MotomanDriver:
         stop: Callable[[], bool] = lambda: False,
         progress: Callable[[str, float], None] = lambda phase, share: None,
         look: Callable[[Sequence[Feedback]], None] | None = None,
+        arrived: Callable[[Mapping[str, Any]], None] = lambda samples: None,
     ) -> Mapping[str, Any]:
         """One joint's motions as one job on the controller.
 
@@ -286,6 +287,7 @@ class MotomanDriver:
             stop: asked often; True brings the joint to rest and raises ``Interrupted``.
             progress: told ``motion`` or ``transfer`` and the share that is done.
             look: given what ``standing`` says, about twice a second while the job runs; its ``SafetyAbort`` stops it.
+            arrived: given every portion of samples as it comes, in order, as the first five columns below.
 
         Returns:
             Columns of shape (n,): ``time_ns``, ``position_rad``, ``velocity_rad_s``, ``torque_nm``,
@@ -315,12 +317,14 @@ class MotomanDriver:
             self._tick_us * 1e-6,
             self._job_number,
             self.clock.now_ns,
+            while_running=reach.batch.reads_while_running,
         )
         self.batch_columns = {}
         try:
             self._job.run(
                 *(plan, self._power.on, stop, progress),
                 (lambda within_s: look(self.standing(within_s=within_s))) if look else (lambda within_s: None),
+                arrived,
             )
         finally:
             self.batch_columns = self._job.columns

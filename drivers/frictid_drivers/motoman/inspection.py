@@ -197,9 +197,17 @@ def _of_layers(setup: RobotSetup, options: SerialOptions, reach: Reach) -> list[
     elif averaging > _LONG_AVERAGING_MS:
         message = f"the controller averages the command over {averaging} ms: fast cycles will fall short of their peak"
         found.append(Finding(Severity.WARNING, "averaging", message, "shorten the filter, or lower the velocity"))
-    if options.layer == "auto" and reach.layer is Layer.BATCH:
-        found.append(Finding(Severity.OK, "transfer", "a joint's recording takes about half a minute at 19200 baud"))
+    if reach.layer is Layer.BATCH:
+        found.append(
+            Finding(Severity.OK, "transfer", _transfer(reach.batch is not None and reach.batch.reads_while_running))
+        )
     return found
+
+
+def _transfer(reads_while_running: bool) -> str:
+    if reads_while_running:
+        return "16 s of motion take half a minute at 19200 baud, a quarter of it while the job runs"
+    return "16 s of motion take half a minute at 19200 baud, all of it once the job is over"
 
 
 def _measures_torque(reach: Reach) -> bool:

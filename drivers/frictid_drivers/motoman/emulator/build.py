@@ -3,17 +3,18 @@
 Every joint's ``simulated`` mapping becomes the joint behind an axis; pulses per degree, gear ratio and limits become
 what the controller knows of the axis. ``options.emulator`` says what kind of controller it is:
 
-=================  ========  ==================================================================================
-key                default   meaning
-=================  ========  ==================================================================================
-averaging_ms       0         moving average on the command
-batch              true      the batch application is installed
-stream             true      the streaming application is installed
-thinking_ms        12        between a command and the bid to reply
-table_delay_ms     0         by which the torque of a friction table comes late, whole ticks
-hand_amplitude_rad 0.349     a person guides a floating joint by this much, about where it stands
-hand_frequency_hz  0.5       so many times a second
-=================  ========  ==================================================================================
+===================  ========  ==================================================================================
+key                  default   meaning
+===================  ========  ==================================================================================
+averaging_ms         0         moving average on the command
+batch                true      the batch application is installed
+stream               true      the streaming application is installed
+thinking_ms          12        between a command and the bid to reply
+table_delay_ms       0         by which the torque of a friction table comes late, whole ticks
+reads_while_running  true      the batch application hands samples over while a job runs
+hand_amplitude_rad   0.349     a person guides a floating joint by this much, about where it stands
+hand_frequency_hz    0.5       so many times a second
+===================  ========  ==================================================================================
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ _DEFAULTS: Mapping[str, float | bool] = {
     "stream": True,
     "thinking_ms": 12,
     "table_delay_ms": 0,
+    "reads_while_running": True,
     "hand_amplitude_rad": 0.349,
     "hand_frequency_hz": 0.5,
 }
@@ -108,6 +110,7 @@ def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Setting
         averaging_ticks=max(1, round(options["averaging_ms"] * 1e-3 / tick_s)),
         thinking_s=options["thinking_ms"] * 1e-3,
         table_delay_ticks=round(options["table_delay_ms"] * 1e-3 / tick_s),
+        reads_while_running=bool(options["reads_while_running"]),
         parameters=Parameters(
             timer_a_s=float(setup.options.get("timer_a_s", 3.0)),
             timer_b_s=float(setup.options.get("timer_b_s", 20.0)),

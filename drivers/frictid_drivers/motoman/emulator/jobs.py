@@ -1,4 +1,4 @@
-"""The batch application: one job of one axis, generated, executed and recorded on the controller, fetched afterwards.
+"""The batch application: one job of one axis, generated, run and recorded on the controller, handed over on request.
 
 Texts are those of the controller-application page; every number in them is decimal unless said otherwise there.
 """
@@ -62,10 +62,8 @@ class Job:
     samples: list[tuple[int, int, int]] = field(default_factory=list)
 
     def shifts(self) -> tuple[int, int]:
-        """How far velocity and torque are shifted right to fit 24 bits."""
-        return _shift(max((abs(s[1]) for s in self.samples), default=0)), _shift(
-            max((abs(s[2]) for s in self.samples), default=0)
-        )
+        """How far velocity and torque of the whole recording are shifted right to fit 24 bits."""
+        return _shifts(self.samples)
 
 
 class BatchApplication:
@@ -77,6 +75,7 @@ class BatchApplication:
         tick_s: interpolation clock.
         averaging_ms: of the command, as FHELLO tells.
         table_delay_ticks: between the tick that a table's torque is computed in and the tick that it acts in.
+        reads_while_running: it knows FREAD 2.
         on_guided: told when an axis is given into a person's hands, and taken back.
 
     Attributes:
@@ -91,6 +90,7 @@ class BatchApplication:
         *,
         averaging_ms: int = 0,
         table_delay_ticks: int = 0,
+        reads_while_running: bool = True,
         on_guided: Callable[[int, bool], None] | None = None,
     ) -> None:
         self._panel = panel
@@ -98,6 +98,7 @@ class BatchApplication:
         self._tick_s = tick_s
         self._averaging_ms = averaging_ms
         self._table_delay_ticks = table_delay_ticks
+        self._reads_while_running = reads_while_running
         self._on_guided = on_guided
         self._job: Job | None = None
         self._tables: dict[int, tuple[bytes, Table]] = {}
@@ -130,11 +131,14 @@ class BatchApplication:
     def obey(self, text: str) -> Reply:
         """Execute one of its commands."""
         command, _, rest = text.partition(" ")
-        operands = rest.split(",")
-        if operands[0] != "1":
+        version, *operands = rest.split(",")
+        action = self._commands[command]
+        if (command, version) == ("FREAD", "2") and self._reads_while_running:
+            action = self._read_so_far
+        elif version != "1":
             return refusal(5170)
         try:
-            return self._commands[command](text, operands[1:])
+            return action(text, operands)
         except (ValueError, struct.error):
             return refusal(1012)
 
@@ -278,20 +282,37 @@ class BatchApplication:
         return DONE
 
     def _read(self, text: str, operands: list[str]) -> Reply:
+        """FREAD 1: of a job that is over, every block shifted alike."""
+        if self.moving:
+            return refusal(2010)
+        return self._blocks(operands, lambda job, rows: (job.shifts(), b""))
+
+    def _read_so_far(self, text: str, operands: list[str]) -> Reply:
+        """FREAD 2: what is there already, also of a running job; every block says how it is shifted."""
+
+        def shifted(job: Job, rows: Sequence[tuple[int, int, int]]) -> tuple[tuple[int, int], bytes]:
+            shifts = _shifts(rows)
+            return shifts, bytes(shifts)
+
+        return self._blocks(operands, shifted)
+
+    def _blocks(
+        self,
+        operands: list[str],
+        shifted: Callable[[Job, Sequence[tuple[int, int, int]]], tuple[tuple[int, int], bytes]],
+    ) -> Reply:
         number, first, count = map(int, operands)
         job = self._job
         if job is None or job.number != number:
             return refusal(4040)
-        if job.state == RUNNING:
-            return refusal(2010)
         if not (0 <= first < len(job.samples) and count > 0):
             return refusal(1012)
-        velocity_shift, torque_shift = job.shifts()
         blocks = []
         last = min(first + count, len(job.samples))
         for begin in range(first, last, SAMPLES_PER_BLOCK):
             rows = job.samples[begin : min(begin + SAMPLES_PER_BLOCK, last)]
-            raw = number.to_bytes(2, "little") + begin.to_bytes(4, "little") + bytes([len(rows)])
+            (velocity_shift, torque_shift), told = shifted(job, rows)
+            raw = number.to_bytes(2, "little") + begin.to_bytes(4, "little") + bytes([len(rows)]) + told
             for pulses, speed, torque in rows:
                 raw += pulses.to_bytes(4, "little", signed=True)
                 raw += (speed >> velocity_shift).to_bytes(3, "little", signed=True)
@@ -370,6 +391,12 @@ def _ticks(number: int) -> int:
     if not 0 < number <= MOST_TICKS:
         raise ValueError(f"{number} ticks")
     return number
+
+
+def _shifts(samples: Sequence[tuple[int, int, int]]) -> tuple[int, int]:
+    """The smallest of velocity and of torque by which all of these fit 24 bits."""
+    speed, torque = (max((abs(sample[k]) for sample in samples), default=0) for k in (1, 2))
+    return _shift(speed), _shift(torque)
 
 
 def _shift(largest: int) -> int:

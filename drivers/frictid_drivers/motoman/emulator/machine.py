@@ -38,6 +38,7 @@ class Settings:
         averaging_ticks: moving average on the command; 1 is none.
         thinking_s: between a command and the bid to reply.
         table_delay_ticks: by which the torque of a friction table comes late.
+        reads_while_running: the batch application hands samples over while a job runs.
         parameters: of the link.
     """
 
@@ -50,6 +51,7 @@ class Settings:
     averaging_ticks: int = 1
     thinking_s: float = 0.012
     table_delay_ticks: int = 0
+    reads_while_running: bool = True
     parameters: Parameters = field(default_factory=Parameters)
 
 
@@ -89,6 +91,7 @@ class Emulator:
             self.settings.tick_s,
             averaging_ms=averaging_ms,
             table_delay_ticks=self.settings.table_delay_ticks,
+            reads_while_running=self.settings.reads_while_running,
             on_guided=on_guided,
         )
         self.station = Station(self.settings.parameters, self, self._message)
