@@ -115,6 +115,7 @@ class Watched:
     driver: MotomanDriver
     truth_pulses: dict[int, int] = field(default_factory=dict)
     jobs: list[Job] = field(default_factory=list)
+    lost_at_sample: int = 0
 
     @staticmethod
     def of(setup: RobotSetup, faults: Sequence[str]) -> Watched:
@@ -136,7 +137,15 @@ class Watched:
                 watched.jobs.append(job)
             return start(text, operands)
 
+        lose = emulator._lose_port
+
+        def remember_loss(for_s: float) -> None:
+            if emulator.batch.moving:
+                watched.lost_at_sample = len(watched.jobs[-1].samples)
+            lose(for_s)
+
         axis.run = remember  # type: ignore[method-assign]
+        emulator._lose_port = remember_loss  # type: ignore[method-assign]
         emulator.batch._commands["FRUN"] = remember_job
         return watched
 
@@ -218,6 +227,8 @@ def inject(layer: str, faults: Sequence[str], *, limit_s: float, told: Callable[
 
 MOVED_PULSES = 500
 """Less than half a degree of any joint: more than it gives way when power comes on."""
+SOON_SAMPLES = 500
+"""Of a job: by then the first of them must have come."""
 INJECTED: list[list[Watched]] = []
 """The runs so far; the healthy one is looked at while it goes on."""
 
@@ -241,8 +252,9 @@ def judge_outcome(
 
 def judge_recording(watched: Watched, out: Path, *, code: int) -> Iterator[str]:
     """What moved is there, and is what happened."""
-    # A stream tells of every tick. A job's recording must be fetched, for which a line that failed leaves no chance.
-    jobs_to_fetch = len(watched.jobs) - (code == 3)
+    # A stream tells of every tick. Of a job some 70 samples a second come while it runs, the rest afterwards, for which
+    # a line that failed leaves no chance.
+    jobs_to_fetch = len(watched.jobs) - (code == 3 and watched.lost_at_sample < SOON_SAMPLES)
     streamed = list(watched.truth_pulses.values())
     recorded = jobs_to_fetch > 0 or bool(streamed and max(streamed) - min(streamed) > MOVED_PULSES)
     path = out / "samples.mcap"

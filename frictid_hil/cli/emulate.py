@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -31,6 +32,15 @@ def motoman(
             help="Robot file whose joints stand behind it (hp3j-serial.yaml).",
         ),
     ] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(
+            "--link",
+            metavar="NAME",
+            dir_okay=False,
+            help="A name of your own for the port, under which it comes back after a fault that took it away.",
+        ),
+    ] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="FAULT", help="What shall go wrong, in the emulator's words; repeat."),
@@ -52,7 +62,7 @@ def motoman(
     def run() -> Result:
         if not pty:
             raise UsageError("where shall it listen?", next_step="frictid-hil emulate motoman --pty")
-        emulate("motoman", announce=announce, robot_name=robot, faults=tuple(fault or ()))
+        emulate("motoman", announce=announce, robot_name=robot, link=link, faults=tuple(fault or ()))
         raise typer.Exit(0)
 
     output.run("emulate", run)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import FrameType
 
 from frictid_hil.config.robot import load_robot
@@ -15,7 +16,12 @@ _DEFAULT_ROBOTS = {"motoman": "hp3j-serial.yaml"}
 
 
 def emulate(
-    kind: str, *, announce: Callable[[str], None], robot_name: str | None = None, faults: Sequence[str] = ()
+    kind: str,
+    *,
+    announce: Callable[[str], None],
+    robot_name: str | None = None,
+    link: Path | None = None,
+    faults: Sequence[str] = (),
 ) -> None:
     """Serve until Ctrl-C or SIGTERM.
 
@@ -23,10 +29,11 @@ def emulate(
         kind: name of an installed emulator (``motoman``).
         announce: told the port once it can be opened.
         robot_name: robot file; the kind's own shipped one where None.
+        link: name for the port, under which it also comes back after a fault.
         faults: what shall go wrong, in the emulator's words.
 
     Raises:
-        UsageError: no such emulator, no robot file for it, or a fault that is none.
+        UsageError: no such emulator, no robot file for it, a link that cannot be, or a fault that is none.
         ConfigError: the robot file is wrong.
     """
     installed = {point.name: point for point in entry_points(group=_GROUP)}
@@ -47,7 +54,7 @@ def emulate(
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with robot.document.locating():
-            serve(setup, announce=announce, faults=faults, stop=lambda: stopping)
+            serve(setup, announce=announce, link=link, faults=faults, stop=lambda: stopping)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -78,25 +78,31 @@ def batch_examples() -> dict[str, str]:
         with pytest.raises(ControllerError):
             host.order("FRUN 1,8")
 
-    made = {"FHELLO": wire.written(client.hello), "FJOB": wire.written(lambda: client.send(ORDER))}
+    def asked(text: str) -> str:
+        return wire.written(lambda: host.ask(text))
+
+    made = {"FHELLO": asked("FHELLO 1"), "FREAD-known": wire.written(client._reads_while_running)}
+    made |= {"FJOB": wire.written(lambda: client.send(ORDER))}
     host.servo(True)
     made["FRUN"] = wire.written(lambda: client.start(7))
     emulator.advance(emulator.now_s + 2.0)
     made["FRUN-refused"] = wire.written(refused)
     made["FSTAT"] = wire.written(lambda: client.state(7))
-    made["FREAD"] = wire.written(lambda: host.ask("FREAD 1,7,40,2"))
-    made["FREAD-long"] = wire.written(lambda: host.ask("FREAD 1,7,0,36"))
+    made["FREAD"] = asked("FREAD 1,7,40,2")
+    made["FREAD-long"] = asked("FREAD 1,7,0,36")
+    made["FREAD-2"] = asked("FREAD 2,7,40,2")
     made["FSTOP"] = wire.written(lambda: client.stop(7))
     units = axis_units(wire.bench.setup.joints)["0"]
     table = friction_table(units, CURVE, 0.9, 8000.0, 4.0, 0.0)
     made["FTABLE"] = wire.written(lambda: host.order(f"FTABLE 1,{table.encoded()}"))
     made["FTABLE-raw"] = base64.b64decode(table.encoded()).hex(" ") + "\n"
-    made["FTREAD"] = wire.written(lambda: host.ask("FTREAD 1,0"))
+    made["FTREAD"] = asked("FTREAD 1,0")
     made["FCOMP"] = wire.written(lambda: client.compensate(1))
     made["FSTREAM"] = wire.written(lambda: host.order("FSTREAM 1,921600,4000,1"))
-    reply = re.search(r"C>H 01 39 30 2c 30 30 31 02 (.*?) 0d 03", made["FREAD"])
-    assert reply
-    made["FREAD-raw"] = base64.b64decode(bytes.fromhex(reply[1])).hex(" ") + "\n"
+    for name in ("FREAD", "FREAD-2"):
+        reply = re.search(r"C>H 01 39 30 2c 30 30 31 02 (.*?) 0d 03", made[name])
+        assert reply
+        made[f"{name}-raw"] = base64.b64decode(bytes.fromhex(reply[1])).hex(" ") + "\n"
     return made
 
 

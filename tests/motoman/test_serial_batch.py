@@ -278,16 +278,15 @@ def test_a_portion_that_cannot_be_had_while_the_job_runs_is_fetched_afterwards()
         asked.append(bench.emulator.now_s)
         return ("90,000", "2080") if len(asked) < 12 else obey(text, operands)
 
-    bench.emulator.batch._read_so_far = refuse_at_first
     driver = bench.driver()
     driver.open()
-    asked.clear()
+    bench.emulator.batch._read_so_far = refuse_at_first
     with pytest.raises(WrongMode):
         # Five refusals end the asking while it runs; afterwards a refusal is the run's end.
         driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 4)))
     assert len(asked) == 6
     assert not bench.emulator.batch.moving
-    asked.extend([0.0] * 2)  # three more refusals: the job runs on
+    asked.extend([0.0] * 2)  # eight asked: three more refusals: the job runs on
     assert len(driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 4)))["time_ns"]) > 500
     driver.close()
 
@@ -298,7 +297,7 @@ def test_a_stop_is_heard_within_one_block_of_the_record() -> None:
     driver.open()
     stop_at_s = bench.emulator.now_s + 4.0
     stop = bench.emulator.batch.stop
-    bench.emulator.batch.stop = lambda reason: (stopped_s.append(bench.emulator.now_s), stop(reason))  # type: ignore[method-assign]
+    bench.emulator.batch.stop = lambda reason: (stopped_s.append(bench.emulator.now_s), stop(reason))
     with pytest.raises(Interrupted):
         driver.run_batch(plan(Sine(START_RAD, 0.3, 1.0, 8)), stop=lambda: bench.emulator.now_s > stop_at_s)
     # A block of the record takes 0.2 s, FSTOP itself less than 0.1 s.

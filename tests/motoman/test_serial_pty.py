@@ -10,29 +10,34 @@ import tty
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from serial_bench import Streamed, stream_motion
 
 from frictid_drivers.motoman import MotomanDriver
-from frictid_drivers.motoman.emulator.pty import Waits
+from frictid_drivers.motoman.emulator.pty import Terminal, Waits
 from frictid_drivers.motoman.port import SerialPort
 from frictid_hil.config.robot import load_robot
 from frictid_hil.driver import Feedback, SetPoint
-from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError
+from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError, InputFileError, UsageError
 from frictid_hil.plan import Hold, JointPlan, Sine
+from frictid_hil.recording.mcap_reader import read_mcap
 
 SERVE = """
 import sys
+from pathlib import Path
 from frictid_hil.jobs.emulate import emulate
-emulate("motoman", announce=lambda port: print(port, flush=True), faults=sys.argv[1:])
+link = Path(sys.argv[1]) if sys.argv[1] else None
+emulate("motoman", announce=lambda port: print(port, flush=True), link=link, faults=sys.argv[2:])
 """
 
 
 @contextmanager
-def controller(*faults: str) -> Iterator[str]:
+def controller(*faults: str, link: str = "") -> Iterator[str]:
     """An emulated controller; its port."""
-    process = subprocess.Popen([sys.executable, "-c", SERVE, *faults], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-c", SERVE, link, *faults], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
         yield process.stdout.readline().strip()
@@ -172,6 +177,86 @@ def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str) -> None:
     after.close()
     assert holds == ["command hold"]
     assert first == pytest.approx(second, abs=1e-5)
+
+
+@pytest.mark.parametrize("gone_s", [0.4, 3])
+def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_s: float) -> None:
+    at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
+    motion = JointPlan("3", (Sine(at, 0.1, 0.5, 8),), {})
+    arrived: list[float] = []
+    with controller(f"unplug@200:{gone_s}", link=str(tmp_path / "port")) as port:
+        assert port == str(tmp_path / "port")
+        driver = driver_on(port, layer="batch", watchdog_s=1.5)
+        driver.open()
+        with pytest.raises(HardwareError, match="the port failed"):
+            driver.run_batch(motion, arrived=lambda samples: arrived.extend(samples["position_rad"].tolist()))
+        state = driver.standing()[3]
+        driver.close()
+    kept = driver.batch_columns
+    # Gone for 0.4 s, the job had not noticed, and was stopped once we were back; else its watchdog had stopped it.
+    assert 200 + 250 * min(gone_s, 1.2) < len(kept["time_ns"]) < 1000
+    assert kept["position_rad"].tolist() == arrived
+    assert np.abs(kept["position_rad"] - kept["position_command_rad"])[:200].max() < 2e-2
+    assert state.position_rad == pytest.approx(kept["position_rad"][-1], abs=1e-2)
+
+
+def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path) -> None:
+    at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
+    with controller("close@130:2", link=str(tmp_path / "port")) as port:
+        driver = driver_on(port, layer="batch")
+        driver.open()
+        line, reopened = driver._open_line().port, []
+        reopen = line.reopen
+
+        def reopen_again() -> None:
+            reopened.append(time.monotonic())
+            reopen()
+
+        line.reopen = reopen_again  # type: ignore[method-assign]
+        columns = driver.run_batch(JointPlan("3", (Sine(at, 0.1, 0.5, 3),), {}))
+        driver.close()
+    assert reopened
+    assert len(columns["time_ns"]) == 1 + 3 * 157
+
+
+def test_what_had_come_of_a_running_job_is_on_disk_after_a_kill(tmp_path: Path) -> None:
+    robot, out = tmp_path / "robot.yaml", tmp_path / "run"
+    robot.write_text(
+        "schema: frictid.robot/1\nextends: hp3j-serial.yaml\nname: killed\nbus: serial:none\n"
+        "options:\n  layer: batch\n  stream_baud: 0\n"
+    )
+    with controller() as port:
+        command = [sys.executable, "-m", "frictid_hil.cli.app", "calibrate", "--robot", str(robot)]
+        command += ["--bus", f"serial:{port}", "--joint", "3", "--yes", "--quiet", "--out", str(out)]
+        state = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "FRICTID_RUNTIME_DIR": str(tmp_path)}
+        process = subprocess.Popen(command, env=state, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            until_s = time.monotonic() + 60.0
+            while recorded(out, "3") < 60:
+                assert process.poll() is None
+                assert time.monotonic() < until_s
+                time.sleep(0.2)
+        finally:
+            process.kill()
+            process.wait(10)
+    # The rehearsal alone is a job of more than 1,000 samples; none of them was on disk before it had ended and come.
+    assert 60 <= recorded(out, "3") < 500
+
+
+def recorded(out: Path, joint: str) -> int:
+    """How many samples a run folder holds, while it is written."""
+    try:
+        return len(read_mcap(out / "samples.mcap", joint)[0].time_ns)
+    except InputFileError:
+        return 0
+
+
+def test_a_link_takes_no_other_files_place(tmp_path: Path) -> None:
+    taken = tmp_path / "letter"
+    taken.write_text("dear")
+    with pytest.raises(UsageError, match="no link"):
+        Terminal(taken)
+    assert taken.read_text() == "dear"
 
 
 def test_the_emulator_tells_how_long_it_waited_for_a_late_host() -> None:

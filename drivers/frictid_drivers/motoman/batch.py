@@ -72,12 +72,12 @@ class BatchClient:
     def _reads_while_running(self) -> bool:
         """Asked for a job that cannot be: who knows the command finds the job missing, anybody else the command."""
         try:
-            self._host.ask("FREAD 2,0,0,1")
+            reply = self._host.ask("FREAD 2,0,0,1")
         except NoSuchJob:
             return True
         except ControllerError:
             return False
-        raise BadReply("a record of no job", where="FREAD 2,0,0,1")
+        raise self._host.bad_reply(f"{reply!r} instead of a refusal", "FREAD 2,0,0,1")
 
     def send(self, order: JobOrder) -> None:
         """FJOB. ``ControllerError`` where the controller refuses it."""

@@ -116,6 +116,11 @@ class Emulator:
         """The port has disappeared; the controller behind it has not."""
         return self.now_s < self._gone_until_s
 
+    @property
+    def gone_for_good(self) -> bool:
+        """The port will not come back."""
+        return math.isinf(self._gone_until_s) and self.gone
+
     def _lose_port(self, for_s: float) -> None:
         """For good where no time is told; a port that comes back finds a line on which nothing is under way."""
         self._gone_until_s = self.now_s + for_s if for_s else math.inf
