@@ -92,9 +92,11 @@ def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[s
     if recording.coupled:
         return None
     steps_s = np.diff(recording.time_s)
-    if steps_s.size and steps_s.max() > _GAP_STEPS * np.median(steps_s):
+    step_s = float(np.median(steps_s))
+    longest_s = max(float(steps_s.max()), step_s + float(recording.stopped_s.max(initial=0.0)))
+    if longest_s > _GAP_STEPS * step_s:
         notes.append(
-            f"whether the link swings is not known: {1e3 * steps_s.max():.1f} ms passed between two samples, and a "
+            f"whether the link swings is not known: {1e3 * longest_s:.1f} ms passed between two samples, and a "
             "joint that jumps after its missing set-points looks like a swinging link"
         )
         return None

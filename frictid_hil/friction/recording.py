@@ -7,9 +7,10 @@ start of cycle 1. Nothing here is fitted; timing, quanta and limits are declared
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.filtering import Gaussian, uniform
@@ -88,6 +89,8 @@ class CycleRecording:
         coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
             combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
         companions: those joints, as far as it is known how much they take.
+        stops_s: where the path stood still for missed set-points; ``time_s`` leaves those moments out. Shape (k,).
+        stopped_s: for how long, shape (k,).
         shaken: the stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
         where: what to name in errors (``joint 1``).
     """
@@ -107,6 +110,8 @@ class CycleRecording:
     late_cycles: int = 0
     coupled: bool = False
     companions: tuple[Companion, ...] = ()
+    stops_s: Array = field(default_factory=lambda: np.zeros(0))
+    stopped_s: Array = field(default_factory=lambda: np.zeros(0))
     shaken: CycleRecording | None = None
     where: str = ""
 
@@ -158,6 +163,13 @@ def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -
         torque_nm=smoother.smooth(torque, advance_s),
         smoother=smoother,
     )
+
+
+def around(time_s: Array, stops_s: Array) -> NDArray[np.int64]:
+    """Rows on either side of every stop of the path: the joint went on or slowed down where its time did not."""
+    after = np.searchsorted(time_s, stops_s, side="right")
+    rows: NDArray[np.int64] = np.clip(np.concatenate([after - 1, after]), 0, time_s.size - 1)
+    return rows
 
 
 def _check(recording: CycleRecording) -> None:

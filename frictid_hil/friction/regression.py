@@ -18,7 +18,7 @@ from scipy.ndimage import binary_dilation
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Prior, solve
-from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.recording import CycleRecording, Motion, around
 from frictid_hil.friction.trajectory import Array
 
 RIPPLE_ORDERS = (1.0, 2.0, 4.0)
@@ -234,6 +234,7 @@ def _choose(recording: CycleRecording, motion: Motion, width_rad: float) -> _Cho
     quarter, travel = _quarters(recording, motion)
     guard = min(np.inf if recording.prismatic else GUARD_RAD, recording.procedure.amplitude_rad / 12)
     spoiled = (quarter < 0) | (travel < guard)
+    spoiled[around(motion.time_s, recording.stops_s)] = True
     # What lies beyond the ends of the recording is as unknown as what is guarded.
     kept = ~binary_dilation(spoiled, iterations=int(np.ceil(3 * width)), border_value=1)
     every = max(1, int(width))  # what the kernel leaves needs no more: it passes 0.7 % of half this rate

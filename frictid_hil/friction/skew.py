@@ -32,7 +32,7 @@ from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Prior, Solved, solve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.link import Link, by_parameter
-from frictid_hil.friction.recording import CycleRecording, Motion, Skew, synchronised
+from frictid_hil.friction.recording import CycleRecording, Motion, Skew, around, synchronised
 from frictid_hil.friction.regression import hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
@@ -178,7 +178,7 @@ def _solve(shaken: CycleRecording, motion: Motion, link: Link | None) -> Solved:
         swung = by_parameter(motion, link.frequency_hz, link.damping) * scale
         torque = torque - link.inertia_kg_m2 * swung[:, 0]
     kernel = Gaussian(step_s, max(_WIDTH_S, step_s))
-    bunch = _passes(motion, math.ceil(3 * kernel.width_s / step_s))
+    bunch = _passes(motion, shaken.stops_s, math.ceil(3 * kernel.width_s / step_s))
     rows = np.flatnonzero(bunch >= 0)[:: max(1, int(kernel.width_s / step_s))]
     columns = _columns(shaken, motion)
     if np.unique(bunch[rows]).size < _FEWEST_PASSES or rows.size < 2 * columns.shape[1]:
@@ -217,8 +217,8 @@ def _columns(shaken: CycleRecording, motion: Motion) -> Array:
     return np.column_stack(parts)
 
 
-def _passes(motion: Motion, edge: int) -> NDArray[np.int64]:
-    """From turn to turn, the number of the pass that each sample belongs to; -1 near a turn, ``edge`` samples more."""
+def _passes(motion: Motion, stops_s: Array, edge: int) -> NDArray[np.int64]:
+    """From turn to turn, the number of the pass that each sample belongs to; -1 near a turn or stop, ``edge`` more."""
     v = motion.velocity_rad_s
     good = np.abs(v) >= _SLOWEST * np.abs(v).max()
     number = np.zeros(v.size, dtype=np.int64)
@@ -227,6 +227,7 @@ def _passes(motion: Motion, edge: int) -> NDArray[np.int64]:
         travelled = np.abs(motion.position_rad[begin:end] - motion.position_rad[begin])
         good[begin:end] &= travelled >= _GUARD_RAD
         number[begin:end] = n
+    good[around(motion.time_s, stops_s)] = False
     good = ~binary_dilation(~good, iterations=edge, border_value=1)
     return np.where(good, number, -1)
 

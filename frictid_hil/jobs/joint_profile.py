@@ -27,6 +27,7 @@ from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.companions import with_companions
 from frictid_hil.jobs.declared import declared_skew
+from frictid_hil.jobs.path_time import path_time
 from frictid_hil.jobs.skew_stretch import wanted_note, with_shaking
 from frictid_hil.recording.samples import Mark, Samples
 
@@ -115,8 +116,15 @@ def _from_cycles(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> JointProfile:
-    recording = with_shaking(_recording(samples, procedure, start_s, joint, late_cycles), samples)
     notes: list[str] = []
+    path = path_time(samples, procedure, round(start_s * 1e9))
+    if path is not None:
+        samples, *company = (path.applied(one) for one in (samples, *company))
+        notes.append(path.said)
+    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    if path is not None:
+        recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
+    recording = with_shaking(recording, samples)
     if len(together) > 1:
         recording = replace(recording, coupled=True)
         try:

@@ -116,5 +116,6 @@ def with_shaking(recording: CycleRecording, samples: Samples) -> CycleRecording:
             velocity_rad_s=None,
             command_rad=None,
             repeat=None,
+            stops_s=recording.stops_s + 1e-9 * (samples.marked("cycles")[0].start_ns - marks[0].start_ns),
         ),
     )
