@@ -243,10 +243,10 @@ def test_a_log_is_a_bus_that_paces_and_echoes(run: Path) -> None:
         heard = ear.recv(0.1)
         assert first is not None and heard is not None
         assert (first.arbitration_id, bytes(first.data)) == (heard.arbitration_id, bytes(heard.data))
+    first_ns = next(t for t, *_ in logged(frames))
+    later = next(t for t, *_ in logged(frames) if t > first_ns + 200_000_000)
+    began = time.monotonic()
     with LogBus(frames, paced=True) as bus:
-        start_ns = bus.take()[0]
-        later = next(t for t, *_ in logged(frames) if t > start_ns + 200_000_000)
-        began = time.monotonic()
         while (taken := bus.take()) is not None and taken[0] < later:
             pass
         assert time.monotonic() - began > 0.19
