@@ -1,6 +1,7 @@
 """Every fault of the serial emulator at every phase of a whole ``calibrate``, streamed and in batch.
 
-    python benchmarks/serial_faults.py [--places 2] [--docs PAGE]   virtual time (about 12 minutes of processor time;
+    python benchmarks/serial_faults.py [--places 2] [--docs PAGE]   virtual time (about 25 minutes of processor time;
+                                                                    half as many with --places 1; --layers one of them;
                                                                     --kept FILE goes on after an interruption)
     python benchmarks/serial_faults.py --pty [--docs PAGE]          20 of them through the command line, on a pseudo
                                                                     terminal and the wall clock (about 10 minutes)
@@ -346,11 +347,11 @@ def row(layer: str, kind: str, phases: Phases, healthy_s: float, count: int) -> 
     return Row(cells, runs, wrong)
 
 
-def in_virtual_time(kinds: Sequence[str], count: int, kept: Path | None) -> tuple[str, int, int]:
+def in_virtual_time(layers: Sequence[str], kinds: Sequence[str], count: int, kept: Path | None) -> tuple[str, int, int]:
     """The whole table, how many runs it took, and how many of them were wrong."""
     known = json.loads(kept.read_text()) if kept is not None and kept.exists() else {}
     lines, runs, wrong = [], 0, 0
-    for layer in ("stream", "batch"):
+    for layer in layers:
         phases, healthy_s = phases_of(layer)
         lines += [f"| {layer} | " + " | ".join(phases) + " |", "|---|" + "---|" * len(phases)]
         for kind in kinds:
@@ -445,11 +446,11 @@ def _stands(bus: str, robot: Path) -> bool:
         driver.close()
 
 
-def write(page: Path, name: str, text: str) -> None:
+def write(page: Path, name: str, how: str, text: str) -> None:
     """Replace what stands between this benchmark's two comments on the page."""
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    command = "python benchmarks/serial_faults.py" + (" --pty" if name == "faults-pty" else "")
+    command = f"python benchmarks/serial_faults.py {how}"
     before, _, rest = page.read_text().partition(begin)
     _, _, after = rest.partition(end)
     page.write_text(f"{before}{begin}\n`{command}` at commit {commit.strip()}: {text}{end}{after}")
@@ -459,15 +460,21 @@ def main() -> int:
     """0 when nothing was wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, default=2, help="how many places per phase and kind")
+    parser.add_argument("--layers", default="stream,batch", help="one of them")
     parser.add_argument("--kinds", default=",".join(KINDS), help="some of them, separated by commas")
     parser.add_argument("--kept", type=Path, help="rows that are there already, and where new ones go")
     parser.add_argument("--pty", action="store_true")
     parser.add_argument("--docs", type=Path, help="the page to write the table to")
     asked = parser.parse_args()
-    text, runs, bad = on_terminals() if asked.pty else in_virtual_time(asked.kinds.split(","), asked.places, asked.kept)
+    if asked.pty:
+        text, runs, bad = on_terminals()
+    else:
+        layers, kinds = asked.layers.split(","), asked.kinds.split(",")
+        text, runs, bad = in_virtual_time(layers, kinds, asked.places, asked.kept)
     print(f"{runs} runs, {bad} wrong")
     if asked.docs:
-        write(asked.docs, "faults-pty" if asked.pty else "faults", text)
+        name, how = ("faults-pty", "--pty") if asked.pty else ("faults", f"--places {asked.places}")
+        write(asked.docs, name, how, text)
     return 0 if bad == 0 else 1
 
 

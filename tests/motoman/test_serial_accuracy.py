@@ -58,13 +58,7 @@ def recording_of(setup: RobotSetup, joint: str, time_ns: Any, columns: dict[str,
 
 def error_percent(setup: RobotSetup, joint: str, result: Estimate) -> float:
     """Distance to the true curve over [V_1, V_N], percent of its mean there."""
-    entry = setup.joint(joint)
-    model = JointModel.from_mapping(
-        entry.simulated,
-        gear_ratio=entry.gear_ratio,
-        rated_torque_nm=entry.rated_torque_nm,
-        max_torque_nm=entry.max_torque_nm,
-    )
+    model = JointModel.of(setup.joint(joint), joint)
     speed = np.linspace(*result.curve.measured_range_rad_s, 400)
     truth = true_curve_nm(model, speed)
     return 100 * math.sqrt(float(np.mean((result.curve.torque(speed) - truth) ** 2))) / float(truth.mean())

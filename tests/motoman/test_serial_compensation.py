@@ -40,13 +40,7 @@ def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def model_of(joint: str) -> JointModel:
-    entry = SETUP.joint(joint)
-    return JointModel.from_mapping(
-        entry.simulated,
-        gear_ratio=entry.gear_ratio,
-        rated_torque_nm=entry.rated_torque_nm,
-        max_torque_nm=entry.max_torque_nm,
-    )
+    return JointModel.of(SETUP.joint(joint), joint)
 
 
 def curve_of(model: JointModel) -> FrictionCurve:
