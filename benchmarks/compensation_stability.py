@@ -115,6 +115,13 @@ def of_joint(options: argparse.Namespace, joint: str, folder: Path, delay: int =
     return robot, load_profile(profile).joints[joint], OtherPlant
 
 
+def off_the_bus(options: argparse.Namespace, joint: str) -> tuple[JointProfile, JointSetup, Plant]:
+    """Profile, limits and plant of one joint that is driven on bare arrays."""
+    with tempfile.TemporaryDirectory() as folder:
+        robot, entry, plant = of_joint(options, joint, Path(folder))
+        return entry, load_robot(str(robot)).to_setup().joint(joint), plant
+
+
 class Forgetful:
     """Keeps nothing."""
 
@@ -212,9 +219,7 @@ def pushes(options: argparse.Namespace) -> None:
     print("|---|---|---|---|---|")
     fell = False
     for joint in options.joint or JOINTS:
-        with tempfile.TemporaryDirectory() as folder:
-            robot, entry, plant = of_joint(options, joint, Path(folder))
-            setup = load_robot(str(robot)).to_setup().joint(joint)
+        entry, setup, plant = off_the_bus(options, joint)
         law = changed_law(entry, setup, False, MORE_RATIO, MORE_STIFFNESS)
         for delay in options.delay or (2, 5):
             fastest = [
@@ -238,9 +243,7 @@ def limits(options: argparse.Namespace) -> None:
     print("| joint | delay [cycles] | our K | largest R, free | largest K, free | largest K, PD hold |")
     print("|---|---|---|---|---|---|")
     for joint in options.joint or JOINTS:
-        with tempfile.TemporaryDirectory() as folder:
-            robot, entry, plant = of_joint(options, joint, Path(folder))
-            setup = load_robot(str(robot)).to_setup().joint(joint)
+        entry, setup, plant = off_the_bus(options, joint)
         presliding = entry.presliding_stiffness_nm_per_rad.value or math.nan
         for delay in options.delay or (2, 5):
             ours = changed_law(entry, setup, False, 0.0, 1.0).friction

@@ -141,8 +141,7 @@ class Sine:
     def position_rad(self, time_s: Array) -> Array:
         """start + A/2 (1 - cos)."""
         phase = 2.0 * self.peak_velocity_rad_s / self.amplitude_rad * np.asarray(time_s)
-        travelled: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase))
-        return self.start_rad + travelled
+        return _out_and_back(self.start_rad, self.amplitude_rad, phase)
 
     def details(self) -> Mapping[str, Any]:
         """Travel, speed, repeats."""
@@ -196,8 +195,8 @@ class Shake:
         phase = 2.0 * math.pi * np.asarray(time_s) / self.duration_s
         slow = self.turns * phase
         shaking = self.shake_rad * np.sin(slow) ** 2 * np.sin(self.periods * phase)
-        moved: Array = self.amplitude_rad / 2 * (1.0 - np.cos(slow)) + shaking
-        return self.start_rad + moved
+        path: Array = _out_and_back(self.start_rad, self.amplitude_rad, slow) + shaking
+        return path
 
     def details(self) -> Mapping[str, Any]:
         """Travel, and what shakes on it."""
@@ -247,8 +246,7 @@ class WarmUp:
     def position_rad(self, time_s: Array) -> Array:
         """start + A/2 (1 - cos)."""
         phase = 2.0 * math.pi / self.cycle_s * np.asarray(time_s)
-        travelled: Array = self.amplitude_rad / 2 * (1.0 - np.cos(phase))
-        return self.start_rad + travelled
+        return _out_and_back(self.start_rad, self.amplitude_rad, phase)
 
     def details(self) -> Mapping[str, Any]:
         """Travel, speed, when it ends."""
@@ -450,6 +448,12 @@ def coupling_bound_nm(joint: str, motions: Mapping[str, Sequence[Motion]], expec
         for other, moved in motions.items()
         if other != joint and other in expected
     )
+
+
+def _out_and_back(start_rad: float, amplitude_rad: float, phase: Array) -> Array:
+    """start + A/2 (1 - cos), the shape of every cycle."""
+    path: Array = start_rad + amplitude_rad / 2 * (1.0 - np.cos(phase))
+    return path
 
 
 def _peaks(motions: Sequence[Motion]) -> tuple[tuple[float, float], float, float]:
