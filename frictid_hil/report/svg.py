@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Literal
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Line:
         y: shape (n,).
         colour: of the line.
         width: in pixels; 0 for markers only.
-        marked: a dot at every point.
+        marker: at every point; "" for none.
     """
 
     label: str
@@ -34,7 +35,7 @@ class Line:
     y: Array
     colour: str
     width: float = 1.6
-    marked: bool = False
+    marker: Literal["", "dot", "cross"] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +84,11 @@ def svg(charts: Sequence[Chart], *, columns: int = 1, width: int = 340, height: 
     return "\n".join([*parts, "</svg>", ""])
 
 
-def ticks(low: float, high: float, about: int = 4) -> list[float]:
-    """Round values within [low, high], ``about`` as many as asked for."""
-    raw = (high - low) / about
-    power = 10.0 ** math.floor(math.log10(raw))
-    step = next(power * nice for nice in (1, 2, 5, 10) if power * nice >= raw * (1 - 1e-9))
+def ticks(low: float, high: float) -> list[float]:
+    """Round values within [low, high], three to eight of them."""
+    most = (high - low) / 3
+    power = 10.0 ** math.floor(math.log10(most))
+    step = next(power * nice for nice in (5, 2, 1) if power * nice <= most * (1 + 1e-9))
     first = math.ceil(low / step - 1e-9)
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
@@ -128,9 +129,20 @@ def _panel(chart: Chart, width: int, height: int) -> list[str]:
             parts.append(
                 f'<polyline points="{points}" fill="none" stroke="{line.colour}" stroke-width="{line.width:g}"/>'
             )
-        if line.marked:
-            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.2" fill="{line.colour}"/>' for x, y in places]
+        parts += [_MARKERS[line.marker](x, y, line.colour) for x, y in places if line.marker]
     return parts
+
+
+def _dot(x: float, y: float, colour: str) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.2" fill="{colour}"/>'
+
+
+def _cross(x: float, y: float, colour: str) -> str:
+    arms = f"M{x - 4:.1f} {y - 4:.1f}l8 8m-8 0l8 -8"
+    return f'<path d="{arms}" fill="none" stroke="{colour}" stroke-width="1.8"/>'
+
+
+_MARKERS = {"dot": _dot, "cross": _cross}
 
 
 def _span(columns: Sequence[Array], *, zero: bool) -> tuple[float, float]:

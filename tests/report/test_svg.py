@@ -17,14 +17,14 @@ _SVG = "{http://www.w3.org/2000/svg}"
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
 def test_ticks_lie_inside_and_are_a_few(low: float, span: float) -> None:
     values = ticks(low, low + span)
-    assert 1 <= len(values) <= 9
+    assert 3 <= len(values) <= 8
     assert all(low - 1e-6 * span <= value <= low + span * (1 + 1e-6) for value in values)
 
 
 def test_a_chart_holds_its_lines_and_its_words_are_escaped() -> None:
     x = np.linspace(0.0, 1.0, 9000)
     chart = Chart(
-        "A < 5 & more", "x", "y", (Line("a<b", x, x**2, "#000000"), Line("", x[:3], x[:3], "#111111", 0, True))
+        "A < 5 & more", "x", "y", (Line("a<b", x, x**2, "#000000"), Line("", x[:3], x[:3], "#111111", 0, "dot"))
     )
     root = ElementTree.fromstring(svg([chart, chart], columns=2))
     assert len(root.findall(f"{_SVG}g")) == 2
@@ -34,6 +34,13 @@ def test_a_chart_holds_its_lines_and_its_words_are_escaped() -> None:
     assert corners[0][1] > corners[-1][1], "up is up"
     assert len(root.findall(f"{_SVG}g/{_SVG}circle")) == 6
     assert "A < 5 & more" in [text.text for text in root.iter(f"{_SVG}text")]
+
+
+def test_what_was_not_obtained_is_a_cross() -> None:
+    one = Line("refused", np.array([5.0]), np.array([1.0]), "#000000", 0, "cross")
+    root = ElementTree.fromstring(svg([Chart("", "", "", (one,))]))
+    assert len([path for path in root.findall(f"{_SVG}g/{_SVG}path") if "l8 8" in path.attrib["d"]]) == 1
+    assert not root.findall(f"{_SVG}g/{_SVG}circle")
 
 
 def test_a_level_line_is_drawn() -> None:
