@@ -4,10 +4,10 @@
 
 `profiles/hp3j-arm.yaml` is calibrated through the bus at its own rate or another, on classical CAN or CAN FD, once with
 all joints together and once with each joint alone, first without torque noise - what then differs is of the method -,
-then with the shipped noise, for every seed. `repeat` is what two calibrations of one joint alone differ by when nothing
-but the seed of the noise changed; less than that cannot be seen in one pair of runs. `left in` is the distance with
-nothing taken off for other joints, the rows below it say what MuJoCo's own terms would leave if they were known and
-taken off instead (least squares' gravity is taken off in every row).
+then with the shipped noise, for every seed. `left in` is the distance with nothing taken off for other joints, the rows
+below it say what MuJoCo's own terms would leave if they were known and taken off instead (least squares' gravity is
+taken off in every row). With noise, single pairs differ by what noise alone makes of two runs; `methodical` is what all
+runs show to be of the method (`two_ways.py` says how).
 Distances are (15) in percent of the curve's mean, over the measured range [V_1, V_N] and, without noise, over [0, V].
 `M found` is the largest error of a row of the off-diagonal inertia against MuJoCo's, in percent of the joint's own.
 """
@@ -17,17 +17,18 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+from two_ways import Comparison, Curves, compare, least_apart
 
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.driver import load_driver
 from frictid_hil.friction.filtering import Gaussian
-from frictid_hil.friction.metrics import CurveDistance, curve_distance
+from frictid_hil.friction.metrics import CurveDistance, curve_distance, curve_mean
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.declared import declared_skew
@@ -103,13 +104,12 @@ def left_in(run: Run, alone: Run) -> dict[str, float]:
     return {name: distance(found[name], alone.profile[name]).e_percent_measured_range for name in NAMES}
 
 
-def without_true(run: Run, alone: Run, parts: Sequence[str]) -> dict[str, float]:
+def without_true(run: Run, alone: Run) -> dict[str, dict[str, float]]:
     """Distances of the same recording, parts of the true rigid-body torque taken off: which one is it that is left?
 
     Args:
         run: together.
         alone: one by one.
-        parts: of ``inertia`` (the other joints' share of it), ``gravity`` and ``velocity`` (products).
     """
     setup = load_robot(ROBOT).to_setup()
     bodies = RigidBodies(the_arm())
@@ -121,24 +121,27 @@ def without_true(run: Run, alone: Run, parts: Sequence[str]) -> dict[str, float]
     seen = [np.interp(time_s, s.time_s - declared_skew(s).position_delay_s, s.position_rad) for s in every.values()]
     orders = smoother.smooth, smoother.rate, smoother.curvature
     q, v, a = (np.column_stack([order(column) for column in seen]) for order in orders)
-    taken = np.zeros_like(q)
+    parts = {what: np.zeros_like(q) for what in ("M a", "gravity", "velocity products")}
     still = np.zeros(len(NAMES))
     for k in range(time_s.size):
         matrix, asked = bodies.at(q[k], v[k])
         weight = bodies.at(q[k], still)[1]
-        if "inertia" in parts:
-            taken[k] += matrix @ a[k] - np.diag(matrix) * a[k]
-        if "gravity" in parts:
-            taken[k] += weight
-        if "velocity" in parts:
-            taken[k] += asked - weight
-    found = {}
-    for i, (name, samples) in enumerate(every.items()):
-        assert samples.torque_nm is not None
-        late = np.interp(samples.time_s - declared_skew(samples).torque_delay_s, time_s, taken[:, i])
-        bare = replace(samples, torque_nm=samples.torque_nm - late)
-        found[name] = identify_joint(bare, setup.joint(name), method="aligned")
-    return {name: distance(found[name], alone.profile[name]).e_percent_measured_range for name in NAMES}
+        parts["M a"][k] = matrix @ a[k] - np.diag(matrix) * a[k]
+        parts["gravity"][k] = weight
+        parts["velocity products"][k] = asked - weight
+    parts["all three"] = sum(parts.values(), np.zeros_like(q))
+    rows: dict[str, dict[str, float]] = {}
+    for what, taken in parts.items():
+        found = {}
+        for i, (name, samples) in enumerate(every.items()):
+            assert samples.torque_nm is not None
+            late = np.interp(samples.time_s - declared_skew(samples).torque_delay_s, time_s, taken[:, i])
+            bare = replace(samples, torque_nm=samples.torque_nm - late)
+            found[name] = identify_joint(bare, setup.joint(name), method="aligned")
+        rows[f"true {what} taken off"] = {
+            name: distance(found[name], alone.profile[name]).e_percent_measured_range for name in NAMES
+        }
+    return rows
 
 
 def by_least_squares(folder: Path, prefix: str) -> dict[str, float]:
@@ -213,21 +216,9 @@ def quiet(folder: Path, robot: str) -> str:
 
 def table(title: str, rows: dict[str, dict[str, float]]) -> None:
     print(f"\n{title}")
-    print(f"| {'':34} | " + " | ".join(f"J{name:<5}" for name in NAMES) + " |")
+    print(f"| {'':36} | " + " | ".join(f"J{name:<5}" for name in NAMES) + " |")
     for name, row in rows.items():
-        print(f"| {name:34} | " + " | ".join(f"{row[joint]:6.3f}" for joint in NAMES) + " |")
-
-
-def mean_curves(runs: list[Run], others: list[Run]) -> dict[str, float]:
-    """Distance of the curves averaged over the seeds, at the second ones' knots, in percent of their mean."""
-    gaps = {}
-    for name in NAMES:
-        speeds = np.mean([run.profile[name].velocity_rad_s for run in others], axis=0)
-        first, second = (
-            np.mean([run.profile[name].curve().magnitude(speeds) for run in group], axis=0) for group in (runs, others)
-        )
-        gaps[name] = float(100 * np.trapezoid(np.abs(first - second), speeds) / np.trapezoid(second, speeds))
-    return gaps
+        print(f"| {name:36} | " + " | ".join(f"{row[joint]:6.3f}" for joint in NAMES) + " |")
 
 
 def averaged(rows: list[dict[str, float]]) -> dict[str, float]:
@@ -252,6 +243,92 @@ def highest_rates_hz() -> None:
             print(f"{len(joints)} joints moving, {wire}: at most {rate:.0f} Hz")
 
 
+def noiseless(folder: Path, robot: str) -> None:
+    """What differs is of the method."""
+    file = quiet(folder, robot)
+    together = calibrated(file, folder / "quiet-together", 1, NAMES, together=True)
+    alone = one_by_one(file, folder, "quiet", 1)
+    gaps = {name: distance(together.profile[name], alone.profile[name]) for name in NAMES}
+    table(
+        "without torque noise, percent",
+        {
+            "together - one by one, [V_1, V_N]": {name: gap.e_percent_measured_range for name, gap in gaps.items()},
+            "together - one by one, [0, V]": {name: gap.e_percent for name, gap in gaps.items()},
+            "left in: other joints not taken off": left_in(together, alone),
+            **without_true(together, alone),
+            "truth - together": {name: to_truth(together.profile[name], name) for name in NAMES},
+            "truth - one by one": {name: to_truth(alone.profile[name], name) for name in NAMES},
+            "M found: largest error": inertia_error(together),
+            "least squares, [V_1, V_N]": by_least_squares(folder, "quiet"),
+            "lag behind the set-point, ms": lag_ms(together),
+        },
+    )
+    print(f"\ntogether {together.duration_s:.1f} s; one by one {alone.duration_s:.1f} s")
+
+
+def noisy(folder: Path, seeds: list[int], robot: str) -> None:
+    """Single pairs of runs, and what is left between the means of all of them."""
+    together = [calibrated(robot, folder / f"s{seed}-together", seed, NAMES, together=True) for seed in seeds]
+    alone = [one_by_one(robot, folder, f"s{seed}", seed) for seed in seeds]
+    rows = {
+        f"together - one by one, seed {seed}": {
+            n: distance(a.profile[n], b.profile[n]).e_percent_measured_range for n in NAMES
+        }
+        for seed, a, b in zip(seeds, together, alone, strict=True)
+    }
+    if len(seeds) > 2:
+        found = {name: compare(*at_same_speeds(name, together, alone)) for name in NAMES}
+        for figure in fields(Comparison):
+            rows[figure.name.replace("_", " ")] = {name: getattr(found[name], figure.name) for name in NAMES}
+    rows["Cramer-Rao of two runs, all samples"] = {name: least(name, alone[0]) for name in NAMES}
+    rows["knots that both intervals explain"] = explained(together, alone)
+    rows["truth - together"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in together])
+    rows["truth - one by one"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in alone])
+    rows["M found: largest error"] = averaged([inertia_error(run) for run in together])
+    table(f"with the shipped noise, {len(seeds)} seeds, [V_1, V_N], percent", rows)
+
+
+def at_same_speeds(name: str, *groups: list[Run]) -> list[Curves]:
+    """A joint's curves of every run of each group over the measured range that all of them share."""
+    curves = [[run.profile[name].curve() for run in group] for group in groups]
+    ranges = [curve.measured_range_rad_s for group in curves for curve in group]
+    speeds = np.linspace(max(low for low, _ in ranges), min(high for _, high in ranges), 400)
+    return [np.array([curve.magnitude(speeds) for curve in group]) for group in curves]
+
+
+def least(name: str, run: Run) -> float:
+    """Least distance of two unbiased curves of this joint, percent of the mean."""
+    samples = next(one for one in read(run.folder, None) if one.marks)
+    (cycles,) = samples.marked("cycles")
+    drive = JointModel.of(load_robot(ROBOT).file.joints[name], name).drive
+    per_mille = math.hypot(drive.torque_noise_per_mille, drive.torque_quantum_per_mille / math.sqrt(12))
+    curve = run.profile[name].curve()
+    apart_nm = least_apart(
+        procedure_of(cycles),
+        float(np.median(np.diff(samples.time_s))),
+        np.array(curve.velocity_rad_s),
+        per_mille * 1e-3 * drive.rated_torque_nm,
+    )
+    return 100 * apart_nm / curve_mean(curve, *curve.measured_range_rad_s)
+
+
+def explained(together: list[Run], alone: list[Run]) -> dict[str, float]:
+    """Share of the knots where a pair's difference is within the root sum of squares of both intervals."""
+    shares: dict[str, list[float]] = {name: [] for name in NAMES}
+    for k, run in enumerate(together):
+        for name in NAMES:
+            for other in alone[:k] + alone[k + 1 :]:
+                first, second = run.profile[name], other.profile[name]
+                gap = np.abs(first.curve().magnitude(np.array(second.velocity_rad_s)) - np.array(second.torque_nm))
+                shares[name].append(float(np.mean(gap <= np.hypot(half_widths(first), half_widths(second)))))
+    return {name: float(np.mean(values)) for name, values in shares.items()}
+
+
+def half_widths(profile: JointProfile) -> Array:
+    assert profile.torque_interval_nm is not None
+    return np.diff(np.array(profile.torque_interval_nm), axis=1)[:, 0] / 2
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3")
@@ -263,54 +340,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.out or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        report(folder, seeds, on_wire(folder, options.rate, options.fd))
-
-
-def report(folder: Path, seeds: list[int], robot: str) -> None:
-    file = quiet(folder, robot)
-    together = calibrated(file, folder / "quiet-together", 1, NAMES, together=True)
-    alone = one_by_one(file, folder, "quiet", 1)
-    gaps = {name: distance(together.profile[name], alone.profile[name]) for name in NAMES}
-    table(
-        "without torque noise, percent",
-        {
-            "together - one by one, [V_1, V_N]": {name: gap.e_percent_measured_range for name, gap in gaps.items()},
-            "together - one by one, [0, V]": {name: gap.e_percent for name, gap in gaps.items()},
-            "left in: other joints not taken off": left_in(together, alone),
-            "true M a taken off": without_true(together, alone, ["inertia"]),
-            "true gravity taken off": without_true(together, alone, ["gravity"]),
-            "true velocity products taken off": without_true(together, alone, ["velocity"]),
-            "all three taken off": without_true(together, alone, ["inertia", "gravity", "velocity"]),
-            "truth - together": {name: to_truth(together.profile[name], name) for name in NAMES},
-            "truth - one by one": {name: to_truth(alone.profile[name], name) for name in NAMES},
-            "M found: largest error": inertia_error(together),
-            "least squares, [V_1, V_N]": by_least_squares(folder, "quiet"),
-            "lag behind the set-point, ms": lag_ms(together),
-        },
-    )
-    print(f"\ntogether {together.duration_s:.1f} s; one by one {alone.duration_s:.1f} s")
-
-    all_together = [calibrated(robot, folder / f"s{seed}-together", seed, NAMES, together=True) for seed in seeds]
-    all_alone = [one_by_one(robot, folder, f"s{seed}", seed) for seed in seeds]
-    pairs = list(zip(all_together, all_alone, strict=True))
-    repeats = [(a, b) for k, a in enumerate(all_alone) for b in all_alone[k + 1 :]]
-
-    def measured(first: Run, second: Run) -> dict[str, float]:
-        return {n: distance(first.profile[n], second.profile[n]).e_percent_measured_range for n in NAMES}
-
-    every = [measured(a, b) for a, b in pairs]
-    rows = {f"together - one by one, seed {seed}": row for seed, row in zip(seeds, every, strict=True)}
-    rows["together - one by one, mean of pairs"] = averaged(every)
-    if repeats:
-        again = [measured(a, b) for a, b in repeats]
-        rows["repeat: one by one, other noise"] = averaged(again)
-        rows["repeat: the worst"] = {name: max(row[name] for row in again) for name in NAMES}
-    rows["curves averaged over the seeds"] = mean_curves(all_together, all_alone)
-    rows["truth - together"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_together])
-    rows["truth - one by one"] = averaged([{n: to_truth(run.profile[n], n) for n in NAMES} for run in all_alone])
-    rows["M found: largest error"] = averaged([inertia_error(run) for run in all_together])
-    table(f"with the shipped noise, {len(seeds)} seeds, [V_1, V_N], percent", rows)
-    highest_rates_hz()
+        robot = on_wire(folder, options.rate, options.fd)
+        noiseless(folder, robot)
+        noisy(folder, seeds, robot)
+        highest_rates_hz()
 
 
 if __name__ == "__main__":

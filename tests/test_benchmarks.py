@@ -8,10 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
+from frictid_hil.friction import trajectory
+from frictid_hil.friction.regression import hat_functions
+from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.simulation.joint import JointModel
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -83,3 +87,32 @@ def test_joints_of_the_diagnosis_end_to_end_load(benchmark_named: Callable[[str]
     for effect in end_to_end.SIZES:
         joints = joints_of(end_to_end.robot_with({effect: end_to_end.drawn(effect)}, tmp_path))
         assert set(joints["0"].effects) == {effect}
+
+
+def test_what_is_of_the_way_is_told_from_noise(benchmark_named: Callable[[str], Any]) -> None:
+    two_ways = benchmark_named("two_ways")
+    rng = np.random.default_rng(4)
+    curve, noise = 10 + np.linspace(0.0, 4.0, 50), rng.normal(scale=0.06, size=(2, 40, 50))
+    alike = two_ways.compare(curve + noise[0], curve + noise[1])
+    apart = two_ways.compare(curve + 0.03 + noise[0], curve + noise[1])
+    assert alike.methodical < 0.08 and alike.methodical_below < 0.1
+    assert alike.ratio == pytest.approx(1.0, abs=0.05)
+    assert apart.methodical == pytest.approx(100 * 0.03 / 12, abs=0.05) and apart.methodical_below > apart.methodical
+    assert apart.means_apart > apart.noise_of_means == pytest.approx(100 * 0.06 / 12 * np.sqrt(2 / 40), rel=0.1)
+    assert apart.single > apart.alone == pytest.approx(100 * 0.06 / 12 * np.sqrt(2), rel=0.05)
+
+
+def test_no_unbiased_curve_scatters_less_than_its_samples_allow(benchmark_named: Callable[[str], Any]) -> None:
+    """Least squares on the same knots, tried with noise, reaches the bound and does not fall below it."""
+    two_ways = benchmark_named("two_ways")
+    procedure, step_s = Procedure(0.35, 2.0), 0.004
+    knots = 0.932 * np.linspace(0.1, 1.0, 10) * 2.0
+    bound = two_ways.least_apart(procedure, step_s, knots, 0.5)
+    assert bound == pytest.approx(two_ways.least_apart(procedure, step_s / 4, knots, 1.0), rel=0.02), "s / sqrt(n)"
+    velocity = trajectory.velocity(procedure, trajectory.sample_times(procedure, step_s))
+    moving = velocity[np.abs(velocity) >= knots[0] / 2]
+    model = np.sign(moving)[:, None] * hat_functions(np.clip(np.abs(moving), knots[0], knots[-1]), knots)
+    noise = np.random.default_rng(5).normal(scale=0.5, size=(moving.size, 400))
+    runs = hat_functions(np.linspace(knots[0], knots[-1], 100), knots) @ np.linalg.lstsq(model, noise, rcond=None)[0]
+    gaps = np.sqrt(np.mean((runs[:, ::2] - runs[:, 1::2]) ** 2))
+    assert gaps == pytest.approx(bound, rel=0.05)
