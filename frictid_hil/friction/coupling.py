@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from scipy.linalg import block_diag
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.filtering import Gaussian, uniform
-from frictid_hil.friction.recording import Companion, CycleRecording, Motion, synchronised
+from frictid_hil.friction.recording import Companion, CycleRecording, Motion, passes, synchronised
 from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.trajectory import Array
 
@@ -197,7 +196,9 @@ def _row(stretch: CycleRecording, motion: Motion, others: tuple[Companion, ...])
         ]
     )
     kernel = Gaussian(motion.smoother.step_s, max(_WIDTH_S, motion.smoother.step_s))
-    kept = _moving(motion, int(np.ceil(kernel.reach_s / 2 / motion.smoother.step_s)))
+    kept = passes(motion, slowest_share=_SLOWEST, guard_rad=_GUARD_RAD) >= 0
+    edge = int(np.ceil(kernel.reach_s / 2 / motion.smoother.step_s))
+    kept[:edge] = kept[kept.size - edge :] = False
     both = np.column_stack([kernel.smooth(column) for column in np.column_stack([model, motion.torque_nm]).T])[kept]
     scale = np.linalg.norm(both[:, :-1], axis=0)
     if both.shape[0] < 2 * both.shape[1] or not np.all(scale > 0):
@@ -214,18 +215,6 @@ def _row(stretch: CycleRecording, motion: Motion, others: tuple[Companion, ...])
     variance = noise * alike * np.diag(np.linalg.inv(gram)) / scale**2
     m = drawn.shape[1]
     return solution[:m] / scale[:m], variance[:m]
-
-
-def _moving(motion: Motion, edge: int) -> NDArray[np.bool_]:
-    """Which samples are far enough from a reversal and from the ends."""
-    v = motion.velocity_rad_s
-    kept: NDArray[np.bool_] = np.abs(v) >= _SLOWEST * np.abs(v).max()
-    turns = np.concatenate([[0], np.flatnonzero(np.diff(np.sign(v))) + 1, [v.size]])
-    for begin, end in pairwise(turns.tolist()):
-        travelled = np.abs(motion.position_rad[begin:end] - motion.position_rad[begin])
-        kept[begin:end] &= travelled >= _GUARD_RAD
-    kept[:edge] = kept[v.size - edge :] = False
-    return kept
 
 
 def _undetermined(where: str) -> IdentificationError:

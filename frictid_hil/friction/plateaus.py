@@ -96,7 +96,12 @@ def plateaus(
     step_s = float(np.median(np.diff(grid)))
     found = _find(path, step_s)
     if not found:
-        raise IdentificationError("no stretch of constant speed was found", where=where)
+        raise IdentificationError(
+            "no stretch of constant speed was found",
+            where=where,
+            cause="the recording carries no marks of sine cycles, and holds no speed either",
+            next_step="sine cycles of another tool: name their -A, -V and -N",
+        )
     fine = Gaussian(step_s, 2 * step_s)
     velocity, force = fine.rate(position), fine.smooth(torque, torque_delay_s)
     groups = _groups(found)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.filtering import Gaussian, uniform
@@ -135,6 +136,24 @@ class Motion:
     acceleration_rad_s2: Array
     torque_nm: Array
     smoother: Gaussian
+
+
+def passes(motion: Motion, *, slowest_share: float, guard_rad: float) -> NDArray[np.int64]:
+    """From turn to turn, the number of the pass that each sample belongs to, shape (n,); -1 near a turn.
+
+    Args:
+        motion: of the joint.
+        slowest_share: samples below this share of the highest speed are near a turn.
+        guard_rad: and so are those of the first so many radians after it.
+    """
+    v = motion.velocity_rad_s
+    number = np.zeros(v.size, dtype=np.int64)
+    turns = np.concatenate([[0], np.flatnonzero(np.diff(np.sign(v))) + 1, [v.size]])
+    for n, (begin, end) in enumerate(pairwise(turns.tolist())):
+        travelled = np.abs(motion.position_rad[begin:end] - motion.position_rad[begin])
+        number[begin:end] = np.where(travelled >= guard_rad, n, -1)
+    number[np.abs(v) < slowest_share * np.abs(v).max()] = -1
+    return number
 
 
 def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -> Motion:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Prior, Solved, solve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.link import Link, by_parameter
-from frictid_hil.friction.recording import CycleRecording, Motion, Skew, around, synchronised
+from frictid_hil.friction.recording import CycleRecording, Motion, Skew, around, passes, synchronised
 from frictid_hil.friction.regression import hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
@@ -219,17 +218,10 @@ def _columns(shaken: CycleRecording, motion: Motion) -> Array:
 
 def _passes(motion: Motion, stops_s: Array, edge: int) -> NDArray[np.int64]:
     """From turn to turn, the number of the pass that each sample belongs to; -1 near a turn or stop, ``edge`` more."""
-    v = motion.velocity_rad_s
-    good = np.abs(v) >= _SLOWEST * np.abs(v).max()
-    number = np.zeros(v.size, dtype=np.int64)
-    turns = np.concatenate([[0], np.flatnonzero(np.diff(np.sign(v))) + 1, [v.size]])
-    for n, (begin, end) in enumerate(pairwise(turns.tolist())):
-        travelled = np.abs(motion.position_rad[begin:end] - motion.position_rad[begin])
-        good[begin:end] &= travelled >= _GUARD_RAD
-        number[begin:end] = n
-    good[around(motion.time_s, stops_s)] = False
-    good = ~binary_dilation(~good, iterations=edge, border_value=1)
-    return np.where(good, number, -1)
+    number = passes(motion, slowest_share=_SLOWEST, guard_rad=_GUARD_RAD)
+    number[around(motion.time_s, stops_s)] = -1
+    number[binary_dilation(number < 0, iterations=edge, border_value=1)] = -1
+    return number
 
 
 def _undetermined(where: str) -> IdentificationError:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,6 +80,13 @@ class _Identified:
     failed: dict[str, str]
     error: FrictidError | None = None
 
+    def told(self) -> str:
+        """One line for whoever waits."""
+        if self.error is not None:
+            return f"{self.error} ({self.error.cause})" if self.error.cause else str(self.error)
+        good = f"joint {', '.join(self.joints)}"
+        return "; ".join([good, *(f"joint {name} failed: {why}" for name, why in self.failed.items())])
+
 
 def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Identify every joint of every recording.
@@ -95,8 +104,7 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
             result = _Identified({}, {}, answer) if isinstance(answer, FrictidError) else answer
             results.append(result)
             if len(tasks) > 1:
-                said = str(result.error) if result.error else f"{len(result.joints)} joints"
-                note(f"{len(results)}/{len(tasks)} {task.log}: {said}")
+                note(f"{len(results)}/{len(tasks)} {task.log}: {result.told()}")
     if len(results) == 1 and results[0].error is not None:
         raise results[0].error
     return _result(tasks, results, options)
@@ -160,9 +168,17 @@ def _identified(task: _Task) -> _Identified:
         try:
             joints[samples.joint] = _joint(samples, task, every)
         except FrictidError as error:
-            failed[samples.joint] = str(error)
-            last = error
+            last = _with_damage(error, samples)
+            failed[samples.joint] = str(error).removeprefix(f"joint {samples.joint}: ")
     return _Identified(joints, failed, None if joints else last)
+
+
+def _with_damage(error: FrictidError, samples: Samples) -> FrictidError:
+    """The error, and that the file is damaged, where that is a likelier cause than any that was looked for."""
+    damage = samples.meta.get("damage")
+    if not damage:
+        return error
+    return type(error)(error.what, where=error.where, cause=f"the file is damaged: {damage}", next_step=error.next_step)
 
 
 def _decoded(task: _Task) -> list[Samples]:
@@ -199,15 +215,16 @@ def _has_marks(every: Sequence[Samples]) -> bool:
 
 def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOptions) -> dict[str, Any]:
     entries: list[dict[str, Any]] = []
-    for task, result in zip(tasks, results, strict=True):
-        joints = {name: joint_result(profile) for name, profile in result.joints.items()}
+    names = profile_names([task.log for task in tasks])
+    for task, result, name in zip(tasks, results, names, strict=True):
+        joints = {joint: joint_result(profile) for joint, profile in result.joints.items()}
         joints.update(
             {
-                name: {"outcome": "gate_failed", "remarks": [why], "velocity_rad_s": [], "torque_nm": []}
-                for name, why in result.failed.items()
+                joint: {"outcome": "gate_failed", "remarks": [why], "velocity_rad_s": [], "torque_nm": []}
+                for joint, why in result.failed.items()
             }
         )
-        profile_path = _write(task, result, options.out, alone=len(tasks) == 1)
+        profile_path = None if options.out is None else _write(task, result, options.out / name)
         entries.append(
             {
                 "log": str(task.log.resolve()),
@@ -216,24 +233,21 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
                 "joints": joints,
             }
         )
-    every = [joint for entry in entries for joint in entry["joints"].values()]
-    bad = [entry for entry in entries if entry["error"]]
-    outcome = "ok" if every and all(joint["outcome"] == "ok" for joint in every) and not bad else "gate_failed"
-    whole: dict[str, Any] = {"outcome": outcome, "recordings": entries if len(entries) > 1 else []}
+    failures = [entry for entry in entries if entry["error"] or _failed(entry)]
+    sound = any(entry["joints"] for entry in entries) and not failures
+    whole: dict[str, Any] = {"outcome": "ok" if sound else "gate_failed", "run": None}
     if len(entries) == 1:
-        whole.update(run=None, profile=entries[0]["profile"], joints=entries[0]["joints"])
+        count, of = len(_failed(entries[0])), f"{len(entries[0]['joints'])} joints"
+        whole.update(recordings=[], profile=entries[0]["profile"], joints=entries[0]["joints"])
+        said = _failed(entries[0])
     else:
-        whole.update(run=None, profile=None, joints={})
-    if outcome != "ok":
-        failures = [f"{Path(entry['log']).name}: {entry['error']}" for entry in bad]
-        failures += [
-            f"{name}: {'; '.join(joint['remarks'])}"
-            for entry in entries
-            for name, joint in entry["joints"].items()
-            if joint["outcome"] != "ok" and not entry["error"]
-        ]
+        count, of = len(failures), f"{len(entries)} recordings"
+        whole.update(recordings=entries, profile=None, joints={})
+        said = [f"{Path(entry['log']).name}: {entry['error'] or '; '.join(_failed(entry))}" for entry in failures]
+    if not sound:
+        more = f"; and {len(said) - 5} more" if len(said) > 5 else ""
         whole["error"] = {
-            "what": f"{len(failures)} of {max(len(entries), len(every))} failed: {'; '.join(failures[:5])}",
+            "what": f"{count} of {of} failed: {'; '.join(said[:5])}{more}",
             "where": "",
             "cause": "",
             "next_step": "results of the others stand",
@@ -241,11 +255,33 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
     return whole
 
 
-def _write(task: _Task, result: _Identified, out: Path | None, *, alone: bool) -> Path | None:
-    if out is None or not result.joints:
+def _failed(entry: Mapping[str, Any]) -> list[str]:
+    """What went wrong with a recording's joints, one by one."""
+    return [
+        f"joint {name}: {'; '.join(joint['remarks'])}"
+        for name, joint in entry["joints"].items()
+        if joint["outcome"] != "ok"
+    ]
+
+
+def profile_names(logs: Sequence[Path]) -> list[str]:
+    """A file name for the profile of each recording: folder and name, with all folders above where two are alike."""
+    if len(logs) == 1:
+        return ["profile.yaml"]
+    whole = [log.resolve() for log in logs]
+    short = [f"{log.parent.name}-{log.stem}" for log in whole]
+    times = Counter(short)
+    top = Path(os.path.commonpath(whole))
+    return [
+        f"{name if times[name] == 1 else '-'.join(log.relative_to(top).parts)}.yaml"
+        for name, log in zip(short, whole, strict=True)
+    ]
+
+
+def _write(task: _Task, result: _Identified, path: Path) -> Path | None:
+    if not result.joints:
         return None
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / ("profile.yaml" if alone else f"{task.log.parent.name}-{task.log.stem}.yaml")
+    path.parent.mkdir(parents=True, exist_ok=True)
     robot = task.setup.name if task.setup else task.log.stem
     FrictionProfile(
         robot=robot,

@@ -116,7 +116,7 @@ def _from_cycles(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> JointProfile:
-    notes: list[str] = []
+    notes = _damage(samples)
     path = path_time(samples, procedure, round(start_s * 1e9))
     if path is not None:
         samples, *company = (path.applied(one) for one in (samples, *company))
@@ -199,7 +199,7 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         where=f"joint {samples.joint}",
     )
     pairs, curve, half = found.pairs, found.curve, found.half_width_nm
-    notes = ["no sine cycles: windows are stretches of constant speed, both ways"]
+    notes = [*_damage(samples), "no sine cycles: windows are stretches of constant speed, both ways"]
     known = bool(np.all(np.isfinite(half)))
     if not known:
         notes.append("no interval could be formed: every speed was held at one place only, and once")
@@ -216,6 +216,11 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         time_skew_s=skew.torque_delay_s - skew.position_delay_s,
         quality={"notes": notes},
     )
+
+
+def _damage(samples: Samples) -> list[str]:
+    damage = samples.meta.get("damage")
+    return [f"the recording is damaged, what is left of it was used: {damage}"] if damage else []
 
 
 def _interval(torque_nm: tuple[float, ...], half_width_nm: Array) -> tuple[tuple[float, float], ...]:

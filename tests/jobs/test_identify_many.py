@@ -16,7 +16,9 @@ from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.executors import answers, executor
-from frictid_hil.jobs.identify import IdentifyOptions, identify
+from frictid_hil.jobs.identify import IdentifyOptions, identify, profile_names
+from frictid_hil.recording.mcap import write_samples
+from frictid_hil.recording.samples import Samples
 
 P = Procedure(0.35, 2.0, 4)
 
@@ -57,7 +59,7 @@ def check_as_alone(logs: Path, executor: str, out: Path) -> None:
     entries = {Path(entry["log"]).name: entry for entry in result["recordings"]}
     assert len(entries) == 5 and [line.split()[0] for line in told] == [f"{k}/5" for k in range(1, 6)]
     assert entries["zz_broken.csv"]["error"] and "zz_broken.csv" in result["error"]["what"]
-    assert result["outcome"] == "gate_failed"
+    assert result["outcome"] == "gate_failed" and result["error"]["what"].startswith("1 of 5 recordings failed: zz_")
     for k in range(4):
         alone = identify(options(logs / f"log{k}.csv", out=out / f"alone{k}"))
         entry = entries[f"log{k}.csv"]
@@ -72,6 +74,38 @@ def test_over_processes_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, t
 
 def test_over_a_cluster_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, cluster: str, tmp_path: Path) -> None:
     check_as_alone(logs, cluster, tmp_path)
+
+
+def test_profiles_of_recordings_with_one_name_do_not_overwrite_each_other(logs: Path, tmp_path: Path) -> None:
+    for night in ("night1", "night2"):
+        (tmp_path / night / "arm").mkdir(parents=True)
+        (tmp_path / night / "arm" / "log.csv").write_bytes((logs / f"log{night[-1]}.csv").read_bytes())
+    result = identify(options(tmp_path / "night*", executor="processes:1", out=tmp_path / "out"))
+    names = [Path(entry["profile"]).name for entry in result["recordings"]]
+    assert names == ["night1-arm-log.csv.yaml", "night2-arm-log.csv.yaml"] and result["outcome"] == "ok"
+
+
+def test_names_of_profiles_come_from_whole_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = tmp_path.name
+    assert profile_names([Path("a.csv"), Path("b.csv")]) == [f"{name}-a.yaml", f"{name}-b.yaml"]
+    assert profile_names([Path("a.csv"), Path("a.mcap")]) == ["a.csv.yaml", "a.mcap.yaml"]
+    assert profile_names([Path("a.csv")]) == ["profile.yaml"]
+
+
+def test_a_damaged_recording_is_told(tmp_path: Path) -> None:
+    time_s = np.arange(0.0, P.duration_s + 1.0, 0.001)
+    v, a, path = (of(P, time_s - 0.5) for of in (trajectory.velocity, trajectory.acceleration, trajectory.position))
+    torque = 4.0 * np.tanh(v / 0.01) + 0.5 * a
+    write_samples(tmp_path / "whole.mcap", [Samples("0", np.round(time_s * 1e9).astype(np.int64), path, v, torque)])
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[:-3000])
+    (tmp_path / "torn.mcap").write_bytes(data[: len(data) // 4])
+    told: list[str] = []
+    cut, torn, whole = identify(options(tmp_path), told.append)["recordings"]
+    assert cut["joints"]["0"]["torque_nm"] == whole["joints"]["0"]["torque_nm"]
+    assert "is damaged" in cut["joints"]["0"]["notes"][0] and "is damaged" not in str(whole["joints"]["0"]["notes"])
+    assert torn["error"] and "the file is damaged: the file ends in the middle" in told[1]
 
 
 def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> None:
