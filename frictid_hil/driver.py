@@ -63,6 +63,7 @@ class Timing:
         position_delay_s: of the reported position.
         velocity_delay_s: of the reported velocity, filters included.
         torque_delay_s: of the reported torque, filters and zero-order hold included.
+        torque_lag_s: the part of it that is a first-order low-pass, which can be undone and not only shifted back.
         uncertainty_s: one standard deviation of the torque-to-velocity skew that remains.
         source: where these figures come from (``drive``, ``robot file``, ``assumed``).
     """
@@ -70,6 +71,7 @@ class Timing:
     position_delay_s: float = 0.0
     velocity_delay_s: float = 0.0
     torque_delay_s: float = 0.0
+    torque_lag_s: float = 0.0
     uncertainty_s: float = 0.0002
     source: str = "assumed"
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from frictid_hil.friction.recording import Skew
 from frictid_hil.recording.samples import Samples
 
-_KEYS = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
+_KEYS = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s", "uncertainty_s")
 
 
 def declared_skew(samples: Samples) -> Skew:

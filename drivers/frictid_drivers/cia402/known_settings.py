@@ -82,6 +82,7 @@ def timing_of(settings: dict[Setting, int], cycle_s: float) -> Timing | None:
         position_delay_s=0.0,
         velocity_delay_s=filters[Effect.VELOCITY_FILTER_US],
         torque_delay_s=cycle_s / 2 + filters[Effect.TORQUE_FILTER_US],
+        torque_lag_s=filters[Effect.TORQUE_FILTER_US],
         uncertainty_s=0.0002,
         source="drive",
     )

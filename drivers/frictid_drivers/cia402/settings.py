@@ -34,7 +34,8 @@ position_units_per_revolution           -         of the joint; where 6092 and 6
 velocity_unit_rad_s                     -         joint side; where 60A9 does not tell
 rated_torque_side                       motor     6076 is ``motor`` or ``joint`` side
 torque_source                           -         what the reported torque is, for the profile
-timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s
+timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s;
+                                                  torque_lag_s: what of torque_delay_s is a low-pass
 fd_object                               -         e.g. ``"2023:00 u8"``: 1 makes the drive's PDOs CAN FD frames, 0 not
 ======================================  ========  =====================================================================
 """
@@ -240,7 +241,7 @@ class _Reader:
         given = options.get("timing")
         if given is None:
             return None
-        known = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "uncertainty_s")
+        known = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s", "uncertainty_s")
         if not isinstance(given, Mapping) or not set(given) <= set(known):
             self._problem((*at, "timing"), f"expected a mapping of {', '.join(known)}")
             return None
