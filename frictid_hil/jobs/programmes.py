@@ -47,7 +47,7 @@ PROGRAMMES = {
     for programme in (
         Programme("thorough", (), "aligned", 0.25),
         Programme("standard", (12 / _TOP, 60 / _TOP, 1.0), "least-squares", 0.3),
-        Programme("quick", (30 / _TOP, 1.0), "least-squares", 0.35),
+        Programme("quick", (30 / _TOP, 1.0), "least-squares", 0.45),
     )
 }
 DEFAULT = PROGRAMMES["thorough"]
