@@ -125,7 +125,7 @@ def _roughness(recording: CycleRecording, result: Estimate) -> Gate:
     level = float(np.mean(result.curve.torque_nm))
     share = float(np.sqrt(np.mean(fast**2))) / level
     passed = share <= MOST_ROUGHNESS
-    said = f"fast torque is {100 * share:.1f} % of the friction (allowed {100 * MOST_ROUGHNESS:.0f} %)"
+    said = f"torque jitters by {100 * share:.1f} % of the friction (allowed {100 * MOST_ROUGHNESS:.0f} %)"
     return Gate(
         "high_frequency_torque",
         passed,
@@ -138,7 +138,7 @@ def _roughness(recording: CycleRecording, result: Estimate) -> Gate:
 def _samples(result: Estimate) -> Gate:
     fewest = int(min(result.pairs.samples_plus.min(), result.pairs.samples_minus.min()))
     passed = fewest >= LEAST_SAMPLES
-    said = f"the smallest window holds {fewest} samples (at least {LEAST_SAMPLES})"
+    said = f"the smallest window averages {fewest} samples (at least {LEAST_SAMPLES} needed)"
     return Gate(
         "samples_per_window",
         passed,
@@ -168,8 +168,8 @@ def _asymmetry(result: Estimate) -> Gate:
     share = float(shares[worst])
     passed = share <= MOST_ASYMMETRY
     said = (
-        f"at {result.curve.velocity_rad_s[worst]:.3g} rad/s the directions differ by {100 * share:.1f} % "
-        f"to either side (allowed {100 * MOST_ASYMMETRY:.0f} %)"
+        f"at pair {worst + 1} of {shares.size} the two directions lie {100 * share:.1f} % to either side of their mean "
+        f"(allowed {100 * MOST_ASYMMETRY:.0f} %)"
     )
     return Gate(
         "direction_asymmetry",
@@ -183,8 +183,9 @@ def _asymmetry(result: Estimate) -> Gate:
 def _kinks(recording: CycleRecording, result: Estimate) -> Gate:
     """How far a pair leaves the line through its neighbours; below the standard V_1 a Stribeck dip may."""
     v, f = np.array(result.curve.velocity_rad_s), np.array(result.curve.torque_nm)
-    fast = v >= 0.09 * recording.procedure.velocity_rad_s
-    v, f = v[fast], f[fast]
+    slow = int(np.sum(v < 0.09 * recording.procedure.velocity_rad_s))
+    pairs = v.size
+    v, f = v[slow:], f[slow:]
     if v.size < 3:
         return Gate("straightness", True, 0.0, MOST_KINK, "too few pairs to see one leave its neighbours' line")
     line = f[:-2] + (f[2:] - f[:-2]) * (v[1:-1] - v[:-2]) / (v[2:] - v[:-2])
@@ -193,8 +194,8 @@ def _kinks(recording: CycleRecording, result: Estimate) -> Gate:
     share = float(leaves[worst])
     passed = share <= MOST_KINK
     said = (
-        f"the pair at {v[1 + worst]:.3g} rad/s leaves its neighbours' line by {100 * share:.1f} % of the friction "
-        f"(allowed {100 * MOST_KINK:.0f} %)"
+        f"pair {slow + worst + 2} of {pairs} leaves the line through its neighbours by {100 * share:.1f} % of the "
+        f"friction (allowed {100 * MOST_KINK:.0f} %)"
     )
     return Gate(
         "straightness",
@@ -209,7 +210,7 @@ def _saturation(recording: CycleRecording) -> Gate:
     high = np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm
     share = float(np.mean(high))
     passed = share <= MOST_SATURATED
-    said = f"torque stood at its limit of {recording.torque_limit_nm:.4g} during {100 * share:.2f} % of the samples"
+    said = f"torque stood at its limit in {100 * share:.2f} % of the samples (allowed {100 * MOST_SATURATED:.1f} %)"
     return Gate(
         "saturation",
         passed,

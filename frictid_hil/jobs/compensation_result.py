@@ -21,6 +21,7 @@ from frictid_hil.plan import Plan
 from frictid_hil.recording.samples import Mark
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page
+from frictid_hil.report.words import plain
 from frictid_hil.runner.events import JointRun
 from frictid_hil.runner.run_folder import RunFolder
 
@@ -140,7 +141,7 @@ def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
         return [f"friction dominates the tracking error: {exact}"]
     return [
         f"inertia has a large part in the tracking error: {exact}, more than {100.0 - DOMINATED_PERCENT:.0f} %; "
-        "at a lower --speed friction dominates"
+        "at a lower `--speed` friction dominates"
     ]
 
 
@@ -190,14 +191,22 @@ def _service_figures(wanted: Wanted, progress: Progress) -> dict[str, Any]:
 
 
 def _facts(result: dict[str, Any]) -> dict[str, str]:
-    names = (
-        "setting",
-        "compensation_ratio",
-        "compensation_ratio_lowest",
-        "stiffness_nm_per_rad",
-        "inertia_kg_m2",
-        "inertia_source",
-        "seed",
-    )
-    facts = {name: str(result[name]) for name in (*names, "rate_hz", "profile", "run")}
-    return {**facts, "warnings": "; ".join(result["warnings"])}
+    """Provenance in words."""
+    inertia, rate = result["inertia_kg_m2"], result["rate_hz"]
+    facts = {
+        "setting": str(result["setting"]),
+        "compensation ratio": f"{_shown(result['compensation_ratio'])}, at its lowest "
+        f"{_shown(result['compensation_ratio_lowest'])}",
+        "stiffness K": f"{_shown(result['stiffness_nm_per_rad'])} N m/rad",
+        "inertia": "unknown" if inertia is None else f"{_shown(inertia)} kg m2, of the {result['inertia_source']}",
+        "rate": f"{_shown(rate)} Hz",
+        "seed": str(result["seed"]),
+        "profile": str(result["profile"]),
+        "run": str(result["run"]),
+        "warnings": "; ".join(result["warnings"]),
+    }
+    return {name: told for name, told in facts.items() if told}
+
+
+def _shown(value: Any) -> str:
+    return plain(value) if isinstance(value, int | float) else str(value)

@@ -7,7 +7,7 @@ taken as damage, and refused: nothing is promoted until a person has looked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,7 @@ def judge(
     baseline: FrictionProfile | None,
     *,
     failed: Mapping[str, str],
+    promote_by_hand: str = "frictid-hil profile promote RUN",
 ) -> Verdict:
     """Apply the policy.
 
@@ -59,6 +60,7 @@ def judge(
         active: in use; None where none is.
         baseline: that drift is measured from; None where nothing was promoted yet.
         failed: joints without a trustworthy result, and why.
+        promote_by_hand: command with which a person makes the new one active all the same.
     """
     reference = baseline if policy.drift_reference == "baseline" else active
     from_reference = {} if reference is None else drift(reference, newer)
@@ -75,20 +77,19 @@ def judge(
         if set(one.other_changes) & set(_NEVER_SILENTLY)
     }
     missing = [name for name in (active.joints if active else ()) if name not in newer.joints]
-    refusal = _refusal(policy, failed, broken, changed, missing, from_active)
+    refusal = _refusal(policy, failed, broken, changed, missing, from_active, promote_by_hand)
     if refusal is not None:
         return Verdict(False, True, drifted, joints, *refusal)
     if policy.promotion == "by_person":
         return Verdict(
             False, False, drifted, joints,
             "within every limit; the policy leaves promotion to a person",
-            "look at the report, then `frictid-hil profile promote RUN`",
+            f"look at the report, then `{promote_by_hand}`",
         )  # fmt: skip
     reason = "first profile of this robot: the baseline from now on" if active is None else "within every limit"
     if drifted:
-        reason += (
-            f"; joints {', '.join(drifted)} have drifted by more than {policy.drift_percent:g} % since the reference"
-        )
+        have = "has" if len(drifted) == 1 else "have"
+        reason += f"; {_named(drifted)} {have} drifted by more than {policy.drift_percent:g} % since the reference"
     next_step = _look_at(drifted) if drifted else "nothing to do"
     return Verdict(True, False, drifted, joints, reason, next_step)
 
@@ -100,6 +101,7 @@ def _refusal(
     changed: Mapping[str, str],
     missing: list[str],
     from_active: Mapping[str, JointDrift],
+    promote_by_hand: str,
 ) -> tuple[str, str] | None:
     """Reason and next step of a refusal; None where there is no cause for one."""
     if failed:
@@ -112,24 +114,28 @@ def _refusal(
         told = ", ".join(f"joint {name} by {from_active[name].distance_percent:.0f} %" for name in broken)
         return (
             f"changed since the active profile by more than {policy.refuse_percent:g} %: {told}",
-            f"{_look_at(broken)}; if the change is meant, promote with `frictid-hil profile promote RUN`",
+            f"{_look_at(broken)}; if the change is meant, promote with `{promote_by_hand}`",
         )
     if changed:
         told = "; ".join(f"joint {name}: {what}" for name, what in changed.items())
         return (
             f"not comparable with the active profile: {told}",
-            "if the change is meant, promote with `frictid-hil profile promote RUN --baseline`",
+            f"if the change is meant, promote with `{promote_by_hand} --baseline`",
         )
     if missing:
         return (
-            f"joints {', '.join(missing)} of the active profile were not measured",
+            f"{_named(missing)} of the active profile {'was' if len(missing) == 1 else 'were'} not measured",
             "see why in the report, then run it again",
         )
     return None
 
 
-def _look_at(joints: tuple[str, ...]) -> str:
-    return f"look at joints {', '.join(joints)}: lubrication, temperature, load, wear"
+def _look_at(joints: Sequence[str]) -> str:
+    return f"look at {_named(joints)}: lubrication, temperature, load, wear"
+
+
+def _named(joints: Sequence[str]) -> str:
+    return f"joint{'' if len(joints) == 1 else 's'} {', '.join(joints)}"
 
 
 def _has_drifted(one: JointDrift, limit_percent: float) -> bool:

@@ -12,6 +12,7 @@ A process killed in the middle leaves the active profile as it was, or the new o
 from __future__ import annotations
 
 import contextlib
+import shlex
 import signal
 import threading
 from collections.abc import Iterator
@@ -172,7 +173,8 @@ def _concluded(
             for name, joint in measured["joints"].items()
             if joint["outcome"] != "ok"
         }
-        verdict = judge(robot.policy, newer, active, baseline, failed=failed)
+        by_hand = _promote_by_hand(result["run"], options.store)
+        verdict = judge(robot.policy, newer, active, baseline, failed=failed, promote_by_hand=by_hand)
         result |= {"drift": dict(verdict.joints), "drifted": list(verdict.drifted)}
         # What an aborted night got done stays in its run folder: half a robot is no point of a trend.
         if measured["outcome"] in ("ok", "gate_failed"):
@@ -198,6 +200,11 @@ def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot:
         result |= {"outcome": GateFailed.outcome, "exit_code": GateFailed.exit_code}
         where = f"{robot}, profile {identity}"
         result["error"] = {"what": verdict.reason, "where": where, "cause": "", "next_step": verdict.next_step}
+
+
+def _promote_by_hand(run: str, store: Path | None) -> str:
+    """The command, ready to be typed next morning."""
+    return shlex.join(["frictid-hil", "profile", "promote", run, *(["--store", str(store.resolve())] if store else [])])
 
 
 def _short(joint: dict[str, Any]) -> dict[str, Any]:

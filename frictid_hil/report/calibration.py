@@ -1,13 +1,16 @@
-"""The page of a calibration: per joint the loops with the identified curve, tracking, gates; where it comes from."""
+"""The page of a calibration: what was done, per joint the curve, the loops it was averaged from, tracking and gates."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, ProcedureUsed
 from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.recording.samples import Samples
 from frictid_hil.report.figures import (
     IDENTIFIED,
@@ -21,6 +24,7 @@ from frictid_hil.report.figures import (
     points,
 )
 from frictid_hil.report.pages import Page, Section, Table
+from frictid_hil.report.words import estimate, sentence, when, with_interval
 from frictid_hil.units import degrees
 
 
@@ -45,109 +49,198 @@ def calibration_page(
     good = sum(all(gate.passed for gate in joint.gates) for joint in joints.values())
     headline = f"{good} of {len(joints)} joints of {profile.robot} identified and passed every quality gate."
     if outcome != "ok":
-        headline += f" The run ended as {outcome}{': ' + error if error else ''}."
-    sections = [Section("Summary", tables=(_summary(joints, previous),))]
+        headline += f" The run ended as {outcome.replace('_', ' ')}{': ' + error if error else ''}."
+    done = (*_what_was_done(profile, samples), _compared_with(previous))
+    sections = [Section("Summary", words=done, tables=(_summary(joints, previous),))]
     sections += [_joint(name, joint, samples.get(name), previous) for name, joint in joints.items()]
+    sections.append(
+        Section(
+            "The pairs in numbers", tables=tuple(_pairs(name, joint, len(joints)) for name, joint in joints.items())
+        )
+    )
     return Page(f"Friction of {profile.robot}", headline, sections, _facts(profile))
+
+
+def _what_was_done(profile: FrictionProfile, samples: Mapping[str, Samples]) -> tuple[str, ...]:
+    """A sentence for all joints that were moved alike."""
+    told = profile.provenance
+    alike: dict[str, list[str]] = {}
+    for name, joint in profile.joints.items():
+        alike.setdefault(_moved(joint.procedure, samples.get(name), prismatic=joint.prismatic), []).append(name)
+    by = f", by the driver `{told.driver}` on `{told.bus}`" if told.driver else ""
+    at = f"On {when(told.created_utc)}" if told.created_utc else "At an unknown time"
+    return tuple(f"{at}, {_joints_were(names)} {how}{by}." for how, names in alike.items())
+
+
+def _joints_were(names: Sequence[str]) -> str:
+    return f"joints {', '.join(names)} were" if len(names) > 1 else f"joint {names[0]} was"
+
+
+def _moved(procedure: ProcedureUsed | None, samples: Samples | None, *, prismatic: bool) -> str:
+    if procedure is None:
+        return "identified from a recording that followed no procedure"
+    travel, peak = (
+        (f"{procedure.amplitude_rad * 1e3:.4g} mm", f"{procedure.velocity_rad_s:.4g} m/s")
+        if prismatic
+        else (f"{degrees(procedure.amplitude_rad):.4g} deg", f"{degrees(procedure.velocity_rad_s):.4g} deg/s")
+    )
+    rate = "" if samples is None else f", sampled at {1.0 / samples.step_s:.4g} Hz"
+    company = "in phase, all at once" if procedure.together else "one at a time with the others locked"
+    return (
+        f"moved {company}, through {procedure.cycles} sinusoidal cycles of {travel} peak to peak with speeds that rise "
+        f"to {peak}{rate}"
+    )
+
+
+def _compared_with(previous: FrictionProfile | None) -> str:
+    if previous is None:
+        return "No profile of this robot was active then, so there is nothing to compare with."
+    return f"Compared with the profile that was active then, of {when(previous.provenance.created_utc)}."
 
 
 def _summary(joints: Mapping[str, JointProfile], previous: FrictionProfile | None) -> Table:
     rows = []
     for name, joint in joints.items():
-        failed = [gate.name for gate in joint.gates if not gate.passed]
-        rows.append(
-            (
-                name,
-                f"failed: {', '.join(failed)}" if failed else "passed",
-                _figure_text(joint.coulomb_nm, "N" if joint.prismatic else "N m"),
-                _highest(joint),
-                _figure_text(joint.inertia_kg_m2, "kg" if joint.prismatic else "kg m2"),
-                _figure_text(joint.presliding_stiffness_nm_per_rad, "N/m" if joint.prismatic else "N m/rad"),
-                _change(name, joint, previous),
-            )
+        failed = [gate.name.replace("_", " ") for gate in joint.gates if not gate.passed]
+        cells = (
+            name,
+            f"failed: {', '.join(failed)}" if failed else "passed",
+            estimate(joint.coulomb_nm, "N" if joint.prismatic else "N m"),
+            _highest(joint),
+            estimate(joint.inertia_kg_m2, "kg" if joint.prismatic else "kg m\u00b2"),
+            estimate(joint.presliding_stiffness_nm_per_rad, "N/m" if joint.prismatic else "N m/rad"),
         )
+        rows.append(cells if previous is None else (*cells, _change(name, joint, previous)))
+    headings = ("joint", "gates", "F_0", "at the highest speed", "inertia", "presliding stiffness")
     return Table(
-        ("joint", "gates", "F_0", "highest measured", "inertia", "presliding", "change"),
+        headings if previous is None else (*headings, "curve changed by"),
         tuple(rows),
-        caption="Figures with their 95 % interval. F_0 is an extrapolated Coulomb level, not the break-away torque.",
+        caption="With 95 % intervals. F_0 is the Coulomb level that the curve is extrapolated to, not the torque at "
+        "which the joint breaks away.",
     )
 
 
 def _joint(name: str, joint: JointProfile, samples: Samples | None, previous: FrictionProfile | None) -> Section:
-    figures = [_curve_figure(name, joint, samples, previous)]
-    if samples is not None and samples.position_command_rad is not None and samples.marked("cycles"):
-        figures.append(_tracking_figure(name, samples))
-    notes = tuple(str(note) for note in joint.quality.get("notes", ()))
+    figures = [_curve_figure(name, joint, previous)]
+    part = _cycles(samples)
+    if part is not None and part.velocity_rad_s is not None and part.torque_nm is not None:
+        figures.append(_loops_figure(name, joint, part, part.velocity_rad_s, part.torque_nm))
+    if part is not None and part.position_command_rad is not None:
+        figures.append(_tracking_figure(name, part, part.position_command_rad))
+    notes = tuple(sentence(str(note)) for note in joint.quality.get("notes", ()))
     return Section(
         f"Joint {name}",
         words=notes,
-        checks=tuple((gate.passed, gate.message) for gate in joint.gates),
-        tables=(_pairs(joint),),
+        checks=tuple((gate.passed, sentence(gate.message)) for gate in joint.gates),
         figures=tuple(figures),
     )
 
 
-def _curve_figure(name: str, joint: JointProfile, samples: Samples | None, previous: FrictionProfile | None) -> Figure:
-    unit, force, scale = ("m/s", "N", 1.0) if joint.prismatic else ("deg/s", "N m", degrees(1.0))
-    curve = joint.curve()
-    top = joint.procedure.velocity_rad_s if joint.procedure else joint.velocity_rad_s[-1]
-    speeds = np.linspace(0.0, top, 200)[1:]
-    traces = []
-    if samples is not None and samples.marked("cycles"):
-        part = samples.during(samples.marked("cycles")[0])
-        if part.velocity_rad_s is not None and part.torque_nm is not None:
-            middle = float(np.mean([np.quantile(part.torque_nm, q) for q in (0.05, 0.95)]))
-            traces.append(
-                cloud("measured, middle removed", part.velocity_rad_s * scale, part.torque_nm - middle, MEASURED)
-            )
+def _cycles(samples: Samples | None) -> Samples | None:
+    """The samples of the cycles, where they are at hand."""
+    marks = [] if samples is None else samples.marked("cycles")
+    return samples.during(marks[0]) if samples is not None and marks else None
+
+
+def _axes(joint: JointProfile) -> tuple[str, str, float]:
+    return ("m/s", "N", 1.0) if joint.prismatic else ("deg/s", "N m", degrees(1.0))
+
+
+def _curve_figure(name: str, joint: JointProfile, previous: FrictionProfile | None) -> Figure:
+    """The curve alone, close enough to see its intervals."""
+    unit, force, scale = _axes(joint)
+    curve, known = joint.curve(), np.array(joint.velocity_rad_s)
+    speeds = np.linspace(0.0, _top(joint), 200)[1:]
+    traces: list[Mapping[str, Any]] = []
+    half = None
     if joint.torque_interval_nm is not None:
         half = np.array([(high - low) / 2 for low, high in joint.torque_interval_nm])
-        width = np.interp(speeds, joint.velocity_rad_s, half)
-        level = curve.magnitude(speeds)
+        width, level = np.interp(speeds, known, half), curve.magnitude(speeds)
         traces.append(band("95 % interval", speeds * scale, level - width, level + width))
-    signed = np.concatenate([-speeds[::-1], speeds])
-    traces.append(line("identified curve", signed * scale, curve.torque(signed), IDENTIFIED))
-    traces.append(
-        points("pairs V_n, F_n", np.array(joint.velocity_rad_s) * scale, np.array(joint.torque_nm), IDENTIFIED)
-    )
-    if joint.published is not None:
-        traces.append(
-            points(
-                "as published (Function A)",
-                np.array(joint.published.velocity_rad_s) * scale,
-                np.array(joint.published.torque_nm),
-                PUBLISHED,
-                symbol="x-thin-open",
-            )
-        )
     if previous is not None and name in previous.joints:
         before = previous.joints[name].curve()
         traces.append(line("active before", speeds * scale, before.magnitude(speeds), REFERENCE, dash="dash"))
+    traces.append(line("identified curve", speeds * scale, curve.magnitude(speeds), IDENTIFIED))
+    traces += _one_way(joint, scale)
+    if joint.published is not None:
+        velocity, torque = np.array(joint.published.velocity_rad_s), np.array(joint.published.torque_nm)
+        traces.append(points("as published (Function A)", velocity * scale, torque, PUBLISHED, symbol="x-thin-open"))
+    traces.append(points("pairs V_n, F_n", known * scale, np.array(joint.torque_nm), IDENTIFIED, half_width=half))
     low, high = curve.measured_range_rad_s
     return Figure(
-        f"Joint {name}: torque over velocity",
+        f"Joint {name}: friction over speed",
         tuple(traces),
-        f"velocity [{unit}]",
-        f"torque [{force}]",
-        caption=f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}; extrapolated outside.",
+        f"speed [{unit}]",
+        f"friction [{force}]",
+        caption=f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}, extrapolated outside. The curve is the "
+        "mean of both directions.",
     )
 
 
-def _tracking_figure(name: str, samples: Samples) -> Figure:
-    part = samples.during(samples.marked("cycles")[0])
-    assert part.position_command_rad is not None  # by the caller
-    time_s = part.time_s - part.time_s[0]
-    error = (part.position_command_rad - part.position_rad) * (1e3 if part.prismatic else degrees(1.0))
+def _one_way(joint: JointProfile, scale: float) -> list[Mapping[str, Any]]:
+    """Friction of either direction, where the estimator gives how far they lie apart."""
+    apart = joint.quality.get("asymmetry_nm")
+    if not isinstance(apart, list | tuple) or len(apart) != len(joint.torque_nm):
+        return []
+    velocity, level, half = np.array(joint.velocity_rad_s) * scale, np.array(joint.torque_nm), np.array(apart)
+    return [
+        points("forward", velocity, level + half, MEASURED, symbol="triangle-right-open"),
+        points("backward", velocity, level - half, MEASURED, symbol="triangle-left-open"),
+    ]
+
+
+def _top(joint: JointProfile) -> float:
+    return max(joint.procedure.velocity_rad_s if joint.procedure else 0.0, joint.velocity_rad_s[-1])
+
+
+def _loops_figure(name: str, joint: JointProfile, part: Samples, velocity: Array, torque: Array) -> Figure:
+    """Torque over velocity as measured, with what lies in the windows of (7) told apart, and the curve through it."""
+    unit, force, scale = _axes(joint)
+    middle = float(np.mean([np.quantile(torque, q) for q in (0.05, 0.95)]))
+    inside = _in_windows(joint.procedure, part.time_s - part.time_s[0], velocity)
+    traces = [cloud("measured", velocity[~inside] * scale, torque[~inside] - middle, MEASURED)]
+    caption = "Torque as measured with its constant part removed; what opens the loops is inertia, which cancels."
+    if inside.any():
+        traces.append(
+            cloud("inside the windows", velocity[inside] * scale, torque[inside] - middle, PUBLISHED, opacity=0.8)
+        )
+        assert joint.procedure is not None  # or nothing were inside
+        caption += (
+            f" Each pair is averaged from the samples faster than {joint.procedure.ratio:g} of its cycle's peak speed,"
+            " forward and backward: the windows."
+        )
+    speeds = np.linspace(0.0, _top(joint), 200)[1:]
+    signed = np.concatenate([-speeds[::-1], speeds])
+    traces.append(line("identified curve", signed * scale, joint.curve().torque(signed), IDENTIFIED))
+    title = f"Joint {name}: torque over velocity"
+    return Figure(title, tuple(traces), f"velocity [{unit}]", f"torque [{force}]", caption=caption)
+
+
+def _in_windows(used: ProcedureUsed | None, time_s: Array, velocity: Array) -> NDArray[np.bool_]:
+    """Which samples (7) averages: as fast as c times the peak speed of their cycle, shape (n,)."""
+    if used is None:
+        return np.zeros(velocity.shape, dtype=bool)
+    procedure = Procedure(used.amplitude_rad, used.velocity_rad_s, used.cycles, used.ratio, used.shares or ())
+    cycle = procedure.cycle_of(time_s)
+    known = (cycle >= 0) & (cycle < procedure.cycles)
+    peak = procedure.peak_velocities_rad_s[np.clip(cycle, 0, procedure.cycles - 1)]
+    inside: NDArray[np.bool_] = known & (np.abs(velocity) >= procedure.ratio * peak)
+    return inside
+
+
+def _tracking_figure(name: str, part: Samples, command: Array) -> Figure:
+    error = (command - part.position_rad) * (1e3 if part.prismatic else degrees(1.0))
     return Figure(
         f"Joint {name}: tracking",
-        (line("command - position", time_s, error, IDENTIFIED, width=1),),
+        (line("command - position", part.time_s - part.time_s[0], error, IDENTIFIED, width=1),),
         "time [s]",
-        f"following error [{'mm' if part.prismatic else 'deg'}]",
-        caption="Tracking needs only to reach the speeds; the identification uses measured velocity and torque.",
+        f"command - position [{'mm' if part.prismatic else 'deg'}]",
+        caption="The joint need not follow closely, only reach the speeds: friction is identified from measured "
+        "velocity and torque.",
     )
 
 
-def _pairs(joint: JointProfile) -> Table:
+def _pairs(name: str, joint: JointProfile, of: int) -> Table:
     unit, force = ("m/s", "N") if joint.prismatic else ("deg/s", "N m")
     intervals: Sequence[tuple[float, float] | None] = joint.torque_interval_nm or [None] * len(joint.torque_nm)
     rows = tuple(
@@ -158,28 +251,21 @@ def _pairs(joint: JointProfile) -> Table:
         )
         for velocity, torque, interval in zip(joint.velocity_rad_s, joint.torque_nm, intervals, strict=True)
     )
-    return Table((f"V_n [{unit}]", f"F_n [{force}]", "95 % interval"), rows, caption=f"Estimator: {joint.method}")
+    caption = f"Joint {name}, estimator {joint.method}" if of > 1 else f"Estimator: {joint.method}"
+    return Table((f"V_n [{unit}]", f"F_n [{force}]", f"95 % interval [{force}]"), rows, caption=caption)
 
 
-def _change(name: str, joint: JointProfile, previous: FrictionProfile | None) -> str:
-    if previous is None or name not in previous.joints:
-        return "no earlier profile"
+def _change(name: str, joint: JointProfile, previous: FrictionProfile) -> str:
+    if name not in previous.joints:
+        return "not in it"
     before = previous.joints[name].curve()
-    distance = curve_distance(joint.curve(), before, joint.velocity_rad_s[-1])
-    return f"{distance.e_percent:.1f} % from the active profile"
-
-
-def _figure_text(figure: Estimate, unit: str) -> str:
-    if figure.value is None:
-        return f"none: {figure.reason}"
-    if figure.low is None or figure.high is None:
-        return f"{figure.value:.4g} {unit}"
-    return f"{figure.value:.4g} {unit} ({figure.low:.4g} .. {figure.high:.4g})"
+    return f"{curve_distance(joint.curve(), before, joint.velocity_rad_s[-1]).e_percent:.1f} %"
 
 
 def _highest(joint: JointProfile) -> str:
-    unit = "N" if joint.prismatic else "N m"
-    return f"{joint.torque_nm[-1]:.4g} {unit} at {_speed(joint, joint.velocity_rad_s[-1])}"
+    unit, intervals = "N" if joint.prismatic else "N m", joint.torque_interval_nm
+    low, high = intervals[-1] if intervals else (None, None)
+    return f"{with_interval(joint.torque_nm[-1], low, high, unit)} at {_speed(joint, joint.velocity_rad_s[-1])}"
 
 
 def _speed(joint: JointProfile, velocity: float) -> str:
@@ -189,7 +275,7 @@ def _speed(joint: JointProfile, velocity: float) -> str:
 def _facts(profile: FrictionProfile) -> dict[str, str]:
     told = profile.provenance
     facts = {
-        "made": told.created_utc,
+        "made": when(told.created_utc),
         "frictid-hil": f"{told.tool_version} {told.git_revision}".strip(),
         "robot file": f"{told.robot_file} (sha256 {told.config_sha256[:12]})" if told.robot_file else "",
         "driver and bus": f"{told.driver} on {told.bus}" if told.driver else "",

@@ -10,7 +10,7 @@ from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, REFERENC
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.units import degrees
 
-_COLORS = {"nc": MEASURED, "mo": PUBLISHED, "mol": "#8a5fb0", "mop": IDENTIFIED, "mop-reference": REFERENCE}
+_COLORS = {"nc": "#b2477f", "mo": PUBLISHED, "mol": "#8a5fb0", "mop": IDENTIFIED, "mop-reference": REFERENCE}
 _SHOWN_CYCLES = 2.0
 _NAMES = {
     "nc": "NC: no friction compensation",
@@ -106,7 +106,7 @@ def _headline(joint: str, task: str, modes: Mapping[str, Mapping[str, Any]]) -> 
     if not best:
         return f"Joint {joint}: nothing to compare with; run nc beside the others."
     reduction, mode = max(best)
-    return f"Joint {joint}: {mode} reduces {measure} by {reduction:.1f} %."
+    return f"Joint {joint}: {_short(mode)} reduces {measure} by {reduction:.1f} %."
 
 
 def _table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]], *, hand: bool) -> Table:
@@ -114,20 +114,31 @@ def _table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]], *, hand
 
 
 def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Table:
-    headings = ("mode", "V_s [deg/s]", "F_s [N m]", "less", "inertia removed [N m]", "less", "ceiling of F_s")
+    headings = (
+        "mode",
+        "speed V_s [deg/s]",
+        "hand torque F_s [N m]",
+        "reduced by",
+        "could be at most",
+        "F_s, inertia removed [N m]",
+        "reduced by",
+    )
     rows = tuple(
         (
             _NAMES.get(name, name),
             _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
             _number(modes[name]["torque_rms_nm"]),
             _percent(modes[name]["reduction_percent"]),
+            _percent(modes[name].get("ceiling_percent")),
             _number(modes[name]["torque_rms_inertia_removed_nm"]),
             _percent(modes[name]["reduction_inertia_removed_percent"]),
-            _percent(modes[name].get("ceiling_percent")),
         )
         for name in names
     )
-    caption = "The ceiling is what a joint without any friction would reach: inertia still has to be moved."
+    caption = (
+        "Root mean squares over the whole task. At most: what a joint without any friction would reach, whose inertia "
+        "the hand still has to move."
+    )
     return Table(headings, rows, caption)
 
 
@@ -143,10 +154,12 @@ def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]
         for name in names
     )
     caption = (
-        "The same gains in all modes. The ceiling is what they would reach on a joint without friction, or with the "
-        "reference velocity on one whose friction is given back exactly: so weak a PD still has to turn the inertia."
+        "Root mean squares over the whole task, the same gains in all modes. At most: what they would reach on a joint "
+        "without friction, or with the reference velocity on one whose friction is given back exactly; a PD this weak "
+        "still has to turn the inertia."
     )
-    return Table(("mode", "E_s [deg]", "less", "ceiling", "V_s [deg/s]"), rows, caption)
+    headings = ("mode", "tracking error E_s [deg]", "reduced by", "could be at most", "speed V_s [deg/s]")
+    return Table(headings, rows, caption)
 
 
 def _over_time(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
@@ -154,9 +167,9 @@ def _over_time(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
     for mode, run in runs.items():
         shown = _first_cycles(run)
         time_s, color = run.time_s[shown], _color(mode)
-        velocities.append(line(mode, time_s, degrees(1.0) * run.velocity_rad_s[shown], color, width=1))
+        velocities.append(line(_short(mode), time_s, degrees(1.0) * run.velocity_rad_s[shown], color, width=1))
         if run.external_torque_nm is not None:
-            torques.append(line(mode, time_s, run.external_torque_nm[shown], color, width=1))
+            torques.append(line(_short(mode), time_s, run.external_torque_nm[shown], color, width=1))
     return (
         Figure("Velocity (Fig. 11)", tuple(velocities), "time [s]", "velocity [deg/s]"),
         Figure(
@@ -172,7 +185,8 @@ def _moving(runs: Mapping[str, Run]) -> Figure:
     traces = []
     for mode, run in runs.items():
         if run.external_torque_nm is not None:
-            traces.append(line(mode, degrees(1.0) * run.velocity_rad_s, run.external_torque_nm, _color(mode), width=1))
+            speed = degrees(1.0) * run.velocity_rad_s
+            traces.append(line(_short(mode), speed, run.external_torque_nm, _color(mode), width=1))
     return Figure(
         "Torque of the hand over velocity",
         tuple(traces),
@@ -185,7 +199,7 @@ def _moving(runs: Mapping[str, Run]) -> Figure:
 def _hand_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> tuple[Figure, Figure]:
     velocity = [degrees(float(modes[name]["velocity_rms_rad_s"])) for name in names]
     torques = [
-        bars(told, names, [modes[name][key] for name in names], color)
+        bars(told, [_short(name) for name in names], [modes[name][key] for name in names], color)
         for told, key, color in (
             ("as measured", "torque_rms_nm", IDENTIFIED),
             ("inertia removed", "torque_rms_inertia_removed_nm", REFERENCE),
@@ -193,7 +207,12 @@ def _hand_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> 
         if any(modes[name][key] is not None for name in names)
     ]
     return (
-        Figure("Magnitude of velocity V_s (Fig. 12)", (bars("V_s", names, velocity, MEASURED),), "mode", "V_s [deg/s]"),
+        Figure(
+            "Magnitude of velocity V_s (Fig. 12)",
+            (bars("V_s", [_short(name) for name in names], velocity, MEASURED),),
+            "mode",
+            "V_s [deg/s]",
+        ),
         Figure(
             "Magnitude of hand torque F_s (Fig. 12)",
             tuple(torques),
@@ -210,17 +229,19 @@ def _following(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
         "reference",
         first.time_s[_first_cycles(first)],
         degrees(1.0) * first.reference_rad[_first_cycles(first)],
-        "#222222",
+        MEASURED,
         dash="dot",
         width=1,
     )
     positions = [
-        line(mode, run.time_s[shown[mode]], degrees(1.0) * run.position_rad[shown[mode]], _color(mode), width=1.5)
+        line(
+            _short(mode), run.time_s[shown[mode]], degrees(1.0) * run.position_rad[shown[mode]], _color(mode), width=1.5
+        )
         for mode, run in runs.items()
     ]
     errors = [
         line(
-            mode,
+            _short(mode),
             run.time_s[shown[mode]],
             degrees(1.0) * (run.reference_rad - run.position_rad)[shown[mode]],
             _color(mode),
@@ -236,13 +257,23 @@ def _following(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
 
 def _tracking_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Figure:
     values = [degrees(float(modes[name]["tracking_rms_rad"])) for name in names]
-    return Figure("Tracking error E_s (Fig. 14)", (bars("E_s", names, values, IDENTIFIED),), "mode", "E_s [deg]")
+    return Figure(
+        "Tracking error E_s (Fig. 14)",
+        (bars("E_s", [_short(name) for name in names], values, IDENTIFIED),),
+        "mode",
+        "E_s [deg]",
+    )
 
 
 def _first_cycles(run: Run) -> slice:
     """As much of a run as shows its shape: two seconds or so."""
     count = int((run.time_s < run.time_s[0] + _SHOWN_CYCLES * 1.5).sum())
     return slice(0, max(2, count))
+
+
+def _short(mode: str) -> str:
+    """As in the paper and in the table: MOP."""
+    return mode.upper() if mode in ("nc", "mo", "mol", "mop") else mode.replace("mop", "MOP").replace("-", " with ")
 
 
 def _color(mode: str) -> str:

@@ -12,7 +12,7 @@ from frictid_hil.friction.trajectory import Array
 
 MEASURED, PUBLISHED, IDENTIFIED, REFERENCE = "#7f8c9b", "#c07a2c", "#1f6fb2", "#3a9a5b"
 _BAND = "rgba(31, 111, 178, 0.18)"
-_MOST_POINTS = 6000
+_MOST_POINTS, _MOST_DOTS = 6000, 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +34,26 @@ class Figure:
     caption: str = ""
 
     def spec(self) -> dict[str, Any]:
-        """What ``Plotly.newPlot`` takes."""
+        """What ``Plotly.newPlot`` takes; the title stands above it on the page."""
+        dots = any(trace.get("mode") == "markers" and trace["marker"]["size"] < 5 for trace in self.traces)
         return {
+            "title": self.title,
             "data": list(self.traces),
             "layout": {
-                "title": {"text": self.title},
-                "xaxis": {"title": {"text": self.x_title}, "automargin": True},
-                "yaxis": {"title": {"text": self.y_title}, "automargin": True},
-                "legend": {"orientation": "h", "y": -0.25},
-                "margin": {"l": 60, "r": 20, "t": 50, "b": 60},
-                "height": 380,
+                "xaxis": {"title": {"text": self.x_title, "standoff": 10}, "automargin": True},
+                "yaxis": {"title": {"text": self.y_title, "standoff": 10}, "automargin": True},
+                "legend": {
+                    "orientation": "h",
+                    "x": 0,
+                    "xanchor": "left",
+                    "y": 1.02,
+                    "yanchor": "bottom",
+                    "itemsizing": "constant" if dots else "trace",  # a dot of the figure is no legend
+                },
+                "hovermode": "closest",
+                "showlegend": len(self.traces) > 1,
+                "margin": {"l": 60, "r": 20, "t": 40, "b": 50},
+                "height": 400,
             },
         }
 
@@ -61,16 +71,16 @@ def line(name: str, x: Array, y: Array, color: str, *, dash: str = "solid", widt
     }
 
 
-def cloud(name: str, x: Array, y: Array, color: str) -> dict[str, Any]:
+def cloud(name: str, x: Array, y: Array, color: str, *, opacity: float = 0.5) -> dict[str, Any]:
     """Measured points, small and pale."""
-    every = max(1, -(-len(x) // _MOST_POINTS))
+    every = max(1, -(-len(x) // _MOST_DOTS))
     return {
-        "type": "scattergl" if len(x) > 20_000 else "scatter",
+        "type": "scatter",
         "mode": "markers",
         "name": name,
         "x": rounded(x[::every]),
         "y": rounded(y[::every]),
-        "marker": {"color": color, "size": 2.5, "opacity": 0.5},
+        "marker": {"color": color, "size": 3, "opacity": opacity},
         "hoverinfo": "skip",
     }
 
@@ -85,7 +95,7 @@ def points(
         "name": name,
         "x": rounded(x),
         "y": rounded(y),
-        "marker": {"color": color, "size": 8, "symbol": symbol},
+        "marker": {"color": color, "size": 7, "symbol": symbol},
     }
     if half_width is not None:
         trace["error_y"] = {"type": "data", "array": rounded(half_width), "visible": True, "color": color}

@@ -9,8 +9,10 @@ from frictid_hil.config.promotions import Promotion
 from frictid_hil.config.summary import TrendPoint
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
+from frictid_hil.report.words import sentence, when, with_interval
 
 _SHOWN = 60
+_DONE = {"promote": "promoted", "rollback": "rolled back to", "baseline": "made the baseline"}
 
 
 def index_page(
@@ -31,12 +33,15 @@ def index_page(
         active: what is in force; None where nothing is.
         baseline: id of the profile that drift is measured from.
     """
-    headline = f"Profile {active.id} is active since {active.utc}." if active else "No profile was promoted yet."
+    headline = f"Profile {active.id} is active since {when(active.utc)}." if active else "No profile was promoted yet."
     if nights:
         last = nights[-1]
-        headline += f" Last recalibration: {last.utc}, {last.outcome}{', promoted' if last.promoted else ''}."
+        told = "promoted" if last.promoted else f"{_word(last.outcome)}, not promoted"
+        headline += f" Last recalibration: {when(last.utc)}, {told}."
         if last.drifted:
-            headline += f" Drifted: joints {', '.join(last.drifted)}."
+            headline += f" Drifted: joint{'s' if len(last.drifted) > 1 else ''} {', '.join(last.drifted)}."
+        if not last.promoted and last.next_step:
+            headline += f" Next step: {sentence(last.next_step)}"
     sections = [
         Section("Joints", words=(_baseline(baseline),), tables=(_joints(trends),), figures=trend_figures(trends)),
         Section("Recalibrations", tables=(_nights(nights),)) if nights else None,
@@ -51,6 +56,10 @@ def _baseline(baseline: str | None) -> str:
     return f"Drift is measured from the baseline {baseline}." if baseline else "There is no baseline to measure from."
 
 
+def _word(outcome: str) -> str:
+    return outcome.replace("_", " ")
+
+
 def _joints(trends: Mapping[str, Sequence[TrendPoint]]) -> Table:
     rows = []
     for name, points in trends.items():
@@ -58,34 +67,46 @@ def _joints(trends: Mapping[str, Sequence[TrendPoint]]) -> Table:
         rows.append(
             (
                 name,
-                "" if last.coulomb_nm is None else f"{last.coulomb_nm:.4g}",
+                ""
+                if last.coulomb_nm is None
+                else with_interval(last.coulomb_nm, last.coulomb_low_nm, last.coulomb_high_nm, "").strip(),
                 "" if last.distance_percent is None else f"{last.distance_percent:.1f}",
                 "" if last.temperature_c is None else f"{last.temperature_c:.1f}",
-                ", ".join(last.gates_failed) or "none",
-                points[-1].created_utc,
+                ", ".join(last.gates_failed).replace("_", " ") or "none",
+                when(points[-1].created_utc),
             )
         )
-    headings = ("joint", "F_0 [N m or N]", "from baseline [%]", "temperature [degC]", "failed gates", "measured")
-    return Table(headings, tuple(rows), caption="The newest measurement of every joint, promoted or not.")
+    headings = ("joint", "F_0 [N m, N]", "from baseline [%]", "temperature [degC]", "failed gates", "measured")
+    caption = "The newest measurement of every joint, promoted or not; F_0 with its 95 % interval."
+    return Table(headings, tuple(rows), caption=caption)
 
 
 def _nights(nights: Sequence[Attempt]) -> Table:
     rows = tuple(
         (
-            one.utc,
-            one.outcome,
+            when(one.utc),
+            _word(one.outcome),
             "promoted" if one.promoted else "not promoted",
-            ", ".join(one.drifted),
-            one.reason,
-            one.next_step,
+            ", ".join(one.drifted) or "none",
+            sentence(one.reason),
+            sentence(one.next_step),
         )
         for one in reversed(nights[-_SHOWN:])
     )
-    caption = f"Newest first, {min(_SHOWN, len(nights))} of {len(nights)}."
-    return Table(("began", "outcome", "profile", "drifted joints", "why", "next step"), rows, caption=caption)
+    return Table(
+        ("began", "outcome", "profile", "drifted joints", "why", "next step"),
+        rows,
+        caption=_newest(len(nights)),
+    )
 
 
 def _promotions(promotions: Sequence[Promotion]) -> Table:
-    rows = tuple((one.utc, one.action, one.id, one.by, one.reason) for one in reversed(promotions[-_SHOWN:]))
-    caption = f"Newest first, {min(_SHOWN, len(promotions))} of {len(promotions)}."
-    return Table(("when", "what", "profile", "by", "why"), rows, caption=caption)
+    rows = tuple(
+        (when(one.utc), _DONE.get(one.action, one.action), one.id, one.by, sentence(one.reason))
+        for one in reversed(promotions[-_SHOWN:])
+    )
+    return Table(("when", "what", "profile", "by", "why"), rows, caption=_newest(len(promotions)))
+
+
+def _newest(count: int) -> str:
+    return f"The newest {_SHOWN} of {count}, newest first." if count > _SHOWN else "Newest first."

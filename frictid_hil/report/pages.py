@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup, escape
 
 from frictid_hil.files import write_whole
 from frictid_hil.report.figures import Figure
@@ -30,10 +32,11 @@ class Section:
 
     Attributes:
         title: heading.
-        words: paragraphs.
+        words: paragraphs; what stands between backquotes is set as code.
         checks: (passed, sentence) pairs.
         tables: of facts.
         figures: of data.
+        links: title and relative address of pages that lie beside this one.
     """
 
     title: str
@@ -41,6 +44,7 @@ class Section:
     checks: tuple[tuple[bool, str], ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
+    links: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,7 @@ def write_page(page: Page, path: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["prose"] = _prose
     specs: list[dict[str, Any]] = []
     numbered: dict[int, int] = {}
     for section in page.sections:
@@ -87,3 +92,8 @@ def write_page(page: Page, path: Path) -> Path:
     )
     write_whole(path, html)
     return path
+
+
+def _prose(words: str) -> Markup:
+    """Plain words as HTML, escaped, with code where backquotes are."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(words))))

@@ -13,7 +13,10 @@ from frictid_hil.config.summary import TrendPoint
 from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure, line, points
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
+from frictid_hil.report.words import change, estimate, sentence, when
 from frictid_hil.units import degrees
+
+_REFERENCE = {"baseline": "baseline", "active": "active profile"}
 
 
 def recalibration_page(
@@ -34,20 +37,21 @@ def recalibration_page(
         baseline: that drift is measured from; None where there is none yet.
         trends: of every joint, this night included.
     """
-    verdict = "promoted" if result["promoted"] else f"not promoted ({result['outcome']})"
-    headline = f"{newer.robot}: the new profile was {verdict}: {result['reason']}. Next step: {result['next_step']}."
+    verdict = "promoted" if result["promoted"] else f"not promoted ({result['outcome'].replace('_', ' ')})"
+    headline = f"The new profile was {verdict}: {sentence(result['reason'])} Next step: {result['next_step']}."
+    pages = (("Everything that was measured this night", "report.html"),) if result.get("report") else ()
     curves = tuple(_curves(name, joint, active, baseline) for name, joint in newer.joints.items())
     sections = [
-        Section("Verdict", words=(_policy(policy),), checks=_checks(result), tables=(_drift(result),)),
-        Section("Over time", figures=trend_figures(trends)),
+        Section("Verdict", (_policy(policy),), _checks(result), (_drift(result, newer),), links=pages),
+        Section("Over time", figures=trend_figures(trends, drift_limit_percent=_limit(policy))),
         Section("Curves", figures=curves),
     ]
     facts = {
-        "measured": newer.provenance.created_utc,
+        "measured": when(newer.provenance.created_utc),
         "run": str(result["run"]),
         "stored as": str(result["stored"]),
-        "active before": "none" if active is None else active.provenance.created_utc,
-        "baseline": "none" if baseline is None else baseline.provenance.created_utc,
+        "active before": "none" if active is None else when(active.provenance.created_utc),
+        "baseline": "none" if baseline is None else when(baseline.provenance.created_utc),
         "driver and bus": f"{newer.provenance.driver} on {newer.provenance.bus}",
         "frictid-hil": f"{newer.provenance.tool_version} {newer.provenance.git_revision}".strip(),
     }
@@ -55,11 +59,21 @@ def recalibration_page(
 
 
 def _policy(policy: Policy) -> str:
-    promotion = "automatically" if policy.promotion == "automatic" else "by a person only"
-    return (
-        f"Policy: drift is reported beyond {policy.drift_percent:g} % from the {policy.drift_reference}; a change of "
-        f"more than {policy.refuse_percent:g} % from the active profile is refused; promotion {promotion}."
+    promotion = (
+        "What passes is promoted at once."
+        if policy.promotion == "automatic"
+        else "What passes waits for a person to promote it."
     )
+    return (
+        f"The robot file's policy: a joint further than {policy.drift_percent:g} % from the "
+        f"{_REFERENCE[policy.drift_reference]} is told as drifted; one that changed by more than "
+        f"{policy.refuse_percent:g} % since the active profile is refused. {promotion}"
+    )
+
+
+def _limit(policy: Policy) -> float | None:
+    """Drift over time is drawn from the baseline: the limit means something there if it is measured from it, too."""
+    return policy.drift_percent if policy.drift_reference == "baseline" else None
 
 
 def _checks(result: Mapping[str, Any]) -> tuple[tuple[bool, str], ...]:
@@ -67,47 +81,54 @@ def _checks(result: Mapping[str, Any]) -> tuple[tuple[bool, str], ...]:
     for name, figures in result["drift"].items():
         gates = result["joints"].get(name, {})
         if gates.get("outcome", "ok") != "ok":
-            checks.append((False, f"joint {name}: {'; '.join(gates.get('remarks', []))}"))
+            checks.append((False, f"Joint {name}: {'; '.join(gates.get('remarks', []))}."))
         elif figures["broken"]:
-            checks.append(
-                (False, f"joint {name}: {figures['distance_from_active_percent']:.1f} % from the active profile")
-            )
+            percent = figures["distance_from_active_percent"]
+            checks.append((False, f"Joint {name} changed by {percent:.1f} % since the active profile."))
         elif figures["drifted"]:
-            checks.append((False, f"joint {name}: has drifted by {figures['distance_percent']:.1f} %"))
+            checks.append((False, f"Joint {name} has drifted by {figures['distance_percent']:.1f} %."))
         else:
             distance = figures["distance_percent"]
-            told = "nothing to compare with yet" if distance is None else f"{distance:.1f} % from the reference"
-            checks.append((True, f"joint {name}: {told}"))
+            told = "passed; nothing to compare with yet" if distance is None else f"within {distance:.1f} %"
+            checks.append((True, f"Joint {name}: {told}."))
     return tuple(checks)
 
 
-def _drift(result: Mapping[str, Any]) -> Table:
-    rows = []
+def _drift(result: Mapping[str, Any], newer: FrictionProfile) -> Table:
+    rows: list[tuple[str, ...]] = []
     for name, figures in result["drift"].items():
-        share = figures["overlap_share"]
+        share, joint = figures["overlap_share"], newer.joints[name]
         rows.append(
             (
                 name,
+                estimate(joint.coulomb_nm, "N" if joint.prismatic else "N m"),
+                change(figures["coulomb_change_percent"]),
                 _number(figures["distance_percent"]),
-                _number(figures["distance_from_active_percent"]),
                 "" if share is None else f"{100 * share:.0f}",
-                _number(figures["coulomb_change_percent"]),
+                _number(figures["distance_from_active_percent"]),
                 _number(figures["temperature_c"]),
-                _number(figures["temperature_change_c"]),
+                change(figures["temperature_change_c"]),
                 "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
             )
         )
-    headings = (
+    headings = [
         "joint",
-        "from reference [%]",
-        "from active [%]",
-        "intervals that overlap [%]",
-        "change of F_0 [%]",
+        "F_0",
+        "F_0 changed [%]",
+        "curve changed [%]",
+        "intervals that meet [%]",
+        "since the active profile [%]",
         "temperature [degC]",
-        "change [K]",
+        "warmer by [K]",
         "what else changed",
+    ]
+    if not any(row[-1] for row in rows):
+        headings, rows = headings[:-1], [row[:-1] for row in rows]
+    caption = (
+        "Changes of F_0, curve and temperature are from the policy's reference. A curve's change is the mean distance "
+        "between the two over the measured speeds, in percent of the older one's mean, equation (15)."
     )
-    return Table(headings, tuple(rows), caption="Distances are (15) over the measured speeds.")
+    return Table(tuple(headings), tuple(rows), caption=caption)
 
 
 def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, baseline: FrictionProfile | None) -> Figure:
@@ -116,7 +137,12 @@ def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, base
     half = None
     if joint.torque_interval_nm is not None:
         half = np.array([(high - low) / 2 for low, high in joint.torque_interval_nm])
-    traces = [
+    traces = []
+    for title, other, color in (("active before", active, REFERENCE), ("baseline", baseline, PUBLISHED)):
+        if other is not None and name in other.joints:
+            curve = other.joints[name].curve()
+            traces.append(line(title, speeds * scale, curve.magnitude(speeds), color, dash="dash"))
+    traces += [
         line("measured now", speeds * scale, joint.curve().magnitude(speeds), IDENTIFIED),
         points(
             "pairs V_n, F_n",
@@ -126,12 +152,10 @@ def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, base
             half_width=half,
         ),
     ]
-    for title, other, color in (("active before", active, REFERENCE), ("baseline", baseline, PUBLISHED)):
-        if other is not None and name in other.joints:
-            curve = other.joints[name].curve()
-            traces.append(line(title, speeds * scale, curve.magnitude(speeds), color, dash="dash"))
     caption = "Bars are 95 % intervals."
-    return Figure(f"Joint {name}: friction", tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption=caption)
+    return Figure(
+        f"Joint {name}: friction over speed", tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption=caption
+    )
 
 
 def _number(value: float | None) -> str:

@@ -15,23 +15,31 @@ _COLORS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#b2477f", "#7a6cc0", "#6b7785", "#b
 _MOST_POINTS = 1500
 
 
-def trend_figures(trends: Mapping[str, Sequence[TrendPoint]]) -> tuple[Figure, ...]:
-    """F_0, distance from the baseline, temperature; a figure without a single value is left out."""
+def trend_figures(
+    trends: Mapping[str, Sequence[TrendPoint]], *, drift_limit_percent: float | None = None
+) -> tuple[Figure, ...]:
+    """F_0, distance from the baseline, temperature; a figure without a single value is left out.
+
+    Args:
+        trends: of every joint, oldest first.
+        drift_limit_percent: of the policy, drawn beside the distance.
+    """
     figures = (
         _figure(
             trends,
             _coulomb_percent,
             "Coulomb friction F_0 over time",
-            "F_0 [percent of the first]",
-            "Extrapolated Coulomb level of every joint, in percent of its first; bars are 95 % intervals.",
+            "F_0 [% of the first]",
+            "The extrapolated Coulomb level of every joint; bars are 95 % intervals.",
             half_width=_coulomb_half_percent,
         ),
         _figure(
             trends,
             lambda point, _: point.joint.distance_percent,
             "Distance of the curve from the baseline over time",
-            "distance (15) [percent of the baseline's mean]",
-            "Equation (15) over the measured speeds. Drift shows here as a slope, damage as a step.",
+            "distance [% of the baseline's mean]",
+            "Mean distance (15) of the two curves over the measured speeds. Wear shows as a slope, damage as a step.",
+            limit=drift_limit_percent,
         ),
         _figure(
             trends,
@@ -55,8 +63,10 @@ def _figure(
     caption: str,
     *,
     half_width: _Value | None = None,
+    limit: float | None = None,
 ) -> Figure:
-    traces = []
+    traces: list[dict[str, Any]] = []
+    dates: list[str] = []
     for number, (name, points) in enumerate(trends.items()):
         every = max(1, -(-len(points) // _MOST_POINTS))
         shown = [point for at, point in enumerate(points) if at % every == 0 or at == len(points) - 1]
@@ -69,6 +79,9 @@ def _figure(
                 array = [0.0 if width is None else width for width in widths]
                 trace["error_y"] = {"type": "data", "array": rounded(np.array(array)), "visible": True, "thickness": 1}
             traces.append(trace)
+            dates += [point.created_utc for point, _ in known]
+    if limit is not None and dates:
+        traces.append(_limit_line([min(dates), max(dates)], limit))
     return Figure(title, tuple(traces), "date [UTC]", y_title, caption=caption)
 
 
@@ -81,6 +94,17 @@ def _trace(name: str, points: Sequence[TrendPoint], values: Sequence[float], col
         "y": rounded(np.array(values)),
         "line": {"color": color, "width": 1.5},
         "marker": {"color": color, "size": 5},
+    }
+
+
+def _limit_line(dates: list[str], limit: float) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": "limit of the policy",
+        "x": dates,
+        "y": [limit, limit],
+        "line": {"color": "#c0392b", "dash": "dot", "width": 1.5},
     }
 
 

@@ -59,7 +59,7 @@ def test_nights_are_promoted_until_one_is_broken(tmp_path: Path) -> None:
     first = night(tmp_path, 1)
     assert first["promoted"] and first["outcome"] == "ok" and first["drift"]["5"]["distance_percent"] is None
     second = night(tmp_path, 2, friction=1.15)
-    assert second["promoted"] and second["drifted"] == ["5"] and "look at joints 5" in second["next_step"]
+    assert second["promoted"] and second["drifted"] == ["5"] and "look at joint 5:" in second["next_step"]
     assert second["drift"]["5"]["distance_percent"] == pytest.approx(15, abs=3)
     broken = night(tmp_path, 3, friction=2.0)
     assert (broken["outcome"], broken["exit_code"], broken["promoted"]) == ("gate_failed", 5, False)
@@ -172,7 +172,7 @@ def test_a_change_within_the_intervals_is_no_drift() -> None:
     [
         (profile(), {"0": "too little tracking"}, "too little tracking"),
         (profile(serial="2"), {}, "drive serial 1 -> 2"),
-        (profile(joints="0"), {}, "joints 1 of the active profile were not measured"),
+        (profile(joints="0"), {}, "joint 1 of the active profile was not measured"),
     ],
 )
 def test_what_is_never_promoted_silently(newer: FrictionProfile, failed: dict[str, str], says: str) -> None:

@@ -215,6 +215,33 @@ def test_pages_are_whole_in_themselves_and_escape_what_people_wrote(history: Pro
         assert "prefers-color-scheme: dark" in text and "@media print" in text
 
 
+def test_the_loops_tell_apart_what_lies_in_the_windows(history: ProfileStore) -> None:
+    page = pages(history)["calibration"]
+    (loops,) = [
+        one for section in page.sections for one in section.figures if one.title == "Joint 0: torque over velocity"
+    ]
+    outside, inside, _ = loops.traces
+    top = np.degrees(2.0)
+    assert inside["name"] == "inside the windows" and len(outside["x"]) > 1000 and len(inside["x"]) > 1000
+    # Four cycles of V = 2 rad/s and c = 0.8: the windows of the slowest begin at 0.8 / 4 of V.
+    assert 0.2 * top <= min(abs(v) for v in inside["x"]) < 0.21 * top
+    assert max(abs(v) for v in outside["x"]) < 0.8 * top
+    done = page.sections[0].words[0]
+    assert "4 sinusoidal cycles of 20.05 deg peak to peak" in done and "rise to 114.6 deg/s" in done
+
+
+def test_the_limit_of_the_policy_is_drawn_beside_the_distance(history: ProfileStore) -> None:
+    figures = [one for section in pages(history)["recalibration"].sections for one in section.figures]
+    (distance,) = [one for one in figures if one.title.startswith("Distance")]
+    assert [trace["y"] for trace in distance.traces if trace["name"] == "limit of the policy"] == [[10.0, 10.0]]
+
+
+def test_words_between_backquotes_are_code_and_nothing_else_is_markup(tmp_path: Path) -> None:
+    page = Page("t", "type `frictid-hil <x>` & look", [], {})
+    text = write_page(page, tmp_path / "t.html").read_text()
+    assert "type <code>frictid-hil &lt;x&gt;</code> &amp; look" in text
+
+
 def test_an_index_page_of_nothing_says_so() -> None:
     page = index_page("arm", {}, [], [], None, None)
     assert "No profile was promoted" in page.headline
