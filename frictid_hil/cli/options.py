@@ -46,7 +46,13 @@ DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; o
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
 OutOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to write to.")]
 NotifyOption = Annotated[
-    str | None, typer.Option("--notify", metavar="CMD", help="Command that is given the JSON on its standard input.")
+    str | None,
+    typer.Option(
+        "--notify",
+        metavar="CMD",
+        help="Command that is given the JSON on its standard input, however it ended; `sh -c '...'` where it needs a "
+        "shell.",
+    ),
 ]
 
 RobotOption = Annotated[

@@ -131,7 +131,7 @@ ENDINGS = {
     "power lost": Ending(4, "aborted", changes=fault("mute", 3.0)),
     "encoder lost": Ending(4, "aborted", "following error", "look at the joint", fault("stuck_encoder", 6.0)),
     "interlock open": Ending(4, "aborted", "interlock", "close the cell", {**ALLOWED, **fault("interlock_open", 0.0)}),
-    "changed too much": Ending(5, "gate_failed", "changed since", "look at joints 5", {"friction": 0.6}),
+    "changed too much": Ending(5, "gate_failed", "changed since", "look at joint 5:", {"friction": 0.6}),
     "drive exchanged": Ending(5, "gate_failed", "drive serial 1234", "--baseline", meanwhile=another_drive_in_force),
 }
 
