@@ -166,14 +166,14 @@ def compensate(
 _HAND: dict[str, tuple[str, str, float]] = {
     "V_s": ("velocity_rms_rad_s", "deg/s", degrees(1.0)),
     "F_s": ("torque_rms_nm", "N m", 1.0),
-    "less": ("reduction_percent", "%", 1.0),
+    "reduced by": ("reduction_percent", "%", 1.0),
     "ceiling": ("ceiling_percent", "%", 1.0),
     "inertia removed": ("torque_rms_inertia_removed_nm", "N m", 1.0),
-    "less of it": ("reduction_inertia_removed_percent", "%", 1.0),
+    "reduced by, inertia removed": ("reduction_inertia_removed_percent", "%", 1.0),
 }
 _TRACK: dict[str, tuple[str, str, float]] = {
     "E_s": ("tracking_rms_rad", "deg", degrees(1.0)),
-    "less": ("reduction_percent", "%", 1.0),
+    "reduced by": ("reduction_percent", "%", 1.0),
     "ceiling": ("ceiling_percent", "%", 1.0),
     "V_s": ("velocity_rms_rad_s", "deg/s", degrees(1.0)),
 }

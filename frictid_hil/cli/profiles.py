@@ -168,13 +168,13 @@ def history(
 
     def show(result: Result) -> None:
         joints = list(dict.fromkeys(name for profile in result["profiles"] for name in profile["joints"]))
-        table = Table(title=f"F_0, distance from the baseline, temperature: {robot}")
-        table.add_column("profile", no_wrap=True)
-        for heading in ("", *(f"joint {name}" for name in joints)):
-            table.add_column(heading)
+        table = Table(title=escape(f"{robot}: F_0 [N m, N], distance from the baseline [%], temperature [degC]"))
+        table.add_column("profile (* active)", no_wrap=True)
+        for name in joints:
+            table.add_column(f"joint {name}")
         for profile in result["profiles"]:
             cells = [_cell(profile["joints"].get(name)) for name in joints]
-            table.add_row(profile["id"], "active" if profile["active"] else "", *cells)
+            table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}", *cells)
         output.out.print(table)
         for one in result["promotions"]:
             output.out.print(
@@ -190,13 +190,13 @@ def history(
 
 
 def _cell(joint: Result | None) -> str:
+    """F_0 above the other two: six joints then fit side by side."""
     if joint is None or joint["coulomb_nm"] is None:
         return ""
     distance, temperature = joint["distance_percent"], joint["temperature_c"]
-    parts = [f"{joint['coulomb_nm']:.3g}"]
-    parts += [f"{distance:.1f} %"] if distance is not None else []
-    parts += [f"{temperature:.0f} C"] if temperature is not None else []
-    return ", ".join(parts)
+    below = [f"{distance:.1f} %"] if distance is not None else []
+    below += [f"{temperature:.0f} C"] if temperature is not None else []
+    return "\n".join([f"{joint['coulomb_nm']:.4g}", ", ".join(below)])
 
 
 def _signed(value: float | None) -> str:

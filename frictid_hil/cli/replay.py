@@ -121,4 +121,7 @@ def _print(output: Output, result: Result) -> None:
 def _verdict(joint: Result) -> str:
     if joint["identical"] is None:
         return "nothing to compare with"
-    return "identical" if joint["identical"] else f"differs by {joint['difference_percent']:.3g} %"
+    if joint["identical"]:
+        return "identical"
+    percent = joint["difference_percent"]
+    return f"curve differs by {percent:.3g} %" if percent else "same curve, other figures or words"

@@ -119,7 +119,7 @@ def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) ->
         "speed V_s [deg/s]",
         "hand torque F_s [N m]",
         "reduced by",
-        "could be at most",
+        "ceiling",
         "F_s, inertia removed [N m]",
         "reduced by",
     )
@@ -136,8 +136,8 @@ def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) ->
         for name in names
     )
     caption = (
-        "Root mean squares over the whole task. At most: what a joint without any friction would reach, whose inertia "
-        "the hand still has to move."
+        "Root mean squares over the whole task. The ceiling is what a joint without any friction would reach, whose "
+        "inertia the hand still has to move."
     )
     return Table(headings, rows, caption)
 
@@ -154,11 +154,11 @@ def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]
         for name in names
     )
     caption = (
-        "Root mean squares over the whole task, the same gains in all modes. At most: what they would reach on a joint "
-        "without friction, or with the reference velocity on one whose friction is given back exactly; a PD this weak "
-        "still has to turn the inertia."
+        "Root mean squares over the whole task, the same gains in all modes. The ceiling is what they would reach on a "
+        "joint without friction, or with the reference velocity on one whose friction is given back exactly; a PD this "
+        "weak still has to turn the inertia."
     )
-    headings = ("mode", "tracking error E_s [deg]", "reduced by", "could be at most", "speed V_s [deg/s]")
+    headings = ("mode", "tracking error E_s [deg]", "reduced by", "ceiling", "speed V_s [deg/s]")
     return Table(headings, rows, caption)
 
 

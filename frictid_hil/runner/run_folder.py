@@ -41,6 +41,7 @@ from frictid_hil.runner.ring import Rows
 
 SCHEMA = "frictid.run/1"
 _FLUSH_S = 0.25
+_WHERE_RUNS_ARE = "every run tells its folder when it ends; unless --out was given it lies below runs/<robot>/"
 
 
 class RowKeeper:
@@ -287,8 +288,11 @@ def load_manifest(path: Path) -> dict[str, Any]:
     """
     try:
         manifest = json.loads((path / "manifest.json").read_text())
-    except (OSError, ValueError) as error:
-        raise UsageError(f"not a run folder: {error}", where=str(path)) from error
+    except OSError as error:
+        why = "it has no manifest.json" if path.is_dir() else error.strerror
+        raise UsageError(f"not a run folder: {why}", where=str(path), next_step=_WHERE_RUNS_ARE) from error
+    except ValueError as error:
+        raise UsageError(f"not a run folder: its manifest.json cannot be read: {error}", where=str(path)) from error
     if not isinstance(manifest, dict) or manifest.get("schema") != SCHEMA:
         raise UsageError(f"not a run of schema {SCHEMA}", where=str(path))
     return manifest
