@@ -9,6 +9,7 @@ from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive, robot
 
 from frictid_drivers.cia402 import Cia402Driver
+from frictid_drivers.cia402.known_settings import KNOWN_SETTINGS, Effect, timing_of
 from frictid_drivers.cia402.network import BusLock
 from frictid_hil.driver import Driver, Severity
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
@@ -26,6 +27,10 @@ def test_is_a_driver():
         ({"options": {"quick_stop_option": 2}}, ("options", "quick_stop_option")),
         ({"joint_options": {"following_window_rad": 0}}, ("joints", "0", "options", "following_window_rad")),
         ({"joint_options": {"external_torque_object": "2030"}}, ("joints", "0", "options", "external_torque_object")),
+        (
+            {"joint_options": {"timing": {"torque_delay_s": 0.001, "torque_lag_s": 0.004}}},
+            ("joints", "0", "options", "timing", "torque_lag_s"),
+        ),
         (
             {"joint_options": {"external_torque_object": "2030:00 i32"}},
             ("joints", "0", "options", "external_torque_nm_per_unit"),
@@ -85,6 +90,16 @@ def test_identity():
     assert identity.position_resolution_rad == pytest.approx(RAD)
     assert identity.torque_resolution_nm == pytest.approx(0.05)
     assert (identity.timing.torque_delay_s, identity.timing.source) == (0.002, "robot file")
+
+
+def test_a_filter_on_the_torque_is_declared_as_lag_within_the_delay():
+    (settings,) = KNOWN_SETTINGS.values()
+    timing = timing_of({one: 4000 for one in settings if one.effect is Effect.TORQUE_FILTER_US}, 0.001)
+    assert timing is not None
+    assert (timing.torque_delay_s, timing.torque_lag_s) == (pytest.approx(0.0045), pytest.approx(0.004))
+    told = {"torque_delay_s": 0.003, "torque_lag_s": 0.002}
+    timing = bench(1, joint_options={"timing": told}).open().driver.identify()["0"].timing
+    assert (timing.torque_delay_s, timing.torque_lag_s) == (0.003, 0.002)
 
 
 def test_a_silent_drive_is_named():

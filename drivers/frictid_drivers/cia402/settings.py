@@ -247,6 +247,8 @@ class _Reader:
             return None
         here = (*at, "timing")
         values = {key: self._number(here, given, key, 0.0, -1.0, 1.0) for key in known if key in given}
+        if not 0.0 <= values.get("torque_lag_s", 0.0) <= max(values.get("torque_delay_s", 0.0), 0.0):
+            self._problem((*here, "torque_lag_s"), "is the part of torque_delay_s that is a low-pass, 0 or more")
         return Timing(**values, source="robot file")
 
     def _fd_object(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Object | None:
