@@ -186,7 +186,7 @@ def main() -> None:
                         flagged[method].append(not all(gate.passed for gate in gates(recording, found)))
                         if arguments.terms and found.terms is not None:
                             t = found.terms
-                            parts = [t.scatter, t.skew, t.model, t.drift, t.link]
+                            parts = [t.scatter, t.skew, t.model, t.drift, t.beside, t.link]
                             terms[method].append([float(np.mean((100 * part / level) ** 2)) for part in parts])
             for method, error in errors.items():
                 e, w = np.array(error), np.array(widths[method])

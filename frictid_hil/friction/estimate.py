@@ -20,6 +20,7 @@ import numpy as np
 
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import intervals, least_squares
+from frictid_hil.friction.beside import Beside, beside
 from frictid_hil.friction.cleaned import Cleaned, cleaned
 from frictid_hil.friction.coupling import posture, without_gravity
 from frictid_hil.friction.curve import FrictionCurve
@@ -98,14 +99,15 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     clean = cleaned(recording, notes)
     solved = _solved(clean, notes, required=method == "least-squares")
     drift = intervals.repeated(clean.recording, clean.motion, clean.windows)
+    others = None if solved is None else _beside(clean, solved)
     if method == "least-squares":
         assert solved is not None
-        found = _by_least_squares(clean, solved, drift, notes)
+        found = _by_least_squares(clean, solved, drift, others, notes)
     elif method == "function-a":
         assert published is not None
-        found = _as_published(_by_windows(clean, solved, drift), published, recording.where)
+        found = _as_published(_by_windows(clean, solved, drift, others), published, recording.where)
     else:
-        found = _by_windows(clean, solved, drift)
+        found = _by_windows(clean, solved, drift, others)
     body = None if solved is None else rigid_body(clean.recording, solved)
     speeds = np.asarray(found.curve.velocity_rad_s)
     even = asymmetry(found.pairs, speeds) if solved is None else solved.even_nm(speeds)
@@ -153,7 +155,7 @@ def _solved(clean: Cleaned, notes: list[str], *, required: bool) -> Fit | None:
             motion,
             least_squares.curve_knots(recording),
             clean.level_nm,
-            extra=posture(motion) if recording.coupled else None,
+            extra=_postures(clean),
             doubtful=None if taken is None else taken.columns,
         )
     except IdentificationError as problem:
@@ -161,6 +163,14 @@ def _solved(clean: Cleaned, notes: list[str], *, required: bool) -> Fit | None:
             raise
         notes.append(f"inertia, gravity and bias are not known: {problem.what}")
         return None
+
+
+def _postures(clean: Cleaned) -> Array | None:
+    return posture(clean.motion) if clean.recording.coupled else None
+
+
+def _beside(clean: Cleaned, solved: Fit) -> Beside:
+    return beside(clean.recording, clean.motion, solved, clean.level_nm, _postures(clean))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,23 +183,25 @@ class _Found:
     terms: intervals.Terms
 
 
-def _by_least_squares(clean: Cleaned, solved: Fit, drift: intervals.Drift | None, notes: list[str]) -> _Found:
+def _by_least_squares(
+    clean: Cleaned, solved: Fit, drift: intervals.Drift | None, others: Beside | None, notes: list[str]
+) -> _Found:
     recording = clean.recording
     if solved.unobserved.size:
         slow = ", ".join(f"{speed:.3g}" for speed in solved.unobserved)
         notes.append(f"too few samples at {slow} rad/s: the curve is extended to there from faster ones")
     kept = least_squares.trusted(recording, solved, clean.level_nm)
-    terms = intervals.least_squares_terms(recording, clean.motion, solved, kept, drift, clean.taken)
+    terms = intervals.least_squares_terms(recording, clean.motion, solved, kept, drift, others, clean.taken)
     curve = least_squares.curve_of(solved, kept, recording.where)
     return _Found(curve, terms.half_width_nm, clean.windows, terms)
 
 
-def _by_windows(clean: Cleaned, solved: Fit | None, drift: intervals.Drift | None) -> _Found:
+def _by_windows(clean: Cleaned, solved: Fit | None, drift: intervals.Drift | None, others: Beside | None) -> _Found:
     recording, pairs, weighed = clean.recording, clean.windows, clean.taken
     if recording.coupled and solved is not None:
         freed, weighed = without_gravity(clean.motion, solved, clean.others)
         pairs = intervals.aligned_pairs(recording, freed)
-    terms = intervals.window_terms(recording, clean.motion, pairs, solved, drift, weighed)
+    terms = intervals.window_terms(recording, clean.motion, pairs, solved, drift, others, weighed)
     rising = np.argsort(pairs.velocity_rad_s, kind="stable")
     return _Found(pairs.curve(where=recording.where), terms.half_width_nm[rising], pairs, terms)
 

@@ -1,11 +1,13 @@
 """Honest 95 % intervals: how far an identified torque may be from the truth, by terms that can be named.
 
-* **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise, ripple
-  and friction that depends on the place show as their disagreement;
+* **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise and ripple
+  show as their disagreement. What comes again in every cycle is no chance, and their mean has none of it;
 * **skew**: what the data leave open of the declared uncertainty of the delay between torque and position (``delay``),
   through the very same windows;
-* **model**: the distance between windows and global least squares, two estimators that fail differently;
-* **drift**: friction changed between the first and the second run of the repeated cycle;
+* **model**: the distance between windows and global least squares, two estimators that fail differently, beyond the
+  scatter of both;
+* **drift**: friction changed between the first and the second run of the repeated cycle, at the same speed;
+* **beside**: friction that varies along the travel or grows with the load, which neither contains (``beside``);
 * **link**: the swinging of a soft joint's link, or the pull of joints that moved along, taken off the torque, is known
   only so well.
 
@@ -21,6 +23,7 @@ from typing import Protocol
 import numpy as np
 from scipy.stats import t as student
 
+from frictid_hil.friction.beside import Beside
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
@@ -33,6 +36,10 @@ FINER = 8
 """Points per sample at which windows begin and end: one sample too many on one side is an error of its own."""
 STEADY = 0.28
 """Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
+
+
+_ENOUGH = 6
+"""Cycles from which on two parameters can be told from the scatter of so many differences."""
 
 
 class TakenOff(Protocol):
@@ -58,6 +65,7 @@ class Terms:
         skew: undeclared torque delay.
         model: what the estimator leaves out.
         drift: friction that changed while it was measured.
+        beside: friction that depends on place or load.
         link: torque of the swinging link, or of the joints that moved along.
     """
 
@@ -65,12 +73,13 @@ class Terms:
     skew: Array
     model: Array
     drift: Array
+    beside: Array
     link: Array
 
     @property
     def half_width_nm(self) -> Array:
         """Half of the 95 % interval, shape (N,)."""
-        terms = self.scatter, self.skew, self.model, self.drift, self.link
+        terms = self.scatter, self.skew, self.model, self.drift, self.beside, self.link
         half: Array = COVERAGE * np.sqrt(sum(term**2 for term in terms))
         return half
 
@@ -113,6 +122,7 @@ def window_terms(
     pairs: IdentifiedPairs,
     solved: Fit | None,
     drift: Drift | None,
+    others: Beside | None,
     link: TakenOff | None,
 ) -> Terms:
     """Terms of the aligned Function A.
@@ -123,26 +133,31 @@ def window_terms(
         pairs: of the same columns.
         solved: the least-squares model of the same columns; None where it could not be solved.
         drift: the repeated cycle; None without one.
+        others: place and load beside the solved model; None where it could not be solved.
         link: what was taken off the torque; None of a rigid joint.
     """
     rate = np.gradient(motion.torque_nm, motion.smoother.step_s)
     slope = aligned_pairs(recording, motion, rate).torque_nm
     scatter = _scatter(recording, motion, solved)
-    model = np.zeros_like(slope)
-    if solved is not None:
-        model = np.abs(pairs.torque_nm - hat_functions(pairs.mean_speed_rad_s, solved.knots) @ solved.odd_nm)
+    starts_s = recording.procedure.cycle_starts_s
+    weights = None if others is None else _windowed(recording, motion, others.columns)
     return Terms(
         scatter=scatter,
         skew=np.abs(slope) * recording.skew.uncertainty_s,
-        model=model,
-        drift=pairs.torque_nm * _drift_share(recording, scatter, drift),
-        link=np.zeros_like(slope) if link is None else _spread(_windowed(recording, motion, link), link.covariance),
+        model=np.zeros_like(slope)
+        if solved is None or others is None or weights is None
+        else _apart(pairs, solved, scatter, others, weights),
+        drift=pairs.torque_nm * _drift_shares(recording, (starts_s[:-1] + starts_s[1:]) / 2, scatter, drift),
+        beside=np.zeros_like(slope) if others is None or weights is None else others.deviation(weights),
+        link=np.zeros_like(slope)
+        if link is None
+        else _spread(_windowed(recording, motion, link.columns), link.covariance),
     )
 
 
-def _windowed(recording: CycleRecording, motion: Motion, link: TakenOff) -> Array:
-    """What each window makes of the link's columns, shape (N, m)."""
-    return np.column_stack([aligned_pairs(recording, motion, column).torque_nm for column in link.columns.T])
+def _windowed(recording: CycleRecording, motion: Motion, columns: Array) -> Array:
+    """What each window makes of the columns, shape (N, m) for columns of shape (n, m)."""
+    return np.column_stack([aligned_pairs(recording, motion, column).torque_nm for column in columns.T])
 
 
 def _spread(weights: Array, covariance: Array) -> Array:
@@ -152,7 +167,13 @@ def _spread(weights: Array, covariance: Array) -> Array:
 
 
 def least_squares_terms(
-    recording: CycleRecording, motion: Motion, solved: Fit, kept: slice, drift: Drift | None, link: TakenOff | None
+    recording: CycleRecording,
+    motion: Motion,
+    solved: Fit,
+    kept: slice,
+    drift: Drift | None,
+    others: Beside | None,
+    link: TakenOff | None,
 ) -> Terms:
     """Terms of the global least squares at its trusted knots."""
     odd, knots = solved.odd_nm, solved.knots
@@ -162,11 +183,16 @@ def least_squares_terms(
     bend[1:-1] = np.abs(np.diff(slopes)) * np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) / 12
     bend[0], bend[-1] = bend[1], bend[-2]
     odd_block = solved.blocks.odd
+    # A knot is seen by every cycle from the first that reaches its speed.
+    starts_s, peaks = recording.procedure.cycle_starts_s, recording.procedure.peak_velocities_rad_s
+    first = np.searchsorted(peaks, knots * (1 - 1e-6)).clip(max=peaks.size - 1)
+    seen_s = (starts_s[first] + starts_s[-1]) / 2
     return Terms(
         scatter=np.sqrt(np.diag(solved.covariance)[odd_block])[kept] * student.ppf(0.975, 8) / COVERAGE,
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
         model=bend[kept],
-        drift=np.abs(odd[kept]) * _drift_share(recording, _scatter(recording, motion, solved), drift),
+        drift=(np.abs(odd) * _drift_shares(recording, seen_s, _scatter(recording, motion, solved), drift))[kept],
+        beside=np.zeros_like(odd[kept]) if others is None else others.deviation(others.on_knots)[kept],
         link=np.zeros_like(odd[kept]) if link is None else _spread(solved.per_doubt[odd_block], link.covariance)[kept],
     )
 
@@ -205,9 +231,14 @@ class Drift:
     change: float
     apart_s: float
 
-    def over(self, duration_s: float) -> float:
-        """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most."""
-        return self.change * min(duration_s / self.apart_s, 3.0)
+    def over(self, duration_s: float, change: float | None = None) -> float:
+        """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most.
+
+        Args:
+            duration_s: of the run.
+            change: in place of the one that was seen.
+        """
+        return (self.change if change is None else change) * min(duration_s / self.apart_s, 3.0)
 
 
 def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) -> Drift | None:
@@ -229,23 +260,53 @@ def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) 
         velocity_rad_s=motion.velocity_rad_s[rows],
         torque_nm=motion.torque_nm[rows],
     )
-    once = float(pairs.torque_nm[repeat.cycle - 1])
-    twice = float(aligned_pairs(recording, exchanged).torque_nm[repeat.cycle - 1])
-    return Drift(repeat.cycle, once, (twice - once) / once, float(repeat.start_s - first))
+    once, twice = pairs, aligned_pairs(recording, exchanged)
+    nth = repeat.cycle - 1
+    first_nm = float(once.torque_nm[nth])
+    # After the fastest cycle the joint has not settled yet and runs up to 3 % slower than it did after a slow one.
+    rising = np.argsort(once.mean_speed_rad_s, kind="stable")
+    slower = np.interp(
+        [once.mean_speed_rad_s[nth], twice.mean_speed_rad_s[nth]],
+        once.mean_speed_rad_s[rising],
+        once.torque_nm[rising],
+    )
+    change_nm = float(twice.torque_nm[nth]) - first_nm - float(slower[1] - slower[0])
+    return Drift(repeat.cycle, first_nm, change_nm / first_nm, float(repeat.start_s - first))
 
 
-def _drift_share(recording: CycleRecording, scatter_nm: Array, drift: Drift | None) -> float:
-    """Standard deviation of a steady drift over the run, as a share of the friction.
+def _drift_shares(recording: CycleRecording, seen_s: Array, scatter_nm: Array, drift: Drift | None) -> Array:
+    """Standard deviation that a steady drift over the run means for what was seen at these times, as shares of it.
 
-    The truth may be the friction at any moment of the run, so that the drift counts whole; what scatter alone would
-    show is taken off.
+    The truth may be the friction at any moment of the run, the farthest included: a rectangular distribution as wide
+    as the drift and one standard deviation of it, that of two looks at one F_n.
     """
     if drift is None:
-        return 0.0
-    noise = scatter_nm[drift.cycle - 1] / drift.first_nm
-    seen = drift.over(recording.procedure.duration_s)
-    beyond_noise = np.sqrt(max(1 - 2 * (noise / drift.change) ** 2, 0.0)) if drift.change else 0.0
-    return float(abs(seen) * beyond_noise / np.sqrt(3.0))
+        return np.zeros_like(seen_s)
+    duration_s = recording.procedure.duration_s
+    noise = np.sqrt(2.0) * float(scatter_nm[drift.cycle - 1]) / drift.first_nm
+    most = abs(drift.over(duration_s)) + drift.over(duration_s, noise)
+    farthest = 0.5 + np.abs(seen_s / duration_s - 0.5)
+    shares: Array = most * farthest / np.sqrt(3.0)
+    return shares
+
+
+def _apart(pairs: IdentifiedPairs, solved: Fit, scatter_nm: Array, others: Beside, weights: Array) -> Array:
+    """What the distance between windows and least squares says beyond the scatter of both, shape (N,).
+
+    Place and load move both, unlike: what they explain of the distance is a term of its own.
+    """
+    hats = hat_functions(pairs.mean_speed_rad_s, solved.knots)
+    odd = solved.blocks.odd
+    known = np.einsum("nj,jk,nk->n", hats, solved.covariance[odd, odd], hats)
+    distance = pairs.torque_nm - hats @ solved.odd_nm - others.moved(weights - hats @ others.on_knots)
+    beyond = _pooled(distance**2) - _pooled(known + scatter_nm**2)
+    apart: Array = np.sqrt(np.maximum(beyond, 0.0))
+    return apart
+
+
+def _pooled(power: Array) -> Array:
+    """Means over five neighbours; the outermost count again beyond the ends."""
+    return np.convolve(np.pad(power, 2, mode="edge"), np.full(5, 0.2), "valid")
 
 
 def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> Array:
@@ -253,7 +314,8 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
 
     Forwards the early half covers the lower half of the travel, backwards the late one does. Lower minus upper halves,
     both ways with the sign of the motion, is free of gravity, of asymmetry and of what is left of inertia: it holds
-    the scatter of all four halves, and friction that depends on the place. F_n is their mean, hence the quarter.
+    the scatter of all four halves, and what friction has more at one end of the travel (``_by_chance``). F_n is their
+    mean, hence the quarter.
     """
     procedure = recording.procedure
     torque = motion.torque_nm
@@ -272,7 +334,24 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
             rows = np.flatnonzero(sign * v >= procedure.ratio * procedure.peak_velocities_rad_s[n])
             early, late = np.array_split(f[rows], 2)
             single[n] += (early.mean() - late.mean()) / 4 if late.size else 0.0
-    # One degree of freedom each: pooled over five neighbours, and widened for those five.
-    pooled = np.convolve(np.pad(single**2, 2, mode="edge"), np.full(5, 0.2), "valid")
-    spread: Array = np.sqrt(pooled) * student.ppf(0.975, 5) / COVERAGE
+    chance, free = _by_chance(recording, single)
+    # One degree of freedom each at most: pooled over five neighbours, and widened for those.
+    spread: Array = np.sqrt(_pooled(chance**2)) * student.ppf(0.975, 5 * free) / COVERAGE
     return spread
+
+
+def _by_chance(recording: CycleRecording, single: Array) -> tuple[Array, float]:
+    """The differences of half windows without what comes again in every cycle, and the freedom that is left to each.
+
+    Every cycle passes the same places: friction that varies along the travel makes the same difference in all of them,
+    and a gear's loss one that grows with the inertial torque, n^2. Both are as large above the middle as they are small
+    below and leave the mean alone; what their bend leaves in it is ``beside``.
+    """
+    procedure = recording.procedure
+    if procedure.cycles < _ENOUGH:
+        return single, 1.0
+    inertial = (procedure.peak_velocities_rad_s / procedure.velocity_rad_s) ** 2
+    again = np.column_stack([np.ones_like(inertial), inertial])
+    rest = single - again @ np.linalg.lstsq(again, single, rcond=None)[0]
+    free = 1.0 - again.shape[1] / single.size
+    return rest / np.sqrt(free), free

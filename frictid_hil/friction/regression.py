@@ -114,6 +114,7 @@ def fit(
     *,
     width_rad: float = FINE,
     extra: Array | None = None,
+    expected: tuple[float, ...] = (),
     doubtful: Array | None = None,
 ) -> Fit:
     """Solve the model on every sample of the cycles that is not guarded.
@@ -125,6 +126,7 @@ def fit(
         level_nm: typical friction torque; scale of the prior on the bias.
         width_rad: of the kernel, in radians of the fastest cycle.
         extra: further columns of the model, shape (n, m).
+        expected: within how much of zero each of their coefficients is expected; empty: nothing is.
         doubtful: columns of which the torque may hold more or less than was taken off, shape (n, m).
 
     Raises:
@@ -137,11 +139,12 @@ def fit(
     doubts = np.zeros((late.size, 0)) if doubtful is None else doubtful
     both = np.column_stack([columns, motion.torque_nm, late, doubts])
     both = _smoothed_rows(both, chosen.rows, chosen.width)
+    wished = [Prior(np.eye(blocks.size)[blocks.extra.start + k], share, 0.0) for k, share in enumerate(expected)]
     solved = solve(
         both[:, : blocks.size],
         both[:, blocks.size :],
         chosen.quarter[chosen.rows],
-        _priors(blocks, knots[observed], level_nm, chosen.rows_alike),
+        [*_priors(blocks, knots[observed], level_nm, chosen.rows_alike), *wished],
         recording.where,
     )
     return Fit(

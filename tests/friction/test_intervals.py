@@ -57,7 +57,7 @@ def test_skew_that_is_left_open_widens_the_fast_knots_only(plants):
     recording = plants.record(plants.arm[1], plants.procedure(20))
     recording = replace(recording, skew=Skew(torque_delay_s=5e-4, uncertainty_s=1e-3))
     motion = synchronised(recording)
-    terms = window_terms(recording, motion, aligned_pairs(recording, motion), None, None, None)
+    terms = window_terms(recording, motion, aligned_pairs(recording, motion), None, None, None, None)
     assert terms.skew[0] < 0.01 * terms.skew[-1]
     predicted = 0.93 * 1.9 * recording.procedure.velocity_rad_s * 1e-3
     predicted *= recording.procedure.angular_frequencies_rad_s[-1] ** 2
@@ -81,6 +81,54 @@ def test_the_seen_delay_widens_an_interval_and_moves_no_curve(plants, monkeypatc
     without = estimate(recording)
     assert with_it.curve == without.curve
     assert np.all(with_it.half_width_nm <= without.half_width_nm)
+
+
+def extended(recording, more_nm):
+    """The recording with that much more friction, given speed, acceleration and place along the travel (-1 to 1)."""
+    motion = synchronised(recording)
+    inside = (motion.time_s >= 0) & (motion.time_s < recording.procedure.duration_s)
+    low, high = np.min(motion.position_rad[inside]), np.max(motion.position_rad[inside])
+    place = (2 * motion.position_rad - low - high) / (high - low)
+    more = np.sign(motion.velocity_rad_s) * more_nm(motion.velocity_rad_s, motion.acceleration_rad_s2, place)
+    return replace(recording, torque_nm=recording.torque_nm + more)
+
+
+@pytest.mark.parametrize("amplitude", [20, 5])
+def test_friction_that_rises_along_the_travel_is_no_scatter_of_its_mean(plants, amplitude):
+    recording = plants.record(plants.arm[0], plants.procedure(amplitude))
+    level = np.full(10, 12.0)
+    plain, sloped = estimate(recording), estimate(extended(recording, lambda v, a, x: 0.05 * 12.0 * x))
+    moved = np.array(sloped.curve.torque_nm) - np.array(plain.curve.torque_nm)
+    assert np.all(np.abs(moved) < 0.003 * level)
+    assert np.all(np.abs(sloped.terms.scatter - plain.terms.scatter) < 0.003 * level)
+
+
+@pytest.mark.parametrize("method", ["aligned", "least-squares"])
+@pytest.mark.parametrize(
+    "more_nm",
+    [lambda v, a, x: 0.04 * 1.1 * np.abs(a), lambda v, a, x: 0.03 * 12.0 * (3 * x**2 - 1) / 2],
+    ids=["load", "bend along the travel"],
+)
+def test_what_place_and_load_do_to_a_curve_is_in_its_interval(plants, method, more_nm):
+    recording = plants.record(plants.arm[0], plants.procedure(10))
+    plain, more = estimate(recording, method), estimate(extended(recording, more_nm), method)
+    fast = np.array(plain.curve.velocity_rad_s) > 0.2
+    moved = np.interp(plain.curve.velocity_rad_s, more.curve.velocity_rad_s, more.curve.torque_nm)
+    moved = float(np.sqrt(np.mean((moved - plain.curve.torque_nm)[fast] ** 2)))
+    known = float(np.sqrt(np.mean(more.terms.beside[more.terms.beside.size - fast.sum() :] ** 2)))
+    before = float(np.sqrt(np.mean(plain.terms.beside[fast] ** 2)))
+    assert moved > 0.03
+    assert 0.5 * moved < known < 2.0 * moved
+    assert before < 0.5 * known
+
+
+@pytest.mark.parametrize("index", [3, 4])
+def test_a_repeated_cycle_that_runs_slower_feigns_no_drift(plants, index):
+    """At 5 deg the fast cycle before leaves the repeated one 3 % slower, which is 0.6 % less viscous friction."""
+    recording = plants.record(plants.arm[index], plants.procedure(5))
+    assert abs(estimate(recording).drift.change) < 0.0025
+    falling = replace(plants.arm[index], drift=-0.12)  # in 16 s, so 1.5 % between the two runs
+    assert estimate(plants.record(falling, plants.procedure(5))).drift.change == pytest.approx(-0.015, abs=0.0035)
 
 
 def test_coulomb_interval_is_that_of_a_line_through_two_uncertain_pairs():
