@@ -49,7 +49,7 @@ def test_the_page_of_a_robot_has_its_history(store: ProfileStore) -> None:
     page = Path(result["report"])
     assert page == store.root.resolve() / "arm" / "index.html"
     text = page.read_text()
-    for told in (store.history("arm")[1].id, "somebody", "night 2", "robot is off", "switch it on", "10.0", "22.0"):
+    for told in (store.history("arm")[1].id, "somebody", "Night 2.", "Robot is off.", "Switch it on.", "10.0", "22.0"):
         assert told in text, told
     for figure in ("Coulomb friction F_0 over time", "Distance of the curve from the baseline", "Temperature during"):
         assert figure in text
