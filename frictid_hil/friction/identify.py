@@ -97,9 +97,9 @@ def function_a(
         )
     velocity, torque = velocity[bounds[0] : bounds[-1]], torque[bounds[0] : bounds[-1]]
     bounds = bounds - bounds[0]
-    threshold = thresholds.repeat(lengths)
+    above, below = _by_sample(procedure, tuple(lengths.tolist()))
     (v_plus, f_plus, n_plus), (v_minus, f_minus, n_minus) = _means(
-        (velocity >= threshold, velocity <= -threshold), velocity, torque, bounds, where
+        (velocity >= above, velocity <= below), velocity, torque, bounds, where
     )
     if not (n_plus.all() and n_minus.all()):
         raise _empty_window(velocity, bounds, thresholds, n_plus, where)
@@ -109,6 +109,13 @@ def function_a(
 @lru_cache(maxsize=16)
 def _windows(procedure: Procedure) -> tuple[Array, Array]:
     return procedure.cycle_starts_s, procedure.ratio * procedure.peak_velocities_rad_s
+
+
+@lru_cache(maxsize=16)
+def _by_sample(procedure: Procedure, lengths: tuple[int, ...]) -> tuple[Array, Array]:
+    """Threshold of every sample, forwards and backwards: the same for all recordings that were sampled alike."""
+    above = _windows(procedure)[1].repeat(lengths)
+    return above, -above
 
 
 def _means(
