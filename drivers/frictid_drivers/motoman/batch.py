@@ -173,7 +173,10 @@ class BatchClient:
                 if self.now_s() > until_s:
                     self.stop(number)
                     raise HardwareError(
-                        f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s", where=f"job {number}"
+                        f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s",
+                        where=f"job {number}",
+                        cause="the controller ticks more slowly than it says, or the job hangs",
+                        next_step="look at the pendant; compare `check` with the controller's interpolation clock",
                     )
                 pause_until_s = self.now_s() + min(_POLL_S, watchdog_s / 10)
                 while self.now_s() < pause_until_s and (stopping or not stop()):
