@@ -52,7 +52,7 @@ class Figure:
                 },
                 "hovermode": "closest",
                 "showlegend": len(self.traces) > 1,
-                "margin": {"l": 60, "r": 20, "t": 40, "b": 50},
+                "margin": {"l": 60, "r": 20, "t": 52, "b": 50},
                 "height": 400,
             },
         }
