@@ -435,20 +435,23 @@ def test_what_a_job_recorded_is_fetched_once_a_lost_port_is_back(gone_s: int) ->
     assert not bench.still_moving()
 
 
-def test_a_port_that_is_lost_during_the_transfer_and_comes_back_costs_nothing() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_a_port_that_is_lost_during_the_transfer_and_comes_back_costs_nothing(share: float) -> None:
     motion = plan(Sine(START_RAD, 0.3, 1.0, 10))
     spoken: dict[str, int] = {}
     bench = make_bench(layer="batch", stream_baud=0)
     driver = bench.driver()
     driver.open()
 
-    def remember(stage: str, share: float) -> None:
-        spoken[f"{stage} {share:.0%}"] = bench.emulator.faults.counted["utterance"]
+    def remember(stage: str, done: float) -> None:
+        spoken[f"{stage} {done:.0%}"] = bench.emulator.faults.counted["utterance"]
 
     whole = driver.run_batch(motion, progress=remember)
     driver.close()
-    middle = (spoken["motion 100%"] + spoken["transfer 100%"]) // 2
-    bench = make_bench(layer="batch", stream_baud=0, faults=[f"close@{middle}:8"])
+    # From the question about the finished job on, with which the transfer begins.
+    first, last = spoken["motion 100%"], spoken["transfer 100%"]
+    at = first + round(share * (last - first))
+    bench = make_bench(layer="batch", stream_baud=0, faults=[f"close@{at}:8"])
     driver = bench.driver()
     driver.open()
     kept = driver.run_batch(motion)

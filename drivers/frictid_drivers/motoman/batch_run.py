@@ -202,10 +202,8 @@ class BatchRun:
             )
 
     def _fetch(self, record: JobRecord, progress: Callable[[str, float], None]) -> None:
-        state = self._batch.state(self.number)
-
         def fetch() -> None:
-            record.complete(state, lambda share: progress("transfer", share))
+            record.complete(self._batch.state(self.number), lambda share: progress("transfer", share))
 
         try:
             fetch()
