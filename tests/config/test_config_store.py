@@ -313,26 +313,19 @@ def test_a_thousand_kills_never_spoil_the_store(tmp_path: Path) -> None:
     kill_while_writing(tmp_path, 1000)
 
 
-@pytest.mark.slow
-def test_ten_thousand_profiles_are_told_in_two_seconds(tmp_path: Path) -> None:
+def test_a_long_history_opens_no_profile(tmp_path: Path) -> None:
     store = ProfileStore(tmp_path)
     folder = tmp_path / "hp3j"
     first = store.add(profile(joints="012345"))
     store.promote("hp3j", first)
     line = json.loads((folder / "index.jsonl").read_text())
     assert line["baseline"] == first
-    text = store.path("hp3j", first).read_bytes()
     with (folder / "index.jsonl").open("a") as index:
-        for k in range(9_999):
+        for k in range(200):
             identity = f"20260101T{k:06d}Z-{k:012x}"
-            (folder / "profiles" / f"{identity}.yaml").write_bytes(text)
+            (folder / "profiles" / f"{identity}.yaml").write_text("read, I am no profile")
             index.write(json.dumps({**line, "id": identity}) + "\n")
-    began = time.process_time()
-    history = store.history("hp3j")
-    trends = store.trends("hp3j")
-    took_s = time.process_time() - began
-    assert len(history) == len(trends["5"]) == 10_000
-    assert took_s < 2.0
+    assert len(store.history("hp3j")) == len(store.trends("hp3j")["5"]) == 201
 
 
 words = st.text("abc :#'\"\n-{}[]é", max_size=200)
