@@ -113,8 +113,8 @@ def test_what_place_and_load_do_to_a_curve_is_in_its_interval(plants, method, mo
     recording = plants.record(plants.arm[0], plants.procedure(10))
     plain, more = estimate(recording, method), estimate(extended(recording, more_nm), method)
     fast = np.array(plain.curve.velocity_rad_s) > 0.2
-    moved = np.interp(plain.curve.velocity_rad_s, more.curve.velocity_rad_s, more.curve.torque_nm)
-    moved = float(np.sqrt(np.mean((moved - plain.curve.torque_nm)[fast] ** 2)))
+    changed_nm = np.interp(plain.curve.velocity_rad_s, more.curve.velocity_rad_s, more.curve.torque_nm)
+    moved = float(np.sqrt(np.mean((changed_nm - plain.curve.torque_nm)[fast] ** 2)))
     known = float(np.sqrt(np.mean(more.terms.beside[more.terms.beside.size - fast.sum() :] ** 2)))
     before = float(np.sqrt(np.mean(plain.terms.beside[fast] ** 2)))
     assert moved > 0.03
