@@ -183,14 +183,14 @@ def test_the_page_compares_with_the_profile_in_force(interrupted: tuple[str, Pat
     robot, run = interrupted
     whole, store = tmp_path / "run", ProfileStore(tmp_path / "store")
     shutil.copytree(run, whole)
-    assert "no earlier profile" in (whole / "report.html").read_text()
+    assert "there is nothing to compare with" in (whole / "report.html").read_text()
     old = load_profile(whole / "profile.yaml")
     slower = {
         n: one.model_copy(update={"torque_nm": tuple(1.5 * t for t in one.torque_nm)}) for n, one in old.joints.items()
     }
     store.promote("two", store.add(old.model_copy(update={"joints": slower})))
     calibrate(CalibrateOptions(robot, resume=whole, store=store.root), Silent())
-    assert "from the active profile" in (whole / "report.html").read_text()
+    assert "Compared with the profile that was active then" in (whole / "report.html").read_text()
     (whole / "report.html").unlink()
     page = Path(report(whole)["report"]).read_text()
-    assert "from the active profile" in page and "active before" in page
+    assert "Compared with the profile that was active then" in page and "active before" in page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import tomllib
 from dataclasses import replace
@@ -481,11 +482,10 @@ def test_closing_twice_and_quick_stopping_a_closed_driver_is_harmless() -> None:
 
 def test_the_import_contracts_name_every_module_of_the_driver() -> None:
     """So that no codec can come to be shared by driver and emulator through a new file."""
-    root = Path(__file__).parents[2]
-    folder = root / "drivers" / "frictid_drivers" / "motoman"
+    folder = Path(inspect.getfile(MotomanDriver)).parent
     modules = {f"frictid_drivers.motoman.{path.stem}" for path in folder.glob("[!_]*.py")}
-    contracts = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    by_name = {contract["name"]: contract for contract in contracts}
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    by_name = {contract["name"]: contract for contract in project["tool"]["importlinter"]["contracts"]}
     shared = by_name["The emulated serial controller shares nothing with the serial driver"]
     assert set(shared["forbidden_modules"]) == modules
     assert set(by_name["The serial driver knows neither its emulator nor the simulation"]["source_modules"]) == modules
