@@ -92,8 +92,8 @@ class CycleRecording:
         coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
             combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
         companions: those joints, as far as it is known how much they take.
-        stops_s: where the path stood still for missed set-points; ``time_s`` leaves those moments out. Shape (k,).
-        stopped_s: for how long, shape (k,).
+        stops_s: where reports are missing, or the path stood still for missed set-points; shape (k,).
+        stopped_s: how long it stood still where ``time_s`` leaves those moments out, shape (j,).
         shaken: the stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
         where: what to name in errors (``joint 1``).
     """

@@ -27,7 +27,7 @@ from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.companions import with_companions
 from frictid_hil.jobs.declared import declared_skew
-from frictid_hil.jobs.path_time import path_time
+from frictid_hil.jobs.path_time import gaps_ns, path_time
 from frictid_hil.jobs.skew_stretch import wanted_note, with_shaking
 from frictid_hil.recording.samples import Mark, Samples
 
@@ -248,6 +248,7 @@ def _recording(
         torque_quantum_nm=float(quantum) if quantum else 0.0,
         repeat=_repeat(drift[0], procedure, start_s) if drift else None,
         late_cycles=late_cycles,
+        stops_s=gaps_ns(kept) * 1e-9 - start_s,
         where=f"joint {samples.joint}",
     )
 

@@ -17,6 +17,8 @@ from frictid_hil.recording.samples import Nanoseconds, Samples
 
 _GAP_STEPS = 1.5
 """Between two samples, in sample periods: a longer one is a gap."""
+_LONG_STEPS = 2.5
+"""A gap of one lost report is bridged as well as it was measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +90,13 @@ def path_time(samples: Samples, procedure: Procedure, start_ns: int) -> PathTime
     ):
         return stopped
     return None
+
+
+def gaps_ns(samples: Samples) -> Nanoseconds:
+    """Times before gaps of more than one report, shape (k,): what lies in them nobody knows."""
+    steps_ns = np.diff(samples.time_ns)
+    gaps: Nanoseconds = samples.time_ns[:-1][steps_ns > _LONG_STEPS * np.median(steps_ns)]
+    return gaps
 
 
 def _misfit(samples: Samples, time_ns: Nanoseconds, procedure: Procedure, start_ns: int) -> float:

@@ -69,6 +69,15 @@ def test_lost_reports_are_no_stops() -> None:
     assert profile.torque_nm == pytest.approx(whole.torque_nm, rel=2e-3)
 
 
+def test_where_stops_and_lost_reports_mix_the_inertia_is_still_right() -> None:
+    """As on a computer short of time: neither time is the path's, and a jump in it is no acceleration."""
+    samples = stopped(run(), STOPS)
+    kept = np.ones(len(samples), dtype=np.bool_)
+    kept[np.random.default_rng(1).integers(0, len(samples), 120)] = False
+    mixed = identify_joint(samples.select(kept), None, method="aligned")
+    assert mixed.inertia_kg_m2.value == pytest.approx(INERTIA, rel=0.01)
+
+
 def test_without_commanded_positions_nothing_tells() -> None:
     samples = stopped(run(), STOPS)
     silent = Samples(samples.joint, samples.time_ns, samples.position_rad, torque_nm=samples.torque_nm)
