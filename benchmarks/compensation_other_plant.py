@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from pathlib import Path
+from unittest.mock import patch
 
 from compensation_robots import JOINTS, variant
 from other_plant import OtherPlant
@@ -23,9 +24,9 @@ from frictid_hil.jobs.compensation_wanted import Wanted
 from frictid_hil.jobs.watch import Silent
 
 
+@patch.object(joint_drive, "ServoLoop", OtherPlant)  # another plant behind the drive
 def calibrated(joint: str, kept: Path, bus: str, seed: int) -> tuple[Path, Path]:
     """(Robot file, profile) of one joint of the other plant, identified by the product unless ``kept`` has them."""
-    joint_drive.ServoLoop = OtherPlant  # type: ignore[attr-defined,assignment]  # another plant behind the drive
     folder = kept / f"{joint}-seed-{seed}"
     robot, profile = folder / "robot.yaml", folder / "calibration" / "profile.yaml"
     if not profile.exists():
@@ -35,6 +36,7 @@ def calibrated(joint: str, kept: Path, bus: str, seed: int) -> tuple[Path, Path]
     return robot, profile
 
 
+@patch.object(joint_drive, "ServoLoop", OtherPlant)  # another plant behind the drive
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--joint", action="append")

@@ -35,6 +35,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from compensation_other_plant import calibrated
@@ -188,12 +189,12 @@ def bus(options: argparse.Namespace) -> None:
         for delay in options.delay or (2, 5):
             with tempfile.TemporaryDirectory() as folder:
                 robot, entry, plant = of_joint(options, joint, Path(folder), delay)
-                joint_drive.ServoLoop = remembering(plant)  # type: ignore[attr-defined]  # a tap
-                found = [
-                    on_the_bus(robot, options.bus, entry, joint, hold, way, options.seed)
-                    for hold in (False, True)
-                    for way in (1.0, -1.0)
-                ]
+                with patch.object(joint_drive, "ServoLoop", remembering(plant)):
+                    found = [
+                        on_the_bus(robot, options.bus, entry, joint, hold, way, options.seed)
+                        for hold in (False, True)
+                        for way in (1.0, -1.0)
+                    ]
                 friction = changed_law(
                     entry, load_robot(str(robot)).to_setup().joint(joint), False, MORE_RATIO, MORE_STIFFNESS
                 ).friction

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from command_line import call
 
@@ -29,6 +30,7 @@ from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan import Hold, JointPlan, Motion, Move
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 LIMIT_POINTS = 3.0
 TICK_S, SECONDS, NOT_COUNTED_S = 0.004, 12.0, 2.0
@@ -65,14 +67,15 @@ def felt_nm(
     def feel(duration_s: float) -> None:
         move_on(duration_s)
         if axis.floating:
-            felt.append(axis.servo.external_torque_nm)  # type: ignore[attr-defined]  # a tap
+            assert isinstance(axis.servo, ServoLoop)
+            felt.append(axis.servo.external_torque_nm)
 
-    axis.run = feel  # type: ignore[method-assign]
-    driver.open()
-    driver.download_table(joint, curve, **table)
-    driver.compensate_by_table([joint])
-    driver.run_batch(JointPlan(joint, tuple(motions), {}))
-    driver.close()
+    with patch.object(axis, "run", feel):
+        driver.open()
+        driver.download_table(joint, curve, **table)
+        driver.compensate_by_table([joint])
+        driver.run_batch(JointPlan(joint, tuple(motions), {}))
+        driver.close()
     return felt
 
 

@@ -145,8 +145,8 @@ class Watched:
                 watched.lost_at_sample = len(watched.jobs[-1].samples)
             lose(for_s)
 
-        axis.run = remember  # type: ignore[method-assign]
-        emulator._lose_port = remember_loss  # type: ignore[method-assign]
+        axis.run = remember  # type: ignore[method-assign]  # a tap that stays as long as the controller
+        emulator._lose_port = remember_loss  # type: ignore[method-assign]  # likewise
         emulator.batch._commands["FRUN"] = remember_job
         return watched
 

@@ -152,7 +152,7 @@ def test_unplugging_is_noticed_at_once() -> None:
         assert len(streamed.rows) > 20
 
 
-def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str) -> None:
+def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     driver = driver_on(port)
     driver.open()
     exchange, cycles = driver.exchange, 0
@@ -164,7 +164,7 @@ def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str) -> None:
             driver._open_line().port.close()
         return exchange(set_points)
 
-    driver.exchange = until_pulled  # type: ignore[method-assign]
+    monkeypatch.setattr(driver, "exchange", until_pulled)
     with pytest.raises(HardwareError, match="the port is closed"):
         stream_motion(driver, ticks=400, travel_rad=0.1)
     driver.close()
@@ -200,7 +200,7 @@ def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_
     assert state.position_rad == pytest.approx(kept["position_rad"][-1], abs=1e-2)
 
 
-def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path) -> None:
+def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
     with controller("close@130:2", link=str(tmp_path / "port")) as port:
         driver = driver_on(port, layer="batch")
@@ -212,7 +212,7 @@ def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path) -> None:
             reopened.append(time.monotonic())
             reopen()
 
-        line.reopen = reopen_again  # type: ignore[method-assign]
+        monkeypatch.setattr(line, "reopen", reopen_again)
         columns = driver.run_batch(JointPlan("3", (Sine(at, 0.1, 0.5, 3),), {}))
         driver.close()
     assert reopened
