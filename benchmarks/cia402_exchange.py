@@ -18,7 +18,8 @@ from canopen.objectdictionary import ODVariable
 
 from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 
 CYCLES = 4000
 

@@ -20,7 +20,7 @@ from frictid_drivers.virtual import joint_drive
 from frictid_hil.config.profile import load_profile
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
-from frictid_hil.jobs.compensation_wanted import Wanted
+from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Silent
 
 

@@ -45,15 +45,17 @@ from other_plant import OtherPlant
 from frictid_drivers.virtual import joint_drive
 from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.control import Bounds, Compensated, ControlLaw, Swing
-from frictid_hil.driver import Feedback, JointSetup, Mode
 from frictid_hil.errors import FrictidError
-from frictid_hil.jobs.compensation_laws import law_of
-from frictid_hil.jobs.compensation_wanted import Wanted
-from frictid_hil.plan import Hold, Motion, Move, Plan, joint_plan
+from frictid_hil.jobs.compensation.laws import law_of
+from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Swing
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Hold, Motion, Move, Plan, joint_plan
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Feedback
 from frictid_hil.runner.compensation import Controller
 from frictid_hil.runner.events import Event, PhaseStarted
-from frictid_hil.runner.run import run_plan
+from frictid_hil.runs.run import run_plan
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 

@@ -43,7 +43,7 @@ from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
 from frictid_hil.friction.recording import CycleRecording, Repeat, Skew
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.skew_stretch import shaking
+from frictid_hil.jobs.identification.skew_stretch import shaking
 
 KINDS = {
     "rigid": {},

@@ -41,7 +41,7 @@ from frictid_hil.friction.link import soft_link
 from frictid_hil.friction.recording import CycleRecording, Skew, synchronised
 from frictid_hil.friction.skew import measured_skew
 from frictid_hil.friction.trajectory import Array, Procedure
-from frictid_hil.jobs.skew_stretch import shaking
+from frictid_hil.jobs.identification.skew_stretch import shaking
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from on_the_bus import calibrated, distance, plant, profiles, variant
 
-from frictid_hil.jobs.programmes import PROGRAMMES
+from frictid_hil.jobs.identification.programmes import PROGRAMMES
 
 
 def main() -> None:

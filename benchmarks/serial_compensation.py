@@ -29,7 +29,7 @@ from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan import Hold, JointPlan, Motion, Move
+from frictid_hil.plan.plan import Hold, JointPlan, Motion, Move
 from frictid_hil.simulation.servo_loop import ServoLoop
 
 LIMIT_POINTS = 3.0

@@ -39,14 +39,14 @@ from frictid_drivers.motoman.emulator.jobs import Job
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_mcap
-from frictid_hil.runner import run as run_module
 from frictid_hil.runner.events import Event, JobProgress, Marked, PhaseStarted
+from frictid_hil.runs import run as run_module
 
 JOINT, LIMIT_PERCENT, LATER_S, TICK_NS = "3", 2.5, 150.0, 4_000_000
 ROBOT = """\

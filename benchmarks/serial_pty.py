@@ -23,11 +23,11 @@ from typing import Any
 from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.build import build
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
-from frictid_hil.driver import RobotSetup
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.runner import run as run_module
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.runs import run as run_module
 
 LIMIT_PERCENT = 2.5
 TOOL = "frictid-hil"

@@ -28,7 +28,7 @@ from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.quality import gates
 from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.programmes import PROGRAMMES
+from frictid_hil.jobs.identification.programmes import PROGRAMMES
 
 V_RAD_S = math.radians(115.0)
 PLANTS = {"rigid": "rigid", "flexible": "flexible, 28 Hz", "load": "5 % load-dependent friction"}

@@ -26,14 +26,14 @@ import time
 import traceback
 from pathlib import Path
 
-from frictid_hil.config.attempts import attempts
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.profiles.attempts import attempts
+from frictid_hil.profiles.store import ProfileStore
 
 SPEEDS = tuple(0.2 * k for k in range(1, 11))
 JOINT, ROBOT = "5", "killed"

@@ -25,15 +25,15 @@ from two_ways import Comparison, Curves, compare, least_apart
 
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import load_driver
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.metrics import CurveDistance, curve_distance, curve_mean
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import true_curve
-from frictid_hil.jobs.declared import declared_skew
-from frictid_hil.jobs.joint_profile import identify_joint, procedure_of
+from frictid_hil.jobs.identification.declared import declared_skew
+from frictid_hil.jobs.identification.joint_profile import identify_joint, procedure_of
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.protocol.driver import load_driver
 from frictid_hil.recording.read import read
 from frictid_hil.simulation.arm_model import ArmModel
 from frictid_hil.simulation.joint import JointModel

@@ -4,10 +4,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.plan import (
+from frictid_hil.plan.limits import refuse_beyond_limits
+from frictid_hil.plan.plan import (
     Corners,
     Cycles,
     Expected,
@@ -18,7 +18,7 @@ from frictid_hil.plan import (
     coupling_bound_nm,
     joint_plan,
 )
-from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 DEG = math.pi / 180
 

@@ -10,14 +10,14 @@ from typer.testing import CliRunner
 
 from frictid_hil.cli.app import app
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import Feedback
 from frictid_hil.errors import ConfigError, PlanRefused, SafetyAbort
 from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
 from frictid_hil.kinematics import DhRow
+from frictid_hil.plan.workspace import Workspace
+from frictid_hil.protocol.driver import Feedback
 from frictid_hil.runner.ring import Rows
-from frictid_hil.runner.run import run_plan
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
-from frictid_hil.workspace import Workspace
+from frictid_hil.runs.run import run_plan
 
 PLANAR = (DhRow(a_m=0.5), DhRow(a_m=0.3))
 ROOM = ((-1.0, 1.0), (-1.0, 1.0), (-0.1, 0.1))

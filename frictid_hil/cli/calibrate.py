@@ -121,7 +121,7 @@ def calibrate(
     from frictid_hil.cli.progress import print_plan, watching
     from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
     from frictid_hil.jobs.calibrate import calibrate as job
-    from frictid_hil.plan import described
+    from frictid_hil.plan.plan import described
 
     output = Output(as_json, quiet, notify)
     options = CalibrateOptions(

@@ -25,8 +25,8 @@ from frictid_hil.cli.options import (
     quantity,
 )
 from frictid_hil.cli.output import Output, Result
-from frictid_hil.driver import Mode
 from frictid_hil.errors import UsageError
+from frictid_hil.plan.mode import Mode
 from frictid_hil.units import degrees
 
 _DRIVE_MODES = {"torque": Mode.TORQUE, "position": Mode.POSITION, "velocity": Mode.VELOCITY}
@@ -124,8 +124,8 @@ def compensate(
     from frictid_hil.cli.progress import print_plan, watching
     from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
     from frictid_hil.jobs.compensate import compensate as job
-    from frictid_hil.jobs.compensation_wanted import Wanted
-    from frictid_hil.plan import described
+    from frictid_hil.jobs.compensation.wanted import Wanted
+    from frictid_hil.plan.plan import described
 
     output = Output(as_json, quiet)
 

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from frictid_hil.driver import RobotSetup
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.ring import Rows
 from frictid_hil.units import degrees
 

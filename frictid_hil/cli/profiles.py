@@ -161,8 +161,8 @@ def history(
     quiet: QuietOption = False,
 ) -> None:
     """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
-    from frictid_hil.config.store import ProfileStore
     from frictid_hil.jobs.history import history as job
+    from frictid_hil.profiles.store import ProfileStore
 
     output = Output(as_json, quiet)
 

@@ -13,12 +13,13 @@ from rich.table import Table
 
 from frictid_hil.cli.joint_view import JointView
 from frictid_hil.cli.output import Output
-from frictid_hil.driver import RobotSetup, Severity
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.live import DEFAULT_ADDRESS
 from frictid_hil.jobs.live import live as live_watcher
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import Plan, stretch_name
+from frictid_hil.plan.plan import Plan, stretch_name
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Severity
 from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import Rows
 from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity

@@ -21,7 +21,7 @@ from frictid_hil.config.write import dump, plain, write_whole
 from frictid_hil.config.yaml import Document, KeyPath, Node, read
 from frictid_hil.errors import ConfigError, ProfileMismatch
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.linear_axis import linear_name, linear_names, rotary_name
+from frictid_hil.plan.linear_axis import linear_name, linear_names, rotary_name
 
 KIND = "frictid.profile"
 NEWEST = 1

@@ -26,11 +26,11 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.schema import Pair, Strict, Triple, schema_version, validated
 from frictid_hil.config.search import find
 from frictid_hil.config.yaml import Document, merge, read
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.kinematics import DhRow
-from frictid_hil.workspace import Workspace
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.plan.workspace import Workspace
 
 KIND = "frictid.robot"
 NEWEST = 1

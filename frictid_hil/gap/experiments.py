@@ -21,7 +21,7 @@ import numpy as np
 
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.plan import Corners, Hold, Motion, Move, Sine
+from frictid_hil.plan.plan import Corners, Hold, Motion, Move, Sine
 
 SCHEMA = "frictid.gap_plan/1"
 CHIRP_LOW_HZ = 0.3

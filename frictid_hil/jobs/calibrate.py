@@ -14,26 +14,27 @@ from frictid_hil.config.policy import WarmUp
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.config.store import ProfileStore
-from frictid_hil.driver import RobotSetup, planned_quantum_s
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
-from frictid_hil.jobs.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.programmes import Programme, programme
+from frictid_hil.jobs.identification.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
 from frictid_hil.jobs.plans import calibration_plan, expected_of, rehearsal_note
-from frictid_hil.jobs.programmes import Programme, programme
 from frictid_hil.jobs.report import write_run_page
-from frictid_hil.jobs.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import Plan
-from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.plan.limits import refuse_beyond_limits
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.profiles.store import ProfileStore
+from frictid_hil.protocol.driver import planned_quantum_s
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
-from frictid_hil.runner.rehearsals import Rehearsals
-from frictid_hil.runner.run import run_plan
-from frictid_hil.runner.run_folder import RunFolder
+from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runs.rehearsals import Rehearsals
+from frictid_hil.runs.run import run_plan
 from frictid_hil.units import format_velocity
 
 VERB = "calibrate"

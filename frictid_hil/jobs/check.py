@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import Driver, Finding, Severity, load_driver
 from frictid_hil.errors import PlanRefused
 from frictid_hil.jobs.plans import calibration_plan, expected_of
-from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.plan.limits import refuse_beyond_limits
+from frictid_hil.protocol.driver import Driver, Finding, Severity, load_driver
 
 
 def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:

@@ -13,24 +13,25 @@ from typing import Any
 
 from frictid_hil.config.profile import load_profile, profile_file
 from frictid_hil.config.robot import load_robot
-from frictid_hil.control import Compensated
-from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Mode
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
-from frictid_hil.jobs.compensation_companions import Hand, Live, LiveFigures
-from frictid_hil.jobs.compensation_figures import mode_run
-from frictid_hil.jobs.compensation_plan import compensation_plan
-from frictid_hil.jobs.compensation_result import Asked, Progress, result_of
-from frictid_hil.jobs.compensation_wanted import MODES, Wanted
+from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
+from frictid_hil.jobs.compensation.figures import mode_run
+from frictid_hil.jobs.compensation.plan import compensation_plan
+from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of_file, refuse
+from frictid_hil.jobs.compensation.result import Asked, Progress, result_of
+from frictid_hil.jobs.compensation.wanted import MODES, Wanted
 from frictid_hil.jobs.plans import expected_of
-from frictid_hil.jobs.profile_fit import doubts_of_drive, doubts_of_file, refuse
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.plan.control import Compensated
+from frictid_hil.plan.limits import refuse_beyond_limits
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
-from frictid_hil.runner.rehearsals import Rehearsals
-from frictid_hil.runner.run import run_plan
-from frictid_hil.runner.run_folder import RunFolder
+from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runs.rehearsals import Rehearsals
+from frictid_hil.runs.run import run_plan
 
 VERB = "compensate"
 

@@ -13,8 +13,8 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
-from frictid_hil.jobs.export_mujoco import export_mujoco
-from frictid_hil.jobs.improved_robot import improved_robot
+from frictid_hil.jobs.gap.export_mujoco import export_mujoco
+from frictid_hil.jobs.gap.improved_robot import improved_robot
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.simulation.joint import JointModel

@@ -17,7 +17,6 @@ import yaml
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import Driver, JointIdentity, JointSetup, RobotSetup, load_driver
 from frictid_hil.errors import FrictidError, GateFailed, InputFileError, PlanRefused, UsageError
 from frictid_hil.gap.experiments import (
     FULL,
@@ -29,11 +28,12 @@ from frictid_hil.gap.experiments import (
     chosen,
     names_of_plan,
 )
-from frictid_hil.jobs.gap_belief import Belief, belief_of, read_back
-from frictid_hil.jobs.gap_set import existing_set, write_set
+from frictid_hil.jobs.gap.belief import Belief, belief_of, read_back
+from frictid_hil.jobs.gap.set import existing_set, write_set
 from frictid_hil.jobs.plans import APPROACH_RAD_S, expected_of
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import (
+from frictid_hil.plan.limits import refuse_beyond_limits
+from frictid_hil.plan.plan import (
     REHEARSAL,
     Expected,
     Hold,
@@ -44,12 +44,13 @@ from frictid_hil.plan import (
     Sine,
     joint_plan,
 )
-from frictid_hil.plan_limits import refuse_beyond_limits
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import Driver, JointIdentity, load_driver
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.events import Event, JointRun, Preflight
-from frictid_hil.runner.rehearsals import Rehearsals
-from frictid_hil.runner.run import run_plan
-from frictid_hil.runner.run_folder import RunFolder
+from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runs.rehearsals import Rehearsals
+from frictid_hil.runs.run import run_plan
 
 VERB = "gap-record"
 

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.attempts import attempts
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import UsageError
+from frictid_hil.profiles.attempts import attempts
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import write_page
 

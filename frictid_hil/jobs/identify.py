@@ -14,17 +14,17 @@ from frictid_hil.config.columns import load_columns
 from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FrictidError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.bus_logs import is_log, logs_of
-from frictid_hil.jobs.decoded_log import Account, samples_in
-from frictid_hil.jobs.executors import answers, executor
-from frictid_hil.jobs.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.executors import answers, executor
+from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.plans import given_procedure
+from frictid_hil.jobs.replaying.bus_logs import is_log, logs_of
+from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
-from frictid_hil.runner.run_folder import load_manifest
+from frictid_hil.runs.folder import load_manifest
 
 _READABLE = (".mcap", ".csv", ".csv.gz", ".mat")
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.ring import Rows
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from frictid_hil.config import policy
 from frictid_hil.config.robot import Robot
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.skew_stretch import shaking
-from frictid_hil.plan import (
+from frictid_hil.jobs.identification.skew_stretch import shaking
+from frictid_hil.plan.plan import (
     REHEARSAL,
     Corners,
     Cycles,
@@ -30,6 +29,7 @@ from frictid_hil.plan import (
     coupling_bound_nm,
     joint_plan,
 )
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 APPROACH_RAD_S = math.radians(20.0)
 """Speed of moves between the locked position and the start, and of the rehearsal."""

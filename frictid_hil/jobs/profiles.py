@@ -8,10 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.drift import drift
 from frictid_hil.config.profile import FrictionProfile, load_profile, profile_file
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import GateFailed, ProfileMismatch
+from frictid_hil.profiles.drift import drift
+from frictid_hil.profiles.store import ProfileStore
 
 
 def show(path: Path) -> dict[str, Any]:

@@ -23,17 +23,17 @@ from typing import Any, NoReturn
 
 import filelock
 
-from frictid_hil.config.attempts import Attempt, note_attempt
 from frictid_hil.config.policy import Policy, WarmUp
 from frictid_hil.config.profile import FrictionProfile, load_profile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
-from frictid_hil.jobs.judgement import Verdict, judge
 from frictid_hil.jobs.watch import Watcher
+from frictid_hil.profiles.attempts import Attempt, note_attempt
+from frictid_hil.profiles.judgement import Verdict, judge
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.recalibration import recalibration_page
 from frictid_hil.runner.interlock import Interlock

@@ -19,7 +19,6 @@ import numpy as np
 from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile, profile_file
 from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import (
     HardwareError,
     IdentificationError,
@@ -27,10 +26,11 @@ from frictid_hil.errors import (
 )
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.bus_logs import given_map, is_log, logs_of
-from frictid_hil.jobs.decoded_log import Account, samples_in
-from frictid_hil.jobs.joint_profile import identify_joint, joint_result
-from frictid_hil.jobs.simulated_replay import simulate
+from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.replaying.bus_logs import given_map, is_log, logs_of
+from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
+from frictid_hil.jobs.replaying.simulated_replay import simulate
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 

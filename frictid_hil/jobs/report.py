@@ -9,14 +9,14 @@ from typing import Any
 
 from frictid_hil.config.profile import FrictionProfile, load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.jobs.history import write_index_page
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.pages import write_page
-from frictid_hil.runner.run_folder import load_manifest
+from frictid_hil.runs.folder import load_manifest
 
 
 def report(

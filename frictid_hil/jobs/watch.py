@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from frictid_hil.driver import RobotSetup
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.ring import Rows
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 FILE_HEADER = struct.Struct("<4sLBBBBBBBBQQLL8H8H")
 FILE_HEADER_SIZE = 144

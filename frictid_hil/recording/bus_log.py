@@ -16,8 +16,8 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import InputFileError
+from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording import blf
 from frictid_hil.recording.growing_file import GrowingFile
 

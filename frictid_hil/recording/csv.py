@@ -24,7 +24,7 @@ from frictid_hil.columns import ColumnMap
 from frictid_hil.errors import InputFileError
 from frictid_hil.files import write_whole
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.linear_axis import linear_name
+from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped, samples_of
 

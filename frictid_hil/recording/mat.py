@@ -14,7 +14,7 @@ import numpy as np
 from frictid_hil.columns import ColumnMap, JointColumns, Source
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.linear_axis import linear_name
+from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.mat5 import SpoiltMatFile, read_numbers
 from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped

@@ -15,7 +15,7 @@ import json
 
 import numpy as np
 
-from frictid_hil.linear_axis import linear_name
+from frictid_hil.plan.linear_axis import linear_name
 
 VALUES = (
     "position_rad",

@@ -12,7 +12,7 @@ from typing import Any
 
 import can
 
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording.bus_log import EXTENDED, Frames
 
 

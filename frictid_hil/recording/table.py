@@ -14,7 +14,7 @@ import numpy as np
 from frictid_hil.columns import ColumnMap, JointColumns, Source
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.linear_axis import linear_name
+from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.samples import Nanoseconds, Samples, checked
 
 _EPOCH_NS = 1e17

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from frictid_hil.config.attempts import Attempt
-from frictid_hil.config.promotions import Promotion
-from frictid_hil.config.summary import TrendPoint
+from frictid_hil.profiles.attempts import Attempt
+from frictid_hil.profiles.promotions import Promotion
+from frictid_hil.profiles.summary import TrendPoint
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 from frictid_hil.report.words import sentence, when, with_interval

@@ -9,7 +9,7 @@ import numpy as np
 
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import FrictionProfile, JointProfile
-from frictid_hil.config.summary import TrendPoint
+from frictid_hil.profiles.summary import TrendPoint
 from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure, line, points
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures

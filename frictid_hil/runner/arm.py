@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 
-from frictid_hil.driver import Driver, Feedback, JointSetup, JointState, Mode
 from frictid_hil.errors import FrictidError, SafetyAbort
-from frictid_hil.plan import Move
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Move
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Driver, Feedback, JointState
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.motions import AT_RAD, stream

@@ -19,9 +19,11 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Protocol
 
-from frictid_hil.driver import Batched, Driver, Feedback, JointState, Mode, RobotSetup, SetPoint
 from frictid_hil.errors import Interrupted, SafetyAbort
-from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Batched, Driver, Feedback, JointState, SetPoint
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import StopRequest

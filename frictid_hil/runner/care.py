@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from frictid_hil.driver import JointSetup
-from frictid_hil.plan import JointPlan
+from frictid_hil.plan.plan import JointPlan
+from frictid_hil.plan.setup import JointSetup
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.supervisor import JointLimits
 

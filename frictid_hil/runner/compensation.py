@@ -12,9 +12,10 @@ from itertools import repeat
 
 import numpy as np
 
-from frictid_hil.control import Compensated, ControlLaw
-from frictid_hil.driver import Feedback, Mode, SetPoint
 from frictid_hil.friction.compensation import Compensation
+from frictid_hil.plan.control import Compensated, ControlLaw
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, SetPoint
 
 _VELOCITY_LOOP_PER_S = 5.0
 """Share of a position error that a drive in velocity mode is asked to make good per second."""

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from frictid_hil.driver import Driver, Feedback, SetPoint
 from frictid_hil.errors import Interrupted, SafetyAbort
+from frictid_hil.protocol.driver import Driver, Feedback, SetPoint
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import Supervisor
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from frictid_hil.driver import Capabilities, Finding, JointIdentity
+from frictid_hil.protocol.driver import Capabilities, Finding, JointIdentity
 from frictid_hil.recording.samples import Mark
 
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from frictid_hil.driver import JointSetup
-from frictid_hil.plan import Motion, Move
+from frictid_hil.plan.plan import Motion, Move
+from frictid_hil.plan.setup import JointSetup
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, Stream
 from frictid_hil.runner.motions import AT_RAD, REHEARSAL_TORQUE

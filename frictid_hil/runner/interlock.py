@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from frictid_hil.driver import Feedback
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.protocol.driver import Feedback
 
 
 @dataclass(frozen=True, slots=True)

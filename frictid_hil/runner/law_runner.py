@@ -14,8 +14,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from frictid_hil.control import Compensated
-from frictid_hil.driver import Driver, Feedback, JointSetup, Mode
+from frictid_hil.plan.control import Compensated
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Driver, Feedback
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
 from frictid_hil.runner.cycle import CyclicLoop

@@ -12,10 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from frictid_hil.control import Compensated, Probe
-from frictid_hil.driver import Driver, JointSetup
 from frictid_hil.errors import ProfileMismatch
-from frictid_hil.plan import REHEARSAL, JointPlan, Motion, Move, WarmUp
+from frictid_hil.plan.control import Compensated, Probe
+from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move, WarmUp
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, Stream
 from frictid_hil.runner.events import Event, Marked, PhaseStarted, Warned

@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from frictid_hil.control import Probe
-from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import ProfileMismatch, SafetyAbort
+from frictid_hil.plan.control import Probe
+from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.runner.cycle import SetPointSource
 from frictid_hil.units import format_torque
 

@@ -28,9 +28,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
-from frictid_hil.driver import RobotSetup, load_driver
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, SafetyAbort
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import load_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import DECELERATE, QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight, Warned

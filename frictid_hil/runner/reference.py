@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from frictid_hil.driver import Feedback, JointSetup
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Feedback
 from frictid_hil.units import degrees, format_angle
 
 

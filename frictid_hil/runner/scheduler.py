@@ -20,16 +20,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
-from frictid_hil.driver import (
-    OWN_FRICTION_COMPENSATION,
-    Driver,
-    FrameMapped,
-    JointSetup,
-    RobotSetup,
-    Severity,
-)
 from frictid_hil.errors import HardwareError, PlanRefused
-from frictid_hil.plan import REHEARSAL, JointPlan, Plan, stretch_name
+from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Severity
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.batch import BatchDriver, BatchRunner

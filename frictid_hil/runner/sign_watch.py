@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.runner.cycle import SetPointSource
 
 

@@ -10,8 +10,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.runner.workspace_watch import WorkspaceWatch

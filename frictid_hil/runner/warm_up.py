@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from frictid_hil.driver import Feedback, SetPoint
-from frictid_hil.plan import WarmUp
+from frictid_hil.plan.plan import WarmUp
+from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.runner.cycle import SetPointSource
 
 WINDOW_S = 20.0

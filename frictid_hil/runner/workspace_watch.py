@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from frictid_hil.driver import Feedback
 from frictid_hil.errors import SafetyAbort
-from frictid_hil.workspace import Workspace
+from frictid_hil.plan.workspace import Workspace
+from frictid_hil.protocol.driver import Feedback
 
 INTERVAL_S = 0.02
 """At 1 m/s the arm moves 2 cm in between."""

@@ -10,7 +10,9 @@ from cia402_wire import HandClock, ScriptedDrive, WireBus, robot
 
 from frictid_drivers.cia402 import Cia402Driver
 from frictid_hil.config.search import find
-from frictid_hil.driver import JointSetup, JointState, Mode, RobotSetup, SetPoint
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import JointState, SetPoint
 
 RAD = 2 * math.pi / (4096 * 50)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import can
 
-from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 OBJECTS = {
     # address: (format, value)

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from frictid_drivers.cia402.codec import Command, CommandDecoder, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
-from frictid_hil.driver import Feedback, JointState, Mode
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState
 
 RAD, RAD_S, NM = 4.79e-7, -1.05e-6, 0.0852
 

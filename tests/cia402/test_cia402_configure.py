@@ -9,8 +9,8 @@ import pytest
 from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive
 
-from frictid_hil.driver import Severity
 from frictid_hil.errors import HardwareError, PlanRefused
+from frictid_hil.protocol.driver import Severity
 
 
 def test_everything_is_written_and_read_back():

@@ -11,8 +11,9 @@ import pytest
 from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive
 
-from frictid_hil.driver import JointState, Mode, SetPoint
 from frictid_hil.errors import HardwareError, InvalidFields, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import JointState, SetPoint
 
 
 def test_power_comes_on_without_a_jump_and_the_set_point_is_followed():

@@ -13,8 +13,9 @@ from cia402_wire import OBJECTS, ScriptedDrive
 from frictid_drivers.cia402 import network
 from frictid_drivers.cia402.replay import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
-from frictid_hil.driver import FD_FRAME, Mode, SetPoint
 from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import FD_FRAME, SetPoint
 
 FD = {"fd": True, "data_bitrate": 4_000_000}
 PDOS = {base + node for base in (0x180, 0x280, 0x380, 0x480, 0x200, 0x300) for node in range(1, 7)}

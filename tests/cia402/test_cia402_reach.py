@@ -11,8 +11,8 @@ from cia402_wire import ScriptedDrive, robot
 from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.cia402.known_settings import KNOWN_SETTINGS, Effect, timing_of
 from frictid_drivers.cia402.network import BusLock
-from frictid_hil.driver import Driver, Severity
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
+from frictid_hil.protocol.driver import Driver, Severity
 
 
 def test_is_a_driver():

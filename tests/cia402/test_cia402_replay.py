@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from frictid_drivers.cia402 import Cia402Driver, FrameMap
 from frictid_drivers.cia402.replay import LogDecoder
-from frictid_hil.driver import Mode, SetPoint
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import SetPoint
 
 TWO = {
     "schema": "frictid.frames/1",

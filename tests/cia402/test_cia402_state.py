@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from frictid_drivers.cia402.state import DriveState, Target, drive_state, joint_state, next_controlword
-from frictid_hil.driver import JointState
+from frictid_hil.protocol.driver import JointState
 
 TABLE = {
     DriveState.NOT_READY: (0x4F, 0x00),

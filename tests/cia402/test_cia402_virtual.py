@@ -10,7 +10,8 @@ from cia402_bench import hp3j
 from frictid_drivers.cia402 import FrameMap
 from frictid_drivers.cia402.replay import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
-from frictid_hil.driver import JointState, Mode, SetPoint, Severity
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import JointState, SetPoint, Severity
 
 
 class Session:

@@ -9,7 +9,7 @@ import can
 from cia402_wire import ScriptedDrive, WireBus, robot
 
 from frictid_drivers.cia402 import Cia402Driver
-from frictid_hil.driver import SetPoint
+from frictid_hil.protocol.driver import SetPoint
 
 RAD = 2 * math.pi / (4096 * 50)
 

@@ -20,10 +20,10 @@ from typer.testing import CliRunner
 
 from frictid_drivers.virtual.channel import runtime_folder
 from frictid_hil.cli.app import app
-from frictid_hil.config.attempts import attempts
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
+from frictid_hil.profiles.attempts import attempts
+from frictid_hil.profiles.store import ProfileStore
 
 ROBOT = "endings"
 UNATTENDED = {

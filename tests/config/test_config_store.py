@@ -13,13 +13,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from frictid_hil.config import store as store_module
-from frictid_hil.config.drift import drift
 from frictid_hil.config.profile import DriveIdentity, Estimate, FrictionProfile, Gate, JointProfile
 from frictid_hil.config.provenance import Provenance
-from frictid_hil.config.store import ProfileStore
-from frictid_hil.config.summary import Reference, summary, summary_of_file
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
+from frictid_hil.profiles import store as store_module
+from frictid_hil.profiles.drift import drift
+from frictid_hil.profiles.store import ProfileStore
+from frictid_hil.profiles.summary import Reference, summary, summary_of_file
 
 V = (0.2, 0.4, 0.6, 1.9)
 

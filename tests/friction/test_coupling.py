@@ -14,7 +14,7 @@ from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.intervals import aligned_pairs
 from frictid_hil.friction.recording import CycleRecording, synchronised
 from frictid_hil.friction.trajectory import Array, Procedure, position
-from frictid_hil.plan import Shake
+from frictid_hil.plan.plan import Shake
 
 STEP_S = 0.004
 PROCEDURE = Procedure(math.radians(20), math.radians(115))

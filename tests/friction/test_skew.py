@@ -12,7 +12,7 @@ from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.quality import gates
 from frictid_hil.friction.recording import Skew, synchronised
 from frictid_hil.friction.skew import MeasuredSkew, TimeSkew, measured_skew
-from frictid_hil.jobs.skew_stretch import shaking
+from frictid_hil.jobs.identification.skew_stretch import shaking
 
 STEP_S = 0.001
 PLANT_S = 25e-6

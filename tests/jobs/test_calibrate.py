@@ -11,7 +11,6 @@ import pytest
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
 from frictid_hil.errors import Interrupted, PlanRefused, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
@@ -19,9 +18,10 @@ from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.report import report
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import REHEARSAL
+from frictid_hil.plan.plan import REHEARSAL
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.runner.events import Event, PhaseStarted
-from frictid_hil.runner.run_folder import load_manifest
+from frictid_hil.runs.folder import load_manifest
 
 
 def run(out: Path, **changes: object) -> dict[str, object]:

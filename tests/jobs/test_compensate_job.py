@@ -21,18 +21,18 @@ from frictid_drivers.virtual import joint_drive, rack
 from frictid_drivers.virtual.servo import Servo
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
-from frictid_hil.driver import Mode
 from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, ProfileMismatch, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compensate import CompensateOptions, compensate, plan_compensation
-from frictid_hil.jobs.compensation_wanted import Wanted
+from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import REHEARSAL, Plan
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import REHEARSAL, Plan
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.read import read
 from frictid_hil.runner.events import Event, PhaseStarted
-from frictid_hil.runner.rehearsals import Rehearsals
+from frictid_hil.runs.rehearsals import Rehearsals
 
 JOINT = "3"
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frictid_hil.control import PositionGains
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.jobs.compensation_figures import ModeRun, figures, friction_dominates
-from frictid_hil.jobs.compensation_plan import triangle
-from frictid_hil.jobs.tracking_floor import tracking_floor_rad
+from frictid_hil.jobs.compensation.figures import ModeRun, figures, friction_dominates
+from frictid_hil.jobs.compensation.plan import triangle
+from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
+from frictid_hil.plan.control import PositionGains
 
 INERTIA, STEP = 0.5, 1e-3
 OMEGA, REACH = math.pi, math.radians(20)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from frictid_hil.config.robot import load_robot
-from frictid_hil.control import ControlLaw, Gravity
 from frictid_hil.friction.compensation import OUR_RATIO, RATIO_MARGIN, CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.plan.control import ControlLaw, Gravity
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.simulation.steady import true_curve_nm

@@ -17,7 +17,7 @@ from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, ful
 from frictid_hil.jobs import gap_record
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
 from frictid_hil.runner.events import Preflight
 
 HP3J = find("hp3j.yaml").resolve()

@@ -15,7 +15,7 @@ from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.executors import answers, executor
+from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.jobs.identify import IdentifyOptions, identify, profile_names
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.recording.samples import Samples
@@ -124,7 +124,7 @@ def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> 
 
 def test_no_cluster_there(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("frictid_hil.jobs.executors.CONNECT_TIMEOUT", "0.3s")
+    monkeypatch.setattr("frictid_hil.jobs.identification.executors.CONNECT_TIMEOUT", "0.3s")
     with pytest.raises(HardwareError, match="no cluster answers"), executor("dask://127.0.0.1:9", 4):
         pass
 

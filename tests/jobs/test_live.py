@@ -15,12 +15,12 @@ import pytest
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.live import LIVE_HZ, live
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_rows
 
 pytest.importorskip("foxglove")

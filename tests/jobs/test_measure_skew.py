@@ -14,7 +14,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import SKEW, Plan
+from frictid_hil.plan.plan import SKEW, Plan
 
 
 def planned(robot: str = "hp3j", **options: Any) -> Plan:

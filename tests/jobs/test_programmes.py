@@ -11,10 +11,10 @@ from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
+from frictid_hil.jobs.identification.programmes import PROGRAMMES
 from frictid_hil.jobs.identify import IdentifyOptions, identify
-from frictid_hil.jobs.programmes import PROGRAMMES
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import Cycles
+from frictid_hil.plan.plan import Cycles
 
 
 @pytest.fixture(scope="module")

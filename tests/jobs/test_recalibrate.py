@@ -13,19 +13,19 @@ from typing import Any
 import filelock
 import pytest
 
-from frictid_hil.config.attempts import attempts
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
-from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import HardwareBusy, UsageError
-from frictid_hil.jobs.judgement import judge
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.plan import WarmUp
+from frictid_hil.plan.plan import WarmUp
+from frictid_hil.profiles.attempts import attempts
+from frictid_hil.profiles.judgement import judge
+from frictid_hil.profiles.store import ProfileStore
+from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.recording.mcap_reader import read_rows
 from frictid_hil.runner.warm_up import WarmUpWatch
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from frictid_hil.config.attempts import Attempt, note_attempt
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import load_robot
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.report import report
+from frictid_hil.profiles.attempts import Attempt, note_attempt
+from frictid_hil.profiles.store import ProfileStore
 
 
 def profile(factor: float, day: int) -> FrictionProfile:

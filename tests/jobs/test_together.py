@@ -11,13 +11,13 @@ import pytest
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import PlanRefused, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.replay import ReplayOptions, replay
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording.bus_log import read_frames
 from frictid_hil.simulation.arm_model import ArmModel
 from frictid_hil.simulation.rigid_bodies import RigidBodies

@@ -13,7 +13,9 @@ from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator, Settings
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
-from frictid_hil.driver import Feedback, JointSetup, Mode, RobotSetup, SetPoint
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import Feedback, SetPoint
 
 PULSES_PER_DEGREE = 1000.0
 GEAR = 100.0

@@ -15,12 +15,12 @@ from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.build import build
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import RobotSetup
 from frictid_hil.friction import quality
 from frictid_hil.friction.estimate import Estimate, estimate
 from frictid_hil.friction.recording import CycleRecording, Skew, synchronised
 from frictid_hil.jobs.plans import calibration_plan, expected_of
-from frictid_hil.plan import Cycles, Hold, JointPlan, Move
+from frictid_hil.plan.plan import Cycles, Hold, JointPlan, Move
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun
 from frictid_hil.runner.ring import frame_ring, sample_ring

@@ -28,7 +28,7 @@ from frictid_drivers.motoman.table import friction_table
 from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
-from frictid_hil.plan import Corners, Cycles, Hold, JointPlan, Motion, Move, Sine
+from frictid_hil.plan.plan import Corners, Cycles, Hold, JointPlan, Motion, Move, Sine
 
 UNITS = AxisUnits(axis=0, pulses_per_rad=math.degrees(1000.0), gear_ratio=100.0, rated_torque_nm=20.0, direction=1)
 TICK_S = 0.004

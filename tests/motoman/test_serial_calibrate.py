@@ -15,14 +15,14 @@ from frictid_drivers.motoman.emulator.build import build
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_hil.config.profile import load_profile
-from frictid_hil.driver import RobotSetup
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_mcap
-from frictid_hil.runner import run as run_module
 from frictid_hil.runner.events import Event, JobProgress
-from frictid_hil.runner.run_folder import load_manifest
+from frictid_hil.runs import run as run_module
+from frictid_hil.runs.folder import load_manifest
 
 ROBOT = """\
 schema: frictid.robot/1

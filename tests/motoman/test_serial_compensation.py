@@ -20,7 +20,7 @@ import pytest
 from frictid_hil.config.robot import load_robot
 from frictid_hil.friction.compensation import Compensation, CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan import Hold
+from frictid_hil.plan.plan import Hold
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.simulation.steady import true_curve_nm

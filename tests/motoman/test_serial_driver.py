@@ -13,8 +13,9 @@ import pytest
 from serial_bench import START_RAD, Bench, joint, make_bench, stream_motion
 
 from frictid_drivers.motoman import MotomanDriver
-from frictid_hil.driver import Driver, JointState, Mode, SetPoint, Severity, load_driver
 from frictid_hil.errors import ConfigError, HardwareError, InvalidFields, PlanRefused, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Driver, JointState, SetPoint, Severity, load_driver
 
 
 def findings(bench: Bench) -> dict[str, tuple[Severity, str]]:

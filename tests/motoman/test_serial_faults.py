@@ -15,7 +15,7 @@ from serial_bench import START_RAD, Streamed, make_bench, stream_motion
 
 from frictid_hil.errors import FrictidError
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.plan import Hold, JointPlan, Move
+from frictid_hil.plan.plan import Hold, JointPlan, Move
 
 LONGEST_S = 120.0
 

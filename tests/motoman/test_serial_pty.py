@@ -20,9 +20,9 @@ from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.pty import Terminal, Waits
 from frictid_drivers.motoman.port import SerialPort
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import Feedback, SetPoint
 from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError, InputFileError, UsageError
-from frictid_hil.plan import Hold, JointPlan, Sine
+from frictid_hil.plan.plan import Hold, JointPlan, Sine
+from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.recording.mcap_reader import read_mcap
 
 SERVE = """

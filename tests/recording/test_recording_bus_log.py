@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import FrictidError, InputFileError
+from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording.bus_log import EXTENDED, BusLogWriter, Frames, read_frames
 from frictid_hil.recording.playback import LogBus, logged
 

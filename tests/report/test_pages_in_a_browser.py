@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frictid_hil.config.attempts import Attempt
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile, ProcedureUsed
 from frictid_hil.config.provenance import Provenance
-from frictid_hil.config.store import ProfileStore
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Value, Where
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.profiles import missing_torque
-from frictid_hil.jobs.judgement import judge
+from frictid_hil.profiles.attempts import Attempt
+from frictid_hil.profiles.judgement import judge
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.compensation import compensation_page

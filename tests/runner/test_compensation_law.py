@@ -13,12 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.config.robot import load_robot
-from frictid_hil.control import Bounds, Compensated, ControlLaw, Gravity, PositionGains, Probe, RippleTorque, Swing
-from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import ProfileMismatch, SafetyAbort
 from frictid_hil.friction.compensation import CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan import Corners, Hold, Sine, joint_plan
+from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Gravity, PositionGains, Probe, RippleTorque, Swing
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Corners, Hold, Sine, joint_plan
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
 from frictid_hil.runner.cycle import Stream
 from frictid_hil.runner.probe import ProbeWatch

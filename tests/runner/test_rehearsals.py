@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.driver import Capabilities, JointIdentity
 from frictid_hil.errors import UsageError
-from frictid_hil.plan import REHEARSAL, Hold, JointPlan, Plan, Sine
+from frictid_hil.plan.plan import REHEARSAL, Hold, JointPlan, Plan, Sine
+from frictid_hil.protocol.driver import Capabilities, JointIdentity
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.events import JointRun, Preflight
-from frictid_hil.runner.rehearsals import Rehearsals
+from frictid_hil.runs.rehearsals import Rehearsals
 
 CAN = "socketcan:can0"
 

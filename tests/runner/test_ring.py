@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from frictid_hil.errors import UsageError
-from frictid_hil.runner import run
 from frictid_hil.runner.ring import FRAME_ROW, PACK_FRAME, PACK_SAMPLE, SAMPLE_ROW, Ring, frame_ring, sample_ring
+from frictid_hil.runs import run
 
 
 def fill(ring: Ring, first: int, count: int) -> None:

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from frictid_hil.config.robot import load_robot
-from frictid_hil.driver import Driver, JointState, RobotSetup, load_driver
 from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.plans import calibration_plan, expected_of
-from frictid_hil.plan import Plan
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Driver, JointState, load_driver
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler

@@ -3,8 +3,9 @@ from dataclasses import replace
 
 import pytest
 
-from frictid_hil.driver import Feedback, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
 LIMITS = JointLimits(-0.1, 0.5, 2.5, 100.0, following_error_rad=0.05, power_w=150.0, torque_cycles=3)

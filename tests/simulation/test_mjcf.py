@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.errors import UsageError
-from frictid_hil.jobs.export_mujoco import export_mujoco
+from frictid_hil.jobs.gap.export_mujoco import export_mujoco
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.mjcf import MujocoJoint, described

@@ -10,7 +10,7 @@ import pytest
 from frictid_drivers.virtual.objects import Key, Value
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.servo import Servo
-from frictid_hil.driver import JointSetup, RobotSetup
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 MS = 1_000_000
 COUNTS_PER_REVOLUTION = 1_000_000

@@ -17,8 +17,9 @@ from frictid_drivers.virtual import VirtualDriver, channel
 from frictid_drivers.virtual.rack_launcher import encode_setup, start_rack
 from frictid_drivers.virtual.side_channel import write
 from frictid_drivers.virtual.socket_bus import SocketBus
-from frictid_hil.driver import Driver, JointState, Mode, SetPoint, WallClock
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Driver, JointState, SetPoint, WallClock
 
 MS = 1_000_000
 
@@ -215,7 +216,8 @@ HOST = """
 import sys, time
 from frictid_drivers.virtual.rack_launcher import decode_setup
 from frictid_drivers.virtual import VirtualDriver
-from frictid_hil.driver import Mode, SetPoint
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import SetPoint
 setup = decode_setup(sys.stdin.readline())
 driver = VirtualDriver(setup)
 driver.open()

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 CONTROL, MODE, TARGET, OFFSET = 0x60400010, 0x60600008, 0x607A0020, 0x60B20010
 STATUS, POSITION, TORQUE, DISPLAY, ERROR = 0x60410010, 0x60640020, 0x60770010, 0x60610008, 0x603F0010

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from frictid_drivers.virtual.rack_launcher import decode_setup, encode_setup
 from frictid_drivers.virtual.rack_process import SyncTime
 from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub, SocketBus, message_of, pack
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 MS = 1_000_000
 

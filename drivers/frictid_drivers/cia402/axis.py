@@ -21,8 +21,9 @@ from frictid_drivers.cia402.state import (
     drive_state,
     next_controlword,
 )
-from frictid_hil.driver import Feedback, Mode, SetPoint
 from frictid_hil.errors import HardwareError, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, SetPoint
 
 _NEVER = -1
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)

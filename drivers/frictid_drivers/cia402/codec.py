@@ -16,7 +16,8 @@ from dataclasses import fields
 from frictid_drivers.cia402.frame_map import ERROR, FIGURES, INPUTS, MODE, STATUS, Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.packing import packing
 from frictid_drivers.cia402.state import JOINT_STATES
-from frictid_hil.driver import Feedback, JointState, Mode
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState
 
 EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x700
 MALFORMED_EMERGENCY = 0x1000

@@ -26,8 +26,9 @@ from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import logged_id
 from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE
-from frictid_hil.driver import Clock, Feedback, FrameSink, Mode, SetPoint
 from frictid_hil.errors import HardwareError, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Clock, Feedback, FrameSink, SetPoint
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"

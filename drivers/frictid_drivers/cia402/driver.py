@@ -25,21 +25,20 @@ from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, open_bus
 from frictid_drivers.cia402.settings import read_settings
 from frictid_drivers.cia402.state import DriveState
-from frictid_hil.driver import (
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import (
     Capabilities,
     Clock,
     Feedback,
     Finding,
     FrameSink,
     JointIdentity,
-    JointSetup,
-    Mode,
-    RobotSetup,
     SetPoint,
     WallClock,
 )
-from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
-from frictid_hil.plan import Plan
 
 _SETTLE_S = 2.0
 _RESET_S = 0.5

@@ -16,8 +16,8 @@ from frictid_drivers.cia402.facts import raise_on_error, read_facts, scale_of
 from frictid_drivers.cia402.frame_map import Entry, Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.objects import IntegerType, Object
 from frictid_drivers.cia402.settings import read_settings
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import HardwareError, InputFileError
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 _NOT_VALID = 1 << 31
 _PDOS = range(1, 9)

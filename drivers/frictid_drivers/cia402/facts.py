@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from frictid_drivers.cia402 import objects as od
-from frictid_hil.driver import Finding, JointSetup, Severity
 from frictid_hil.errors import HardwareError
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Finding, Severity
 
 _TURN = 2.0 * math.pi
 _ANGLES = {0xB4: _TURN, 0x10: 1.0, 0x41: math.pi / 180.0}

@@ -17,8 +17,10 @@ from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
 from frictid_drivers.cia402.network import Node, Wire
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
-from frictid_hil.driver import FrameSink, JointSetup, Mode, RobotSetup
 from frictid_hil.errors import HardwareError
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import FrameSink
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 PRE_OPERATIONAL_STATE = b"\x7f"

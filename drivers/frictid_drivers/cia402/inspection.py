@@ -12,7 +12,9 @@ from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DriveState, drive_state
-from frictid_hil.driver import OWN_FRICTION_COMPENSATION, Finding, JointIdentity, JointSetup, Mode, Severity, Timing
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Finding, JointIdentity, Severity, Timing
 from frictid_hil.units import format_angle, format_torque
 
 Said = Callable[..., Finding]

@@ -12,7 +12,7 @@ from enum import Enum
 
 from frictid_drivers.cia402.objects import IntegerType, Object
 from frictid_drivers.cia402.sdo import Drive
-from frictid_hil.driver import Timing
+from frictid_hil.protocol.driver import Timing
 
 
 class Effect(Enum):

@@ -1,4 +1,4 @@
-"""What this driver brings for replays (``frictid_hil.frames``): decoders by frame map, and frame maps by EDS."""
+"""What this driver brings for replays (``protocol.frames``): decoders by frame map, and frame maps by EDS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from frictid_drivers.cia402.eds import frame_map_from_eds
 from frictid_drivers.cia402.frame_map import SCHEMA, FrameMap
 from frictid_drivers.cia402.replay import LogDecoder
-from frictid_hil.driver import RobotSetup
+from frictid_hil.plan.setup import RobotSetup
 
 schema = SCHEMA
 

@@ -21,8 +21,8 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 from filelock import FileLock, Timeout
 
-from frictid_hil.driver import FD_FRAME, FrameSink
 from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
+from frictid_hil.protocol.driver import FD_FRAME, FrameSink
 
 BusFactory = Callable[[], can.BusABC]
 

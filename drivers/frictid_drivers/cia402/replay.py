@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from frictid_drivers.cia402.codec import CommandDecoder, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
-from frictid_hil.driver import FD_FRAME, Feedback
+from frictid_hil.protocol.driver import FD_FRAME, Feedback
 
 LoggedFrame = tuple[int, int, bytes]
 """Run time in ns, CAN id (bit 29: a CAN FD frame), data - in the order of the log."""

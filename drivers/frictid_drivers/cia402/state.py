@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from frictid_hil.driver import JointState
+from frictid_hil.protocol.driver import JointState
 
 
 class DriveState(Enum):

@@ -16,9 +16,9 @@ from frictid_drivers.motoman.controller_errors import BadReply, ControllerError,
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
-from frictid_hil.driver import JointSetup
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
-from frictid_hil.plan import JointPlan
+from frictid_hil.plan.plan import JointPlan
+from frictid_hil.plan.setup import JointSetup
 from frictid_hil.units import degrees
 
 _AT_START_RAD = 0.005

@@ -13,8 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.stream import StreamSession
 from frictid_drivers.motoman.stream_frames import Flag, TickReport
-from frictid_hil.driver import Feedback, JointSetup, JointState, Mode, SetPoint
 from frictid_hil.errors import SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.units import degrees
 
 _SERVO_ON = 1 << 6

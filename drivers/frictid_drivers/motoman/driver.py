@@ -21,20 +21,12 @@ from frictid_drivers.motoman.port import BytePort, SerialPort
 from frictid_drivers.motoman.power import ServoPower
 from frictid_drivers.motoman.settings import serial_options
 from frictid_drivers.motoman.table import friction_table
-from frictid_hil.driver import (
-    Capabilities,
-    Feedback,
-    Finding,
-    FrameSink,
-    JointIdentity,
-    JointState,
-    Mode,
-    RobotSetup,
-    SetPoint,
-)
 from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan import JointPlan, Plan
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import JointPlan, Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Capabilities, Feedback, Finding, FrameSink, JointIdentity, JointState, SetPoint
 
 PortFactory = Callable[[str, int, str], BytePort]
 """Opens a port: path, baud, parity."""

@@ -11,9 +11,11 @@ from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.layers import Layer, Reach, busy_share, streamed_mask
 from frictid_drivers.motoman.segments import motion_segments
 from frictid_drivers.motoman.settings import SerialOptions
-from frictid_hil.driver import Capabilities, Finding, JointIdentity, JointSetup, Mode, RobotSetup, Severity
 from frictid_hil.errors import PlanRefused
-from frictid_hil.plan import Plan
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import Capabilities, Finding, JointIdentity, Severity
 from frictid_hil.units import degrees
 
 _LONG_AVERAGING_MS = 20

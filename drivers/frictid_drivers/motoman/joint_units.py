@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from frictid_hil.driver import JointSetup, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import unknown_options
 
 JOINT_OPTIONS: Final = frozenset({"pulses_per_degree", "digital_inputs"})
 """``digital_inputs`` is asked of every driver by unattended jobs; this one reports none, and the runner says so."""

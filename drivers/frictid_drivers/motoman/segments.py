@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_hil.errors import PlanRefused
-from frictid_hil.plan import Corners, Cycles, Hold, Motion, Move, Sine, WarmUp
+from frictid_hil.plan.plan import Corners, Cycles, Hold, Motion, Move, Sine, WarmUp
 
 GUIDED = "guided"
 """Name of a ``Hold`` during which a person guides the joint by hand, the friction table in force."""

@@ -10,8 +10,8 @@ from typing import Any
 
 from frictid_drivers.motoman.bsc import BscTiming
 from frictid_drivers.motoman.host_control import PROFILES
-from frictid_hil.driver import Timing, unknown_options
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.protocol.driver import Timing, unknown_options
 
 _PSEUDO_TERMINALS = "/dev/pts/"
 _ASSUMED = Timing(uncertainty_s=0.0005)

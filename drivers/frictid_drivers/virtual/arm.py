@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from frictid_drivers.virtual.axis import Axis
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.simulation.arm import ArmLoop
 from frictid_hil.simulation.arm_model import ArmModel
 from frictid_hil.simulation.servo_loop import ServoLoop

@@ -21,30 +21,29 @@ from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
 from frictid_drivers.virtual.socket_bus import SocketBus
-from frictid_hil.driver import (
+from frictid_hil.errors import InvalidFields, UsageError
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import (
     Capabilities,
     Feedback,
     Finding,
     FrameSink,
     JointIdentity,
-    JointSetup,
-    Mode,
-    RobotSetup,
     SetPoint,
     WallClock,
     unknown_options,
 )
-from frictid_hil.errors import InvalidFields, UsageError
 from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
     import filelock
 
-    from frictid_hil.plan import Plan
+    from frictid_hil.plan.plan import Plan
 
 
 class VirtualDriver:
-    """See the module's first page and ``frictid_hil.driver.Driver``."""
+    """See the module's first page and ``frictid_hil.protocol.driver.Driver``."""
 
     def __init__(self, setup: RobotSetup) -> None:
         # Late, because the drives' own process imports this package and has no use for the host.

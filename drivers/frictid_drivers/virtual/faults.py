@@ -40,8 +40,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from frictid_hil.driver import FD_FRAME, RobotSetup
 from frictid_hil.errors import UsageError
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.simulation.fields import Fields
 
 FRAME_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")

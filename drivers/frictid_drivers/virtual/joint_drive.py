@@ -13,8 +13,8 @@ from fractions import Fraction
 
 from frictid_drivers.virtual.objects import Key, Value, key
 from frictid_drivers.virtual.servo import Send, Servo
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import ConfigError
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 

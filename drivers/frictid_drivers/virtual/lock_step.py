@@ -15,7 +15,7 @@ from typing import Any, Protocol, cast
 import can
 from can.interfaces.virtual import VirtualBus
 
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 
 class Drives(Protocol):
@@ -109,7 +109,7 @@ class LockStepBus(VirtualBus):
 
 
 class LockStepClock:
-    """Run time of the drives on a lock-step bus; see ``frictid_hil.driver.Clock``."""
+    """Run time of the drives on a lock-step bus; see ``frictid_hil.protocol.driver.Clock``."""
 
     lock_step = True
 

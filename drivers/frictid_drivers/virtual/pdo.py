@@ -36,7 +36,7 @@ from frictid_drivers.virtual.objects import (
     Key,
     key,
 )
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 _CODES = {
     DataType.I8: "b",

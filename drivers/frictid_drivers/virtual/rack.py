@@ -12,7 +12,7 @@ from frictid_drivers.virtual.arm import arm_of, couple
 from frictid_drivers.virtual.joint_drive import plant_for, servo_for
 from frictid_drivers.virtual.pdo import NEVER_NS
 from frictid_drivers.virtual.servo import Servo
-from frictid_hil.driver import RobotSetup
+from frictid_hil.plan.setup import RobotSetup
 
 Transmit = Callable[[int, bytes], None]
 Handler = Callable[[bytes, int], None]

@@ -10,8 +10,8 @@ import subprocess
 import sys
 from typing import Any
 
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import HardwareError
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 READY = "ready"
 """What the process says once its drives are on the bus."""

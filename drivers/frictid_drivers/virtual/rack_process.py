@@ -27,8 +27,8 @@ from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import DISMISSAL, READY, decode_setup
 from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub
-from frictid_hil.driver import FD_FRAME
 from frictid_hil.errors import FrictidError
+from frictid_hil.protocol.driver import FD_FRAME
 
 SYNC_ID = 0x80
 PATIENCE_NS = 50_000_000

@@ -22,7 +22,7 @@ from typing import Any
 import can
 
 from frictid_drivers.virtual.channel import runtime_folder, socket_path
-from frictid_hil.driver import FD_FRAME
+from frictid_hil.protocol.driver import FD_FRAME
 
 FRAME = struct.Struct("<IBB2x64sQ")
 """Identifier with flags as in SocketCAN, length, 1 for a CAN FD frame, data, and when it was sent on the machine's

@@ -28,8 +28,8 @@ from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import FaultPlan
 from frictid_drivers.motoman.emulator.machine import Emulator, Settings
 from frictid_drivers.motoman.emulator.station import Parameters
-from frictid_hil.driver import JointSetup, RobotSetup
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 

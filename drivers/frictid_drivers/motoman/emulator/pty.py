@@ -25,8 +25,8 @@ from pathlib import Path
 from frictid_drivers.motoman.emulator.build import build
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.machine import Emulator
-from frictid_hil.driver import RobotSetup
 from frictid_hil.errors import UsageError
+from frictid_hil.plan.setup import RobotSetup
 
 _CHUNK = 4096
 _LONGEST_WAIT_S = 0.05

@@ -1,0 +1,1 @@
+"""What `compensate` plans, runs and measures."""

@@ -1,0 +1,219 @@
+"""What a compensation reached: the paper's criteria (25) and (28), raw and with inertia removed, each mode against nc.
+
+Hand torque obeys tau_hand = I a + (what friction and gravity still take). The first term is work that no friction
+compensation can spare: it sets the ceiling of the raw reduction, and is removed for the second figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from frictid_hil.friction.filtering import Gaussian
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.plan.control import Compensated
+from frictid_hil.recording.samples import Mark, Samples
+
+DOMINATED_PERCENT = 85.0
+"""Friction dominates a tracking error where giving it back exactly would take away this much of it."""
+
+_WIDTH_S = 0.004
+"""Of the smoothing that is common to acceleration and torque: half power at 33 Hz."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModeRun:
+    """One mode's whole cycles, the first left out.
+
+    Attributes:
+        mode: name.
+        time_s: since the beginning of the task, shape (n,).
+        position_rad: measured.
+        velocity_rad_s: measured.
+        reference_rad: the path.
+        torque_nm: of the drive.
+        external_torque_nm: a person's; None without a force sensor.
+        velocity_delay_s: by which the reported velocity is older than its row.
+    """
+
+    mode: str
+    time_s: Array
+    position_rad: Array
+    velocity_rad_s: Array
+    reference_rad: Array
+    torque_nm: Array
+    external_torque_nm: Array | None
+    velocity_delay_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ModeFigures:
+    """One mode in numbers; None where it cannot be formed, and why in ``reasons``.
+
+    Attributes:
+        velocity_rms_rad_s: V_s of (25).
+        torque_rms_nm: F_s of (25).
+        torque_rms_inertia_removed_nm: of hand torque minus inertia times acceleration.
+        reduction_percent: of the task's own measure against nc: F_s for ``hand``, E_s for ``track``.
+        reduction_inertia_removed_percent: of the one with inertia removed.
+        tracking_rms_rad: E_s of (28).
+        ceiling_percent: reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without
+            any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor``).
+        inertial_rms_nm: of inertia times acceleration.
+        reasons: by figure.
+    """
+
+    velocity_rms_rad_s: float
+    torque_rms_nm: float | None = None
+    torque_rms_inertia_removed_nm: float | None = None
+    reduction_percent: float | None = None
+    reduction_inertia_removed_percent: float | None = None
+    tracking_rms_rad: float | None = None
+    ceiling_percent: float | None = None
+    inertial_rms_nm: float | None = None
+    reasons: Mapping[str, str] | None = None
+
+    def values(self) -> dict[str, object]:
+        """As JSON has it."""
+        return {
+            "velocity_rms_rad_s": self.velocity_rms_rad_s,
+            "torque_rms_nm": self.torque_rms_nm,
+            "torque_rms_inertia_removed_nm": self.torque_rms_inertia_removed_nm,
+            "reduction_percent": self.reduction_percent,
+            "reduction_inertia_removed_percent": self.reduction_inertia_removed_percent,
+            "tracking_rms_rad": self.tracking_rms_rad,
+            "ceiling_percent": self.ceiling_percent,
+            "reasons": dict(self.reasons or {}),
+        }
+
+
+def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, period_s: float) -> ModeRun:
+    """The samples of one mode, from its second cycle to the end of its last whole one."""
+    part = samples.during(mark)
+    time_s = (part.time_ns - mark.start_ns) * 1e-9
+    whole_s = np.floor(float(time_s[-1]) / period_s + 0.01) * period_s
+    kept = (time_s >= min(period_s, whole_s - period_s)) & (time_s < whole_s)
+    part, time_s = part.select(kept), time_s[kept]
+    assert part.velocity_rad_s is not None and part.torque_nm is not None  # live rows have both
+    return ModeRun(
+        mode=mode,
+        time_s=time_s,
+        position_rad=part.position_rad,
+        velocity_rad_s=part.velocity_rad_s,
+        reference_rad=motion.position_rad(time_s),
+        torque_nm=part.torque_nm,
+        external_torque_nm=part.external_torque_nm,
+        velocity_delay_s=_velocity_delay_s(samples.meta),
+    )
+
+
+def figures(
+    runs: Mapping[str, ModeRun], task: str, inertia_kg_m2: float | None, floors_rad: Mapping[str, float] | None = None
+) -> dict[str, ModeFigures]:
+    """All modes in numbers, each against ``nc`` where that ran.
+
+    Args:
+        runs: by mode.
+        task: ``hand`` or ``track``.
+        inertia_kg_m2: that is removed from the hand torque.
+        floors_rad: by mode, the tracking error that an ideal joint would have.
+    """
+    floors_rad = floors_rad or {}
+    alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}
+    base = alone.get("nc")
+    return {mode: _against(figure, base, task, floors_rad.get(mode)) for mode, figure in alone.items()}
+
+
+def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
+    """Whether friction, not inertia under so weak a PD, makes the tracking error; None without nc and mop-reference.
+
+    Its measure is the ceiling of ``mop-reference``: what an ideal joint of this inertia, under these gains, would gain
+    if its friction were given back exactly and at once.
+    """
+    ceiling = found["mop-reference"].ceiling_percent if "mop-reference" in found else None
+    return None if ceiling is None else ceiling >= DOMINATED_PERCENT
+
+
+def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:
+    """(acceleration rad/s^2, hand torque N m) through the same smoothing, ends cut off; for runs with a hand torque.
+
+    On the wall clock a loop comes late now and then, or misses a cycle: rows are brought to an even grid first, and the
+    acceleration is the rate of the drive's velocity. Differencing the position twice would make v dt / s^2 out of a
+    drive that heard SYNC dt later than its row says (at 60 deg/s, 1 ms and s = 4 ms: 65 rad/s^2); differencing the
+    velocity once makes a dt / s of it, a hundredth of that.
+    """
+    assert run.external_torque_nm is not None
+    step_s = float(np.median(np.diff(run.time_s)))
+    even_s = np.arange(run.time_s[0], run.time_s[-1] + 0.5 * step_s, step_s)
+    velocity, torque_nm = (
+        np.interp(even_s, run.time_s, column) for column in (run.velocity_rad_s, run.external_torque_nm)
+    )
+    kernel = Gaussian(step_s, max(_WIDTH_S, step_s))
+    cut = int(np.ceil((kernel.reach_s + run.velocity_delay_s) / step_s)) + 1
+    inside = slice(cut, -cut)
+    return kernel.rate(velocity, run.velocity_delay_s)[inside], kernel.smooth(torque_nm)[inside]
+
+
+def _velocity_delay_s(meta: Mapping[str, object]) -> float:
+    """As the drive or its robot file declares it."""
+    timing = meta.get("timing")
+    delay_s = timing.get("velocity_delay_s") if isinstance(timing, Mapping) else None
+    return float(delay_s) if isinstance(delay_s, int | float) else 0.0
+
+
+def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
+    figure = ModeFigures(velocity_rms_rad_s=_rms(run.velocity_rad_s))
+    if task == "track":
+        return replace(
+            figure,
+            tracking_rms_rad=_rms(run.reference_rad - run.position_rad),
+            reasons={"torque_rms_nm": "nobody touches the joint while it tracks"},
+        )
+    reasons = {"tracking_rms_rad": "a person's hand has no reference"}
+    if run.external_torque_nm is None or not np.all(np.isfinite(run.external_torque_nm)):
+        reasons["torque_rms_nm"] = "no force sensor"
+        return replace(figure, reasons=reasons)
+    figure = replace(figure, torque_rms_nm=_rms(run.external_torque_nm), reasons=reasons)
+    if inertia_kg_m2 is None:
+        reasons["torque_rms_inertia_removed_nm"] = "the inertia is not known"
+        return figure
+    acceleration, torque_nm = smoothed_acceleration(run)
+    inertial_nm = inertia_kg_m2 * acceleration
+    return replace(
+        figure,
+        torque_rms_inertia_removed_nm=_rms(torque_nm - inertial_nm),
+        inertial_rms_nm=_rms(inertial_nm),
+    )
+
+
+def _against(figure: ModeFigures, base: ModeFigures | None, task: str, floor_rad: float | None) -> ModeFigures:
+    reasons = dict(figure.reasons or {})
+    if base is None:
+        reasons["reduction_percent"] = "nc did not run"
+        return replace(figure, reasons=reasons)
+    if task == "track":
+        return replace(
+            figure,
+            reduction_percent=_reduction(figure.tracking_rms_rad, base.tracking_rms_rad),
+            ceiling_percent=_reduction(floor_rad, base.tracking_rms_rad),
+        )
+    return replace(
+        figure,
+        reduction_percent=_reduction(figure.torque_rms_nm, base.torque_rms_nm),
+        reduction_inertia_removed_percent=_reduction(
+            figure.torque_rms_inertia_removed_nm, base.torque_rms_inertia_removed_nm
+        ),
+        ceiling_percent=_reduction(figure.inertial_rms_nm, base.torque_rms_nm),
+    )
+
+
+def _reduction(value: float | None, base: float | None) -> float | None:
+    if value is None or not base:
+        return None
+    return 100.0 * (1.0 - value / base)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

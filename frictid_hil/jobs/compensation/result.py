@@ -1,0 +1,212 @@
+"""What a compensation came to: its JSON and its page, also where it ended early."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.config.profile import JointProfile
+from frictid_hil.config.robot import Robot
+from frictid_hil.errors import FrictidError, Interrupted
+from frictid_hil.jobs.compensation.figures import DOMINATED_PERCENT, ModeFigures, ModeRun, figures, friction_dominates
+from frictid_hil.jobs.compensation.plan import CompensationPlan
+from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
+from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.plan.control import Compensated
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.recording.samples import Mark
+from frictid_hil.report.compensation import compensation_page
+from frictid_hil.report.pages import write_page
+from frictid_hil.report.words import plain
+from frictid_hil.runner.events import JointRun
+from frictid_hil.runs.folder import RunFolder
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A compensation, decided before a bus is opened.
+
+    Attributes:
+        robot: its file.
+        setup: as the driver knows it.
+        joint: name.
+        profile: file.
+        entry: of the joint.
+        wanted: what a person asked for.
+        planned: what will move, and under which laws.
+    """
+
+    robot: Robot
+    setup: RobotSetup
+    joint: str
+    profile: Path
+    entry: JointProfile
+    wanted: Wanted
+    planned: CompensationPlan
+
+    @property
+    def plan(self) -> Plan:
+        """Frozen."""
+        return self.planned.plan
+
+
+@dataclass(slots=True)
+class Progress:
+    """What a run has come to, so that an error halfway loses nothing.
+
+    Attributes:
+        marks: of finished motions.
+        runs: by mode.
+        begun: a law has commanded the joint.
+        run: the joint's, once it is done.
+        ended: what ended it early.
+    """
+
+    marks: list[Mark] = field(default_factory=list)
+    runs: dict[str, ModeRun] = field(default_factory=dict)
+    begun: bool = False
+    run: JointRun | None = None
+    ended: FrictidError | None = None
+
+
+def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, Any]:
+    """The JSON of the verb; manifest and page are written."""
+    wanted = asked.wanted
+    inertia, source = _inertia(asked)
+    found = figures(progress.runs, wanted.task, inertia, _floors(asked, inertia))
+    modes: dict[str, Any] = {mode: figure.values() for mode, figure in found.items()}
+    modes |= _service_figures(wanted, progress)
+    friction = next((law.friction for law in asked.planned.laws.values() if law.friction is not None), None)
+    run, ended = progress.run, progress.ended
+    result: dict[str, Any] = {
+        "outcome": ended.outcome if ended else "ok",
+        "exit_code": ended.exit_code if ended else 0,
+        "robot": asked.robot.name,
+        "joint": asked.joint,
+        "task": wanted.task,
+        "setting": wanted.setting,
+        "compensation_ratio": friction.ratio if friction else None,
+        "compensation_ratio_lowest": asked.planned.lowest_ratio,
+        "stiffness_nm_per_rad": friction.stiffness_nm_per_rad if friction else None,
+        "inertia_kg_m2": inertia,
+        "inertia_source": source,
+        "seed": asked.setup.seed if wanted.simulated else None,
+        "rate_hz": run.rate_hz if run else None,
+        "late_cycles": run.late_cycles if run else None,
+        "missed_cycles": run.missed_cycles if run else None,
+        "warnings": list(asked.planned.warnings),
+        "profile": str(asked.profile.resolve()),
+        "run": str(folder.path.resolve()),
+        "modes": modes,
+        "friction_dominates": friction_dominates(found),
+        "remarks": _remarks(found),
+    }
+    if ended is not None:
+        result["error"] = {
+            "what": ended.what,
+            "where": ended.where,
+            "cause": ended.cause,
+            # A run of modes has nothing to resume.
+            "next_step": "" if isinstance(ended, Interrupted) else ended.next_step,
+        }
+    folder.finish(result)
+    if progress.runs:
+        page = compensation_page(
+            asked.robot.name,
+            asked.joint,
+            wanted.task,
+            progress.runs,
+            modes,
+            facts=_facts(result),
+            remarks=result["remarks"],
+            outcome=str(result["outcome"]),
+            error=ended.what if ended else "",
+        )
+        result["report"] = str(write_page(page, folder.path / "report.html").resolve())
+    return result
+
+
+def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
+    """What the figures mean, in words."""
+    dominates = friction_dominates(found)
+    if dominates is None:
+        return []
+    left_percent = 100.0 - (found["mop-reference"].ceiling_percent or 0.0)
+    exact = f"given back exactly, friction would leave {left_percent:.1f} % of it"
+    if dominates:
+        return [f"friction dominates the tracking error: {exact}"]
+    return [
+        f"inertia has a large part in the tracking error: {exact}, more than {100.0 - DOMINATED_PERCENT:.0f} %; "
+        "at a lower `--speed` friction dominates"
+    ]
+
+
+def _inertia(asked: Asked) -> tuple[float | None, str]:
+    """What is removed from the hand torque: on a simulated robot its own inertia, which no law ever sees."""
+    if asked.wanted.simulated:
+        value = asked.setup.joint(asked.joint).simulated.get("inertia_kg_m2")
+        if isinstance(value, int | float):
+            return float(value), "simulated joint"
+    return asked.entry.inertia_kg_m2.value, "profile"
+
+
+def _floors(asked: Asked, inertia_kg_m2: float | None) -> dict[str, float]:
+    """By mode, what remains of the tracking error with friction out of the way; not for nc or a drive's own loop."""
+    if asked.wanted.task != "track" or inertia_kg_m2 is None:
+        return {}
+    return {
+        motion.law.mode: tracking_floor_rad(
+            motion.path,
+            motion.law.gains,
+            inertia_kg_m2,
+            asked.entry.curve(),
+            first_s=asked.wanted.period_s,
+            follows_reference=motion.law.follows_reference,
+        )
+        for motion in asked.plan.joints[0].motions
+        if isinstance(motion, Compensated) and motion.law.gains is not None and motion.law.friction is not None
+    }
+
+
+def _service_figures(wanted: Wanted, progress: Progress) -> dict[str, Any]:
+    sums = [mark.details["count_v2_t2"] for mark in progress.marks if mark.name == "service"]
+    if not sums or not sums[0][0]:
+        return {}
+    count, velocity, torque = sums[0]
+    return {
+        wanted.modes[0]: {
+            "velocity_rms_rad_s": math.sqrt(velocity / count),
+            "torque_rms_nm": math.sqrt(torque / count) if torque else None,
+            "torque_rms_inertia_removed_nm": None,
+            "reduction_percent": None,
+            "reduction_inertia_removed_percent": None,
+            "tracking_rms_rad": None,
+            "reasons": {"reduction_percent": "a service has nothing to compare with"},
+        }
+    }
+
+
+def _facts(result: dict[str, Any]) -> dict[str, str]:
+    """Provenance in words."""
+    inertia, rate = result["inertia_kg_m2"], result["rate_hz"]
+    facts = {
+        "setting": str(result["setting"]),
+        "compensation ratio": f"{_shown(result['compensation_ratio'])}, at its lowest "
+        f"{_shown(result['compensation_ratio_lowest'])}",
+        "stiffness K": f"{_shown(result['stiffness_nm_per_rad'])} N m/rad",
+        "inertia": "unknown" if inertia is None else f"{_shown(inertia)} kg m2, of the {result['inertia_source']}",
+        "rate": f"{_shown(rate)} Hz",
+        "seed": str(result["seed"]),
+        "profile": str(result["profile"]),
+        "run": str(result["run"]),
+        "warnings": "; ".join(result["warnings"]),
+    }
+    return {name: told for name, told in facts.items() if told}
+
+
+def _shown(value: Any) -> str:
+    return plain(value) if isinstance(value, int | float) else str(value)

@@ -1,0 +1,1 @@
+"""What the verbs of `gap` need beside the diagnosis."""

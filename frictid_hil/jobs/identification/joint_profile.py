@@ -1,0 +1,316 @@
+"""From one joint's samples to its entry in a profile: estimator, rigid body, presliding, quality gates.
+
+Live runs and recordings come through here alike, so that the same samples give the same profile to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.config.profile import DriveIdentity, Gate, JointProfile, PairList, ProcedureUsed, Ripple, TimeSkew
+from frictid_hil.config.profile import Estimate as Figure
+from frictid_hil.errors import IdentificationError, UsageError
+from frictid_hil.friction import quality
+from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.identify import IdentifiedPairs
+from frictid_hil.friction.onset import cycles_start_s
+from frictid_hil.friction.plateaus import plateaus
+from frictid_hil.friction.presliding import presliding
+from frictid_hil.friction.recording import CycleRecording, Repeat
+from frictid_hil.friction.rigid_body import Measured
+from frictid_hil.friction.trajectory import Array, Procedure
+from frictid_hil.jobs.identification.companions import with_companions
+from frictid_hil.jobs.identification.declared import declared_skew
+from frictid_hil.jobs.identification.path_time import gaps_ns, path_time
+from frictid_hil.jobs.identification.skew_stretch import wanted_note, with_shaking
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.recording.samples import Mark, Samples
+
+_PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
+
+
+def identify_joint(
+    samples: Samples,
+    joint: JointSetup | None,
+    *,
+    method: str,
+    procedure: Procedure | None = None,
+    late_cycles: int = 0,
+    company: Sequence[Samples] = (),
+) -> JointProfile:
+    """Identify one joint.
+
+    Args:
+        samples: of the whole run of the joint, with marks; or of a foreign recording, without.
+        joint: limits and gear, where a robot file tells.
+        method: estimator.
+        procedure: instead of the one that the marks carry; without either, plateaus of constant speed are looked for.
+        late_cycles: control cycles that came late or were missed.
+        company: of the joints that moved together with it, where they did, whole runs too; it may be among them.
+
+    Raises:
+        IdentificationError: no curve can be formed; the reason names cycle or speed.
+    """
+    if samples.torque_nm is None:
+        raise IdentificationError("the recording has no torque", where=f"joint {samples.joint}")
+    if samples.marks:
+        samples = samples.during(Mark("whole run", samples.marks[0].start_ns, samples.marks[-1].end_ns))
+    marks = samples.marked("cycles")
+    if marks:
+        used = procedure_of(marks[0])
+        if procedure is not None and procedure != used:
+            raise UsageError(
+                "the recording was made with another procedure than the one asked for; leave the options out",
+                where=f"joint {samples.joint}",
+            )
+        together = tuple(map(str, marks[0].details.get("together", ())))
+        known = {other.joint: other for other in company if other.joint != samples.joint}
+        others = [known[name] for name in together if name in known]
+        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles, together, others)
+    if procedure is not None:
+        path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
+        start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
+        return _from_cycles(samples, procedure, start_s, joint, method, late_cycles)
+    return _from_plateaus(samples)
+
+
+def procedure_of(mark: Mark) -> Procedure:
+    """V, A, N, c and the shares of V that a recording carries."""
+    amplitude, velocity, cycles, ratio = (mark.details[key] for key in _PROCEDURE_KEYS)
+    shares = tuple(map(float, mark.details.get("shares", ())))
+    return Procedure(float(amplitude), float(velocity), int(cycles), float(ratio), shares)
+
+
+def joint_result(profile: JointProfile) -> dict[str, Any]:
+    """A joint's entry in the JSON of ``calibrate`` and ``identify``."""
+    failed = [gate for gate in profile.gates if not gate.passed]
+    return {
+        "outcome": "gate_failed" if failed else "ok",
+        "method": profile.method,
+        "velocity_rad_s": list(profile.velocity_rad_s),
+        "torque_nm": list(profile.torque_nm),
+        "torque_interval_nm": [list(pair) for pair in profile.torque_interval_nm or ()],
+        "coulomb_nm": profile.coulomb_nm.value,
+        "inertia_kg_m2": profile.inertia_kg_m2.value,
+        "time_skew_s": profile.time_skew_s,
+        "time_skew": None if profile.time_skew is None else profile.time_skew.model_dump(),
+        "presliding_stiffness_nm_per_rad": profile.presliding_stiffness_nm_per_rad.value,
+        "prismatic": profile.prismatic,
+        "remarks": [gate.message for gate in failed],
+        "notes": list(profile.quality.get("notes", ())),
+    }
+
+
+def _from_cycles(
+    samples: Samples,
+    procedure: Procedure,
+    start_s: float,
+    joint: JointSetup | None,
+    method: str,
+    late_cycles: int,
+    together: tuple[str, ...] = (),
+    company: Sequence[Samples] = (),
+) -> JointProfile:
+    notes = _damage(samples)
+    path = path_time(samples, procedure, round(start_s * 1e9))
+    if path is not None:
+        samples, *company = (path.applied(one) for one in (samples, *company))
+        notes.append(path.said)
+    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    if path is not None:
+        recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
+    recording = with_shaking(recording, samples)
+    if len(together) > 1:
+        recording = replace(recording, coupled=True)
+        try:
+            recording = with_companions(recording, samples, company, start_s)
+        except IdentificationError as problem:
+            notes.append(problem.what)
+    result = estimate(recording, method)
+    gates = quality.gates(recording, result)
+    if recording.shaken is None and not recording.coupled and result.terms is not None:
+        notes += filter(None, [wanted_note(result.terms, float(np.mean(result.curve.torque_nm)))])
+    body = result.rigid_body
+    curve = result.curve
+    temperature = samples.temperature_c
+    stiffness, level, gradual = _presliding(samples, recording)
+    apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
+    return JointProfile(
+        method=result.method,
+        prismatic=samples.prismatic,
+        velocity_rad_s=curve.velocity_rad_s,
+        torque_nm=curve.torque_nm,
+        torque_interval_nm=_interval(curve.torque_nm, result.half_width_nm),
+        coulomb_nm=_figure(result.coulomb_nm),
+        presliding_stiffness_nm_per_rad=stiffness,
+        presliding_level_nm=level,
+        presliding_yields="gradually" if gradual else "at once",
+        inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, apart),
+        gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, apart),
+        gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, apart),
+        bias_nm=_figure(body.bias_nm if body else None, apart),
+        forward=_pair_list(result.pairs.velocity_plus_rad_s, result.pairs.torque_plus_nm),
+        backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
+        published=_published(result.published),
+        ripple=Ripple(period_rad=result.ripple.period_rad, torque_nm=result.ripple.torque_nm)
+        if result.ripple
+        else None,
+        torque_source=str(samples.meta.get("torque_source", "")),
+        time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s
+        if result.time_skew is None
+        else result.time_skew.used_s,
+        time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
+        temperature_c=None if temperature is None else round(float(np.nanmean(temperature)), 2),
+        procedure=ProcedureUsed(
+            amplitude_rad=procedure.amplitude_rad,
+            velocity_rad_s=procedure.velocity_rad_s,
+            cycles=procedure.cycles,
+            ratio=procedure.ratio,
+            shares=procedure.shares or None,
+            together=together or None,
+        ),
+        drive=_drive(samples.meta),
+        quality={
+            **{name: float(value) for name, value in result.figures.items()},
+            "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
+            "drift_percent": 100 * result.drift.change if result.drift else None,
+            "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
+            "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
+            "notes": [*notes, *result.notes],
+        },
+        gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
+    )
+
+
+def _from_plateaus(samples: Samples) -> JointProfile:
+    assert samples.torque_nm is not None  # by the caller
+    skew = declared_skew(samples)
+    found = plateaus(
+        samples.time_s,
+        samples.position_rad,
+        samples.torque_nm,
+        command_rad=samples.position_command_rad,
+        torque_delay_s=skew.torque_delay_s - skew.position_delay_s,
+        where=f"joint {samples.joint}",
+    )
+    pairs, curve, half = found.pairs, found.curve, found.half_width_nm
+    notes = [*_damage(samples), "no sine cycles: windows are stretches of constant speed, both ways"]
+    known = bool(np.all(np.isfinite(half)))
+    if not known:
+        notes.append("no interval could be formed: every speed was held at one place only, and once")
+    return JointProfile(
+        method="plateaus",
+        prismatic=samples.prismatic,
+        velocity_rad_s=curve.velocity_rad_s,
+        torque_nm=curve.torque_nm,
+        torque_interval_nm=_interval(curve.torque_nm, half) if known else None,
+        coulomb_nm=_figure(found.coulomb_nm),
+        forward=_pair_list(pairs.velocity_plus_rad_s, pairs.torque_plus_nm),
+        backward=_pair_list(-pairs.velocity_minus_rad_s, pairs.torque_minus_nm),
+        torque_source=str(samples.meta.get("torque_source", "")),
+        time_skew_s=skew.torque_delay_s - skew.position_delay_s,
+        quality={"notes": notes},
+    )
+
+
+def _damage(samples: Samples) -> list[str]:
+    damage = samples.meta.get("damage")
+    return [f"the recording is damaged, what is left of it was used: {damage}"] if damage else []
+
+
+def _interval(torque_nm: tuple[float, ...], half_width_nm: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((f - h, f + h) for f, h in zip(torque_nm, half_width_nm.tolist(), strict=True))
+
+
+def _recording(
+    samples: Samples, procedure: Procedure, start_s: float, joint: JointSetup | None, late_cycles: int
+) -> CycleRecording:
+    kept = samples.select(_around_cycles(samples, procedure, start_s))
+    assert kept.torque_nm is not None  # by the caller
+    drift = samples.marked("drift")
+    quantum = samples.meta.get("torque_resolution_nm")
+    return CycleRecording(
+        time_s=kept.time_s - start_s,
+        position_rad=kept.position_rad,
+        torque_nm=kept.torque_nm,
+        procedure=procedure,
+        velocity_rad_s=kept.velocity_rad_s,
+        command_rad=kept.position_command_rad,
+        skew=declared_skew(samples),
+        gear_ratio=joint.gear_ratio if joint else math.nan,
+        prismatic=samples.prismatic,
+        torque_limit_nm=joint.max_torque_nm if joint else math.inf,
+        torque_quantum_nm=float(quantum) if quantum else 0.0,
+        repeat=_repeat(drift[0], procedure, start_s) if drift else None,
+        late_cycles=late_cycles,
+        stops_s=gaps_ns(kept) * 1e-9 - start_s,
+        where=f"joint {samples.joint}",
+    )
+
+
+def _repeat(drift: Mark, procedure: Procedure, start_s: float) -> Repeat:
+    """Which cycle was run again: the one whose peak speed the mark carries."""
+    off = np.abs(procedure.peak_velocities_rad_s - float(drift.details["peak_velocity_rad_s"]))
+    return Repeat(int(np.argmin(off)) + 1, drift.start_ns * 1e-9 - start_s)
+
+
+def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """From the hold before the cycles to the end of the repeated cycle; half a second around where no marks tell."""
+    first_s, last_s = start_s - 0.5, start_s + procedure.duration_s + 0.5
+    holds = [mark for mark in samples.marked("hold") if mark.end_ns * 1e-9 <= start_s + 1e-6]
+    if holds:
+        first_s = holds[-1].start_ns * 1e-9
+    drift = samples.marked("drift")
+    if drift:
+        last_s = drift[0].end_ns * 1e-9
+    time_s = samples.time_s
+    inside: np.ndarray[Any, np.dtype[np.bool_]] = (time_s >= first_s) & (time_s < last_s)
+    return inside
+
+
+def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
+    return DriveIdentity(
+        serial=str(meta.get("serial") or ""),
+        firmware=str(meta.get("firmware") or ""),
+        product=str(meta.get("product") or ""),
+        rated_torque_nm=meta.get("rated_torque_nm"),
+        gear_ratio=meta.get("gear_ratio"),
+        settings=dict(meta.get("settings") or {}),
+    )
+
+
+def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Figure, bool]:
+    """Stiffness, level, and whether it yields gradually."""
+    reversals = samples.marked("reversal")
+    if not reversals:
+        nothing = Figure.none("the recording has no slow reversal")
+        return nothing, nothing, False
+    part = samples.during(reversals[0])
+    assert part.torque_nm is not None  # by the caller
+    try:
+        found = presliding(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
+    except IdentificationError as problem:
+        nothing = Figure.none(problem.what)
+        return nothing, nothing, False
+    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm), found.gradual
+
+
+def _figure(measured: Measured | None, reason: str = "") -> Figure:
+    if measured is None:
+        return Figure.none(reason)
+    if not math.isfinite(measured.half_width):
+        return Figure(value=measured.value, reason="no interval could be formed")
+    return Figure(value=measured.value, low=measured.low, high=measured.high)
+
+
+def _published(pairs: IdentifiedPairs | None) -> PairList | None:
+    return None if pairs is None else _pair_list(pairs.velocity_rad_s, pairs.torque_nm)
+
+
+def _pair_list(velocity: Any, torque: Any) -> PairList:
+    return PairList(velocity_rad_s=tuple(map(float, velocity)), torque_nm=tuple(map(float, torque)))

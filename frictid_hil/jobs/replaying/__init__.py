@@ -1,0 +1,1 @@
+"""Bus logs played back."""

@@ -1,0 +1,252 @@
+"""A bus log as the samples that a live run would have kept, with an account of what the log lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from frictid_hil.config.profile import Gate
+from frictid_hil.errors import InputFileError
+from frictid_hil.jobs.replaying.bus_logs import Log, Motion
+from frictid_hil.protocol.frames import LogDecoder, LoggedFrame, frame_decoders, joint_names
+from frictid_hil.recording.bus_log import Frames, read_frames
+from frictid_hil.recording.playback import LogBus
+from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.runner.ring import SAMPLE_ROW, Rows
+from frictid_hil.runs.folder import samples_from_rows
+
+MOST_LOST_PERCENT = 5.0
+"""A joint that lacks more of its rows than this is not trusted."""
+
+
+@dataclass(slots=True)
+class Account:
+    """What a log holds besides rows, and what it lacks.
+
+    Attributes:
+        frames: in the log.
+        rows: cycles decoded.
+        unknown: frames that nothing describes, by name.
+        services: frames around the cycles, by name.
+        repeated: reports that came twice in a row.
+        backwards: frames that stood before an earlier one in the log; they were put back by their time.
+        skipped: error and remote frames.
+        lost_rows: rows that a joint lacks during its own motion, by joint.
+        lost_percent: the same in percent of what should be there.
+        damage: where the log ends before its end.
+    """
+
+    frames: int = 0
+    rows: int = 0
+    unknown: dict[str, int] = field(default_factory=dict)
+    services: dict[str, int] = field(default_factory=dict)
+    repeated: int = 0
+    backwards: int = 0
+    skipped: int = 0
+    lost_rows: dict[str, int] = field(default_factory=dict)
+    lost_percent: dict[str, float] = field(default_factory=dict)
+    damage: str = ""
+
+    def take(self, samples: Samples) -> None:
+        """Count what one joint lacks."""
+        lost, percent = lost_rows(samples.time_ns)
+        self.lost_rows[samples.joint] = self.lost_rows.get(samples.joint, 0) + lost
+        self.lost_percent[samples.joint] = max(self.lost_percent.get(samples.joint, 0.0), percent)
+
+    def gate(self, joint: str) -> Gate | None:
+        """What a profile must say of this joint's log; None for a whole one."""
+        lost, percent = self.lost_rows.get(joint, 0), self.lost_percent.get(joint, 0.0)
+        if not lost:
+            return None
+        message = f"{lost} rows ({percent:.2g} %) are missing from the log"
+        if percent > MOST_LOST_PERCENT:
+            return Gate(name="log", passed=False, message=f"{message}; up to {MOST_LOST_PERCENT:g} % are tolerated")
+        return Gate(name="log", passed=True, message=f"{message}; the others were used")
+
+
+def lost_rows(time_ns: NDArray[np.int64]) -> tuple[int, float]:
+    """How many rows of an evenly sampled recording are missing, and percent of what should be there."""
+    if time_ns.size < 3:
+        return 0, 0.0
+    steps = np.diff(time_ns)
+    period_ns = float(np.median(steps))
+    lost = int(np.sum(np.maximum(0, np.round(steps / period_ns).astype(np.int64) - 1)))
+    return lost, 100.0 * lost / (time_ns.size + lost)
+
+
+def ordered(frames: Frames) -> tuple[Frames, int]:
+    """The frames in the order of their times, and how many stood before an earlier one."""
+    backwards = int(np.count_nonzero(np.diff(frames.t_ns) < 0))
+    if not backwards:
+        return frames, 0
+    order = np.argsort(frames.t_ns, kind="stable")
+    return (
+        replace(
+            frames,
+            t_ns=frames.t_ns[order],
+            can_id=frames.can_id[order],
+            length=frames.length[order],
+            data=frames.data[order],
+            sent=frames.sent[order],
+        ),
+        backwards,
+    )
+
+
+def decoder_for(frame_map: Mapping[str, Any]) -> LogDecoder:
+    """A fresh decoder.
+
+    Raises:
+        InvalidFields: nobody understands this map, or a field of it is wrong.
+    """
+    return frame_decoders(str(frame_map.get("schema"))).decoder(frame_map)
+
+
+def rows_by_joint(
+    frames: Iterable[LoggedFrame],
+    frame_map: Mapping[str, Any],
+    account: Account,
+    at: Callable[[int], None] = lambda _: None,
+) -> dict[str, Rows]:
+    """Every report of every joint as rows of ``ring.SAMPLE_ROW``, as the cyclic loop would have kept them.
+
+    Args:
+        frames: in order of time.
+        frame_map: which frame carries what.
+        account: counts are added to it.
+        at: told the run time of rows as they come, in ns.
+    """
+    names = joint_names(frame_map)
+    kept: list[list[tuple[Any, ...]]] = [[] for _ in names]
+    decoder = decoder_for(frame_map)
+    for row in decoder.rows(frames):
+        account.rows += 1
+        if account.rows % 1024 == 0:
+            at(row.t_ns)
+        for report, mine in zip(row.feedback, kept, strict=True):
+            if report.age_cycles == 0 and report.valid:
+                mine.append(
+                    (
+                        report.t_ns,
+                        report.position_rad,
+                        report.velocity_rad_s,
+                        report.torque_nm,
+                        report.position_command_rad,
+                        0.0,
+                        report.external_torque_nm,
+                        report.temperature_c,
+                        report.status_raw,
+                        0,
+                        report.error_code,
+                    )
+                )
+    for name, count in decoder.unknown.items():
+        account.unknown[name] = account.unknown.get(name, 0) + count
+    for name, count in decoder.services.items():
+        account.services[name] = account.services.get(name, 0) + count
+    account.repeated += decoder.repeated
+    account.backwards += decoder.backwards
+    return {name: _increasing(np.array(mine, dtype=SAMPLE_ROW)) for name, mine in zip(names, kept, strict=True)}
+
+
+def samples_of(
+    joint: str, rows: Rows, marks: tuple[Mark, ...], identity: Mapping[str, Any], robot: str, account: Account
+) -> Samples:
+    """One joint's samples during its own motion (all of them, where no marks tell), counted in the account."""
+    if marks:
+        rows = rows[(rows["t_ns"] >= marks[0].start_ns) & (rows["t_ns"] < marks[-1].end_ns)]
+    samples = samples_from_rows(joint, rows, marks, identity, robot)
+    # Before its first command a joint has none, and a log of other origin may carry none at all.
+    samples = replace(
+        samples,
+        velocity_rad_s=_filled(samples.velocity_rad_s),
+        torque_nm=_filled(samples.torque_nm),
+        position_command_rad=_filled(samples.position_command_rad),
+    )
+    account.take(samples)
+    return samples
+
+
+def _increasing(rows: Rows) -> Rows:
+    """Rows with a time after all before them; a damaged log may hold others."""
+    if rows.size < 2:
+        return rows
+    highest = np.maximum.accumulate(rows["t_ns"])
+    kept: Rows = rows[np.concatenate([[True], rows["t_ns"][1:] > highest[:-1]])]
+    return kept
+
+
+def _filled(column: NDArray[np.floating[Any]] | None) -> NDArray[np.floating[Any]] | None:
+    """The nearest value after, or before, what is missing; None where all is."""
+    if column is None or np.isfinite(column).all():
+        return column
+    good = np.flatnonzero(np.isfinite(column))
+    if not good.size:
+        return None
+    return np.asarray(column[good[np.clip(np.searchsorted(good, np.arange(column.size)), 0, good.size - 1)]])
+
+
+def samples_in(
+    logs: Sequence[Log],
+    robot: str,
+    account: Account,
+    *,
+    joints: Collection[str] = (),
+    paced: bool = False,
+    echo: can.BusABC | None = None,
+    at: Callable[[float], None] = lambda _: None,
+) -> dict[str, Samples]:
+    """The samples of every joint that moved during some logs, by joint; of the last one in which it did.
+
+    Args:
+        logs: of one run, in order.
+        robot: name, for the samples' meta.
+        account: counts are added to it.
+        joints: only these; all when empty.
+        paced: at recorded speed.
+        echo: bus on which every frame is sent again.
+        at: told the time since the start of a log, s, as rows come.
+
+    Raises:
+        InputFileError: a log is unreadable, or no report could be decoded.
+    """
+    newest: dict[str, Samples] = {}
+    for log in logs:
+        frames = read_frames(log.path)
+        account.frames += len(frames)
+        account.skipped += frames.skipped
+        account.damage = account.damage or frames.damage
+        frames, backwards = ordered(frames)
+        account.backwards += backwards
+        began_ns = int(frames.t_ns[0])
+        with LogBus(frames, paced=paced, echo=echo) as bus:
+            rows = rows_by_joint(iter(bus.take, None), log.frame_map, account, partial(_tell, at, began_ns))
+        for motion in log.motions or [Motion(name) for name in rows]:
+            if motion.joint in rows and (not joints or motion.joint in joints):
+                identity = log.identities.get(motion.joint, {})
+                samples = samples_of(motion.joint, rows[motion.joint], motion.marks, identity, robot, account)
+                if len(samples) >= 2:
+                    newest[motion.joint] = samples
+    if not newest:
+        raise InputFileError(
+            "no report of a joint could be decoded",
+            where=", ".join(str(log.path) for log in logs),
+            cause=f"frames that nothing describes: {_counted(account.unknown)}" if account.unknown else "",
+            next_step="say which frame is what with `frictid-hil replay --frames` or `--eds`",
+        )
+    return newest
+
+
+def _tell(at: Callable[[float], None], began_ns: int, t_ns: int) -> None:
+    at((t_ns - began_ns) * 1e-9)
+
+
+def _counted(names: Mapping[str, int]) -> str:
+    most = sorted(names.items(), key=lambda item: -item[1])[:5]
+    return ", ".join(f"{count} x {name}" for name, count in most)

@@ -1,0 +1,270 @@
+"""What commands a joint that is compensated: gravity, a low-gain PD, friction compensation - as plain values.
+
+Section 5 of the paper in one value, ``ControlLaw``, and the two motions of a plan that need it: ``Probe`` asks whether
+the profile still describes the joint, ``Compensated`` runs the law. They print and cross process borders like the rest
+of the plan; ``runner.compensation`` turns a law into torque, cycle by cycle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.friction.compensation import CompensationSettings
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Motion, Sine
+
+
+@dataclass(frozen=True, slots=True)
+class Gravity:
+    """Torque that holds the joint where it stands, as identified.
+
+    Attributes:
+        cos_nm: of ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``.
+        sin_nm: see there.
+        bias_nm: constant part.
+        centre_rad: middle of the travel over which it was identified.
+        spread_rad: rms distance from there, over that travel.
+        unsure_nm: half of the 95 % interval of the bias.
+    """
+
+    cos_nm: float = 0.0
+    sin_nm: float = 0.0
+    bias_nm: float = 0.0
+    centre_rad: float = 0.0
+    spread_rad: float = 0.0
+    unsure_nm: float = 0.0
+
+    def torque_nm(self, position_rad: float) -> float:
+        """At one position."""
+        return self.cos_nm * math.cos(position_rad) + self.sin_nm * math.sin(position_rad) + self.bias_nm
+
+    def doubt_nm(self, position_rad: float) -> float:
+        """By how much it may be wrong at one position, half of a 95 % interval.
+
+        Over a short travel a bias and the top of a cosine look alike. What the one got of the other changes nothing
+        there, and is missing elsewhere: ``unsure_nm (cos(spread) - cos(q - centre))``.
+        """
+        away = math.cos(self.spread_rad) - math.cos(position_rad - self.centre_rad)
+        return self.unsure_nm * away if away > 0.0 else 0.0
+
+    @property
+    def largest_nm(self) -> float:
+        """Bound over all positions."""
+        return math.hypot(self.cos_nm, self.sin_nm) + abs(self.bias_nm)
+
+
+@dataclass(frozen=True, slots=True)
+class RippleTorque:
+    """Torque that repeats over a stretch of joint travel, as identified.
+
+    Attributes:
+        period_rad: after which it repeats.
+        torque_nm: at equal steps over one period, the first at position 0, shape (k,).
+    """
+
+    period_rad: float
+    torque_nm: tuple[float, ...]
+
+    def torque_at_nm(self, position_rad: float) -> float:
+        """Linear between the steps."""
+        table = self.torque_nm
+        at = (position_rad / self.period_rad % 1.0) * len(table)
+        low = int(at)
+        here, there = table[low % len(table)], table[(low + 1) % len(table)]
+        return here + (there - here) * (at - low)
+
+
+@dataclass(frozen=True, slots=True)
+class PositionGains:
+    """A PD on position.
+
+    Attributes:
+        stiffness_nm_per_rad: k_p.
+        damping_nm_s_per_rad: k_d.
+    """
+
+    stiffness_nm_per_rad: float
+    damping_nm_s_per_rad: float
+
+    @staticmethod
+    def low(coulomb_nm: float, inertia_kg_m2: float) -> PositionGains:
+        """Gains by which Coulomb friction alone costs 2 deg, at a damping ratio of 0.7 (section 5.2)."""
+        stiffness = coulomb_nm / math.radians(2.0)
+        return PositionGains(stiffness, 2.0 * 0.7 * math.sqrt(stiffness * inertia_kg_m2))
+
+
+@dataclass(frozen=True, slots=True)
+class ControlLaw:
+    """All that decides the torque of one joint.
+
+    Attributes:
+        mode: ``nc``, ``mo``, ``mol``, ``mop`` or ``mop-reference``.
+        gravity: always compensated.
+        gains: None where a person moves the joint.
+        friction: None for ``nc``.
+        ripple: None where it is not compensated.
+        follows_reference: friction is that of the reference velocity instead of the measured one.
+        torque_limit_nm: no more is ever commanded.
+        slew_nm_per_s: nor changed faster.
+    """
+
+    mode: str
+    gravity: Gravity
+    gains: PositionGains | None
+    friction: CompensationSettings | None
+    ripple: RippleTorque | None
+    follows_reference: bool
+    torque_limit_nm: float
+    slew_nm_per_s: float
+
+    def friction_share(self, position_rad: float) -> float:
+        """Of friction compensation that is given at one position, 1 where gravity is as good as known.
+
+        1 - R of F_0 is left to stop a free joint. Where gravity may be wrong, that much less friction is given, so that
+        as much is left in the worst case.
+        """
+        friction = self.friction
+        if friction is None:
+            return 1.0
+        share = 1.0 - self.gravity.doubt_nm(position_rad) / (friction.ratio * friction.coulomb_nm)
+        return share if share > 0.0 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """A slow sine that asks whether a profile still describes the joint, before anything is compensated with it.
+
+    Attributes:
+        sine: the travel, in position control.
+        curve: friction as identified.
+        gravity: as identified.
+        tolerance: largest deviation of friction, and of gravity as a share of F_0.
+        temperature_c: at which it was identified, None where unknown.
+        temperature_tolerance_c: largest difference from it.
+        enforced: False only tells.
+    """
+
+    sine: Sine
+    curve: FrictionCurve
+    gravity: Gravity
+    tolerance: float
+    temperature_c: float | None = None
+    temperature_tolerance_c: float = math.inf
+    enforced: bool = True
+    name: str = "probe"
+
+    @property
+    def duration_s(self) -> float:
+        """Of the sine."""
+        return self.sine.duration_s
+
+    def position_rad(self, time_s: Array) -> Array:
+        """The sine's."""
+        return self.sine.position_rad(time_s)
+
+    def details(self) -> Mapping[str, Any]:
+        """The sine's, and the tolerance."""
+        return {**self.sine.details(), "tolerance": self.tolerance}
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """Where a person is expected to guide a joint: centre + amplitude sin(2 pi f t) (section 5.1).
+
+    Attributes:
+        centre_rad: middle of the travel.
+        amplitude_rad: to either side.
+        frequency_hz: of the metronome.
+        duration_s: infinite for a service.
+    """
+
+    centre_rad: float
+    amplitude_rad: float
+    frequency_hz: float
+    duration_s: float
+    name: str = "swing"
+
+    @property
+    def peak_velocity_rad_s(self) -> float:
+        """2 pi f times the amplitude."""
+        return 2.0 * math.pi * self.frequency_hz * self.amplitude_rad
+
+    def position_rad(self, time_s: Array) -> Array:
+        """Along the sine."""
+        swung: Array = self.amplitude_rad * np.sin(2.0 * math.pi * self.frequency_hz * np.asarray(time_s))
+        return self.centre_rad + swung
+
+    def details(self) -> Mapping[str, Any]:
+        """Centre, amplitude, frequency."""
+        return {
+            "centre_rad": self.centre_rad,
+            "amplitude_rad": self.amplitude_rad,
+            "frequency_hz": self.frequency_hz,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What the supervisor allows while a control law commands the joint.
+
+    Attributes:
+        position_min_rad: lowest position.
+        position_max_rad: highest position.
+        velocity_rad_s: largest measured speed.
+        power_w: largest mechanical power.
+        growth_s: speed that grows for longer than this is a runaway; see ``runner.runaway``.
+    """
+
+    position_min_rad: float
+    position_max_rad: float
+    velocity_rad_s: float
+    power_w: float
+    growth_s: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Compensated:
+    """A stretch in which a control law commands the joint, closed over its own feedback.
+
+    Attributes:
+        name: ``stand``, ``hand``, ``track``, ... with the mode behind it.
+        path: the reference, or where a person is expected to guide the joint; endless where its duration is infinite.
+        law: decides the torque.
+        bounds: for the supervisor.
+        drive_mode: TORQUE: the law commands all torque; POSITION, VELOCITY: the drive follows the path by its own
+            loop, and the law's torque is an offset (60B2).
+    """
+
+    name: str
+    path: Motion
+    law: ControlLaw
+    bounds: Bounds
+    drive_mode: Mode = Mode.TORQUE
+
+    @property
+    def duration_s(self) -> float:
+        """Of the path."""
+        return self.path.duration_s
+
+    def position_rad(self, time_s: Array) -> Array:
+        """The path's."""
+        return self.path.position_rad(time_s)
+
+    def details(self) -> Mapping[str, Any]:
+        """Mode, gains, limits, and the path's own."""
+        law = self.law
+        told: dict[str, Any] = {**self.path.details(), "mode": law.mode, "torque_limit_nm": law.torque_limit_nm}
+        if law.gains is not None:
+            told["stiffness_nm_per_rad"] = law.gains.stiffness_nm_per_rad
+            told["damping_nm_s_per_rad"] = law.gains.damping_nm_s_per_rad
+        if law.friction is not None:
+            told["compensation_ratio"] = law.friction.ratio
+            told["compensation_stiffness_nm_per_rad"] = law.friction.stiffness_nm_per_rad
+        return told

@@ -1,0 +1,17 @@
+"""How a joint is commanded: by position, velocity or torque."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Mode(IntEnum):
+    """How a joint is commanded; values are those of CiA-402 object 6060."""
+
+    NONE = 0
+    POSITION = 8
+    """Cyclic synchronous position (CSP)."""
+    VELOCITY = 9
+    """Cyclic synchronous velocity (CSV)."""
+    TORQUE = 10
+    """Cyclic synchronous torque (CST)."""

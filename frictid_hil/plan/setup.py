@@ -1,0 +1,86 @@
+"""A robot as plans and drivers need to know it: values of the robot file, joint side of the gear."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.workspace import Workspace
+
+
+@dataclass(frozen=True, slots=True)
+class JointSetup:
+    """One joint as a driver needs to know it; values of the robot file, joint side of the gear.
+
+    Attributes:
+        name: the joint's name in the robot file ("0".."5").
+        address: node id (CAN) or axis index (serial).
+        gear_ratio: motor revolutions per joint revolution.
+        direction: +1 or -1, sign of joint motion for positive motor motion.
+        max_velocity_rad_s: limit of the joint.
+        max_torque_nm: limit of the joint.
+        rated_torque_nm: joint-side torque that the drive calls 1000 per mille (motor rated torque times gear ratio).
+        position_min_rad: software limit.
+        position_max_rad: software limit.
+        start_position_rad: where its identification starts; the travel goes to start + A.
+        locked_position_rad: where it is held while another joint moves.
+        options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
+        simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
+        dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
+    """
+
+    name: str
+    address: int
+    gear_ratio: float
+    direction: int
+    max_velocity_rad_s: float
+    max_torque_nm: float
+    rated_torque_nm: float
+    position_min_rad: float
+    position_max_rad: float
+    start_position_rad: float
+    locked_position_rad: float
+    options: Mapping[str, Any] = field(default_factory=dict)
+    simulated: Mapping[str, Any] = field(default_factory=dict)
+    dh: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSetup:
+    """A robot as a driver needs to know it.
+
+    Attributes:
+        name: the robot's name.
+        bus: ``interface:channel`` as typed (``socketcan:can0``, ``virtual:hp3j``, ``serial:/dev/ttyUSB0``).
+        cycle_hz: requested cycle rate.
+        joints: in the order of the robot file.
+        options: driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
+        realtime: run on the wall clock even where lock-step is possible.
+        seed: seed of every simulated noise; ignored by real hardware.
+        simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
+        workspace: the box that the arm may not leave; None where the robot file names none.
+    """
+
+    name: str
+    bus: str
+    cycle_hz: float
+    joints: tuple[JointSetup, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    realtime: bool = False
+    seed: int = 0
+    simulated_arm: Mapping[str, Any] = field(default_factory=dict)
+    workspace: Workspace | None = None
+
+    def joint(self, name: str) -> JointSetup:
+        """The joint of that name.
+
+        Raises:
+            InvalidFields: no such joint; the message lists the joints there are.
+        """
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        known = ", ".join(j.name for j in self.joints)
+        raise InvalidFields([FieldProblem(("joints", name), f"no such joint; this robot has {known}")])

@@ -1,0 +1,169 @@
+"""What history shows of a stored profile: a few figures per joint, and the line of the index that holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.config.profile import FrictionProfile, with_rotary_names
+from frictid_hil.config.yaml import parse
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.plan.linear_axis import rotary_name
+from frictid_hil.profiles.drift import distance_and_mean_nm
+
+_NEEDED = ("prismatic", "velocity_rad_s", "torque_nm", "coulomb_nm", "temperature_c", "gates")
+
+
+@dataclass(frozen=True, slots=True)
+class JointSummary:
+    """One joint of one profile, as far as history shows it.
+
+    Attributes:
+        coulomb_nm: F_0, None where it could not be formed.
+        coulomb_low_nm: its interval.
+        coulomb_high_nm: its interval.
+        temperature_c: during the cycles, None where not measured.
+        gates_failed: names of failed quality gates.
+        distance_percent: (15) from the baseline's curve, in percent of its mean; None where it has none.
+    """
+
+    coulomb_nm: float | None
+    coulomb_low_nm: float | None
+    coulomb_high_nm: float | None
+    temperature_c: float | None
+    gates_failed: Sequence[str]
+    distance_percent: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A profile in the store.
+
+    Attributes:
+        id: ``<UTC>-<first 12 digits of sha256>``; sorts by time.
+        robot: name.
+        created_utc: from its provenance.
+        baseline: id of the profile that the distances are from, None before the first promotion.
+        joints: summaries by name.
+    """
+
+    id: str
+    robot: str
+    created_utc: str
+    baseline: str | None
+    joints: Mapping[str, JointSummary]
+
+
+@dataclass(frozen=True, slots=True)
+class TrendPoint:
+    """One joint at one time.
+
+    Attributes:
+        id: of the profile.
+        created_utc: when.
+        joint: its figures; ``distance_percent`` is from the baseline of today.
+    """
+
+    id: str
+    created_utc: str
+    joint: JointSummary
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The baseline and its profile, read once.
+
+    Attributes:
+        id: None before the first promotion.
+        profile: likewise.
+    """
+
+    id: str | None
+    profile: FrictionProfile | None
+
+
+def summary(identity: str, profile: FrictionProfile, reference: Reference) -> Stored:
+    """What is kept of a profile in the index."""
+    joints = {
+        name: JointSummary(
+            coulomb_nm=joint.coulomb_nm.value,
+            coulomb_low_nm=joint.coulomb_nm.low,
+            coulomb_high_nm=joint.coulomb_nm.high,
+            temperature_c=joint.temperature_c,
+            gates_failed=[gate.name for gate in joint.gates if not gate.passed],
+            distance_percent=_distance_percent(reference, name, joint.curve()),
+        )
+        for name, joint in profile.joints.items()
+    }
+    return Stored(identity, profile.robot, profile.provenance.created_utc, reference.id, joints)
+
+
+def summary_of_file(identity: str, robot: str, text: str, reference: Reference) -> Stored:
+    """The same from a file that is, byte for byte, what was stored: it was whole then, and is not judged again.
+
+    A third of the time of reading and judging all of it, which counts where an index of thousands was lost.
+    """
+    document = with_rotary_names(parse(_outline(text), Path(f"{identity}.yaml")))
+    values = document.data
+    joints = {}
+    for name, joint in values["joints"].items():
+        coulomb = joint["coulomb_nm"]
+        curve = FrictionCurve(tuple(map(float, joint["velocity_rad_s"])), tuple(map(float, joint["torque_nm"])))
+        joints[name] = JointSummary(
+            coulomb_nm=coulomb["value"],
+            coulomb_low_nm=coulomb.get("low"),
+            coulomb_high_nm=coulomb.get("high"),
+            temperature_c=joint.get("temperature_c"),
+            gates_failed=[gate["name"] for gate in joint.get("gates", ()) if not gate["passed"]],
+            distance_percent=_distance_percent(reference, name, curve),
+        )
+    return Stored(identity, robot, values["provenance"]["created_utc"], reference.id, joints)
+
+
+def _distance_percent(reference: Reference, name: str, curve: FrictionCurve) -> float | None:
+    known = None if reference.profile is None else reference.profile.joints.get(name)
+    if known is None:
+        return None
+    distance_nm, mean_nm = distance_and_mean_nm(known.curve(), curve)
+    return 100.0 * distance_nm / mean_nm
+
+
+def _outline(text: str) -> str:
+    """The lines that a summary needs, of a profile as ``FrictionProfile.to_yaml`` writes it: in block style."""
+    kept, section, keep = [], "", False
+    for line in text.splitlines(keepends=True):
+        begins = line.lstrip(" ")
+        indent = len(line) - len(begins)
+        if begins.strip() and not begins.startswith("- "):  # else it goes on with what was begun
+            key = begins.partition(":")[0]
+            if indent == 0:
+                section = key
+                keep = section in ("joints", "provenance")
+            elif indent == 2:
+                keep = section == "joints" or (section == "provenance" and key == "created_utc")
+            elif indent == 4 and section == "joints":
+                keep = rotary_name(key) in _NEEDED
+        if keep:
+            kept.append(line)
+    return "".join(kept)
+
+
+def line_of(stored: Stored) -> dict[str, Any]:
+    """A line of the index; a joint is a list of its figures, because a store may have 60,000 of them."""
+    joints = {
+        name: [getattr(joint, field) for field in JointSummary.__slots__] for name, joint in stored.joints.items()
+    }
+    return {"index": 1, "id": stored.id, "utc": stored.created_utc, "baseline": stored.baseline, "joints": joints}
+
+
+def stored_of(line: Mapping[str, Any], robot: str) -> Stored | None:
+    """What a line of the index says; None where it is not one that this version writes."""
+    try:
+        if line["index"] != 1:
+            return None  # written by another version: the profile itself is read instead
+        joints = {name: JointSummary(*figures) for name, figures in line["joints"].items()}
+        return Stored(line["id"], robot, line["utc"], line["baseline"], joints)
+    except (KeyError, TypeError, AttributeError):
+        return None

@@ -1,0 +1,1 @@
+"""What a driver must bring, and the frames that it speaks."""

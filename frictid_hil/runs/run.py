@@ -1,0 +1,141 @@
+"""Run a plan whichever clock its driver lives on, and hand every row to whoever keeps it.
+
+Lock-step drivers run in this process, rings drained between cycles. Wall-clock drivers run in a process of their own
+(``runner.process``). The caller sees no difference.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Protocol
+
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Driver, load_driver
+from frictid_hil.plan.plan import Plan
+from frictid_hil.runner.care import Care
+from frictid_hil.runner.cycle import QUICK_STOP
+from frictid_hil.runner.events import Event, Preflight
+from frictid_hil.runner.process import run_in_own_process
+from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
+from frictid_hil.runner.scheduler import Recorder, Scheduler
+
+
+class Keeper(Protocol):
+    """Who keeps what was measured."""
+
+    def samples(self, rows: Rows) -> None:
+        """Rows of ``ring.SAMPLE_ROW``, in order."""
+        ...
+
+    def frames(self, rows: Rows) -> None:
+        """Rows of ``ring.FRAME_ROW``, in order."""
+        ...
+
+
+class Interrupts:
+    """Ctrl-C and SIGTERM as stop levels: the first decelerates, the second stops quickly.
+
+    A context manager; handlers are restored on leaving. Outside the main thread it only holds ``level``.
+    """
+
+    def __init__(self) -> None:
+        self.level = 0
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> Interrupts:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._raise)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]  # exactly what signal.signal returned
+        self._previous.clear()
+
+    def _raise(self, _signal: int, _frame: FrameType | None) -> None:
+        self.level = min(QUICK_STOP, self.level + 1)
+
+
+def run_plan(
+    driver_name: str,
+    setup: RobotSetup,
+    plan: Plan,
+    keeper: Keeper,
+    *,
+    notify: Callable[[Event], None],
+    proceed: Callable[[Preflight], bool],
+    care: Care | None = None,
+    prepare: Callable[[Driver], None] | None = None,
+) -> int:
+    """Run a plan to its end.
+
+    Args:
+        driver_name: entry-point name of the driver.
+        setup: the robot as the driver knows it.
+        plan: checked against limits.
+        keeper: given every row, also after an error.
+        notify: told what happens.
+        proceed: asked once, after the preflight and before anything moves.
+        care: bounds.
+        prepare: called with the driver before it is opened, for what only a simulated robot can do (hands, payloads);
+            on the wall clock with a twin of the driver, since the one that runs is in another process.
+
+    Returns:
+        Rows that were lost because files were written too slowly (0 in a healthy run).
+
+    Raises:
+        FrictidError: see ``Scheduler.run``; what was measured has been given to the keeper by then.
+    """
+    care = care or Care()
+    driver: Driver = load_driver(driver_name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    own_process = not driver.clock.lock_step
+    with sample_ring(shared=own_process) as samples, frame_ring(shared=own_process) as frames:
+        recorder = Recorder(samples, frames)
+
+        def drain() -> None:
+            rows = samples.drain()
+            if rows.size:
+                keeper.samples(rows)
+            rows = frames.drain()
+            if rows.size:
+                keeper.frames(rows)
+
+        def after_draining(event: Event) -> None:
+            drain()
+            notify(event)
+
+        if prepare is not None:
+            prepare(driver)
+        with Interrupts() as interrupts:
+            try:
+                if own_process:
+                    run_in_own_process(
+                        driver_name,
+                        setup,
+                        plan,
+                        recorder,
+                        notify=after_draining,
+                        proceed=proceed,
+                        stop_level=lambda: interrupts.level,
+                        drain=drain,
+                        care=care,
+                    )
+                else:
+                    Scheduler(
+                        driver,
+                        setup,
+                        plan,
+                        recorder,
+                        notify=after_draining,
+                        proceed=proceed,
+                        stop=interrupts,
+                        pump=drain,
+                        care=care,
+                    ).run()
+            finally:
+                drain()
+        return samples.dropped + frames.dropped
