@@ -20,7 +20,7 @@ from frictid_hil.gap.blind.check import run_check
 from frictid_hil.gap.blind.generator import Assignment, draw_case
 from frictid_hil.gap.blind.page import AIMS, CLOSED_AIMS, LEFT_OUT_AIM, SECONDS_AIM, headline, page
 
-DOCS_PAGE = Path(__file__).parents[1] / "docs" / "gap-check.md"
+DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-check.md"
 BEGIN, END = "<!-- the last full run: written by benchmarks/gap_check.py -->", "<!-- end of the last full run -->"
 
 
@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", "--processes", type=int, default=1, help="processes that draw and diagnose at once")
     parser.add_argument("--leave-one-out", action="store_true", help="also take each joint's own effect away")
-    parser.add_argument("--write-docs", action="store_true", help="replace the last full run in docs/gap-check.md")
+    parser.add_argument("--write-docs", action="store_true", help="replace the last full run on its page")
     parser.add_argument("--out", type=Path, help="folder to keep everything in (default: in the temporary folder)")
     arguments = parser.parse_args()
     name = f"frictid-gap-check-{arguments.cases}-{arguments.seed}"

@@ -1,7 +1,7 @@
 """The diagnosis on real machines: fitted on some recordings, judged on others, both ways.
 
 Prints one line per set and direction: verdict, causes, and every effect's held-out change; ``--write-docs`` puts the
-tables into ``docs/gap-real.md``. The recordings are named by
+tables into ``docs/evidence/gap-real.md``. The recordings are named by
 FRICTID_REAL_DATA; see their README for origin and licences.
 """
 
@@ -28,7 +28,7 @@ from frictid_hil.simulation.effects import all_effects
 EMPS = {"mass_kg": 95.1089, "viscous_n_s_per_m": 203.5034, "coulomb_n": 20.3935, "offset_n": -3.1648}
 MOTION_HZ = 8.0
 """Band of the pendulum's motion that its rigid-body torque is formed in."""
-DOCS_PAGE = Path(__file__).resolve().parents[1] / "docs" / "gap-real.md"
+DOCS_PAGE = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "gap-real.md"
 BEGIN, END = "<!-- written by benchmarks/gap_real.py -->", "<!-- end of what it wrote -->"
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
@@ -278,7 +278,7 @@ EXPECTED = (
 
 
 def page(found: Mapping[str, Diagnosis]) -> str:
-    """The tables of ``docs/gap-real.md``."""
+    """The tables of ``docs/evidence/gap-real.md``."""
     parts = ["## What was expected, and what came\n", "| expected | sets as expected |", "|---|---|"]
     for expected in EXPECTED:
         chosen = {name: d for name, d in found.items() if name.startswith(expected.sets)}

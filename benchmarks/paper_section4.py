@@ -310,17 +310,17 @@ Written by `python benchmarks/paper_section4.py`.
 
 ## Fig. 6: torque over velocity, joint 1
 
-![loops of joint 1](images/paper-fig6.svg)
+![loops of joint 1](../images/paper-fig6.svg)
 
 ## Fig. 7: curves of every joint for A = 5 ... 50 deg
 
 As published:
 
-![curves as published](images/paper-fig7-published.svg)
+![curves as published](../images/paper-fig7-published.svg)
 
 Aligned:
 
-![aligned curves](images/paper-fig7-aligned.svg)
+![aligned curves](../images/paper-fig7-aligned.svg)
 
 A = 5 deg on joint 1 is missing, as it is in the paper ("not obtained due to the limit of the servo controller"). Here
 the plan is refused before anything moves:
@@ -329,7 +329,7 @@ the plan is refused before anything moves:
 
 ## Fig. 8: E(A, 50) of (15), N m
 
-![distance from the curve at 50 deg](images/paper-fig8.svg)
+![distance from the curve at 50 deg](../images/paper-fig8.svg)
 
 As published ({CROSS}: refused):
 
@@ -357,7 +357,7 @@ Over [0, V] about 1 % remains at any A: the Stribeck dip below V_1, where the cu
 
 ## Fig. 9: five postures, joint 1, A = 20 deg
 
-![five postures](images/paper-fig9.svg)
+![five postures](../images/paper-fig9.svg)
 
 A posture is what it makes of joint 1: its inertia and its gravity torque gravity_cos cos q + gravity_sin sin q. The
 gains of the position loop stay the same.
@@ -419,7 +419,7 @@ def main() -> None:
     e_aligned = {joint: distances(runs[joint], published=False) for joint in JOINTS}
     images = arguments.docs / "images"
     images.mkdir(parents=True, exist_ok=True)
-    (arguments.docs / "paper-section4.md").write_text(text, encoding="utf-8")
+    (arguments.docs / "evidence" / "paper-section4.md").write_text(text, encoding="utf-8")
     for name, picture in {
         "fig6": figure_6(runs["1"]),
         "fig7-published": figure_7(runs, published=True),

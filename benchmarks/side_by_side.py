@@ -193,7 +193,7 @@ def main() -> None:
                 text += block
     if arguments.docs:
         page = "\n".join([PAGE.format(commit=git_revision()[:7]), *text, why_lost.text()])
-        (arguments.docs / "side-by-side.md").write_text(page, encoding="utf-8")
+        (arguments.docs / "evidence" / "side-by-side.md").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All effects as a page for people; ``python -m frictid_hil.simulation.catalogue docs`` writes it with its pictures."""
+"""All effects as a page with pictures; ``python -m frictid_hil.simulation.catalogue docs/reference`` writes it."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ joint's Coulomb level, phi_0(v) the rate-dependent rest of its friction curve, q
 all on the joint side of the gear. *Off* is the value at which an effect vanishes.
 
 This page is generated from `frictid_hil/simulation/effects/`, one file each, by
-`python -m frictid_hil.simulation.catalogue docs`. Adding a file there adds the effect to the simulated joint, to robot
-files, to the diagnosis and to this page.
+`python -m frictid_hil.simulation.catalogue docs/reference`. Adding a file there adds the effect to the simulated joint,
+to robot files, to the diagnosis and to this page.
 """
 
 

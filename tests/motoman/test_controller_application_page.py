@@ -27,7 +27,7 @@ from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.table import friction_table
 from frictid_hil.friction.curve import FrictionCurve
 
-PAGE = Path(__file__).parents[2] / "docs" / "motoman-controller-application.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "motoman-controller-application.md"
 BLOCK = re.compile(r"^```hex (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 ORDER = JobOrder(
@@ -173,7 +173,7 @@ def test_every_command_and_frame_of_the_code_is_on_the_page() -> None:
 
 
 def test_every_option_and_fault_is_on_the_users_page() -> None:
-    text = (PAGE.parent / "driver-motoman.md").read_text()
+    text = (PAGE.parents[1] / "guides" / "motoman.md").read_text()
     for name in [*OCCASIONS, *EMULATOR_OPTIONS, *(entry.name for entry in fields(SerialOptions))]:
         assert f"`{name}`" in text, name
 

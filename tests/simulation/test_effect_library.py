@@ -192,7 +192,7 @@ def test_the_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monk
 
 
 def test_the_page_of_effects_is_up_to_date() -> None:
-    docs = Path(__file__).parents[2] / "docs"
+    docs = Path(__file__).parents[2] / "docs" / "reference"
     regenerate = "python -m frictid_hil.simulation.catalogue docs"
     assert (docs / "effects.md").read_text(encoding="utf-8") == catalogue.page(), regenerate
     for name in NAMES:

@@ -52,7 +52,7 @@ class Drive:
                 f"the drive has no {item.name}",
                 where=self.where(item.address),
                 cause="another drive than expected, or another firmware",
-                next_step="compare the drive's EDS with docs/connect-a-real-drive.md",
+                next_step="compare the drive's EDS with docs/guides/connect-a-drive.md",
             )
         return value
 

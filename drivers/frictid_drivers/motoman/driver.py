@@ -130,7 +130,7 @@ class MotomanDriver:
         if self._reach.layer is Layer.HOST:
             raise PlanRefused(
                 "this controller offers no torque: " + "; ".join(self._reach.reasons.values()),
-                next_step="install the controller application (docs/motoman-controller-application.md)",
+                next_step="install the controller application (docs/reference/motoman-controller-application.md)",
             )
         if round(1e6 / cycle_hz) != self._tick_us:
             raise PlanRefused(f"the controller ticks every {self._tick_us} us, not at {cycle_hz:g} Hz")

@@ -176,7 +176,7 @@ def _of_layers(setup: RobotSetup, options: SerialOptions, reach: Reach) -> list[
                 Severity.ERROR,
                 "torque",
                 "stock host control reads no torque, so nothing can be identified through it",
-                "install the controller application (docs/motoman-controller-application.md)",
+                "install the controller application (docs/reference/motoman-controller-application.md)",
             )
         )
     ticks = {found_in.tick_us for found_in in (reach.welcome, reach.batch) if found_in is not None}
