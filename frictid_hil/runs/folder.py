@@ -30,9 +30,9 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import file_sha256, utc_now
 from frictid_hil.config.robot import Robot
 from frictid_hil.config.write import dump, plain
-from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import write_whole
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.bus_log import BusLogWriter
 from frictid_hil.recording.mcap import SampleWriter
 from frictid_hil.recording.samples import Mark, Samples

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Protocol
 
+from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver, load_driver
-from frictid_hil.plan.plan import Plan
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight
