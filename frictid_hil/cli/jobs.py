@@ -20,6 +20,7 @@ from frictid_hil.cli.options import (
     RobotOption,
     SeedOption,
     StoreOption,
+    quantity,
 )
 from frictid_hil.cli.output import Output, Result
 
@@ -72,6 +73,10 @@ def schedule(
         str, typer.Option("--account", metavar="NAME", help="Account that a system service runs as.")
     ] = "frictid",
     notify: NotifyOption = None,
+    time_limit: Annotated[
+        float,
+        typer.Option("--time-limit", metavar="TIME", parser=quantity("duration"), help="A longer night is stopped."),
+    ] = "4h",  # type: ignore[assignment]  # typer parses it
     out: OutOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -81,7 +86,9 @@ def schedule(
     from frictid_hil.jobs.schedule import schedule as job
 
     output = Output(as_json, quiet)
-    options = ScheduleOptions(robot, on_calendar, bus=bus, system=system, user=account, notify=notify, out=out)
+    options = ScheduleOptions(
+        robot, on_calendar, bus=bus, system=system, user=account, notify=notify, out=out, time_limit_s=time_limit
+    )
 
     def show(result: Result) -> None:
         for key in ("service", "timer"):
@@ -89,7 +96,8 @@ def schedule(
         output.out.print(f"next time: {result['next_elapse'] or 'unknown (systemd-analyze is not installed)'}")
         output.out.print(f"verified by systemd-analyze: {'yes' if result['verified'] else 'no'}")
         output.out.print(f"turn it on: {result['enable']}", soft_wrap=True, markup=False)
-        output.out.print(f"without systemd, for crontab -e:\n{result['cron']}", soft_wrap=True, markup=False)
+        cron = f"for crontab -e:\n{result['cron']}" if result["cron"] else result["cron_refused"]
+        output.out.print(f"without systemd, {cron}", soft_wrap=True, markup=False)
 
     output.run("schedule", lambda: job(options), show)
 

@@ -1,13 +1,14 @@
 """``frictid-hil schedule``: the systemd service and timer that run ``recalibrate``, and a cron line for those without.
 
 The service may do what a night needs and nothing else: write below its own state and data folders, schedule in real
-time, reach the bus. It is started once per night, catches up after a power failure, and is stopped with the signal
-that brings a joint to rest.
+time, reach the bus. It ends with the signal that brings a joint to rest, at the latest after its time limit. A night
+missed on a real bus stays missed: people are there when the computer comes up again.
 """
 
 from __future__ import annotations
 
 import os
+import pwd
 import shlex
 import shutil
 import subprocess
@@ -17,13 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.robot import Robot, load_robot
+import platformdirs
+
+from frictid_hil.config.robot import Robot, interface_of, load_robot
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.files import write_whole
+from frictid_hil.jobs.cron import cron_fields
 
 _EXAMPLE = 'for example --on-calendar "Mon..Fri 02:30"'
-_WEEK = ("sun", "mon", "tue", "wed", "thu", "fri", "sat")
-"""As cron counts the days, from 0."""
 _STOP_S = 60
 _VERIFY_TIMEOUT_S = 30.0
 
@@ -40,6 +42,7 @@ class ScheduleOptions:
         user: account of a system service.
         notify: command given the result on its standard input.
         out: folder for the units; None for systemd's own.
+        time_limit_s: a night that takes longer is stopped as by Ctrl-C.
     """
 
     robot: str
@@ -49,13 +52,15 @@ class ScheduleOptions:
     user: str = "frictid"
     notify: str | None = None
     out: Path | None = None
+    time_limit_s: float = 4 * 3600.0
 
 
 def schedule(options: ScheduleOptions) -> dict[str, Any]:
     """Write the units, verified; nothing is enabled or started.
 
     Raises:
-        UsageError: a calendar expression that systemd refuses, or a robot that may not be moved unattended.
+        UsageError: a calendar expression that systemd refuses, an account that does not exist here, or a robot that may
+            not be moved unattended.
         FrictidError: a folder that cannot be written, or units that systemd refuses.
     """
     robot = load_robot(options.robot)
@@ -64,6 +69,12 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
             "this robot may not be moved unattended",
             where=str(robot.path),
             next_step="add policy.unattended to the robot file first",
+        )
+    if options.system and options.out is None and not _account_exists(options.user):
+        raise UsageError(
+            f"there is no account {options.user!r} on this computer",
+            next_step=f"make it: `sudo useradd --system --groups dialout {options.user}`; or give --account, or --out "
+            "for units of another computer",
         )
     elapses = next_elapse(options.on_calendar)
     name = f"frictid-hil-{robot.name}"
@@ -79,7 +90,7 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
     paths = [folder / f"{name}.service", folder / f"{name}.timer"]
     for path, text in zip(paths, (service, timer), strict=True):
         write_whole(path, text)
-    scope = "" if options.system else "--user "
+    cron, cron_refused = _cron_line(options, robot)
     return {
         "outcome": "ok",
         "robot": robot.name,
@@ -87,9 +98,29 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
         "timer": str(paths[1].resolve()),
         "next_elapse": elapses,
         "verified": verified,
-        "enable": f"systemctl {scope}daemon-reload && systemctl {scope}enable --now {name}.timer",
-        "cron": cron_line(options, robot),
+        "enable": _enable(options, paths),
+        "cron": cron,
+        "cron_refused": cron_refused,
     }
+
+
+def _account_exists(name: str) -> bool:
+    try:
+        pwd.getpwnam(name)
+    except KeyError:
+        return False
+    return True
+
+
+def _enable(options: ScheduleOptions, paths: list[Path]) -> str:
+    """The commands that turn the timer on."""
+    systemctl = "systemctl" if options.system else "systemctl --user"
+    # Without lingering a person's units end when the person logs out.
+    first = [] if options.system else ["loginctl enable-linger"]
+    known = options.out is None or options.out.resolve() == _unit_folder(options.system).resolve()
+    # systemd looks for units in its own folders only; it has to be shown others.
+    found = "daemon-reload" if known else f"link {shlex.join(str(path.resolve()) for path in paths)}"
+    return " && ".join([*first, f"{systemctl} {found}", f"{systemctl} enable --now {paths[1].name}"])
 
 
 def next_elapse(on_calendar: str) -> str | None:
@@ -99,9 +130,7 @@ def next_elapse(on_calendar: str) -> str | None:
         UsageError: systemd does not understand it, or it never comes true.
     """
     if not on_calendar.strip() or "\n" in on_calendar:
-        raise UsageError(
-            f"no calendar expression: {on_calendar!r}", next_step='for example --on-calendar "Mon..Fri 02:30"'
-        )
+        raise UsageError(f"no calendar expression: {on_calendar!r}", next_step=_EXAMPLE)
     tool = shutil.which("systemd-analyze")
     if tool is None:
         return None
@@ -151,13 +180,17 @@ def verify(units: dict[str, str], *, system: bool) -> bool:
     return False
 
 
-def cron_line(options: ScheduleOptions, robot: Robot) -> str:
-    """A line for ``crontab -e``: at the weekdays and the hour of the calendar expression, else daily at 02:30."""
-    hour, minute = _hour_and_minute(options.on_calendar)
-    folder = shlex.quote(str(_work_folder()))
+def _cron_line(options: ScheduleOptions, robot: Robot) -> tuple[str | None, str]:
+    """A line for ``crontab -e`` that comes true exactly when the timer does; else None, and why."""
+    try:
+        when = cron_fields(options.on_calendar)
+    except UsageError as error:
+        return None, error.what
+    folder = shlex.quote(str(platformdirs.user_state_path("frictid-hil")))
+    limit = f"timeout --kill-after={_STOP_S} {options.time_limit_s:.0f}"
     # cron tells nobody of a folder that is not there: the line makes it.
-    words = f"mkdir -p {folder} && cd {folder} && {shlex.join(_command(options, robot))} >> {robot.name}.log 2>&1"
-    return f"{minute} {hour} * * {_weekdays(options.on_calendar)} " + words.replace("%", r"\%")
+    command = f"{limit} {shlex.join(_command(options, robot))} >> {robot.name}.log 2>&1"
+    return f"{when} " + f"mkdir -p {folder} && cd {folder} && {command}".replace("%", r"\%"), ""
 
 
 def _command(options: ScheduleOptions, robot: Robot) -> list[str]:
@@ -172,81 +205,86 @@ def _command(options: ScheduleOptions, robot: Robot) -> list[str]:
 
 def _service(options: ScheduleOptions, robot: Robot) -> str:
     command = " ".join(_quoted(word) for word in _command(options, robot))
-    lines = [
-        "[Unit]",
-        f"Description=Recalibrate the friction profile of robot {robot.name}",
-        "",
-        "[Service]",
-        "Type=oneshot",
-        f"ExecStart={command}",
-        # 5: a quality gate failed, which is a result and is told as one.
-        "SuccessExitStatus=5",
-        "KillSignal=SIGTERM",
-        "KillMode=mixed",
-        f"TimeoutStopSec={_STOP_S}",
-        "TimeoutStartSec=infinity",
-        "",
-        "# Real time: the cyclic loop asks for SCHED_FIFO 60 and locked memory.",
-        "LimitRTPRIO=99",
-        "LimitMEMLOCK=infinity",
-        "RestrictRealtime=no",
-        "",
-        "# It needs its own folders, the bus, and nothing else.",
-        "NoNewPrivileges=yes",
-        "ProtectSystem=strict",
-        "LockPersonality=yes",
-        "RestrictSUIDSGID=yes",
-        "SystemCallArchitectures=native",
-        "RestrictAddressFamilies=AF_UNIX AF_CAN AF_INET AF_INET6 AF_NETLINK",
-        "UMask=0027",
-    ]
-    if options.system:
-        lines += [
-            f"User={options.user}",
-            f"StateDirectory=frictid-hil/{robot.name}",
-            f"WorkingDirectory=/var/lib/frictid-hil/{robot.name}",
-            f"Environment=XDG_DATA_HOME=/var/lib/frictid-hil/{robot.name}/data",
-            f"Environment=XDG_STATE_HOME=/var/lib/frictid-hil/{robot.name}/state",
-            f"Environment=NUMBA_CACHE_DIR=/var/lib/frictid-hil/{robot.name}/numba",
-            "AmbientCapabilities=CAP_SYS_NICE",
-            "CapabilityBoundingSet=CAP_SYS_NICE",
-            "PrivateTmp=yes",
-            "ProtectHome=read-only",
-            "ProtectKernelTunables=yes",
-            "ProtectKernelModules=yes",
-            "ProtectKernelLogs=yes",
-            "ProtectControlGroups=yes",
-            "ProtectClock=yes",
-            "ProtectHostname=yes",
-            "RestrictNamespaces=yes",
-            "MemoryDenyWriteExecute=no",
-        ]
-    else:
-        lines += [
-            "StateDirectory=frictid-hil",
-            "WorkingDirectory=%S/frictid-hil",
-            "ReadWritePaths=%h",
-        ]
-    return "\n".join(lines) + "\n"
+    return f"""\
+[Unit]
+Description=Recalibrate the friction profile of robot {robot.name}
+
+[Service]
+Type=oneshot
+ExecStart={command}
+KillSignal=SIGTERM
+KillMode=mixed
+TimeoutStartSec={options.time_limit_s:.0f}
+TimeoutStopSec={_STOP_S}
+
+# Real time: the cyclic loop asks for SCHED_FIFO 60 and locked memory.
+LimitRTPRIO=99
+LimitMEMLOCK=infinity
+RestrictRealtime=no
+
+# It needs its own folders, the bus, and nothing else. Not PrivateTmp: the lock of a bus lies in /tmp, for all to see.
+NoNewPrivileges=yes
+ProtectSystem=strict
+ReadWritePaths=/tmp
+LockPersonality=yes
+RestrictSUIDSGID=yes
+SystemCallArchitectures=native
+RestrictAddressFamilies=AF_UNIX AF_CAN AF_INET AF_INET6 AF_NETLINK
+UMask=0027
+""" + (_system_part(options, robot) if options.system else _USER_PART)
+
+
+_USER_PART = """\
+StateDirectory=frictid-hil
+WorkingDirectory=%S/frictid-hil
+ReadWritePaths=%h
+"""
+
+
+def _system_part(options: ScheduleOptions, robot: Robot) -> str:
+    folder = f"/var/lib/frictid-hil/{robot.name}"
+    bus = options.bus or robot.file.bus
+    port = f"DeviceAllow={_quoted(bus.partition(':')[2])} rw\n" if interface_of(bus) == "serial" else ""
+    return f"""\
+User={options.user}
+StateDirectory=frictid-hil/{robot.name}
+WorkingDirectory={folder}
+Environment=XDG_DATA_HOME={folder}/data
+Environment=XDG_STATE_HOME={folder}/state
+Environment=NUMBA_CACHE_DIR={folder}/numba
+AmbientCapabilities=CAP_SYS_NICE
+CapabilityBoundingSet=CAP_SYS_NICE
+DevicePolicy=closed
+{port}ProtectHome=read-only
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectKernelLogs=yes
+ProtectControlGroups=yes
+ProtectClock=yes
+ProtectHostname=yes
+ProtectProc=invisible
+RestrictNamespaces=yes
+KeyringMode=private
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
+"""
 
 
 def _timer(options: ScheduleOptions, robot: Robot) -> str:
-    return "\n".join(
-        [
-            "[Unit]",
-            f"Description=When robot {robot.name} is recalibrated",
-            "",
-            "[Timer]",
-            f"OnCalendar={options.on_calendar}",
-            "# A night missed while the computer was off is made up for once.",
-            "Persistent=true",
-            "AccuracySec=1min",
-            "",
-            "[Install]",
-            "WantedBy=timers.target",
-            "",
-        ]
-    )
+    missed = "Persistent=true" if robot.driver(options.bus) == "virtual" else "Persistent=false"
+    return f"""\
+[Unit]
+Description=When robot {robot.name} is recalibrated
+
+[Timer]
+OnCalendar={options.on_calendar}
+# A night missed while the computer was off is made up for by a simulated robot only.
+{missed}
+AccuracySec=1min
+
+[Install]
+WantedBy=timers.target
+"""
 
 
 def _quoted(word: str) -> str:
@@ -256,36 +294,7 @@ def _quoted(word: str) -> str:
 
 
 def _unit_folder(system: bool) -> Path:
-    if system:
-        return Path("/etc/systemd/system")
-    base = os.environ.get("XDG_CONFIG_HOME", "")
-    return (Path(base) if base else Path.home() / ".config") / "systemd" / "user"
-
-
-def _work_folder() -> Path:
-    base = os.environ.get("XDG_STATE_HOME", "")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "frictid-hil"
-
-
-def _weekdays(on_calendar: str) -> str:
-    """The weekdays of an expression that begins with some (``Mon..Fri``, ``Tue,Sat``) as cron counts them, else all."""
-    word = on_calendar.split()[0].lower()
-    numbers: set[int] = set()
-    for part in word.split(","):
-        first, _, last = part.partition("..")
-        if first not in _WEEK or (last or first) not in _WEEK:
-            return "*"
-        low, high = _WEEK.index(first), _WEEK.index(last or first)
-        numbers |= {at % 7 for at in range(low, high + 1 + 7 * (high < low))}
-    return ",".join(map(str, sorted(numbers)))
-
-
-def _hour_and_minute(on_calendar: str) -> tuple[int, int]:
-    for word in on_calendar.split():
-        hour, colon, rest = word.partition(":")
-        if colon and hour.isdigit() and rest[:2].isdigit():
-            return int(hour), int(rest[:2])
-    return 2, 30
+    return Path("/etc/systemd/system") if system else platformdirs.user_config_path("systemd") / "user"
 
 
 def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
