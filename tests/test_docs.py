@@ -1,9 +1,15 @@
 """Every link between pages leads somewhere, the README's and the changelog's too."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from frictid_hil.config import reference
+from frictid_hil.config.columns import load_columns
+from frictid_hil.config.robot import load_robot
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")})
@@ -16,3 +22,33 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     missing = [link for link in local if not (page.parent / link).exists()]
     # A page of the repository's root names files that the tests' own copy lacks.
     assert [link for link in missing if not (page.parent == ROOT and Path(link).suffix != ".md")] == []
+
+
+def guide_files() -> list[tuple[str, str]]:
+    """Every YAML block of the guides that names its kind, with its page."""
+    blocks = [
+        (page.stem, block)
+        for page in sorted((ROOT / "docs" / "guides").glob("*.md"))
+        for block in re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    ]
+    return [(stem, block) for stem, block in blocks if block.startswith("schema:")]
+
+
+@pytest.mark.parametrize(("page", "block"), guide_files())
+def test_a_file_shown_in_a_guide_loads(page: str, block: str, tmp_path: Path) -> None:
+    path = tmp_path / f"{page}.yaml"
+    path.write_text(block, encoding="utf-8")
+    loaders = {"frictid.robot": load_robot, "frictid.columns": load_columns}
+    assert loaders[re.match(r"schema: ([\w.]+)/", block)[1]](path)
+
+
+def test_the_page_of_files_is_that_of_the_schemas() -> None:
+    page = (ROOT / "docs" / "reference" / "files.md").read_text(encoding="utf-8")
+    assert page == reference.page(), "python -m frictid_hil.config.reference docs/reference"
+
+
+def test_the_page_of_verbs_is_that_of_the_command_line() -> None:
+    command = [sys.executable, "-m", "typer", "frictid_hil.cli.app", "utils", "docs", "--name", "frictid-hil"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    page = (ROOT / "docs" / "reference" / "verbs.md").read_text(encoding="utf-8")
+    assert page.strip() == shown.strip(), " ".join(command[1:]) + " > docs/reference/verbs.md"

@@ -36,7 +36,7 @@ _PLAINLY = 0.015
 """A joint is called gradual where that shape leaves nowhere more than this share of D.
 
 Averaged over a tenth of D / sigma. A joint whose friction is partly of the other kind leaves 2 % and more, and would
-hunt with a spring that is twice as stiff after the turning point as at rest (docs/guides/compensate.md).
+hunt with a spring that is twice as stiff after the turning point as at rest (docs/reference/compensation-law.md).
 """
 _LOOKED_AT = 20
 """Tenths of D / sigma from the turning point on; friction has turned over long before."""

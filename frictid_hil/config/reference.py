@@ -1,0 +1,127 @@
+"""Every file's keys as a page: ``python -m frictid_hil.config.reference docs/reference`` writes it from the schemas.
+
+The tables hold what the loaders enforce: types, limits and defaults come from the models, the words from their
+docstrings. The same models give JSON schemas, with which an editor completes and checks a file while it is typed.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from frictid_hil.config.columns import ColumnsFile
+from frictid_hil.config.nominal import NominalFile
+from frictid_hil.config.profile import FrictionProfile
+from frictid_hil.config.robot import RobotFile
+
+FILES: Mapping[str, tuple[str, type[BaseModel]]] = {
+    "robot": ("Robot file", RobotFile),
+    "profile": ("Friction profile", FrictionProfile),
+    "columns": ("Column map", ColumnsFile),
+    "nominal": ("nominal.yaml of an experiment set", NominalFile),
+}
+_HEAD = """# Files
+
+Every file is YAML and names its kind by `schema:`, except `nominal.yaml`. A number is in the unit that ends its key:
+rad, rad/s, N m, s, m. An unknown key is an error that names the nearest known one, with file, line and column.
+
+For completion in an editor, write the JSON schema of a kind and name it in the file's first line:
+
+    python -m frictid_hil.config.reference --json robot > robot.schema.json
+    # yaml-language-server: $schema=robot.schema.json
+
+This page is generated from the schemas by `python -m frictid_hil.config.reference docs/reference`.
+"""
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    sections = [_HEAD]
+    for title, model in FILES.values():
+        sections += [f"## {title}\n", *_tables(model)]
+    return "\n".join(sections)
+
+
+def _tables(model: type[BaseModel]) -> Iterator[str]:
+    """The table of a model, then those of the models that it holds, each once."""
+    schema = model.model_json_schema(by_alias=True)
+    inner: Mapping[str, Any] = schema.get("$defs", {})
+    classes = _classes(model)
+    yield _table(model, schema)
+    for name, definition in inner.items():
+        if "properties" in definition:
+            yield f"### {name} {{ #{model.__name__.lower()}-{name.lower()} }}\n"
+            yield _table(classes[name], definition, of=model.__name__.lower())
+
+
+def _table(model: type[BaseModel], schema: Mapping[str, Any], of: str = "") -> str:
+    words, attributes = _documented(model)
+    required = schema.get("required", ())
+    rows = [f"{words}\n", "| Key | Type | Default | Meaning |", "|---|---|---|---|"]
+    for key, field in schema["properties"].items():
+        default = "required" if key in required else _default(field.get("default"))
+        meaning = attributes.get(key, field.get("description", "")).replace("|", "\\|")
+        rows.append(f"| `{key}` | {_type(field, of or model.__name__.lower())} | {default} | {meaning} |")
+    return "\n".join(rows) + "\n"
+
+
+def _type(field: Mapping[str, Any], of: str) -> str:
+    """A field's type and limits in words."""
+    if "$ref" in field:
+        name = field["$ref"].rpartition("/")[2]
+        return f"[{name}](#{of}-{name.lower()})"
+    if "anyOf" in field:
+        return " or ".join(_type(option, of) for option in field["anyOf"] if option.get("type") != "null")
+    if "enum" in field or "const" in field:
+        return ", ".join(f"`{value}`" for value in field.get("enum", [field.get("const")]))
+    if field.get("type") == "object":
+        values = field.get("additionalProperties")
+        return f"mapping of {_type(values, of)}" if isinstance(values, Mapping) and values else "mapping"
+    if field.get("type") == "array":
+        return "list"
+    limits = [
+        f"{sign} {field[key]:g}"
+        for key, sign in (("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<="))
+        if key in field
+    ]
+    return " ".join([str(field.get("type", "any")), ", ".join(limits)]).strip()
+
+
+def _default(value: Any) -> str:
+    if value is None:
+        return "-"
+    return "see below" if isinstance(value, Mapping) and value else f"`{json.dumps(value)}`"
+
+
+def _documented(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
+    """A model's docstring: its opening words, and what it says of each attribute."""
+    text = inspect.getdoc(model) or ""
+    opening, _, listed = text.partition("\nAttributes:\n")
+    entries = re.findall(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", listed, flags=re.MULTILINE)
+    plain = re.sub(r"``([^`]*)``", r"`\1`", " ".join(opening.split()))
+    return plain, {name: re.sub(r"``([^`]*)``", r"`\1`", " ".join(words.split())) for name, words in entries}
+
+
+def _classes(kind: Any) -> dict[str, type[BaseModel]]:
+    """The models that a model or an annotation holds, at any depth, by name."""
+    if not (inspect.isclass(kind) and issubclass(kind, BaseModel)):
+        return {name: found for part in get_args(kind) for name, found in _classes(part).items()}
+    inner = [_classes(field.annotation) for field in kind.model_fields.values()]
+    return {kind.__name__: kind} | {name: found for part in inner for name, found in part.items()}
+
+
+if __name__ == "__main__":
+    match sys.argv[1:]:
+        case ["--json", kind] if kind in FILES:
+            print(json.dumps(FILES[kind][1].model_json_schema(by_alias=True), indent=1))
+        case [folder]:
+            (Path(folder) / "files.md").write_text(page(), encoding="utf-8")
+        case _:
+            sys.exit(__doc__)
