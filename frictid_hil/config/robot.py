@@ -8,13 +8,15 @@ A *site file* says only what differs on one machine and extends the shipped file
     bus: socketcan:can0
     driver: cia402
 
-Mappings merge key by key, everything else is replaced; errors point into the file that holds the value.
+Mappings merge key by key, ``joints: {"3": null}`` leaves joint 3 out, everything else is replaced; errors point into
+the file that holds the value. Numbers are in the unit that ends their key; ``position_max_rad: 150deg`` says another.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +25,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from frictid_hil.config.policy import Policy
-from frictid_hil.config.schema import Pair, Strict, Triple, schema_version, validated
+from frictid_hil.config.schema import Pair, Strict, Triple, in_si, schema_version, validated
 from frictid_hil.config.search import find
-from frictid_hil.config.yaml import Document, merge, read
+from frictid_hil.config.yaml import Document, KeyPath, merge, read
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.kinematics import DhRow
@@ -34,6 +36,12 @@ from frictid_hil.plan.workspace import Workspace
 
 KIND = "frictid.robot"
 NEWEST = 1
+
+MOST_TRAVEL_RAD = 4.001 * math.pi
+"""Two turns. A longer travel, or a higher speed than the next, is taken for degrees unless the axis is continuous."""
+
+FASTEST_RAD_S = 50.0
+"""2865 deg/s: the last axes of fast SCARA arms turn at 2500 deg/s."""
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -91,7 +99,10 @@ class DhFile(Strict):
 
 
 class JointFile(Strict):
-    """One joint; torque and position on the joint side of the gear."""
+    """One joint; torque and position on the joint side of the gear.
+
+    ``continuous`` says that the axis turns without end, or faster than any robot's joint, and that this is meant.
+    """
 
     node: int | None = Field(default=None, ge=1, le=127)
     axis: int | None = Field(default=None, ge=0, le=63)
@@ -103,6 +114,7 @@ class JointFile(Strict):
     position_max_rad: float
     start_position_rad: float
     locked_position_rad: float
+    continuous: bool = False
     direction: Literal[-1, 1] = 1
     expected: ExpectedFile | None = None
     procedure: JointProcedureFile = JointProcedureFile()
@@ -318,7 +330,7 @@ def load_robot(name: str | Path) -> Robot:
         ConfigError: not found, or wrong; the message lists every problem with file:line:column.
     """
     path = find(name)
-    document = _extended(path, ())
+    document = in_si(_extended(path, ()))
     file = validated(document, RobotFile)
     problems = _contradictions(file)
     if problems:
@@ -369,6 +381,8 @@ def _contradictions(file: RobotFile) -> list[FieldProblem]:
         low, high = joint.position_min_rad, joint.position_max_rad
         if low >= high:
             problems.append(FieldProblem((*at, "position_max_rad"), f"must be above position_min_rad = {low}"))
+        if not joint.continuous:
+            problems += _in_degrees(joint, at) + _in_degrees(joint.procedure, (*at, "procedure"))
         for key in ("start_position_rad", "locked_position_rad"):
             value = getattr(joint, key)
             if low < high and not low <= value <= high:
@@ -381,12 +395,39 @@ def _contradictions(file: RobotFile) -> list[FieldProblem]:
             first = taken.setdefault((kind, address), name)
             if first != name:
                 problems.append(FieldProblem((*at, kind), f"{kind} {address} is already that of joint {first}"))
+    if not any(joint.continuous for joint in file.joints.values()):
+        problems += _in_degrees(file.procedure, ("procedure",))
     if file.workspace is not None:
         problems += _workspace_problems(file, file.workspace)
     interlock = file.policy.unattended.interlock_input if file.policy.unattended else None
     if interlock and interlock.joint not in file.joints:
         at_joint = ("policy", "unattended", "interlock_input", "joint")
         problems.append(FieldProblem(at_joint, f"no such joint; this robot has {', '.join(file.joints)}"))
+    return problems
+
+
+def _in_degrees(holder: Strict, at: KeyPath) -> list[FieldProblem]:
+    """Travels of more than two turns and speeds of no joint."""
+    values = {name: value for name, value in holder.model_dump().items() if isinstance(value, float | int)}
+    travel = values.get("position_max_rad", 0.0) - values.get("position_min_rad", 0.0)
+    problems = []
+    for name, value in values.items():
+        fast = name.endswith("velocity_rad_s") and value > FASTEST_RAD_S
+        far = name in ("position_min_rad", "position_max_rad", "amplitude_rad") and abs(value) > MOST_TRAVEL_RAD
+        far |= name == "position_max_rad" and travel > MOST_TRAVEL_RAD
+        if fast or far:
+            told = (
+                f"{value:g} rad/s is faster than any robot's joint"
+                if fast
+                else f"{value:g} rad: over two turns of travel"
+            )
+            unit = "deg/s" if fast else "deg"
+            problems.append(
+                FieldProblem(
+                    (*at, name),
+                    f"{told}; in degrees? write {value:g}{unit}; an endless axis says `continuous: true`",
+                )
+            )
     return problems
 
 
@@ -423,7 +464,10 @@ def _address(joint: JointFile, driver: str) -> int | None:
             return joint.axis if joint.node is None else joint.node
 
 
+_NOT_OF_SETUP = {"node", "axis", "continuous", "procedure", "expected", "options", "simulated", "dh"}
+
+
 def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
-    values = joint.model_dump(exclude={"node", "axis", "procedure", "expected", "options", "simulated", "dh"})
+    values = joint.model_dump(exclude=_NOT_OF_SETUP)
     row = joint.dh.model_dump() if joint.dh else {}
     return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, dh=row, **values)

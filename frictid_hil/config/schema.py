@@ -9,13 +9,14 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from frictid_hil.config.yaml import Document, KeyPath
+from frictid_hil.config.yaml import Document, KeyPath, Node
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
 from frictid_hil.units import parse_quantity
 
@@ -158,18 +159,45 @@ _DIMENSIONS = {
 }
 
 
+def _dimension(key: str) -> str | None:
+    """What a key holds, by the unit that ends it."""
+    found = next((dimension for suffix, dimension in _DIMENSIONS.items() if key.endswith(suffix)), None)
+    return None if "_per_" in key and found != "stiffness" else found
+
+
 def _unit_hint(path: KeyPath, value: Any) -> str:
     """For ``20deg`` typed at ``start_position_rad``: the number that belongs there."""
-    if not isinstance(value, str) or not re.search(r"\d", value) or not path:
+    name = next((key for key in reversed(path) if isinstance(key, str)), "")
+    dimension = _dimension(name)
+    if dimension is None or not isinstance(value, str) or not re.search(r"\d", value):
         return ""
-    name = next((str(key) for key in reversed(path) if isinstance(key, str)), "")
-    for suffix, dimension in _DIMENSIONS.items():
-        if name.endswith(suffix):
-            try:
-                return f"; files hold plain numbers: write {parse_quantity(value, dimension)!r}"
-            except UsageError:
-                return f"; files hold plain numbers in the unit that ends the key ({suffix[1:]})"
-    return ""
+    try:
+        return f"; write {parse_quantity(value, dimension)!r}"
+    except UsageError as error:
+        return f"; {error.what}"
+
+
+def in_si(document: Document) -> Document:
+    """The same document with every ``150deg`` or ``115deg/s`` as the number in the unit that ends its key.
+
+    Text that is no such quantity stays, for ``validated`` to complain of.
+    """
+
+    def converted(node: Node, key: str) -> Node:
+        if isinstance(node.content, dict):
+            children = {
+                name: converted(child, key if node.is_list else str(name)) for name, child in node.content.items()
+            }
+            return node._replace(content=children)
+        dimension = _dimension(key)
+        if dimension is None or not isinstance(node.content, str):
+            return node
+        try:
+            return node._replace(content=parse_quantity(node.content, dimension))
+        except UsageError:
+            return node
+
+    return replace(document, root=converted(document.root, ""))
 
 
 def _known_keys(model: type[Strict], path: KeyPath) -> list[str]:

@@ -161,12 +161,15 @@ def parse(text: str, path: Path) -> Document:
 
 
 def merge(base: Node, over: Node) -> Node:
-    """``base`` with the values of ``over``: mappings merge key by key, everything else is replaced."""
+    """``base`` with the values of ``over``: mappings merge key by key, null removes, everything else is replaced."""
     if not (base.is_mapping and over.is_mapping):
         return over
     children = dict(base.content)
     for key, child in over.content.items():
-        children[key] = merge(children[key], child) if key in children else child
+        if key in children and child.content is None:
+            del children[key]
+        else:
+            children[key] = merge(children[key], child) if key in children else child
     return Node(over.place, over.key_place, children, size=1 + sum(c.size for c in children.values()))
 
 

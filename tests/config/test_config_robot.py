@@ -72,7 +72,11 @@ def test_a_joint_may_have_its_own_travel_and_a_person_overrides_both() -> None:
         (("gear_ratio: 100", "gear_ratio: '100'"), "two.yaml:14:17", "expected a valid number, found '100'"),
         (("gear_ratio: 100", "gear_ratio: true"), "two.yaml:14:17", "expected a valid number"),
         (("gear_ratio: 100", "gear_ratio: "), "two.yaml:14:16", "found nothing"),
-        (("start_position_rad: -0.2", "start_position_rad: 20deg"), "two.yaml:20:25", "write 0.3490658503988659"),
+        (("start_position_rad: -0.2", "start_position_rad: 20m"), "two.yaml:20:25", "it takes deg, rad, mrad"),
+        (("position_max_rad: 2.9", "position_max_rad: 150"), "two.yaml:19:23", "in degrees? write 150deg"),
+        (("position_max_rad: 2.9", "position_max_rad: 12"), "two.yaml:19:23", "over two turns of travel"),
+        (("max_velocity_rad_s: 3.49", "max_velocity_rad_s: 190"), "two.yaml:15:25", "write 190deg/s"),
+        (("velocity_rad_s: 2.007128639793479", "velocity_rad_s: 115"), "two.yaml:8:19", "in degrees? write 115"),
         (("start_position_rad: -0.2", "start_position_rad: 3.5"), "two.yaml:20:25", "3.5 lies outside the limits"),
         (("position_max_rad: 2.9", "position_max_rad: -3"), "two.yaml:19:23", "must be above position_min_rad"),
         (("node: 2", "node: 1"), "two.yaml:26:11", "node 1 is already that of joint 0"),
@@ -117,6 +121,37 @@ def test_a_site_file_overrides_what_differs(tmp_path: Path) -> None:
     assert robot.path == site
     (tmp_path / "used.yaml").write_text(dump(robot.values()))
     assert load_robot(tmp_path / "used.yaml").digest == robot.digest, "a run's copy is the configuration itself"
+
+
+def test_a_quantity_may_be_typed_with_its_unit(tmp_path: Path) -> None:
+    changes = (
+        ("position_max_rad: 2.9", "position_max_rad: 150deg"),
+        ("velocity_rad_s: 2.007128639793479", "velocity_rad_s: 30 rpm"),
+    )
+    robot = load_robot(written(tmp_path, *changes))
+    assert robot.file.joints["0"].position_max_rad == math.radians(150)
+    assert robot.file.procedure.velocity_rad_s == pytest.approx(math.pi)
+    assert robot.values()["joints"]["0"]["position_max_rad"] == math.radians(150), "a run's copy holds plain numbers"
+    stiff = written(tmp_path, ("viscous_nm_s_per_rad: 2.0", "viscous_nm_s_per_rad: 20deg"))
+    assert load_robot(stiff).values()["joints"]["0"]["simulated"]["friction"]["viscous_nm_s_per_rad"] == "20deg"
+
+
+def test_an_axis_that_turns_without_end_says_so(tmp_path: Path) -> None:
+    wide = ("position_max_rad: 2.9", "position_max_rad: 1e4\n    continuous: true")
+    fast = ("max_velocity_rad_s: 3.49", "max_velocity_rad_s: 300")
+    assert load_robot(written(tmp_path, wide, fast)).to_setup().joints[0].position_max_rad == 1e4
+    assert "in degrees?" in str(refused(written(tmp_path, fast)))
+
+
+def test_a_site_file_leaves_joints_out(tmp_path: Path) -> None:
+    site = tmp_path / "site.yaml"
+    site.write_text('schema: frictid.robot/1\nextends: hp3j\njoints: {"3": null, "1": null, "4": {expected: null}}\n')
+    robot = load_robot(site)
+    assert robot.joint_names == ("0", "2", "4", "5")
+    assert robot.file.joints["4"].expected is None
+    assert [joint.name for joint in robot.to_setup().joints] == ["0", "2", "4", "5"]
+    site.write_text('schema: frictid.robot/1\nextends: hp3j\njoints: {"7": null}\n')
+    assert "site.yaml:3:15: joints.7" in str(refused(site))
 
 
 def test_errors_of_a_site_file_point_into_the_file_at_fault(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from frictid_hil.config.robot import FASTEST_RAD_S, MOST_TRAVEL_RAD
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.simulation.joint import JointModel
 
@@ -56,6 +57,7 @@ def improved_robot(experiments: ExperimentSet, model: JointModel) -> dict[str, A
                 "position_max_rad": high + _SLACK_RAD,
                 "start_position_rad": start,
                 "locked_position_rad": start,
+                "continuous": high - low + 2 * _SLACK_RAD > MOST_TRAVEL_RAD or 1.5 * fastest > FASTEST_RAD_S,
                 "direction": 1,
                 "simulated": model.to_mapping(),
             }
