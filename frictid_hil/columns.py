@@ -18,6 +18,7 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "position_command_rad": ("angle", "length"),
     "external_torque_nm": ("torque", "force"),
     "rigid_body_torque_nm": ("torque", "force"),
+    "torque_demand_nm": ("torque", "force"),
 }
 """Dimension of each column of ``Samples``, on a rotary joint and on a linear axis."""
 

@@ -81,6 +81,7 @@ class JointFile(Strict):
     position_command: SourceFile | None = None
     external_torque: SourceFile | None = None
     rigid_body_torque: SourceFile | None = None
+    torque_demand: SourceFile | None = None
 
     @model_validator(mode="after")
     def _something_to_explain(self) -> JointFile:
@@ -105,6 +106,7 @@ _QUANTITY_OF = {
     "position_command": "position_command_rad",
     "external_torque": "external_torque_nm",
     "rigid_body_torque": "rigid_body_torque_nm",
+    "torque_demand": "torque_demand_nm",
 }
 
 

@@ -7,7 +7,7 @@ left alone - unless one looks like a misspelt key that is missing, which would q
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -54,15 +54,20 @@ class Friction(Open):
 
 
 class Joint(Open):
-    """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's."""
+    """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's.
 
-    inertia_kg_m2: Positive | None = None
+    An inertia of 0 says that logs bring it in their ``rigid_body_torque_nm``; ``continuous``, that the joint may turn
+    on and on.
+    """
+
+    inertia_kg_m2: NotNegative | None = None
     motor_inertia_share: float | None = Field(default=None, ge=0, le=1)
     gravity_torque_nm: float | None = None
     gravity_cos_nm: float | None = None
     gravity_sin_nm: float | None = None
     gear_ratio: Positive | None = None
     gear: str | None = None
+    continuous: bool = False
     friction: Friction | None = None
 
     @model_validator(mode="after")
@@ -79,16 +84,60 @@ class Payload(Open):
     gravity_torque_nm: float | None = None
 
 
-class Controller(Open):
-    """The position loop."""
+class FeedForward(Strict):
+    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``."""
 
-    rate_hz: Positive
-    kp: NotNegative
+    inertia_kg_m2: float = 0.0
+    gravity_cos_nm: float = 0.0
+    gravity_sin_nm: float = 0.0
+    coulomb_nm: float = 0.0
+    viscous_nm_s_per_rad: float = 0.0
+
+
+def _law(name: Any) -> Any:
+    """Other names of the same laws."""
+    plain = name.lower().replace("-", "_") if isinstance(name, str) else name
+    return {"p_pi": "cascade", "p_pi_cascade": "cascade", "pd": "pid", "pid_feedforward": "pid"}.get(plain, plain)
+
+
+class Controller(Open):
+    """The position loop: what law it follows, and its numbers.
+
+    ``pid``: ``kp*e + integral(ki*e) + kd*(dcommand/dt - v)``. ``cascade``: ``kv*w + integral(ki*w)`` with ``w = kp*e +
+    velocity_feedforward*dcommand/dt - v``. ``columns``: each log brings its demand as ``torque_demand_nm``.
+    ``unknown``: like no controller at all.
+    """
+
+    type: Annotated[Literal["pid", "cascade", "columns", "unknown"], BeforeValidator(_law)] = "pid"
+    rate_hz: Positive | None = None
+    kp: NotNegative | None = None
     ki: NotNegative | None = None
     kd: NotNegative | None = None
+    kv: NotNegative | None = None
+    velocity_feedforward: NotNegative = 0.0
     velocity_filter_s: NotNegative | None = None
     torque_limit_nm: Positive | None = None
     command_rate: Literal["central", "backward"] | None = None
+    feedforward: FeedForward | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Controller:
+        needed = {"pid": ("rate_hz", "kp"), "cascade": ("rate_hz", "kp", "kv")}.get(self.type, ())
+        for name in needed:
+            if getattr(self, name) is None:
+                near = difflib.get_close_matches(name, self.model_extra or {}, n=1, cutoff=0.6)
+                hint = f"; did you write it as {near[0]}?" if near else ""
+                raise ValueError(f"{name}: missing in a controller of type {self.type}{hint}")
+        if self.type == "cascade" and self.kd is not None:
+            raise ValueError("a cascade has kp, kv and perhaps ki; kd belongs to type: pid")
+        return self
+
+
+class ReportFilter(Strict):
+    """A low-pass that the drive's reported torque has passed: ``order`` first-order lags in a row."""
+
+    order: Annotated[int, Field(ge=1, le=8)] = 1
+    time_constant_s: NotNegative
 
 
 class Drive(Open):
@@ -98,6 +147,7 @@ class Drive(Open):
     torque_quantum_nm: NotNegative | None = None
     torque_delay_s: NotNegative | None = None
     current_lag_s: NotNegative | None = None
+    torque_report_filter: ReportFilter | None = None
 
 
 class Encoder(Open):
@@ -107,6 +157,36 @@ class Encoder(Open):
     resolution_rad: NotNegative | None = None
     zero_offset_rad: float | None = None
     velocity_filter_s: NotNegative | None = None
+
+
+ABSOLUTE_ONLY = ("zero_offset_rad", "torque_delay_s", "current_lag_s", "velocity_filter_s")
+"""Numbers whose usual value is 0, so that a share of them says nothing."""
+
+Share = NotNegative | Literal["data_sheet", "cad", "profile"]
+"""One-sigma over the number, or what the number was taken from."""
+
+
+class Tolerance(Strict):
+    """One-sigma beliefs: relative here, in the number's own unit under ``absolute``."""
+
+    inertia_kg_m2: Share | None = None
+    gravity_torque_nm: Share | None = None
+    friction_torque: Share | None = None
+    viscous: Share | None = None
+    presliding_stiffness: Share | None = None
+    torque_constant: Share | None = None
+    controller_gains: Share | None = None
+    rigid_body_torque: Share | None = None
+    absolute: Mapping[str, NotNegative] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known(self) -> Tolerance:
+        known = {*ABSOLUTE_ONLY, *type(self).model_fields} - {"absolute"}
+        for name in self.absolute:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                raise ValueError(f"absolute: unknown number {name}" + (f"; did you mean {near[0]}?" if near else ""))
+        return self
 
 
 class Experiment(Open):
@@ -128,6 +208,7 @@ class NominalFile(Open):
     controller: Controller | None = None
     drive: Drive | None = None
     encoder: Encoder | None = None
+    tolerance: Tolerance | None = None
     experiments: Annotated[tuple[Experiment, ...], BeforeValidator(as_tuple), Field(min_length=1)]
 
 

@@ -8,19 +8,21 @@ diagnosis says what it cannot conclude without it.
 from __future__ import annotations
 
 import gzip
+import itertools
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.config import nominal as config
-from frictid_hil.config.nominal import NominalFile, load_nominal
+from frictid_hil.config.nominal import NominalFile, NominalSet, load_nominal
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.recording.csv import read_csv
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.effects import all_effects
@@ -29,9 +31,31 @@ MAX_ROWS = 2_000_000
 """Rows of one log that are read; a longer one is refused with advice, not quietly cut."""
 
 
+REST_SHARE = 1e-4
+"""A log whose travel is below this share of the longest one shows a joint at rest."""
+LONG_GAP_S = 0.25
+"""A gap from which a recording goes on as another log: nobody knows what the joint did meanwhile."""
+LEAST_PIECE_ROWS = 200
+"""Shorter pieces between gaps are left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeedForward:
+    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``."""
+
+    inertia_kg_m2: float = 0.0
+    gravity_cos_nm: float = 0.0
+    gravity_sin_nm: float = 0.0
+    coulomb_nm: float = 0.0
+    viscous_nm_s_per_rad: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """The digital position loop: ``kp*e + integral(ki*e) + kd*(dcommand/dt - filtered velocity)``, joint side.
+    """The digital position loop, joint side.
+
+    ``kp*(b*command - q) + integral(ki*(command - q)) + kd*(c*dcommand/dt - filtered velocity) + feedforward``. A PID
+    has b = c = 1; a cascade kv (kp e - v), with or without an integral, is the same law with other weights.
 
     Attributes:
         rate_hz: control rate.
@@ -42,6 +66,9 @@ class Controller:
         torque_limit_nm: limit of the demand.
         command_rate: how dcommand/dt is formed, ``central`` or ``backward`` (a drive that follows set-points as they
             come).
+        command_weight: b.
+        command_rate_weight: c.
+        feedforward: None where there is none.
     """
 
     rate_hz: float
@@ -51,6 +78,27 @@ class Controller:
     velocity_filter_s: float = 0.0
     torque_limit_nm: float = float("inf")
     command_rate: str = "central"
+    command_weight: float = 1.0
+    command_rate_weight: float = 1.0
+    feedforward: FeedForward | None = None
+
+    def added_nm(self, command_rad: Array, step_s: float) -> Array:
+        """What the law adds to a plain PID because of its command's weight and its feed-forward, shape (n,)."""
+        added: Array = (self.command_weight - 1.0) * self.kp_nm_per_rad * command_rad
+        if (feed := self.feedforward) is not None:
+            velocity = np.gradient(command_rad, step_s)
+            added = added + feed.inertia_kg_m2 * np.gradient(velocity, step_s)
+            added = added + feed.gravity_cos_nm * np.cos(command_rad) + feed.gravity_sin_nm * np.sin(command_rad)
+            added = added + feed.coulomb_nm * np.sign(velocity) + feed.viscous_nm_s_per_rad * velocity
+        return added
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFilter:
+    """A low-pass that the reported torque has passed: ``order`` first-order lags of ``time_constant_s`` in a row."""
+
+    order: int
+    time_constant_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +125,12 @@ class Nominal:
         controller: of the position loop.
         rated_torque_nm: of the drive, joint side.
         torque_quantum_nm: step of the reported torque.
+        torque_report_filter: declared low-pass of the reported torque; None where none is declared.
         believed_effects: what the file already says of the drive (its delay, its current loop), as effects by name.
         encoder_resolution_rad: step of the reported position, joint side.
         velocity_filter_s: known time constant of the reported velocity.
+        continuous: the joint may turn on and on.
+        tolerances: one-sigma of every number.
         document: the whole file, for writing an improved one.
     """
 
@@ -94,9 +145,12 @@ class Nominal:
     controller: Controller | None = None
     rated_torque_nm: float | None = None
     torque_quantum_nm: float | None = None
+    torque_report_filter: ReportFilter | None = None
     believed_effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     encoder_resolution_rad: float | None = None
     velocity_filter_s: float = 0.0
+    continuous: bool = False
+    tolerances: Tolerances = field(default_factory=Tolerances.of)
     document: Mapping[str, Any] | None = None
 
 
@@ -116,6 +170,7 @@ class Experiment:
         position_command_rad: commanded.
         rigid_body_torque_nm: the part that the user's own rigid-body model explains.
         temperature_c: of motor or gear.
+        torque_demand_nm: the controller's own demand, where the log brings it.
     """
 
     name: str
@@ -129,15 +184,29 @@ class Experiment:
     position_command_rad: Array | None = None
     rigid_body_torque_nm: Array | None = None
     temperature_c: Array | None = None
+    torque_demand_nm: Array | None = None
+
+    @property
+    def travel_rad(self) -> float:
+        """From its lowest to its highest position."""
+        return float(np.ptp(self.position_rad))
 
 
 @dataclass(frozen=True, slots=True)
 class ExperimentSet:
-    """Nominal joint and its experiments, in run order."""
+    """Nominal joint and its experiments, in run order.
+
+    Attributes:
+        name: of the set.
+        nominal: the believed joint.
+        experiments: logs in which the joint moves.
+        at_rest: names of logs in which it does not; they say nothing of friction and are left out.
+    """
 
     name: str
     nominal: Nominal
     experiments: tuple[Experiment, ...]
+    at_rest: tuple[str, ...] = ()
 
     @staticmethod
     def load(folder: Path) -> ExperimentSet:
@@ -148,13 +217,69 @@ class ExperimentSet:
             InputFileError: a log is missing, unreadable or unusable; the message names file, column and row.
         """
         told = load_nominal(folder / "nominal.yaml")
-        where = str(folder / "nominal.yaml")
-        experiments = [_experiment(folder, entry, index) for index, entry in enumerate(told.file.experiments)]
-        return ExperimentSet(
-            str(told.document.data.get("case", folder.name)),
-            _nominal(told.file, told.document.data, where),
-            tuple(sorted(experiments, key=lambda e: e.run_order)),
+        logs = [(entry, read_log(_log_of(folder, entry))) for entry in sorted_by_run(told.file.experiments)]
+        return experiment_set(told, str(told.document.data.get("case", folder.name)), logs)
+
+
+def experiment_set(told: NominalSet, name: str, logs: Sequence[tuple[config.Experiment, Samples]]) -> ExperimentSet:
+    """A set from a checked ``nominal.yaml`` and its recordings, in run order.
+
+    Raises:
+        ConfigError: a believed number makes no sense.
+        InputFileError: no log shows a joint that moves.
+    """
+    pieces = [piece for entry, samples in logs for piece in _without_long_gaps(_experiment(entry, samples), samples)]
+    longest = max((piece.travel_rad for piece in pieces), default=0.0)
+    moving = tuple(piece for piece in pieces if piece.travel_rad > REST_SHARE * longest)
+    if not moving:
+        raise InputFileError("column position_rad never changes", where=name, cause="a sensor or a mapping is dead")
+    nominal = _nominal(told.file, told.document.data, str(told.document.path))
+    if nominal.inertia_kg_m2 == 0.0:
+        absent = [piece.name for piece in moving if piece.rigid_body_torque_nm is None]
+        if absent:
+            raise ConfigError(
+                f"inertia_kg_m2 is 0, and {absent[0]} has no column rigid_body_torque_nm that would bring it",
+                where=str(told.document.path),
+                next_step="give the inertia, leave it out, or add the column to every log",
+            )
+        nominal = replace(nominal, inertia_kg_m2=None)
+    at_rest = tuple(piece.name for piece in pieces if piece.travel_rad <= REST_SHARE * longest)
+    return ExperimentSet(name, nominal, moving, at_rest)
+
+
+def sorted_by_run(experiments: Sequence[config.Experiment]) -> list[config.Experiment]:
+    """In run order; those that do not say keep their place in the file."""
+    placed = [(index if e.run_order is None else e.run_order, e) for index, e in enumerate(experiments)]
+    return [e.model_copy(update={"run_order": place}) for place, e in sorted(placed, key=lambda pair: pair[0])]
+
+
+def _log_of(folder: Path, told: config.Experiment) -> Path:
+    path = folder / (told.file or f"{told.name}.csv")
+    if not path.exists() and path.with_name(path.name + ".gz").exists():
+        path = path.with_name(path.name + ".gz")
+    if not path.exists():
+        raise InputFileError("no such log", where=str(path), next_step="correct `file` in nominal.yaml")
+    return path
+
+
+def _without_long_gaps(log: Experiment, samples: Samples) -> list[Experiment]:
+    """The log, or its pieces between long gaps; pieces too short to tell anything are left out."""
+    cuts = np.flatnonzero(np.diff(samples.time_s) > max(LONG_GAP_S, 20.0 * samples.step_s)) + 1
+    edges = [0, *cuts.tolist(), len(samples)]
+    stretches = [slice(a, b) for a, b in itertools.pairwise(edges) if b - a >= LEAST_PIECE_ROWS]
+    if cuts.size == 0 or not stretches:
+        return [log]
+    return [
+        replace(
+            log,
+            name=f"{log.name}, piece {k}" if len(stretches) > 1 else log.name,
+            **{name: c[part] for name in _LOG_COLUMNS if (c := getattr(log, name)) is not None},
         )
+        for k, part in enumerate(stretches, start=1)
+    ]
+
+
+_LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperature_c", "torque_demand_nm")
 
 
 def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nominal:
@@ -175,23 +300,53 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
         controller=None if file.controller is None else _controller(file.controller),
         rated_torque_nm=drive.rated_torque_nm if drive else None,
         torque_quantum_nm=drive.torque_quantum_nm if drive else None,
+        torque_report_filter=_report_filter(drive),
         believed_effects=_believed_effects(document.get("drive") or {}),
         encoder_resolution_rad=encoder.resolution_rad if encoder else None,
         velocity_filter_s=(encoder.velocity_filter_s if encoder else None) or 0.0,
+        continuous=joint.continuous or joint.gear == "none",
+        tolerances=Tolerances.of(file.tolerance),
         document=document,
     )
 
 
-def _controller(told: config.Controller) -> Controller:
-    return Controller(
+def _controller(told: config.Controller) -> Controller | None:
+    """The law as one form; None where it is unknown or only its demand is recorded.
+
+    ``kv*w + integral(ki*w)`` of a cascade, ``w = kp*e + c*dcommand/dt - v``, is ``(kv*kp + ki)*(b*command - q) +
+    integral(ki*kp*e) + kv*(c*dcommand/dt - v)`` but for a constant, as the integral of v is q; b follows.
+    """
+    if told.type in ("columns", "unknown") or told.rate_hz is None or told.kp is None:
+        return None
+    ki = told.ki or 0.0
+    feed = told.feedforward
+    plain = Controller(
         rate_hz=told.rate_hz,
         kp_nm_per_rad=told.kp,
-        ki_nm_per_rad_s=told.ki or 0.0,
+        ki_nm_per_rad_s=ki,
         kd_nm_s_per_rad=told.kd or 0.0,
         velocity_filter_s=told.velocity_filter_s or 0.0,
         torque_limit_nm=told.torque_limit_nm or float("inf"),
         command_rate=told.command_rate or "central",
+        feedforward=None if feed is None else FeedForward(**feed.model_dump()),
     )
+    if told.type == "pid" or told.kv is None:
+        return plain
+    kp = told.kv * told.kp + ki
+    command_nm = told.kv * told.kp + ki * told.velocity_feedforward
+    return replace(
+        plain,
+        kp_nm_per_rad=kp,
+        ki_nm_per_rad_s=ki * told.kp,
+        kd_nm_s_per_rad=told.kv,
+        command_weight=command_nm / kp if kp > 0.0 else 1.0,
+        command_rate_weight=told.velocity_feedforward,
+    )
+
+
+def _report_filter(drive: config.Drive | None) -> ReportFilter | None:
+    told = drive.torque_report_filter if drive else None
+    return None if told is None or told.time_constant_s == 0.0 else ReportFilter(told.order, told.time_constant_s)
 
 
 def _believed_effects(drive: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -218,26 +373,10 @@ def _curve(friction: config.Friction | None, where: str) -> FrictionCurve | None
     return FrictionCurve.through(speeds, friction.coulomb_nm + viscous * speeds, where=where)
 
 
-def _experiment(folder: Path, told: config.Experiment, index: int) -> Experiment:
-    path = folder / (told.file or f"{told.name}.csv")
-    if not path.exists() and path.with_name(path.name + ".gz").exists():
-        path = path.with_name(path.name + ".gz")
-    if not path.exists():
-        raise InputFileError("no such log", where=str(path), next_step="correct `file` in nominal.yaml")
-    samples = read_log(path)
-    return Experiment(
-        name=told.name,
-        validation=told.role == "validation",
-        payload=told.payload,
-        run_order=index if told.run_order is None else told.run_order,
-        time_s=samples.time_s,
-        position_rad=samples.position_rad,
-        velocity_rad_s=samples.velocity_rad_s,
-        torque_nm=samples.torque_nm,
-        position_command_rad=samples.position_command_rad,
-        rigid_body_torque_nm=samples.rigid_body_torque_nm,
-        temperature_c=samples.temperature_c,
-    )
+def _experiment(told: config.Experiment, samples: Samples) -> Experiment:
+    columns = {name: getattr(samples, name) for name in _LOG_COLUMNS}
+    role, order = told.role == "validation", told.run_order or 0
+    return Experiment(name=told.name, validation=role, payload=told.payload, run_order=order, **columns)
 
 
 def read_log(path: Path) -> Samples:

@@ -120,6 +120,8 @@ class Replay:
             velocity_filter_s=controller.velocity_filter_s,
             torque_limit_nm=controller.torque_limit_nm,
             command_rate=controller.command_rate,
+            command_rate_weight=controller.command_rate_weight,
+            added_nm=controller.added_nm,
         )
 
     def model(self, effects: Effects) -> JointModel:

@@ -145,7 +145,9 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
     velocity = np.gradient(q, step_s)
     demand = actuation = kinematic = plant = None
     view = None
-    if nominal.controller is not None and experiment.position_command_rad is not None:
+    if experiment.torque_demand_nm is not None:
+        demand = experiment.torque_demand_nm
+    elif nominal.controller is not None and experiment.position_command_rad is not None:
         demand = demand_of(nominal.controller, experiment, step_s)
     if experiment.torque_nm is not None:
         view = _view(nominal, experiment, step_s, start_s, velocity)
@@ -176,6 +178,7 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
             "position_command_rad",
             "rigid_body_torque_nm",
             "temperature_c",
+            "torque_demand_nm",
         )
         if (column := getattr(experiment, name)) is not None
     }
@@ -299,7 +302,8 @@ def controller_demand(
     else:
         feed = np.gradient(command_rad, step_s)
     error = command_rad - position_rad
-    direct = controller.kp_nm_per_rad * error + controller.kd_nm_s_per_rad * (feed - velocity)
+    direct = controller.kp_nm_per_rad * error + controller.added_nm(command_rad, step_s)
+    direct += controller.kd_nm_s_per_rad * (controller.command_rate_weight * feed - velocity)
     return _integrated(direct, controller.ki_nm_per_rad_s * step_s * error, controller.torque_limit_nm, integral_nm)
 
 
@@ -336,6 +340,8 @@ def start_rows(values: Array, step_s: float) -> int:
 
 def demand_of(controller: Controller, experiment: Experiment, step_s: float, velocity_lag_s: float = 0.0) -> Array:
     """The controller's demand along a recording; its integral starts where the reported torque says."""
+    if experiment.torque_demand_nm is not None:
+        return experiment.torque_demand_nm
     assert experiment.position_command_rad is not None
     q, command = experiment.position_rad, experiment.position_command_rad
     level = 0.0

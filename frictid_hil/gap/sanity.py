@@ -14,9 +14,13 @@ from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, controller_demand, friction_scales, rms, slip_state, uniform
 
 LARGEST_POSITION_RAD = 60.0
-"""Beyond this, a joint position is more likely in degrees."""
+"""Beyond this, the position of a joint that does not turn on and on is more likely in degrees ..."""
+LARGEST_DEGREES = 720.0
+"""... but no such joint goes beyond this in degrees either: it turns on and on."""
 LARGEST_SPEED_RAD_S = 40.0
 """Beyond this, the speed of a geared joint is more likely in degrees per second, or its time in another unit."""
+LARGEST_SPEED_SHARE = 5.0
+"""Times the highest speed of the believed friction curve that a position in rad may reach."""
 LEAST_ROWS = 200
 SLOWEST_STEP_S = 0.2
 """Sampling steps longer than this are more likely in milliseconds."""
@@ -37,7 +41,7 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
         InputFileError: a constant or too short log, positions in degrees, a torque of the wrong sign.
     """
     for e in experiments.experiments:
-        _check(e)
+        _check(e, experiments.nominal)
     signs = [s for e in experiments.experiments if (s := _torque_sign(e)) is not None]
     if signs and max(signs) < 0.0:
         raise InputFileError(
@@ -50,7 +54,7 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
     return experiments
 
 
-def _check(e: Experiment) -> None:
+def _check(e: Experiment, nominal: Nominal) -> None:
     where = e.name
     if e.time_s.size < LEAST_ROWS:
         raise InputFileError(f"{e.time_s.size} rows; a diagnosis needs at least {LEAST_ROWS}", where=where)
@@ -64,7 +68,7 @@ def _check(e: Experiment) -> None:
         if float(np.ptp(column)) == 0.0 and name != "rigid_body_torque_nm":
             raise InputFileError(f"column {name} never changes", where=where, cause="a sensor or a mapping is dead")
     _check_time(e)
-    _check_position(e)
+    _check_position(e, nominal)
     if e.velocity_rad_s is not None:
         _check_velocity(e, e.velocity_rad_s)
     if e.position_command_rad is not None:
@@ -86,11 +90,15 @@ def _check_time(e: Experiment) -> None:
         )
 
 
-def _check_position(e: Experiment) -> None:
+def _check_position(e: Experiment, nominal: Nominal) -> None:
+    if nominal.continuous:
+        return
     step_s = float(np.median(np.diff(e.time_s)))
     speed = np.abs(np.gradient(LowPass.at(1.0 / step_s)(e.position_rad), e.time_s))
     farthest, fastest = float(np.max(np.abs(e.position_rad))), float(np.quantile(speed, 0.99))
-    if farthest > LARGEST_POSITION_RAD or fastest > LARGEST_SPEED_RAD_S:
+    if nominal.curve is not None and fastest < LARGEST_SPEED_SHARE * max(nominal.curve.velocity_rad_s):
+        return
+    if LARGEST_POSITION_RAD < farthest < LARGEST_DEGREES or fastest > LARGEST_SPEED_RAD_S:
         raise InputFileError(
             f"positions up to {farthest:.3g} rad at speeds up to {fastest:.3g} rad/s",
             where=e.name,

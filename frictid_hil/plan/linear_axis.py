@@ -16,6 +16,7 @@ _LINEAR = {
     "torque_interval_nm": "force_interval_n",
     "external_torque_nm": "external_force_n",
     "rigid_body_torque_nm": "rigid_body_force_n",
+    "torque_demand_nm": "force_demand_n",
     "rated_torque_nm": "rated_force_n",
     "coulomb_nm": "coulomb_n",
     "slopes_nm_s_per_rad": "slopes_n_s_per_m",

@@ -37,6 +37,7 @@ _ORDER = (
     "torque_nm",
     "position_command_rad",
     "rigid_body_torque_nm",
+    "torque_demand_nm",
     "external_torque_nm",
     "temperature_c",
 )

@@ -220,7 +220,7 @@ class _Contents:
         if int(records["log_time"].max()) > np.iinfo(np.int64).max:
             raise InputFileError("a time is out of range", where=str(path))
         columns: dict[str, Any] = {}
-        for name in Samples.COLUMNS:
+        for name in (name for name in Samples.COLUMNS if name in layout.VALUES):
             column = np.ascontiguousarray(records[name])
             if np.isfinite(column[0]) or not np.isnan(column).all():
                 columns[name] = column

@@ -51,6 +51,7 @@ class Samples:
         external_torque_nm: force sensor.
         temperature_c: motor or gear.
         rigid_body_torque_nm: the part of the torque that the user's own rigid-body model explains.
+        torque_demand_nm: the controller's own demand.
         marks: what the joint was doing, in order of time.
         prismatic: the axis is linear: m, m/s, N instead of rad, rad/s, N m.
         meta: provenance that travels with the columns (torque_source, timing, robot, ...); plain values only.
@@ -65,6 +66,7 @@ class Samples:
     external_torque_nm: Array | None = None
     temperature_c: Array | None = None
     rigid_body_torque_nm: Array | None = None
+    torque_demand_nm: Array | None = None
     marks: tuple[Mark, ...] = ()
     prismatic: bool = False
     meta: Mapping[str, Any] = field(default_factory=dict)
@@ -77,6 +79,7 @@ class Samples:
         "external_torque_nm",
         "temperature_c",
         "rigid_body_torque_nm",
+        "torque_demand_nm",
     )
 
     def __len__(self) -> int:

@@ -7,7 +7,7 @@ command k acts from t_k.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +38,8 @@ class Controller:
         torque_limit_nm: of the demand.
         command_rate: how d cmd/dt is formed: ``central`` where the controller knows its command ahead, ``backward``
             where it follows set-points as they come.
+        command_rate_weight: share of d cmd/dt that enters; 0 in a cascade that damps the motion itself.
+        added_nm: (command (n,), step in s) -> torque added along the command (n,); None adds none.
     """
 
     kp_nm_per_rad: float
@@ -47,6 +49,8 @@ class Controller:
     velocity_filter_s: float = 0.0
     torque_limit_nm: float = math.inf
     command_rate: str = "central"
+    command_rate_weight: float = 1.0
+    added_nm: Callable[[Array, float], Array] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,11 @@ def closed_loop(
     else:
         after = np.interp(tick_times + period_s, time, command)
         commands[:, plant.VELOCITY_COMMAND] = (after - before) / (2 * period_s)
+    commands[:, plant.VELOCITY_COMMAND] *= controller.command_rate_weight
+    if controller.added_nm is not None:
+        added = controller.added_nm(commands[:, plant.POSITION_COMMAND], period_s)
+        # The integral starts at the holding torque; what the law adds at rest is already in it.
+        commands[:, plant.TORQUE_OFFSET] = added - added[0]
 
     parameters = packing.parameters(model, payload=payload)
     parameters[plant.KP] = controller.kp_nm_per_rad

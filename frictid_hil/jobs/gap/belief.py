@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from frictid_hil.config.profile import JointProfile
+from frictid_hil.gap.tolerances import stated_by
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import JointIdentity
 from frictid_hil.simulation.joint import CoulombViscous, JointModel
@@ -59,6 +60,7 @@ def belief_of(
         sources.append("robot file, `simulated` without its effects")
     if profile is not None:
         sections["joint"] = {**sections["joint"], **_measured(profile)}
+        sections["tolerance"] = stated_by(profile)
         sources.append(f"profile {profile_name}".strip())
     sections.setdefault("drive", {})["rated_torque_nm"] = joint.rated_torque_nm
     return Belief(sections, tuple(sources))

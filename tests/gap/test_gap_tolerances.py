@@ -1,0 +1,180 @@
+"""What a nominal.yaml may say of its own numbers, and the sets that are legal."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import gap_sets
+import numpy as np
+import pytest
+import yaml
+
+from frictid_hil.config.profile import Estimate, JointProfile
+from frictid_hil.errors import ConfigError, InputFileError
+from frictid_hil.gap.experiment_set import Controller, ExperimentSet
+from frictid_hil.gap.residuals import controller_demand
+from frictid_hil.gap.sanity import checked
+from frictid_hil.gap.tolerances import RELATIVE_BY_KIND, Tolerances, stated_by
+
+TIME_S = 0.01 * np.arange(1000)
+
+
+def _set(folder: Path, logs: dict[str, dict[str, Any]], **sections: Any) -> ExperimentSet:
+    """A set on disk, read back; every log is a mapping of columns."""
+    experiments = [{"name": name, "role": "identification"} for name in logs]
+    document = {"joint": {"gear_ratio": 1}, **sections, "experiments": experiments}
+    (folder / "nominal.yaml").write_text(yaml.safe_dump(document))
+    for name, columns in logs.items():
+        table = np.column_stack(list(columns.values()))
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=",".join(columns), comments="")
+    return ExperimentSet.load(folder)
+
+
+def _moving(**more: Any) -> dict[str, Any]:
+    return {"time_s": TIME_S, "position_rad": np.sin(TIME_S), "torque_nm": np.cos(TIME_S), **more}
+
+
+def test_a_tolerance_is_a_share_or_an_absolute_number_or_a_kind(tmp_path: Path) -> None:
+    told = {"inertia_kg_m2": 0.07, "friction_torque": "data_sheet", "absolute": {"gravity_torque_nm": 0.3}}
+    tolerances = _set(tmp_path, {"a": _moving()}, tolerance=told).nominal.tolerances
+    assert tolerances.inertia_kg_m2.of(-2.0) == pytest.approx(0.14)
+    assert tolerances.gravity_torque_nm.of(40.0) == pytest.approx(0.3)
+    assert tolerances.friction_torque.relative == RELATIVE_BY_KIND["friction_torque"]["data_sheet"]
+    assert tolerances.viscous.source == "unstated" and tolerances.viscous.relative > 0.0
+    assert tolerances.zero_offset_rad.of(0.0) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"inertia": 0.1}, "inertia"),
+        ({"viscous": -0.1}, "greater than or equal to 0"),
+        ({"viscous": "guess"}, "viscous"),
+        ({"absolute": {"zero_offset": 0.1}}, "did you mean zero_offset_rad"),
+    ],
+)
+def test_a_wrong_tolerance_is_told(tmp_path: Path, told: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        _set(tmp_path, {"a": _moving()}, tolerance=told)
+
+
+def test_every_number_has_a_printed_default() -> None:
+    lines = Tolerances.of().lines()
+    assert len(lines) == len(fields(Tolerances))
+    assert "inertia_kg_m2: 5 % (unstated)" in lines and "zero_offset_rad: 0.002 (unstated)" in lines
+
+
+def test_a_profile_hands_on_its_own_intervals(tmp_path: Path) -> None:
+    profile = JointProfile(
+        method="least-squares",
+        velocity_rad_s=(0.2, 0.4, 0.8),
+        torque_nm=(3.0, 3.2, 3.6),
+        torque_interval_nm=((2.9, 3.1), (3.1, 3.3), (3.5, 3.7)),
+        coulomb_nm=Estimate(value=2.8),
+        inertia_kg_m2=Estimate(value=0.5, low=0.451, high=0.549),
+    )
+    tolerances = _set(tmp_path, {"a": _moving()}, tolerance=stated_by(profile)).nominal.tolerances
+    assert tolerances.inertia_kg_m2.of(0.5) == pytest.approx(0.025)
+    assert tolerances.friction_torque.of(3.2) == pytest.approx(0.1 / 1.96)
+
+
+def test_no_inertia_beside_a_rigid_body_column_is_legal(tmp_path: Path) -> None:
+    joint = {"inertia_kg_m2": 0}
+    assert _set(tmp_path, {"a": _moving(rigid_body_torque_nm=TIME_S)}, joint=joint).nominal.inertia_kg_m2 is None
+    with pytest.raises(ConfigError, match="inertia_kg_m2 is 0"):
+        _set(tmp_path, {"a": _moving()}, joint=joint)
+
+
+def test_a_motor_that_turns_on_and_on_is_no_joint_in_degrees(tmp_path: Path) -> None:
+    spinning = _moving(position_rad=8.0 * TIME_S + 0.1 * np.sin(3.0 * TIME_S))
+    friction = {"coulomb_nm": 0.5, "viscous_nm_s_per_rad": 0.05}
+    checked(_set(tmp_path, {"a": spinning}, joint={"continuous": True, "friction": friction}))
+    geared = _set(tmp_path, {"a": spinning}, joint={"gear_ratio": 100})
+    with pytest.raises(InputFileError, match="positions up to"):
+        checked(geared)
+
+
+def test_a_log_at_rest_is_left_out_and_named(tmp_path: Path) -> None:
+    still = {"time_s": TIME_S, "position_rad": np.full_like(TIME_S, 0.3), "torque_nm": np.cos(TIME_S)}
+    read = _set(tmp_path, {"a": _moving(), "still": still})
+    assert [e.name for e in read.experiments] == ["a"] and read.at_rest == ("still",)
+    with pytest.raises(InputFileError, match="never changes"):
+        _set(tmp_path, {"still": still})
+
+
+def test_a_recording_with_a_long_gap_goes_on_as_another_log(tmp_path: Path) -> None:
+    time_s = np.where(np.arange(1000) < 400, TIME_S, TIME_S + 5.0)
+    read = _set(tmp_path, {"a": _moving(time_s=time_s)})
+    assert [(e.name, e.time_s.size) for e in read.experiments] == [("a, piece 1", 400), ("a, piece 2", 600)]
+
+
+def test_a_declared_report_filter_is_read(tmp_path: Path) -> None:
+    drive = {"torque_report_filter": {"order": 2, "time_constant_s": 0.004}}
+    found = _set(tmp_path, {"a": _moving()}, drive=drive).nominal.torque_report_filter
+    assert found is not None and (found.order, found.time_constant_s) == (2, 0.004)
+
+
+def _law(folder: Path, told: dict[str, Any]) -> Controller:
+    found = _set(folder, {"a": _moving()}, controller={"rate_hz": 100, **told}).nominal.controller
+    assert found is not None
+    return found
+
+
+def test_a_cascade_is_replayed_by_its_own_law(tmp_path: Path) -> None:
+    """kv*w + ki*integral(w), w = kp*e - v, stepped by hand."""
+    kp, kv, ki, step_s = 12.0, 3.0, 5.0, 0.01
+    command, q = np.sin(TIME_S), np.sin(TIME_S - 0.05) + 0.01
+    law = _law(tmp_path, {"type": "p_pi", "kp": kp, "kv": kv, "ki": ki})
+    velocity = np.diff(q, prepend=q[0]) / step_s
+    wanted = kp * (command - q) - velocity
+    by_hand = kv * wanted + ki * step_s * np.concatenate([[0.0], np.cumsum(wanted)[:-1]])
+    replayed = controller_demand(law, q, command, step_s)
+    difference = (replayed - by_hand)[1:]  # the first row has no velocity
+    assert np.ptp(replayed) > 5.0
+    assert np.ptp(difference) < 0.02 * np.ptp(replayed)  # a constant apart, which the start of the integral takes up
+
+
+def test_feed_forward_is_added_along_the_command(tmp_path: Path) -> None:
+    feed = {"inertia_kg_m2": 2.0, "gravity_cos_nm": 7.0, "viscous_nm_s_per_rad": 0.5}
+    law = _law(tmp_path, {"kp": 12.0, "feedforward": feed})
+    plain = replace(law, feedforward=None)
+    command, q = np.sin(TIME_S), np.sin(TIME_S - 0.05)
+    added = controller_demand(law, q, command, 0.01) - controller_demand(plain, q, command, 0.01)
+    expected = -2.0 * np.sin(TIME_S) + 7.0 * np.cos(command) + 0.5 * np.cos(TIME_S)
+    assert np.allclose(added[5:-5], expected[5:-5], atol=0.01)
+
+
+@pytest.mark.parametrize("told", [{"type": "unknown"}, {"type": "columns"}], ids=["unknown", "columns"])
+def test_a_law_may_be_unknown_or_a_column(tmp_path: Path, told: dict[str, Any]) -> None:
+    read = _set(tmp_path, {"a": _moving(torque_demand_nm=np.sin(TIME_S))}, controller=told)
+    assert read.nominal.controller is None
+    assert read.experiments[0].torque_demand_nm is not None
+
+
+def test_a_replay_follows_a_cascade() -> None:
+    """The same cascade, replayed on the motion it made, asks for the torque it gave."""
+    from frictid_hil.gap.forward import nominal_model
+    from frictid_hil.simulation.replay import Controller as Loop
+    from frictid_hil.simulation.replay import closed_loop
+
+    c = replace(gap_sets.NOMINAL.controller, command_weight=0.9, command_rate_weight=0.0, command_rate="backward")
+    loop = Loop(
+        c.kp_nm_per_rad, c.ki_nm_per_rad_s, c.kd_nm_s_per_rad, c.rate_hz, c.velocity_filter_s, c.torque_limit_nm,
+        c.command_rate, c.command_rate_weight, c.added_nm,
+    )  # fmt: skip
+    time_s = 0.002 * np.arange(1500)
+    command = 0.3 * (1.0 - np.cos(2.0 * time_s))
+    rows = closed_loop(nominal_model(gap_sets.NOMINAL), loop, time_s, command)
+    asked = controller_demand(c, rows.position_rad, command, 0.002)
+    error = (rows.torque_nm[1:] - asked[:-1])[50:]
+    assert np.ptp(rows.torque_nm) > 5.0
+    assert np.std(error) < 0.02 * np.std(rows.torque_nm)
+
+
+def test_the_page_shows_the_defaults_that_hold() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "guides" / "diagnose.md").read_text()
+    for name, kinds in RELATIVE_BY_KIND.items():
+        cells = " | ".join("exact" if share == 0.0 else f"{100 * share:.3g} %" for share in kinds.values())
+        assert f"| `{name}` | {cells} |" in page
