@@ -23,15 +23,15 @@ def _group() -> None:
 def motoman(
     pty: Annotated[bool, typer.Option("--pty", help="On a pseudo terminal, whose name is printed first.")] = False,
     robot: Annotated[
-        str | None,
+        str,
         typer.Option(
             "--robot",
             "-r",
             metavar="FILE",
             autocompletion=robot_files,
-            help="Robot file whose joints stand behind it (hp3j-serial.yaml).",
+            help="Robot file whose joints stand behind it.",
         ),
-    ] = None,
+    ] = "hp3j-serial.yaml",
     link: Annotated[
         Path | None,
         typer.Option(

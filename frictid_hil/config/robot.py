@@ -33,6 +33,7 @@ from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.kinematics import DhRow
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.plan.workspace import Workspace
+from frictid_hil.protocol.driver import DriverKind, kind_of, line_of
 
 KIND = "frictid.robot"
 NEWEST = 1
@@ -104,8 +105,9 @@ class JointFile(Strict):
     ``continuous`` says that the axis turns without end, or faster than any robot's joint, and that this is meant.
     """
 
-    node: int | None = Field(default=None, ge=1, le=127)
-    axis: int | None = Field(default=None, ge=0, le=63)
+    node: int | None = Field(default=None, ge=0)
+    axis: int | None = Field(default=None, ge=0)
+    id: int | None = Field(default=None, ge=0)
     gear_ratio: Positive
     max_velocity_rad_s: Positive
     max_torque_nm: Positive
@@ -148,6 +150,20 @@ class WorkspaceFile(Strict):
         return value
 
 
+class CareFile(Strict):
+    """Bounds of the supervisor where this robot needs others than usual; see ``runner.care.Care`` for each."""
+
+    reference_tolerance_rad: Positive | None = None
+    approach_rad_s: Positive | None = None
+    still_rad: Positive | None = None
+    still_rad_s: Positive | None = None
+    following_error_rad: Positive | None = None
+    velocity_margin: float | None = Field(default=None, ge=1)
+    velocity_slack_rad_s: Positive | None = None
+    travel_slack_rad: Positive | None = None
+    silence_s: Positive | None = None
+
+
 class RobotFile(Strict):
     """The whole file."""
 
@@ -160,6 +176,7 @@ class RobotFile(Strict):
     options: dict[str, Any] = Field(default_factory=dict)
     procedure: ProcedureFile = ProcedureFile()
     policy: Policy = Policy()
+    care: CareFile = CareFile()
     workspace: WorkspaceFile | None = None
     simulated_arm: dict[str, Any] = Field(default_factory=dict)
     joints: dict[str, JointFile] = Field(min_length=1)
@@ -217,18 +234,29 @@ class Robot:
             bus: ``interface:channel`` as typed with ``--bus``; None for the file's own.
 
         Raises:
-            UsageError: no ``interface:`` in ``bus``.
+            UsageError: no ``interface:`` in ``bus``, or no driver of this robot for such a bus.
+            ConfigError: no such driver.
         """
-        if bus is None:
-            return self.file.driver
-        interface = interface_of(bus)
-        if interface == interface_of(self.file.bus):
-            return self.file.driver
-        if interface == "virtual":
-            return "virtual"
-        if interface == "serial":
-            return "motoman" if self.file.driver in ("virtual", "cia402") else self.file.driver
-        return "cia402" if self.file.driver in ("virtual", "motoman") else self.file.driver
+        own = self.file.driver
+        if bus is None or interface_of(bus) == interface_of(self.file.bus):
+            return own
+        with self.document.locating():
+            kind = kind_of(own)
+        line = line_of(interface_of(bus))
+        if line == kind.line:
+            return own
+        if line not in kind.elsewhere:
+            raise UsageError(
+                f"driver {own} speaks on a {kind.line} bus and has no counterpart on a {line} bus",
+                where=bus,
+                next_step=f"give a {kind.line} bus, or name another `driver` in the robot file",
+            )
+        return kind.elsewhere[line]
+
+    def kind(self, bus: str | None = None) -> DriverKind:
+        """What the driver for this bus is; see ``driver``."""
+        with self.document.locating():
+            return kind_of(self.driver(bus))
 
     def procedure(
         self,
@@ -289,17 +317,21 @@ class Robot:
         Raises:
             ConfigError: a joint has no address of the kind that the driver of this bus needs.
         """
-        driver = self.driver(bus)
-        addresses = {name: _address(joint, driver) for name, joint in self.file.joints.items()}
+        driver, kind = self.driver(bus), self.kind(bus)
+        key, (lowest, highest) = kind.addressed_by, kind.addresses
+        addresses: dict[str, int | None] = {name: getattr(joint, key) for name, joint in self.file.joints.items()}
         missing = [
-            FieldProblem(
-                ("joints", name), f"has no `{_ADDRESSED_BY[driver]}`, by which driver {driver} finds its joints"
-            )
+            FieldProblem(("joints", name), f"has no `{key}`, by which driver {driver} finds its joints")
             for name, address in addresses.items()
             if address is None
         ]
-        if missing:
-            raise self.document.error(missing, at_key=[problem.path for problem in missing])
+        beyond = [
+            FieldProblem(("joints", name, key), f"driver {driver} has {key}s {lowest} to {highest}, found {address}")
+            for name, address in addresses.items()
+            if address is not None and not lowest <= address <= highest
+        ]
+        if missing or beyond:
+            raise self.document.error([*missing, *beyond], at_key=[problem.path for problem in missing])
         return RobotSetup(
             name=self.name,
             bus=bus or self.file.bus,
@@ -314,10 +346,8 @@ class Robot:
             seed=seed,
             simulated_arm=self.file.simulated_arm,
             workspace=_workspace(self.file),
+            care=self.file.care.model_dump(exclude_none=True),
         )
-
-
-_ADDRESSED_BY = {"virtual": "node", "cia402": "node", "motoman": "axis"}
 
 
 def load_robot(name: str | Path) -> Robot:
@@ -387,9 +417,9 @@ def _contradictions(file: RobotFile) -> list[FieldProblem]:
             value = getattr(joint, key)
             if low < high and not low <= value <= high:
                 problems.append(FieldProblem((*at, key), f"{value} lies outside the limits [{low}, {high}]"))
-        if joint.node is None and joint.axis is None:
-            problems.append(FieldProblem(at, "has neither `node` (CAN) nor `axis` (serial)"))
-        for kind, address in (("node", joint.node), ("axis", joint.axis)):
+        if joint.node is None and joint.axis is None and joint.id is None:
+            problems.append(FieldProblem(at, "has no `node` (CANopen), `axis` (a controller's) or `id` (actuators)"))
+        for kind, address in (("node", joint.node), ("axis", joint.axis), ("id", joint.id)):
             if address is None:
                 continue
             first = taken.setdefault((kind, address), name)
@@ -453,18 +483,7 @@ def _workspace(file: RobotFile) -> Workspace | None:
     return Workspace(rows, (box.x_m, box.y_m, box.z_m), box.clearance_m, box.tool_m)
 
 
-def _address(joint: JointFile, driver: str) -> int | None:
-    """A driver of another maker takes whichever address the file gives."""
-    match _ADDRESSED_BY.get(driver):
-        case "node":
-            return joint.node
-        case "axis":
-            return joint.axis
-        case _:
-            return joint.axis if joint.node is None else joint.node
-
-
-_NOT_OF_SETUP = {"node", "axis", "continuous", "procedure", "expected", "options", "simulated", "dh"}
+_NOT_OF_SETUP = {"node", "axis", "id", "continuous", "procedure", "expected", "options", "simulated", "dh"}
 
 
 def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:

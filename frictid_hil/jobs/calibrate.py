@@ -362,7 +362,7 @@ def _active_file(robot: Robot, store: Path | None) -> Path | None:
 def _provenance(
     robot: Robot, setup: RobotSetup, folder: RunFolder, options: CalibrateOptions, progress: _Progress
 ) -> Provenance:
-    driver = robot.driver(options.bus)
+    simulated = robot.kind(options.bus).simulated
     temperatures = {
         f"joint {name}": joint.temperature_c
         for name, joint in progress.joints.items()
@@ -373,11 +373,11 @@ def _provenance(
         git_revision=git_revision(),
         robot_file=robot.path.name,
         config_sha256=robot.digest,
-        driver=driver,
+        driver=robot.driver(options.bus),
         bus=setup.bus,
         settings={"cycle_hz": setup.cycle_hz, "together": options.together, **dict(setup.options)},
-        realtime=setup.realtime or driver != "virtual",
-        seed=setup.seed if driver == "virtual" else None,
+        realtime=setup.realtime or not simulated,
+        seed=setup.seed if simulated else None,
         run=str(folder.path.resolve()),
         log_sha256=folder.log_digests(),
         temperatures_c=temperatures,

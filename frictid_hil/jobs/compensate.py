@@ -69,16 +69,16 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     """
     robot = load_robot(options.robot)
     robot.check_joints([options.joint])
-    driver_name = robot.driver(options.bus)
+    simulated = robot.kind(options.bus).simulated
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     joint = setup.joint(options.joint)
     profile_path = profile_file(options.profile)
     profile = load_profile(profile_path)
-    wanted = options.wanted.completed(simulated=driver_name == "virtual")
+    wanted = options.wanted.completed(simulated=simulated)
     doubts = doubts_of_file(profile, joint, robot.name, robot.policy)
     if not wanted.force:
         refuse(doubts, joint.name)
-    if wanted.task == "hand" and driver_name == "virtual" and "hand" not in joint.simulated:
+    if wanted.task == "hand" and simulated and "hand" not in joint.simulated:
         raise UsageError(
             "this simulated joint has nobody to guide it",
             where=f"joint {joint.name}",

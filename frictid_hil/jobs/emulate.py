@@ -12,14 +12,13 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
 
 _GROUP = "frictid_hil.emulators"
-_DEFAULT_ROBOTS = {"motoman": "hp3j-serial.yaml"}
 
 
 def emulate(
     kind: str,
     *,
     announce: Callable[[str], None],
-    robot_name: str | None = None,
+    robot_name: str,
     link: Path | None = None,
     faults: Sequence[str] = (),
 ) -> None:
@@ -28,21 +27,18 @@ def emulate(
     Args:
         kind: name of an installed emulator (``motoman``).
         announce: told the port once it can be opened.
-        robot_name: robot file; the kind's own shipped one where None.
+        robot_name: robot file.
         link: name for the port, under which it also comes back after a fault.
         faults: what shall go wrong, in the emulator's words.
 
     Raises:
-        UsageError: no such emulator, no robot file for it, a link that cannot be, or a fault that is none.
+        UsageError: no such emulator, a link that cannot be, or a fault that is none.
         ConfigError: the robot file is wrong.
     """
     installed = {point.name: point for point in entry_points(group=_GROUP)}
     if kind not in installed:
         raise UsageError(f"no emulator named {kind!r}; installed: {', '.join(sorted(installed)) or 'none'}")
-    name = robot_name or _DEFAULT_ROBOTS.get(kind)
-    if name is None:
-        raise UsageError(f"emulator {kind!r} needs a robot file", next_step="give --robot")
-    robot = load_robot(name)
+    robot = load_robot(robot_name)
     setup = robot.to_setup()
     serve = installed[kind].load()
     stopping = False

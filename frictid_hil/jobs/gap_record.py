@@ -106,7 +106,7 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
     robot.check_joints([options.joint])
     joint = setup.joint(options.joint)
     driver_name = robot.driver(options.bus)
-    simulated = mounts_its_own_payload(driver_name)
+    simulated = robot.kind(options.bus).simulated
     profile = load_profile(options.profile).joint(options.joint) if options.profile else None
     belief = belief_of(
         joint, profile, profile_name=options.profile.name if options.profile else "", simulated_drive=simulated
@@ -169,11 +169,6 @@ def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
         }
     folder.finish(result)
     return result
-
-
-def mounts_its_own_payload(driver_name: str) -> bool:
-    """Whether the robot is simulated, so that nobody has to mount anything."""
-    return driver_name == "virtual"
 
 
 def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> Envelope:

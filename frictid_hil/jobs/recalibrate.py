@@ -125,7 +125,7 @@ def _permission(robot: Robot, bus: str | None) -> Interlock | None:
     """
     unattended = robot.policy.unattended
     if unattended is None:
-        if robot.driver(bus) == "virtual":
+        if robot.kind(bus).simulated:
             return None
         raise UsageError(
             "this robot may not be moved unattended",

@@ -64,7 +64,7 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
         FrictidError: a folder that cannot be written, or units that systemd refuses.
     """
     robot = load_robot(options.robot)
-    if robot.policy.unattended is None and robot.driver(options.bus) != "virtual":
+    if robot.policy.unattended is None and not robot.kind(options.bus).simulated:
         raise UsageError(
             "this robot may not be moved unattended",
             where=str(robot.path),

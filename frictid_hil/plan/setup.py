@@ -16,7 +16,7 @@ class JointSetup:
 
     Attributes:
         name: the joint's name in the robot file ("0".."5").
-        address: node id (CAN) or axis index (serial).
+        address: node id, axis index or id, as the driver's ``kind`` says.
         gear_ratio: motor revolutions per joint revolution.
         direction: +1 or -1, sign of joint motion for positive motor motion.
         max_velocity_rad_s: limit of the joint.
@@ -61,6 +61,7 @@ class RobotSetup:
         seed: seed of every simulated noise; ignored by real hardware.
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
         workspace: the box that the arm may not leave; None where the robot file names none.
+        care: bounds of the supervisor that the robot file sets, by name; see ``runner.care.Care``.
     """
 
     name: str
@@ -72,6 +73,7 @@ class RobotSetup:
     seed: int = 0
     simulated_arm: Mapping[str, Any] = field(default_factory=dict)
     workspace: Workspace | None = None
+    care: Mapping[str, float] = field(default_factory=dict)
 
     def joint(self, name: str) -> JointSetup:
         """The joint of that name.

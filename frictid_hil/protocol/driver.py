@@ -114,6 +114,8 @@ class Capabilities:
             here; following errors are judged with it.
         digital_inputs: a joint with the option ``digital_inputs: true`` reports its inputs in the feedback, so that an
             interlock can be watched.
+        droop_rad: how far a joint may stand beside its set-point because its position loop has no integral part, by
+            joint; following error and standstill are judged with it.
     """
 
     max_cycle_hz: float
@@ -128,11 +130,38 @@ class Capabilities:
     table_download: bool = False
     command_delay_s: float = 0.0
     digital_inputs: bool = False
+    droop_rad: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverKind:
+    """What a driver is, known before anything is opened: its class attribute ``kind``.
+
+    Attributes:
+        simulated: nothing real moves, so nobody is asked and no payload has to be mounted by hand.
+        line: what it speaks on: ``can`` (any python-can interface), ``serial``, or ``virtual``.
+        addressed_by: key of a joint in the robot file that says where it is found: ``node``, ``axis`` or ``id``.
+        addresses: lowest and highest address there is.
+        elsewhere: names of the drivers that reach the same robot on another line, by line.
+    """
+
+    simulated: bool = False
+    line: str = "can"
+    addressed_by: str = "id"
+    addresses: tuple[int, int] = (0, 0x7FF)
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class SetPoint:
-    """What one joint shall do in the coming cycle; reused from cycle to cycle, never reallocated."""
+    """What one joint shall do in the coming cycle; reused from cycle to cycle, never reallocated.
+
+    Attributes:
+        position_rad: target in position mode; beside the measured position in the recording in other modes.
+        velocity_rad_s: target in velocity mode; in position mode how fast ``position_rad`` moves (feed-forward).
+        torque_nm: target in torque mode.
+        torque_offset_nm: added in every mode.
+    """
 
     position_rad: float = 0.0
     velocity_rad_s: float = 0.0
@@ -265,6 +294,7 @@ class Driver(Protocol):
     """See the module's first page. Constructed as ``DriverClass(setup: RobotSetup)``; construction touches nothing.
 
     Every method raises ``HardwareError`` when the hardware does not answer, naming node, object and what was expected.
+    A class attribute ``kind`` says what the driver is; see ``DriverKind``.
     """
 
     @property
@@ -419,6 +449,21 @@ def load_driver(name: str) -> type[Driver]:
     raise InvalidFields(
         [FieldProblem(("driver",), f"no driver named {name!r}; installed: {', '.join(known_drivers())}")]
     )
+
+
+def kind_of(name: str) -> DriverKind:
+    """What the driver registered under ``name`` is; that of a plain CAN driver where it does not say.
+
+    Raises:
+        InvalidFields: no such driver.
+    """
+    kind: DriverKind = getattr(load_driver(name), "kind", DriverKind())
+    return kind
+
+
+def line_of(interface: str) -> str:
+    """The line that an interface of ``interface:channel`` is: whatever is neither serial nor virtual is CAN."""
+    return interface if interface in ("serial", "virtual") else "can"
 
 
 def unknown_options(

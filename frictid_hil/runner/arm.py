@@ -146,14 +146,15 @@ class Arm:
     def _see_standstill(self) -> None:
         loop, care = self._loop, self._care
         need = max(2, round(_STANDSTILL_S / loop.period_s))
+        bounds_rad = [care.still_of(joint.name) for joint in self._joints]
         still = 0
 
         def standing(feedback: Sequence[Feedback]) -> bool:
             nonlocal still
             quiet = all(
-                abs(report.position_rad - set_point.position_rad) <= care.still_rad
+                abs(report.position_rad - set_point.position_rad) <= still_rad
                 and abs(report.velocity_rad_s if math.isfinite(report.velocity_rad_s) else 0.0) <= care.still_rad_s
-                for report, set_point in zip(feedback, loop.set_points, strict=True)
+                for report, set_point, still_rad in zip(feedback, loop.set_points, bounds_rad, strict=True)
             )
             still = still + 1 if quiet else 0
             return still >= need

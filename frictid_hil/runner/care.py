@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 from frictid_hil.plan.plan import JointPlan
 from frictid_hil.plan.setup import JointSetup
@@ -31,6 +33,7 @@ class Care:
         silence_s: how long the moving joint may go without a report; never less than three cycles.
         interlock: must be closed before and during motion; None where a person watches.
         tolerated: topics of the driver's findings that the caller judges by itself when asked to proceed.
+        droop_rad: see ``Capabilities.droop_rad``.
     """
 
     reference_tolerance_rad: float = math.radians(10.0)
@@ -44,6 +47,15 @@ class Care:
     silence_s: float = 0.02
     interlock: Interlock | None = None
     tolerated: frozenset[str] = frozenset()
+    droop_rad: Mapping[str, float] = field(default_factory=dict)
+
+    def of_robot(self, bounds: Mapping[str, float], droop_rad: Mapping[str, float]) -> Care:
+        """The same care with the bounds that a robot file sets and the droop that its driver declares."""
+        return replace(self, droop_rad=dict(droop_rad), **cast("dict[str, Any]", dict(bounds)))
+
+    def still_of(self, joint: str) -> float:
+        """How far a joint may be from its set-point while it stands."""
+        return self.still_rad + self.droop_rad.get(joint, 0.0)
 
     def limits(self, joint: JointSetup, plan: JointPlan, cycle_hz: float, command_delay_s: float) -> JointLimits:
         """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
@@ -66,7 +78,9 @@ class Care:
             position_max_rad=high,
             velocity_rad_s=velocity,
             torque_nm=joint.max_torque_nm * _OVER_MAXIMUM,
-            following_error_rad=self.following_error_rad + plan.peak_velocity_rad_s * command_delay_s,
-            still_rad=self.still_rad,
+            following_error_rad=self.following_error_rad
+            + plan.peak_velocity_rad_s * command_delay_s
+            + self.droop_rad.get(joint.name, 0.0),
+            still_rad=self.still_of(joint.name),
             max_age_cycles=max(3, math.ceil(self.silence_s * cycle_hz)),
         )

@@ -114,8 +114,9 @@ class LawSource:
             set_point.torque_nm = torque_nm
             return
         set_point.torque_offset_nm = torque_nm
+        set_point.velocity_rad_s = velocity_rad_s
         if self.drive_mode is Mode.VELOCITY:
-            set_point.velocity_rad_s = velocity_rad_s + _VELOCITY_LOOP_PER_S * (position_rad - feedback.position_rad)
+            set_point.velocity_rad_s += _VELOCITY_LOOP_PER_S * (position_rad - feedback.position_rad)
 
 
 class FadeOut:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from frictid_hil.errors import Interrupted, SafetyAbort
 from frictid_hil.protocol.driver import Driver, Feedback, SetPoint
 from frictid_hil.runner.ring import Ring
@@ -38,17 +40,24 @@ class SetPointSource(Protocol):
 
 
 class Stream:
-    """Set-points computed beforehand, one per cycle."""
+    """Set-points computed beforehand, one per cycle, with the speed at which they move.
 
-    def __init__(self, positions_rad: Sequence[float]) -> None:
-        self._next = iter(positions_rad)
+    Args:
+        positions_rad: one per cycle.
+        period_s: of the cycle.
+    """
+
+    def __init__(self, positions_rad: Sequence[float], period_s: float) -> None:
+        speeds = np.gradient(positions_rad, period_s).tolist() if len(positions_rad) > 1 else [0.0]
+        self._next = iter(zip(positions_rad, speeds, strict=True))
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """The next position of the list."""
-        position = next(self._next, None)
-        if position is None:
+        """The next position of the list; the last one stands."""
+        following = next(self._next, None)
+        if following is None:
+            set_point.velocity_rad_s = 0.0
             return False
-        set_point.position_rad = position
+        set_point.position_rad, set_point.velocity_rad_s = following
         return True
 
 
@@ -248,7 +257,9 @@ class CyclicLoop:
                 if self._stop.level >= QUICK_STOP:
                     break
                 for joint, step_rad in steps_rad.items():
-                    self.set_points[joint].position_rad += step_rad * (1.0 - (k + 1) / steps)
+                    slower_rad = step_rad * (1.0 - (k + 1) / steps)
+                    self.set_points[joint].position_rad += slower_rad
+                    self.set_points[joint].velocity_rad_s = slower_rad / self.period_s
                 self.cycle()
         raise Interrupted(
             "stopped on request; the joint was brought to rest",

@@ -54,7 +54,9 @@ class InStep:
             SafetyAbort: by the supervisor.
             Interrupted: asked to stop; all joints were brought to rest.
         """
-        return self._run(motions, {index: Stream(points) for index, points in self._points(motions).items()})
+        return self._run(
+            motions, {index: Stream(points, self._loop.period_s) for index, points in self._points(motions).items()}
+        )
 
     def rehearse(self, motions: Mapping[int, Motion], limits: Mapping[int, JointLimits]) -> dict[int, Mark]:
         """The full travels, slowly, with the torque bounds at half; the sign of every joint's friction must be right.
@@ -72,7 +74,7 @@ class InStep:
                 index, replace(normal, torque_nm=REHEARSAL_TORQUE * self._joints[index].max_torque_nm)
             )
         watches = {
-            index: SignWatch(Stream(points), self._joints[index].name)
+            index: SignWatch(Stream(points, self._loop.period_s), self._joints[index].name)
             for index, points in self._points(motions).items()
         }
         marks = self._run(motions, watches)

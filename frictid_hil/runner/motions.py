@@ -153,7 +153,7 @@ class Motions:
 
 def _set_points(motion: Motion, period_s: float) -> Stream:
     steps = max(1, math.ceil(motion.duration_s / period_s))
-    return Stream(motion.position_rad(np.arange(steps) * period_s).tolist())
+    return Stream(motion.position_rad(np.arange(steps) * period_s).tolist(), period_s)
 
 
 def _streamed(loop: CyclicLoop, index: int, motion: Motion, source: SetPointSource) -> Mark:

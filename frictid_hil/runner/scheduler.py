@@ -119,7 +119,9 @@ class Scheduler:
     def _preflight(self) -> Preflight:
         identities = self._driver.identify()
         findings = self._driver.check(self._plan)
-        self._command_delay_s = self._driver.capabilities().command_delay_s
+        capabilities = self._driver.capabilities()
+        self._command_delay_s = capabilities.command_delay_s
+        self._care = self._care.of_robot(self._setup.care, capabilities.droop_rad)
         tolerated = self._care.tolerated
         errors = [f for f in findings if f.severity is Severity.ERROR and f.topic not in tolerated]
         if errors:
@@ -129,7 +131,6 @@ class Scheduler:
                 "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
                 next_step=errors[0].next_step or "run `frictid-hil check`",
             )
-        capabilities = self._driver.capabilities()
         if self._care.interlock is not None and not capabilities.digital_inputs:
             raise HardwareError(
                 "this driver cannot watch a digital input, and the robot file names one as interlock",

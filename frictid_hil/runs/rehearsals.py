@@ -60,7 +60,7 @@ class Rehearsals:
     def __init__(self, robot: Robot, bus: str | None = None) -> None:
         self._robot = robot
         self._bus = bus or robot.file.bus
-        self._simulated = robot.driver(bus) == "virtual"
+        self._simulated = robot.kind(bus).simulated
         self._serials: dict[str, str] = {}
 
     def covers(self, joint: str, low_rad: float, high_rad: float, moving: Sequence[str] = ()) -> bool:

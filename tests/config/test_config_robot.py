@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from frictid_drivers.motoman import MotomanDriver
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
 from frictid_hil.config.write import dump
 from frictid_hil.errors import ConfigError, FieldProblem, InvalidFields, UsageError
+from frictid_hil.protocol.driver import DriverKind
 
 FIXTURE = Path(__file__).with_name("fixture_robot.yaml")
 TEXT = FIXTURE.read_text()
@@ -80,8 +82,8 @@ def test_a_joint_may_have_its_own_travel_and_a_person_overrides_both() -> None:
         (("start_position_rad: -0.2", "start_position_rad: 3.5"), "two.yaml:20:25", "3.5 lies outside the limits"),
         (("position_max_rad: 2.9", "position_max_rad: -3"), "two.yaml:19:23", "must be above position_min_rad"),
         (("node: 2", "node: 1"), "two.yaml:26:11", "node 1 is already that of joint 0"),
-        (("node: 2", "node: 128"), "two.yaml:26:11", "less than or equal to 127"),
-        (("    node: 2\n", ""), "two.yaml:25:3", "has neither `node` (CAN) nor `axis` (serial)"),
+        (("node: 2", "node: -1"), "two.yaml:26:11", "greater than or equal to 0"),
+        (("    node: 2\n", ""), "two.yaml:25:3", "has no `node` (CANopen), `axis`"),
         (("direction: -1", "direction: 2"), "two.yaml:35:16", "-1 or 1"),
         (("    max_torque_nm: 95.1\n", ""), "two.yaml:12:3", "joints.0.max_torque_nm: missing"),
         (("cycles: 10", "cycles: 1"), "two.yaml:9:11", "greater than or equal to 2"),
@@ -157,7 +159,7 @@ def test_a_site_file_leaves_joints_out(tmp_path: Path) -> None:
 def test_errors_of_a_site_file_point_into_the_file_at_fault(tmp_path: Path) -> None:
     written(tmp_path, ("gear_ratio: 224", "gear_ratio: 0"))
     site = tmp_path / "site.yaml"
-    site.write_text("schema: frictid.robot/1\nextends: two\njoints:\n  '0': {node: 200}\n")
+    site.write_text("schema: frictid.robot/1\nextends: two\njoints:\n  '0': {node: -1}\n")
     lines = str(refused(site)).splitlines()
     assert {line.split(": ")[0] for line in lines} == {"site.yaml:4:15", "two.yaml:27:17"}
     site.write_text("schema: frictid.robot/1\nextends: absent.yaml\n")
@@ -178,6 +180,39 @@ def test_digest_is_of_the_values_alone(tmp_path: Path) -> None:
 )
 def test_the_bus_chooses_the_driver(bus: str | None, driver: str) -> None:
     assert load_robot(FIXTURE).driver(bus) == driver
+
+
+def test_a_bus_that_no_driver_of_the_robot_speaks_on_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MotomanDriver, "kind", DriverKind(line="serial", addressed_by="axis"))
+    robot = load_robot(written(tmp_path, ("driver: virtual", "driver: motoman"), ("bus: virtual:two", "bus: serial:x")))
+    assert robot.driver("serial:/dev/ttyUSB1") == "motoman"
+    with pytest.raises(UsageError, match="speaks on a serial bus and has no counterpart on a can bus"):
+        robot.driver("socketcan:can0")
+
+
+@pytest.mark.parametrize(("key", "value", "bus"), [("node", 200, None), ("node", 0, None), ("axis", 64, "serial:x")])
+def test_addresses_end_where_the_driver_says(tmp_path: Path, key: str, value: int, bus: str | None) -> None:
+    site = tmp_path / "site.yaml"
+    axes = "axis: 1" if key == "node" else f"axis: {value}"
+    node = f"node: {value}" if key == "node" else "node: 9"
+    site.write_text(f"schema: frictid.robot/1\nextends: {FIXTURE}\njoints:\n  '0': {{{node}, {axes}}}\n")
+    with pytest.raises(ConfigError, match=rf"joints.0.{key}: driver .* has {key}s .*, found {value}"):
+        load_robot(site).to_setup(bus)
+
+
+def test_an_unknown_driver_is_told_where_it_stands(tmp_path: Path) -> None:
+    robot = load_robot(written(tmp_path, ("driver: virtual", "driver: nobody")))
+    with pytest.raises(ConfigError, match=r"no driver named 'nobody'; installed: .*cia402"):
+        robot.to_setup()
+
+
+def test_bounds_of_care_come_with_the_setup(tmp_path: Path) -> None:
+    robot = load_robot(written(tmp_path, ("procedure:", "care: {following_error_rad: 0.2}\nprocedure:")))
+    assert robot.to_setup().care == {"following_error_rad": 0.2}
+    bad = written(tmp_path, ("procedure:", "care: {velocity_margin: 0.5}\nprocedure:"), name="bad.yaml")
+    assert "velocity_margin" in str(refused(bad))
 
 
 def test_the_address_must_be_of_the_kind_the_driver_uses() -> None:

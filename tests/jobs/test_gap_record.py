@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import pytest
 import yaml
 from scipy import signal
 
+from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.config.search import find
 from frictid_hil.errors import UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, full_set, names_of_plan, plan_document
-from frictid_hil.jobs import gap_record
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
@@ -129,7 +130,7 @@ def test_what_was_left_out_is_told_with_its_reason(robot: str, tmp_path: Path, m
     assert result["skipped"] == [{"experiment": "sines_payload", "reason": "asked for without the payload"}]
     assert person.notes == ["sines_payload was left out: asked for without the payload"] and not person.questions
     # A machine whose payload nobody announced.
-    monkeypatch.setattr(gap_record, "mounts_its_own_payload", lambda driver: False)
+    monkeypatch.setattr(VirtualDriver, "kind", replace(VirtualDriver.kind, simulated=False))
     unannounced = record(GapRecordOptions(robot, "0", plan=plan, out=tmp_path / "b"), Mounting(True))
     assert "--payload" in unannounced["skipped"][0]["reason"]
     assert unannounced["experiments"] == ["breakaway"]
@@ -141,7 +142,7 @@ def test_what_was_left_out_is_told_with_its_reason(robot: str, tmp_path: Path, m
 def test_a_person_is_asked_to_mount_the_payload_before_it_moves(
     robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mounted: bool
 ) -> None:
-    monkeypatch.setattr(gap_record, "mounts_its_own_payload", lambda driver: False)
+    monkeypatch.setattr(VirtualDriver, "kind", replace(VirtualDriver.kind, simulated=False))
     person = Mounting(mounted)
     # Nothing but payload steps, so that the question comes before the first motion of a robot in lock-step.
     options = GapRecordOptions(

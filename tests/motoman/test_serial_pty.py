@@ -30,7 +30,8 @@ import sys
 from pathlib import Path
 from frictid_hil.jobs.emulate import emulate
 link = Path(sys.argv[1]) if sys.argv[1] else None
-emulate("motoman", announce=lambda port: print(port, flush=True), link=link, faults=sys.argv[2:])
+robot = "hp3j-serial.yaml"
+emulate("motoman", announce=lambda port: print(port, flush=True), robot_name=robot, link=link, faults=sys.argv[2:])
 """
 
 

@@ -231,7 +231,7 @@ def probed(
     time_s = np.arange(0.0, sine.duration_s, DT)
     positions = sine.position_rad(time_s)
     velocities = np.gradient(positions, DT)
-    watch = ProbeWatch(Stream(positions.tolist()), probe, "3")
+    watch = ProbeWatch(Stream(positions.tolist(), 0.001), probe, "3")
     for q, v in zip(positions, velocities, strict=True):
         torque = gravity * probe.gravity.torque_nm(float(q)) + friction * float(CURVE.torque(np.array(v)))
         report = moving(float(q), float(v))
@@ -263,6 +263,6 @@ def test_another_joint_does_not_and_both_values_are_named(change: dict[str, Any]
 
 
 def test_a_joint_that_does_not_move_is_no_answer() -> None:
-    watch = ProbeWatch(Stream([0.0]), Probe(Sine(0, 0.1, 0.1), CURVE, Gravity(), 0.3), "3")
+    watch = ProbeWatch(Stream([0.0], 0.001), Probe(Sine(0, 0.1, 0.1), CURVE, Gravity(), 0.3), "3")
     with pytest.raises(SafetyAbort, match="both ways"):
         watch.judge()

@@ -15,7 +15,9 @@ from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import Driver, JointState, load_driver
+from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, load_driver
+from frictid_hil.runner.care import Care
+from frictid_hil.runner.cycle import Stream
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
@@ -205,3 +207,23 @@ def test_too_high_a_rate_for_all_at_once_is_refused_with_the_highest_that_fits()
     assert isinstance(ended, PlanRefused)
     assert "use a rate of at most 282 Hz" in ended.next_step
     assert rows.size == 0
+
+
+def test_set_points_carry_the_speed_at_which_they_move() -> None:
+    position_rad = 0.1 * np.sin(3.0 * np.arange(500) * 0.002)
+    source, set_point, speeds = Stream(position_rad.tolist(), 0.002), SetPoint(), []
+    while source.update(Feedback(), set_point):
+        speeds.append(set_point.velocity_rad_s)
+    assert np.allclose(speeds[1:-1], 0.3 * np.cos(3.0 * np.arange(500) * 0.002)[1:-1], atol=1e-5)
+    assert set_point.position_rad == position_rad[-1] and set_point.velocity_rad_s == 0.0
+
+
+def test_care_takes_bounds_of_the_robot_file_and_droop_of_the_driver() -> None:
+    setup = replace(ROBOT.to_setup(), care={"still_rad": 0.01, "following_error_rad": 0.2})
+    plan = calibration_plan(
+        ROBOT, setup, {"3": Procedure(6 * DEG, 40 * DEG, cycles=2)}, expected_of(ROBOT), rehearse=()
+    )
+    care = Care().of_robot(setup.care, {"3": 0.03})
+    limits = care.limits(setup.joint("3"), plan.joints[0], 1000.0, 0.0)
+    assert limits.still_rad == pytest.approx(0.04) and limits.following_error_rad == pytest.approx(0.23)
+    assert care.limits(setup.joint("2"), plan.joints[0], 1000.0, 0.0).still_rad == pytest.approx(0.01)

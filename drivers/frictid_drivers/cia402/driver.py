@@ -32,6 +32,7 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import (
     Capabilities,
     Clock,
+    DriverKind,
     Feedback,
     Finding,
     FrameSink,
@@ -61,6 +62,8 @@ class Cia402Driver:
     Raises:
         InvalidFields: an option or node id of the robot file is wrong.
     """
+
+    kind = DriverKind(addressed_by="node", addresses=(1, 127), elsewhere={"virtual": "virtual", "serial": "motoman"})
 
     def __init__(self, setup: RobotSetup, *, bus_factory: BusFactory | None = None, clock: Clock | None = None) -> None:
         self.setup = setup

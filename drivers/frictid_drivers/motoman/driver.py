@@ -26,7 +26,16 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import JointPlan, Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import Capabilities, Feedback, Finding, FrameSink, JointIdentity, JointState, SetPoint
+from frictid_hil.protocol.driver import (
+    Capabilities,
+    DriverKind,
+    Feedback,
+    Finding,
+    FrameSink,
+    JointIdentity,
+    JointState,
+    SetPoint,
+)
 
 PortFactory = Callable[[str, int, str], BytePort]
 """Opens a port: path, baud, parity."""
@@ -50,6 +59,10 @@ class MotomanDriver:
         InvalidFields: an option is unknown or impossible, or pulses per degree are missing.
         ConfigError: the bus is no serial port.
     """
+
+    kind = DriverKind(
+        line="serial", addressed_by="axis", addresses=(0, 63), elsewhere={"virtual": "virtual", "can": "cia402"}
+    )
 
     def __init__(self, setup: RobotSetup, *, port_factory: PortFactory | None = None) -> None:
         interface, _, self._path = setup.bus.partition(":")

@@ -26,6 +26,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import (
     Capabilities,
+    DriverKind,
     Feedback,
     Finding,
     FrameSink,
@@ -44,6 +45,14 @@ if TYPE_CHECKING:
 
 class VirtualDriver:
     """See the module's first page and ``frictid_hil.protocol.driver.Driver``."""
+
+    kind = DriverKind(
+        simulated=True,
+        line="virtual",
+        addressed_by="node",
+        addresses=(1, 127),
+        elsewhere={"can": "cia402", "serial": "motoman"},
+    )
 
     def __init__(self, setup: RobotSetup) -> None:
         # Late, because the drives' own process imports this package and has no use for the host.
