@@ -67,7 +67,7 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
     ]
     if not recording.coupled:
         asked.append(_asymmetry(result))
-    if math.isfinite(recording.torque_limit_nm):
+    if math.isfinite(recording.torque_limit_nm) or recording.limited_share:
         asked.append(_saturation(recording))
     if result.time_skew is not None:
         asked.append(_time_skew(result.time_skew))
@@ -209,8 +209,14 @@ def _kinks(recording: CycleRecording, result: Estimate) -> Gate:
 def _saturation(recording: CycleRecording) -> Gate:
     high = np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm
     share = float(np.mean(high))
-    passed = share <= MOST_SATURATED
     said = f"torque stood at its limit in {100 * share:.2f} % of the samples (allowed {100 * MOST_SATURATED:.1f} %)"
+    if recording.limited_share > share:
+        share = recording.limited_share
+        said = (
+            f"the drive said in {100 * share:.2f} % of the samples that one of its limits was active "
+            f"(statusword bit 11; allowed {100 * MOST_SATURATED:.1f} %)"
+        )
+    passed = share <= MOST_SATURATED
     return Gate(
         "saturation",
         passed,

@@ -86,6 +86,7 @@ class CycleRecording:
         gear_ratio: motor revolutions per joint revolution; NaN where unknown (torque ripple is then not modelled).
         prismatic: a linear axis: gravity does not depend on the position.
         torque_limit_nm: at which the drive saturates.
+        limited_share: share of the recording in which the drive said that one of its limits was active.
         torque_quantum_nm: one step of the reported torque.
         repeat: the repeated cycle, where there is one.
         late_cycles: control cycles that were late or missed while recording.
@@ -108,6 +109,7 @@ class CycleRecording:
     gear_ratio: float = math.nan
     prismatic: bool = False
     torque_limit_nm: float = math.inf
+    limited_share: float = 0.0
     torque_quantum_nm: float = 0.0
     repeat: Repeat | None = None
     late_cycles: int = 0

@@ -190,6 +190,7 @@ class Feedback:
         error_code: 603F or alarm number; 0 when healthy.
         age_cycles: cycles since this joint last reported; 0 = this cycle.
         valid: False until the first report, and when the report could not be decoded.
+        limited: the drive says that one of its limits cuts the set-point or the torque (statusword bit 11).
     """
 
     t_ns: int = 0
@@ -207,6 +208,7 @@ class Feedback:
     error_code: int = 0
     age_cycles: int = 0
     valid: bool = False
+    limited: bool = False
 
 
 class Severity(Enum):

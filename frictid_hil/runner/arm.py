@@ -10,6 +10,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Move
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Driver, Feedback, JointState
+from frictid_hil.protocol.error_words import told_error
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.motions import AT_RAD, stream
@@ -68,9 +69,9 @@ class Arm:
         for joint, report in zip(self._joints, self._loop.feedback, strict=True):
             if report.error_code or report.state is not JointState.ENABLED:
                 raise SafetyAbort(
-                    f"could not be enabled: state {report.state.value}, error {report.error_code:#06x}",
+                    f"could not be enabled: state {report.state.value}, error {told_error(report.error_code)}",
                     where=f"joint {joint.name}",
-                    next_step="clear the drive's fault, then start again",
+                    next_step="clear the cause of the fault, then `frictid-hil reset`",
                 )
         # The bumpless set-point is where the drive stood when it was enabled.
         self._aim_where_it_stands()

@@ -72,6 +72,8 @@ class CycleCount:
         worst_ns: largest lateness.
         first_ns: run time of the first exchange.
         last_ns: run time of the last exchange.
+        streamed: cycles in which a joint was streamed set-points.
+        limited: those of them in which a limit of its drive was active.
     """
 
     cycles: int = 0
@@ -80,6 +82,8 @@ class CycleCount:
     worst_ns: int = 0
     first_ns: int = 0
     last_ns: int = 0
+    streamed: int = 0
+    limited: int = 0
 
     @property
     def rate_hz(self) -> float:
@@ -222,7 +226,9 @@ class CyclicLoop:
                 previous_rad[k] = set_point.position_rad
                 if not source.update(self.feedback[joint], set_point):
                     return
-            self.cycle()
+            feedback = self.cycle()
+            self.count.streamed += 1
+            self.count.limited += any(feedback[joint].limited for joint in sources)
 
     def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
         """Keep cycling with unchanged set-points until ``done(feedback)``.

@@ -157,6 +157,9 @@ def _set_points(motion: Motion, period_s: float) -> Stream:
 
 
 def _streamed(loop: CyclicLoop, index: int, motion: Motion, source: SetPointSource) -> Mark:
-    start_ns = loop.now_ns()
+    start_ns, streamed, limited = loop.now_ns(), loop.count.streamed, loop.count.limited
     loop.run(source, index)
-    return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+    details = motion.details()
+    if loop.count.limited > limited:
+        details = {**details, "limited_share": (loop.count.limited - limited) / (loop.count.streamed - streamed)}
+    return Mark(motion.name, start_ns, loop.now_ns(), details)

@@ -24,6 +24,7 @@ class SignWatch:
         self._joint = joint
         self._sum = [0.0, 0.0]
         self._count = [0, 0]
+        self._least, self._most = math.inf, -math.inf
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Count the report, then pass the next set-point on."""
@@ -31,6 +32,7 @@ class SignWatch:
             backward = feedback.velocity_rad_s < 0
             self._sum[backward] += feedback.torque_nm
             self._count[backward] += 1
+            self._least, self._most = min(self._least, feedback.torque_nm), max(self._most, feedback.torque_nm)
         return self._source.update(feedback, set_point)
 
     def judge(self) -> None:
@@ -41,6 +43,14 @@ class SignWatch:
         """
         if not all(self._count):
             return
+        if self._least == self._most:
+            raise SafetyAbort(
+                f"the reported torque stood at {self._least:.3g} N m all the way, forward and back",
+                where=f"joint {self._joint}",
+                cause="the drive does not measure torque (6077), reports another object in its place, or its step is "
+                "coarser than the friction",
+                next_step="see in the drive's manual what it reports as torque, and `torque_source` in the robot file",
+            )
         forward, backward = (total / count for total, count in zip(self._sum, self._count, strict=True))
         if forward <= backward:
             raise SafetyAbort(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
+from frictid_hil.protocol.error_words import told_error
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
@@ -210,9 +211,9 @@ class Supervisor:
         if report.error_code or report.state is JointState.FAULT:
             raise self._abort(
                 index,
-                f"the drive reports error {report.error_code:#06x}, state {report.state.value} "
+                f"the drive reports error {told_error(report.error_code)}, state {report.state.value} "
                 f"(status {report.status_raw:#06x})",
-                next_step="look the code up in the drive's manual, clear the cause, then start again",
+                next_step="clear the cause (the code is in the drive's manual), then `frictid-hil reset`",
             )
         raise self._abort(index, f"state is {report.state.value}, expected enabled (status {report.status_raw:#06x})")
 

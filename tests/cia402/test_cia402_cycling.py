@@ -7,6 +7,7 @@ import math
 import struct
 import threading
 
+import can
 import pytest
 from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive
@@ -150,7 +151,7 @@ def test_a_fault_that_stays_is_told():
     b = Bench(drive).open().start()
     b.cycle(110)
     b.driver.enable("0", Mode.POSITION)
-    with pytest.raises(HardwareError, match="still in fault 0x7305 after one fault reset"):
+    with pytest.raises(HardwareError, match=r"still in fault 0x7305 \(sensor: .*\) after one fault reset"):
         b.cycle(600)
     b.cycle(20)
     words = drive.controlwords
@@ -338,3 +339,52 @@ def test_an_unknown_joint_lists_the_known_ones():
     b = bench(1, 2).open().start()
     with pytest.raises(InvalidFields, match="this robot has 0, 1"):
         b.driver.enable("7", Mode.POSITION)
+
+
+def test_an_interface_that_pads_data_in_place_changes_no_later_frame():
+    b = bench(1).open().start()
+    plain = b.bus.send
+
+    def padding(message, timeout=None):
+        plain(message, timeout)
+        message.data.extend(bytes(8 - len(message.data)))
+
+    b.bus.send = padding
+    b.power()
+    assert {len(data) for _, can_id, data, sent in b.frames if can_id == 0x80} == {1}
+    assert {len(data) for _, can_id, data, sent in b.frames if can_id == 0x301} == {7}
+
+
+def test_an_error_code_beside_a_healthy_statusword_is_history():
+    drive = ScriptedDrive(1)
+    drive.values[0x603F, 0] = 0x3210
+    b = Bench(drive).open().start().power()
+    assert b.feedback[0].error_code == 0 and b.feedback[0].state is JointState.ENABLED
+    drive.values[0x6041, 0] = 0x0218
+    b.cycle(20)
+    assert b.feedback[0].error_code == 0x3210
+
+
+def test_an_active_limit_is_told():
+    drive = ScriptedDrive(1)
+    b = Bench(drive).open().start().power()
+    assert not b.feedback[0].limited
+    drive.values[0x6041, 0] |= 0x0800
+    assert b.cycle()[0].limited
+
+
+def test_bus_off_is_told_by_name():
+    b = bench(1).open().start().power()
+    b.bus.waiting.append(can.Message(arbitration_id=0x040, is_error_frame=True, data=bytes(8)))
+    with pytest.raises(HardwareError, match="bus-off") as caught:
+        b.cycle(2)
+    assert "restart-ms" in caught.value.next_step and b.bus.sent[-2][1][:2] == b"\x02\x00"
+
+
+def test_error_passive_is_the_likely_cause_of_silence():
+    b = bench(1).open().start().power()
+    b.bus.waiting.append(can.Message(arbitration_id=0x004, is_error_frame=True, data=b"\x00\x20" + bytes(6)))
+    b.clock.dead.add(1)
+    with pytest.raises(SafetyAbort, match="no heartbeat") as caught:
+        b.cycle(400)
+    assert "error-passive" in caught.value.cause

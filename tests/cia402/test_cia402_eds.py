@@ -99,6 +99,13 @@ def test_an_eds_of_another_drive_is_refused(tmp_path):
         frame_map_from_eds(eds(tmp_path / "drive.eds", values={(0x6076, 0): 5000}), robot(3))
 
 
+def test_an_eds_as_windows_writes_it_and_without_a_default_of_1000(tmp_path):
+    path = eds(tmp_path / "drive.eds")
+    text = path.read_text().replace(f"DefaultValue={OBJECTS[0x1000, 0][1]}\n", "", 1).replace("scripted", "Müller GmbH")
+    path.write_bytes(text.encode("cp1252"))
+    assert frame_map_from_eds(path, robot(3)).joints[0].reports
+
+
 @pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe garbage", b"[1000\n", b"[6064]\nDataType=what\n"])
 def test_garbage_is_an_input_error(tmp_path, content):
     path = tmp_path / "garbage.eds"

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -91,3 +92,8 @@ def test_a_disturbed_cycle_and_a_one_sided_load_are_caught(sound):
     one_sided = replace(sound, torque_nm=sound.torque_nm + 12.0 * np.maximum(v, 0.0))
     found = asked(one_sided)["direction_asymmetry"]
     assert not found.passed and "to either side" in found.reason
+
+
+def test_a_drive_that_says_its_limit_was_active_fails_the_gate(sound):
+    found = asked(replace(sound, torque_limit_nm=math.inf, limited_share=0.02))["saturation"]
+    assert not found.passed and "bit 11" in found.reason

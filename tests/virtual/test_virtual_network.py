@@ -71,18 +71,37 @@ def test_1029_keeps_or_stops_the_network_state(make_desk):
         assert desk.servo.nmt_state == state
 
 
-def test_no_power_while_the_heartbeat_is_missing(desk):
+def test_a_fault_of_a_lost_heartbeat_needs_a_reset_of_communication_first(desk):
     watched(desk, 1)
     desk.send(HOST, "05")
     desk.wait(200)
     assert desk.state() == FAULT
-    assert desk.control(0x80) == DISABLED
+    assert desk.control(0x80) == FAULT, "the connection comes first"
+    desk.control(0)
+    desk.send(0x000, "8205")
+    assert desk.state() == FAULT
+    assert desk.control(0x80) == DISABLED and desk.read(0x603F) == 0
+    watched(desk, 1)
+
+
+def test_no_power_while_a_watched_node_is_missing(desk):
+    watched(desk, 2)
+    desk.send(HOST, "05")
+    desk.wait(200)
+    assert desk.state() == DISABLED
     assert [desk.control(word) for word in (6, 7, 15)] == [0x21, 0x23, 0x23]
     assert not desk.plant.powered
     assert desk.read(0x6041) & 0x80, "warning"
     desk.send(HOST, "05")
     assert desk.control(0x07) == 0x23
     assert desk.control(0x0F) == ENABLED
+
+
+def test_a_long_watchdog_does_not_keep_the_drive_s_own_heartbeat_waiting(desk):
+    desk.write(0x1016, 1, 127 << 16 | 600, 4)
+    desk.send(HOST, "05")
+    desk.write(0x1017, 0, 100, 2)
+    assert desk.wait(350) == [(0x705, "7f")] * 3
 
 
 def test_heartbeat_that_returns_ends_the_error(desk):

@@ -24,6 +24,7 @@ from frictid_drivers.cia402.state import (
 from frictid_hil.errors import HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, SetPoint
+from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
@@ -209,10 +210,10 @@ class Axis:
                 return FAULT_RESET
             self.target = Target.DISABLED
             self.alarm = HardwareError(
-                f"still in fault {self.feedback.error_code:#06x} after one fault reset",
+                f"still in fault {told_error(self.feedback.error_code)} after one fault reset",
                 where=f"joint {self.joint}",
-                cause="the cause of the fault is still there",
-                next_step="look the code up in the drive's manual, clear the cause, then start again",
+                cause="the cause of the fault is still there, or this fault needs more than a reset of the fault",
+                next_step="clear the cause (the code is in the drive's manual), then `frictid-hil reset`",
             )
             return DISABLE_VOLTAGE
         if self._reset_wanted:

@@ -31,6 +31,8 @@ _ATTRIBUTES = {
     "temperature": "temperature_c",
 }
 _MODES = {mode.value: mode for mode in Mode}
+_LIMIT_ACTIVE = 0x0800
+"""Statusword bit 11: a set-point or the torque is cut by a limit of the drive."""
 
 
 class _Report:
@@ -76,7 +78,9 @@ class _Report:
 class _Joint:
     """What is known of one joint."""
 
-    __slots__ = ("cyclic", "feedback", "heartbeat_ns", "inputs", "position_at", "restarted", "taken_cycle")
+    __slots__ = (
+        "cyclic", "emergency", "feedback", "heartbeat_ns", "inputs", "position_at", "restarted", "taken_cycle", "told",
+    )  # fmt: skip
 
     def __init__(self, frames: JointFrames) -> None:
         self.feedback = Feedback()
@@ -86,6 +90,16 @@ class _Joint:
         self.taken_cycle = -1
         self.heartbeat_ns: int | None = None
         self.restarted = False
+        self.told = 0
+        self.emergency = 0
+
+    def judge(self) -> None:
+        """What is wrong now: an emergency that was not taken back, or 603F in the state of fault.
+
+        603F beside a healthy statusword is history: at some vendors it is "the cause of the last interruption".
+        """
+        feedback = self.feedback
+        feedback.error_code = self.emergency or (self.told if feedback.state is JointState.FAULT else 0)
 
 
 class Decoder:
@@ -137,6 +151,7 @@ class Decoder:
             joint.taken_cycle = -1
             joint.heartbeat_ns = None
             joint.restarted = False
+            joint.told = joint.emergency = 0
             for field in fields(Feedback):
                 setattr(joint.feedback, field.name, getattr(blank, field.name))
 
@@ -151,7 +166,8 @@ class Decoder:
         report = self._reports.get(cob_id)
         if report is None:
             return self._service(t_ns, cob_id, data)
-        feedback = report.joint.feedback
+        joint = report.joint
+        feedback = joint.feedback
         if len(data) < report.size:
             feedback.valid = False
             return True
@@ -164,8 +180,13 @@ class Decoder:
         if report.status_at >= 0:
             status = feedback.status_raw = values[report.status_at]
             feedback.state = JOINT_STATES[status & 0x6F]
+            feedback.limited = status & _LIMIT_ACTIVE != 0
         if report.error_at >= 0:
-            feedback.error_code = values[report.error_at]
+            joint.told = values[report.error_at]
+            if not joint.told:
+                joint.emergency = 0
+        if joint.told or joint.emergency or feedback.error_code:
+            joint.judge()
         if report.inputs_at >= 0:
             feedback.digital_inputs = values[report.inputs_at]
         if report.mode_at >= 0:
@@ -228,7 +249,8 @@ class Decoder:
             return False
         code = int.from_bytes(data[:2], "little") if len(data) >= 2 else MALFORMED_EMERGENCY
         # Codes 00xx say that the error is gone.
-        joint.feedback.error_code = code if code & 0xFF00 else 0
+        joint.emergency = code if code & 0xFF00 else 0
+        joint.judge()
         return True
 
 

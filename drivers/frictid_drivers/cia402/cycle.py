@@ -23,7 +23,7 @@ from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE, Command, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.layout import Layout
-from frictid_drivers.cia402.network import logged_id
+from frictid_drivers.cia402.network import BUS_OFF, CONTROLLER_STATES, controller_state, logged_id
 from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE
 from frictid_hil.errors import HardwareError, SafetyAbort
@@ -130,6 +130,7 @@ class Cycle:
         self._turn = 0
         self._failures = 0
         self._alarmed = False
+        self._controller = ""
 
     def exchange(self, set_points: Sequence[SetPoint]) -> list[Feedback]:
         """One cycle.
@@ -238,6 +239,8 @@ class Cycle:
         if self._sink is not None:
             self._sink(t_ns, logged_id(message), bytes(message.data), True)
         self._bus.send(message)
+        # Some interfaces (gs_usb) pad the data in place; this message is sent again in the next cycle.
+        del message.data[message.dlc :]
 
     def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> None:
         message = _message(cob_id, bytes(data), fd=fd)
@@ -252,13 +255,19 @@ class Cycle:
         self._failures += 1
         if self._failures >= _WIRE_FAILURES:
             self._failures = 0
-            raise HardwareError(
-                f"{_WIRE_FAILURES} cycles in a row failed on the bus: {error}",
-                where="bus",
-                cause="bus-off, an unplugged adapter, or nobody left on the bus to acknowledge"
-                + ("; a device that knows classical CAN only destroys every CAN FD frame" if self._fd else ""),
-                next_step="check the wiring and termination; the drives stop by their own watchdogs",
-            ) from error
+            raise self._broken_bus(f"{_WIRE_FAILURES} cycles in a row failed on the bus: {error}") from error
+
+    def _broken_bus(self, what: str) -> HardwareError:
+        cause = CONTROLLER_STATES.get(
+            self._controller, "bus-off, an unplugged adapter, or nobody left on the bus to acknowledge"
+        )
+        return HardwareError(
+            what,
+            where="bus",
+            cause=cause + ("; a device that knows classical CAN only destroys every CAN FD frame" if self._fd else ""),
+            next_step="check wiring and termination; the drives stop by their own watchdogs. A bus that is off "
+            "stays off unless its link was brought up with `restart-ms`",
+        )
 
     # -- receiving ----------------------------------------------------------------------------------------------
 
@@ -281,6 +290,8 @@ class Cycle:
 
     def _take(self, message: can.Message, t_ns: int) -> None:
         if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+            if message.is_error_frame:
+                self._controller = controller_state(message) or self._controller
             return
         cob_id, data = message.arbitration_id, message.data
         if self._sink is not None:
@@ -309,6 +320,10 @@ class Cycle:
 
     def _check(self, now_ns: int) -> None:
         decoder, timing = self._decoder, self._timing
+        if self._controller == BUS_OFF and not self._alarmed:
+            self._alarmed = True
+            self.quick_stop()
+            raise self._broken_bus("the bus is off (bus-off)")
         if self._other_kind is not None:
             at, self._other_kind = self._other_kind, None
             self._tell_other_kind(at)
@@ -349,6 +364,6 @@ class Cycle:
         raise SafetyAbort(
             what,
             where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
-            cause="a drive that lost its supply or its bus, or a broken cable",
+            cause=CONTROLLER_STATES.get(self._controller, "a drive that lost its supply or its bus, or a broken cable"),
             next_step="run `frictid-hil check`, and look at the drive's supply and wiring",
         )

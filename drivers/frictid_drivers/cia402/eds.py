@@ -6,6 +6,7 @@ direction, rated torque where 6076 has no default) come from the robot file.
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import canopen
@@ -31,7 +32,7 @@ class _File:
     def __init__(self, path: Path, joint: JointSetup) -> None:
         self._path = path
         try:
-            self._dictionary = canopen.import_od(str(path), joint.address)
+            self._dictionary = canopen.import_od(_text_of(path), joint.address)
         except OSError as error:
             raise InputFileError(f"cannot be read: {error}", where=str(path)) from error
         except Exception as error:  # the parser raises whatever configparser and int() do
@@ -60,6 +61,17 @@ class _File:
         return value if isinstance(value, str) else ""
 
 
+def _text_of(path: Path) -> io.StringIO:
+    """A file of vendors' tools: UTF-8, or what Windows writes in Western Europe."""
+    data = path.read_bytes()
+    try:
+        text = io.StringIO(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        text = io.StringIO(data.decode("cp1252", "replace"))
+    text.name = path.name  # by its ending the parser knows the format
+    return text
+
+
 def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
     """The frames of a robot whose drives all have the mapping of one EDS or DCF file.
 
@@ -75,6 +87,8 @@ def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
     joints = []
     for joint in setup.joints:
         file = _File(path, joint)
+        if file.variable(od.POSITION_ACTUAL.index, 0) is None:
+            raise InputFileError("describes no drive: it has no 6064", where=str(path))
         facts = read_facts(file)
         scale, findings = scale_of(facts, joint, facts.velocity_unit)
         raise_on_error(findings)

@@ -86,7 +86,7 @@ def read_facts(drive: Source) -> Facts:
         return (a, b) if a and b else None
 
     return Facts(
-        device_type=drive.read(od.DEVICE_TYPE),
+        device_type=drive.find(od.DEVICE_TYPE) or 0,
         vendor=drive.find(od.VENDOR) or 0,
         product=drive.find(od.PRODUCT) or 0,
         revision=drive.find(od.REVISION) or 0,

@@ -7,6 +7,7 @@ thread inherits the wrong scheduling class.
 
 from __future__ import annotations
 
+import logging
 import re
 import tempfile
 import threading
@@ -26,9 +27,16 @@ from frictid_hil.protocol.driver import FD_FRAME, FrameSink
 
 BusFactory = Callable[[], can.BusABC]
 
+for _library in ("canopen", "can"):
+    # What they log is told by our errors, with cause and next step; it must not reach stderr on its own.
+    logging.getLogger(_library).addHandler(logging.NullHandler())
+
 DEFAULT_BITRATE = 1_000_000
 DEFAULT_DATA_BITRATE = 2_000_000
-FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host")
+FORWARDED = (
+    "bitrate", "tty_baudrate", "sleep_after_open", "port", "hop_limit", "app_name", "serial", "index", "host",
+    "tcp_tune",
+)  # fmt: skip
 """Robot-file options that are handed to python-can as they are, when given."""
 
 _FD_BY_LINK = ("socketcan", "udp_multicast", "frictid")
@@ -165,6 +173,30 @@ def _likely_cause(error: BaseException) -> str:
 def logged_id(message: can.Message) -> int:
     """The identifier as a ``FrameSink`` takes it."""
     return message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
+
+
+BUS_OFF = "bus-off"
+_PASSIVE = "error-passive"
+
+
+def controller_state(message: can.Message) -> str:
+    """What an error frame of the interface says of our own CAN controller, by name; "" for passing errors.
+
+    Source: Linux SocketCAN, ``linux/can/error.h``: the class is in the identifier (0x40 bus-off, 0x04 controller, 0x20
+    nobody acknowledged), the controller's state in byte 1 (0x10, 0x20 error-passive).
+    """
+    if message.arbitration_id & 0x40:
+        return BUS_OFF
+    if message.arbitration_id & 0x04 and len(message.data) > 1 and message.data[1] & 0x30:
+        return _PASSIVE
+    return "no acknowledgement" if message.arbitration_id & 0x20 else ""
+
+
+CONTROLLER_STATES = {
+    BUS_OFF: "our CAN controller went bus-off: a short circuit, a wrong bit rate, or missing termination",
+    _PASSIVE: "our CAN controller is error-passive: frames are destroyed by a bad cable, termination or bit rate",
+    "no acknowledgement": "nobody acknowledges our frames: no other device is on the bus, or all have another bit rate",
+}
 
 
 class BusLock:

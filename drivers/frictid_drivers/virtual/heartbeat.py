@@ -46,11 +46,9 @@ class HeartbeatWatch:
         return any(consumer.lost for consumer in self.consumers)
 
     def next_deadline_ns(self, otherwise_ns: int) -> int:
-        """When the next one counts as lost."""
-        return min(
-            (consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None),
-            default=otherwise_ns,
-        )
+        """When the next one counts as lost, or ``otherwise_ns`` where that is earlier."""
+        deadlines = (consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None)
+        return min((otherwise_ns, *deadlines))
 
     def newly_lost(self, now_ns: int) -> list[int]:
         """Nodes whose time has run out; each is told once."""

@@ -215,6 +215,8 @@ class PowerStage:
         """Transition 15; in other states warnings are forgotten."""
         if self.state is PowerState.FAULT_REACTION:
             return
+        if self.state is PowerState.FAULT and emergency.HEARTBEAT_LOST in self._errors.present:
+            return  # as with many makers: the connection comes first (NMT reset communication), then the fault
         if self.state is PowerState.FAULT:
             self.state = PowerState.SWITCH_ON_DISABLED
         missing = self._host_missing()

@@ -309,6 +309,7 @@ class Servo:
             self._connection_lost(emergency.CONNECTION_ABORTED, 0)
         self.dictionary.reset(0x1000, 0x1FFF)
         self._restart_communication()
+        self.emergency.clear(emergency.HEARTBEAT_LOST)
 
     def _restart_communication(self) -> None:
         self.nmt_state = INITIALISING

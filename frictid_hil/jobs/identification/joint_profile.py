@@ -232,7 +232,7 @@ def _recording(
 ) -> CycleRecording:
     kept = samples.select(_around_cycles(samples, procedure, start_s))
     assert kept.torque_nm is not None  # by the caller
-    drift = samples.marked("drift")
+    drift, cycles = samples.marked("drift"), samples.marked("cycles")
     quantum = samples.meta.get("torque_resolution_nm")
     return CycleRecording(
         time_s=kept.time_s - start_s,
@@ -245,6 +245,7 @@ def _recording(
         gear_ratio=joint.gear_ratio if joint else math.nan,
         prismatic=samples.prismatic,
         torque_limit_nm=joint.max_torque_nm if joint else math.inf,
+        limited_share=float(cycles[0].details.get("limited_share", 0.0)) if cycles else 0.0,
         torque_quantum_nm=float(quantum) if quantum else 0.0,
         repeat=_repeat(drift[0], procedure, start_s) if drift else None,
         late_cycles=late_cycles,
