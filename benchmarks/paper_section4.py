@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from on_the_bus import V_RAD_S, Variant, calibrated, shipped, variant
+from svg import PALETTE, Chart, Line, svg
 
 from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.provenance import git_revision
@@ -25,7 +26,6 @@ from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance, curve_mean
 from frictid_hil.recording.read import read
-from frictid_hil.report.svg import PALETTE, Chart, Line, svg
 
 AMPLITUDES = (5, 10, 20, 30, 40, 50)
 JOINTS = ("0", "1", "2", "3", "4", "5")

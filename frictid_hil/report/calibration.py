@@ -51,7 +51,8 @@ def calibration_page(
     if outcome != "ok":
         headline += f" The run ended as {outcome.replace('_', ' ')}{': ' + error if error else ''}."
     done = (*_what_was_done(profile, samples), _compared_with(previous))
-    sections = [Section("Summary", words=done, tables=(_summary(joints, previous),))]
+    overview = (_overview(joints, previous),) if len(joints) > 1 else ()
+    sections = [Section("Summary", words=done, tables=(_summary(joints, previous),), figures=overview)]
     sections += [_joint(name, joint, samples.get(name), previous) for name, joint in joints.items()]
     sections.append(
         Section(
@@ -146,34 +147,73 @@ def _axes(joint: JointProfile) -> tuple[str, str, float]:
     return ("m/s", "N", 1.0) if joint.prismatic else ("deg/s", "N m", degrees(1.0))
 
 
+def _overview(joints: Mapping[str, JointProfile], previous: FrictionProfile | None) -> Figure:
+    """Every joint's curve with its interval, one small panel each, and whether its gates passed."""
+    first = next(iter(joints.values()))
+    unit, force, _ = _axes(first)
+    traces: list[Mapping[str, Any]] = []
+    for number, (name, joint) in enumerate(joints.items()):
+        traces += [{**trace, "panel": number} for trace in _curves(name, joint, previous)]
+    return Figure(
+        "All joints: friction over speed",
+        tuple(traces),
+        f"speed [{unit}]",
+        f"friction [{force}]",
+        caption="Solid where measured, dotted where extrapolated; the band is the 95 % interval, the dashed line the "
+        "profile that was active before. A tick says that all gates passed.",
+        panels=tuple(f"{_light(joint)} joint {name}" for name, joint in joints.items()),
+    )
+
+
+def _light(joint: JointProfile) -> str:
+    color, sign = ("#2c8a4b", "\u2713") if all(gate.passed for gate in joint.gates) else ("#c0392b", "\u2717")
+    return f'<span style="color:{color}">{sign}</span>'
+
+
+def _curves(name: str, joint: JointProfile, previous: FrictionProfile | None) -> list[Mapping[str, Any]]:
+    """The interval, the curve that was active before, and the curve: solid where measured, dotted elsewhere."""
+    scale, curve, known = _axes(joint)[2], joint.curve(), np.array(joint.velocity_rad_s)
+    low, high = curve.measured_range_rad_s
+    measured = np.linspace(low, high, 150)
+    traces: list[Mapping[str, Any]] = []
+    if joint.torque_interval_nm is not None:
+        width, level = np.interp(measured, known, _half_width(joint)), curve.magnitude(measured)
+        traces.append(band("95 % interval", measured * scale, level - width, level + width))
+    if previous is not None and name in previous.joints:
+        speeds = np.linspace(0.0, _top(joint), 200)[1:]
+        before = previous.joints[name].curve().magnitude(speeds)
+        traces.append(line("active before", speeds * scale, before, REFERENCE, dash="dash"))
+    for begin, end in ((0.0, low), (high, _top(joint))):
+        if end > begin:
+            beyond = np.linspace(begin, end, 21)[(1 if begin == 0.0 else 0) :]
+            extended = line("extrapolated", beyond * scale, curve.magnitude(beyond), IDENTIFIED, dash="dot")
+            traces.append({**extended, "showlegend": begin == 0.0})
+    traces.append(line("identified curve", measured * scale, curve.magnitude(measured), IDENTIFIED))
+    return traces
+
+
+def _half_width(joint: JointProfile) -> Array:
+    return np.array([(high - low) / 2 for low, high in joint.torque_interval_nm or ()])
+
+
 def _curve_figure(name: str, joint: JointProfile, previous: FrictionProfile | None) -> Figure:
     """The curve alone, close enough to see its intervals."""
     unit, force, scale = _axes(joint)
-    curve, known = joint.curve(), np.array(joint.velocity_rad_s)
-    speeds = np.linspace(0.0, _top(joint), 200)[1:]
-    traces: list[Mapping[str, Any]] = []
-    half = None
-    if joint.torque_interval_nm is not None:
-        half = np.array([(high - low) / 2 for low, high in joint.torque_interval_nm])
-        width, level = np.interp(speeds, known, half), curve.magnitude(speeds)
-        traces.append(band("95 % interval", speeds * scale, level - width, level + width))
-    if previous is not None and name in previous.joints:
-        before = previous.joints[name].curve()
-        traces.append(line("active before", speeds * scale, before.magnitude(speeds), REFERENCE, dash="dash"))
-    traces.append(line("identified curve", speeds * scale, curve.magnitude(speeds), IDENTIFIED))
-    traces += _one_way(joint, scale)
+    traces = _curves(name, joint, previous) + _one_way(joint, scale)
     if joint.published is not None:
         velocity, torque = np.array(joint.published.velocity_rad_s), np.array(joint.published.torque_nm)
         traces.append(points("as published (Function A)", velocity * scale, torque, PUBLISHED, symbol="x-thin-open"))
+    half = None if joint.torque_interval_nm is None else _half_width(joint)
+    known = np.array(joint.velocity_rad_s)
     traces.append(points("pairs V_n, F_n", known * scale, np.array(joint.torque_nm), IDENTIFIED, half_width=half))
-    low, high = curve.measured_range_rad_s
+    low, high = joint.curve().measured_range_rad_s
     return Figure(
         f"Joint {name}: friction over speed",
         tuple(traces),
         f"speed [{unit}]",
         f"friction [{force}]",
-        caption=f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}, extrapolated outside. The curve is the "
-        "mean of both directions.",
+        caption=f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}, extrapolated where dotted. The "
+        "curve is the mean of both directions.",
     )
 
 

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from frictid_hil.friction.trajectory import Array
 
 MEASURED, PUBLISHED, IDENTIFIED, REFERENCE = "#7f8c9b", "#c07a2c", "#1f6fb2", "#3a9a5b"
-_BAND = "rgba(31, 111, 178, 0.18)"
-_MOST_POINTS, _MOST_DOTS = 6000, 3000
+_BAND = "rgba(58, 134, 200, 0.30)"
+_MOST_POINTS, _MOST_DOTS = 700, 500
+_COLUMNS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +27,7 @@ class Figure:
         x_title: quantity and unit.
         y_title: quantity and unit.
         caption: how to read it.
+        panels: titles of panels side by side, all over one range of x; the key ``panel`` of a trace says where it goes.
     """
 
     title: str
@@ -32,16 +35,18 @@ class Figure:
     x_title: str
     y_title: str
     caption: str = ""
+    panels: tuple[str, ...] = ()
 
     def spec(self) -> dict[str, Any]:
         """What ``Plotly.newPlot`` takes; the title stands above it on the page."""
         dots = any(trace.get("mode") == "markers" and trace["marker"]["size"] < 5 for trace in self.traces)
         return {
             "title": self.title,
-            "data": list(self.traces),
+            "data": [_in_its_panel(trace) for trace in self.traces],
             "layout": {
                 "xaxis": {"title": {"text": self.x_title, "standoff": 10}, "automargin": True},
-                "yaxis": {"title": {"text": self.y_title, "standoff": 10}, "automargin": True},
+                "yaxis": {"title": {"text": self.y_title, "standoff": 10}, "automargin": True}
+                | ({"rangemode": "tozero"} if self.panels else {}),
                 "legend": {
                     "orientation": "h",
                     "x": 0,
@@ -51,24 +56,58 @@ class Figure:
                     "itemsizing": "constant" if dots else "trace",  # a dot of the figure is no legend
                 },
                 "hovermode": "closest",
-                "showlegend": len(self.traces) > 1,
+                "showlegend": len(self.traces) > 1 and not self.panels,
                 "margin": {"l": 60, "r": 20, "t": 52, "b": 50},
                 "height": 400,
-            },
+            }
+            | self._panels(),
         }
+
+    def _panels(self) -> dict[str, Any]:
+        """The part of the layout that sets panels side by side; empty for a single one."""
+        if not self.panels:
+            return {}
+        columns = min(_COLUMNS, len(self.panels))
+        rows = -(-len(self.panels) // columns)
+        axes: dict[str, Any] = {}
+        for number in range(2, len(self.panels) + 1):
+            axes[f"xaxis{number}"] = {"matches": "x"}
+            axes[f"yaxis{number}"] = {"rangemode": "tozero"}
+        titles = [
+            {"text": title, "showarrow": False, "x": 0.5, "y": 1.0, "yanchor": "bottom"}
+            | {"xref": f"x{number or ''} domain", "yref": f"y{number or ''} domain"}
+            for number, title in zip((0, *range(2, len(self.panels) + 1)), self.panels, strict=True)
+        ]
+        grid = {"rows": rows, "columns": columns, "pattern": "independent", "xgap": 0.12, "ygap": 0.3}
+        return {"grid": grid, "annotations": titles, "height": 90 + 210 * rows, **axes}
+
+
+def _in_its_panel(trace: Mapping[str, Any]) -> dict[str, Any]:
+    given = dict(trace)
+    number = given.pop("panel", 0) + 1
+    return given if number == 1 else {**given, "xaxis": f"x{number}", "yaxis": f"y{number}"}
 
 
 def line(name: str, x: Array, y: Array, color: str, *, dash: str = "solid", width: float = 2) -> dict[str, Any]:
-    """A line through points, thinned evenly where there are too many for a page."""
-    every = max(1, -(-len(x) // _MOST_POINTS))
+    """A line through points; of more than a screen can show, the lowest and the highest of each stretch."""
+    kept = _extremes(y)
     return {
         "type": "scatter",
         "mode": "lines",
         "name": name,
-        "x": rounded(x[::every]),
-        "y": rounded(y[::every]),
+        "x": rounded(x[kept]),
+        "y": rounded(y[kept]),
         "line": {"color": color, "dash": dash, "width": width},
     }
+
+
+def _extremes(y: Array) -> NDArray[np.intp]:
+    """Indices that keep the shape of a line, at most ``_MOST_POINTS``, in order."""
+    if len(y) <= _MOST_POINTS:
+        return np.arange(len(y))
+    stretches = np.array_split(np.arange(len(y)), _MOST_POINTS // 2)
+    ends = [(at[0] + np.argmin(y[at]), at[0] + np.argmax(y[at])) for at in stretches]
+    return np.unique(np.array(ends))
 
 
 def cloud(name: str, x: Array, y: Array, color: str, *, opacity: float = 0.5) -> dict[str, Any]:
@@ -78,8 +117,8 @@ def cloud(name: str, x: Array, y: Array, color: str, *, opacity: float = 0.5) ->
         "type": "scatter",
         "mode": "markers",
         "name": name,
-        "x": rounded(x[::every]),
-        "y": rounded(y[::every]),
+        "x": rounded(x[::every], digits=4),
+        "y": rounded(y[::every], digits=4),
         "marker": {"color": color, "size": 3, "opacity": opacity},
         "hoverinfo": "skip",
     }
@@ -122,6 +161,6 @@ def bars(name: str, labels: Sequence[str], values: Sequence[float | None], color
     return {"type": "bar", "name": name, "x": list(labels), "y": list(values), "marker": {"color": color}}
 
 
-def rounded(values: Array) -> list[float | None]:
-    """Six significant digits: what a screen can show, at a third of the bytes; None for what is not finite."""
-    return [float(f"{value:.6g}") if np.isfinite(value) else None for value in np.asarray(values, dtype=float)]
+def rounded(values: Array, *, digits: int = 5) -> list[float | None]:
+    """As many significant digits as a screen can show; None for what is not finite."""
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in np.asarray(values, dtype=float)]

@@ -86,7 +86,7 @@ def write_page(page: Page, path: Path) -> Path:
     html = environment.get_template("page.html").render(
         page=page,
         number=lambda figure: numbered[id(figure)],
-        plotly=files("plotly").joinpath("package_data", "plotly.min.js").read_text() if specs else "",
+        plotly=files("frictid_hil.report").joinpath("vendor", "plotly-basic.min.js").read_text() if specs else "",
         # "</" would end the script element early.
         specs=json.dumps(specs, separators=(",", ":")).replace("</", "<\\/"),
     )

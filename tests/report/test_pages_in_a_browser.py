@@ -27,6 +27,7 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.compensation import compensation_page
+from frictid_hil.report.figures import line
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import Page, write_page
@@ -215,6 +216,23 @@ def test_pages_are_whole_in_themselves_and_escape_what_people_wrote(history: Pro
         assert "prefers-color-scheme: dark" in text and "@media print" in text
 
 
+def test_a_page_is_small_and_a_thinned_line_keeps_its_peaks(history: ProfileStore, tmp_path: Path) -> None:
+    assert write_page(pages(history)["calibration"], tmp_path / "page.html").stat().st_size < 1_500_000
+    y = np.zeros(100_000)
+    y[54_321] = 7.0
+    drawn = line("spike", np.arange(y.size, dtype=float), y, "#000000")
+    assert len(drawn["x"]) <= 700 and 7.0 in drawn["y"] and drawn["x"] == sorted(drawn["x"])
+
+
+def test_all_joints_are_shown_first_with_the_verdict_of_their_gates(history: ProfileStore) -> None:
+    (overview,) = pages(history)["calibration"].sections[0].figures
+    assert [title.rpartition("</span> ")[2] for title in overview.panels] == ["joint 0", "joint 1"]
+    assert all("\u2713" in title for title in overview.panels)
+    kinds = {(trace["name"], trace["line"].get("dash")) for trace in overview.traces}
+    assert {("identified curve", "solid"), ("extrapolated", "dot"), ("active before", "dash")} <= kinds
+    assert {trace.get("xaxis", "x") for trace in overview.spec()["data"]} == {"x", "x2"}
+
+
 def test_the_loops_tell_apart_what_lies_in_the_windows(history: ProfileStore) -> None:
     page = pages(history)["calibration"]
     (loops,) = [
@@ -222,7 +240,7 @@ def test_the_loops_tell_apart_what_lies_in_the_windows(history: ProfileStore) ->
     ]
     outside, inside, _ = loops.traces
     top = np.degrees(2.0)
-    assert inside["name"] == "inside the windows" and len(outside["x"]) > 1000 and len(inside["x"]) > 1000
+    assert inside["name"] == "inside the windows" and len(outside["x"]) > 200 and len(inside["x"]) > 200
     # Four cycles of V = 2 rad/s and c = 0.8: the windows of the slowest begin at 0.8 / 4 of V.
     assert 0.2 * top <= min(abs(v) for v in inside["x"]) < 0.21 * top
     assert max(abs(v) for v in outside["x"]) < 0.8 * top
