@@ -307,6 +307,21 @@ def controller_demand(
     return _integrated(direct, controller.ki_nm_per_rad_s * step_s * error, controller.torque_limit_nm, integral_nm)
 
 
+def demand_parts(controller: Controller, position_rad: Array, command_rad: Array, step_s: float) -> Array:
+    """Proportional, integral and derivative part of the demand, (n, 3); the integral from 0, the limit left out."""
+    parts = []
+    for gain in ("kp_nm_per_rad", "ki_nm_per_rad_s", "kd_nm_s_per_rad"):
+        others = {"kp_nm_per_rad": 0.0, "ki_nm_per_rad_s": 0.0, "kd_nm_s_per_rad": 0.0}
+        alone = replace(
+            controller,
+            torque_limit_nm=math.inf,
+            feedforward=None,
+            **{**others, gain: getattr(controller, gain)},
+        )
+        parts.append(controller_demand(alone, position_rad, command_rad, step_s))
+    return np.stack(parts, axis=1)
+
+
 @njit(cache=True)
 def _integrated(direct: Array, integral_step: Array, limit: float, start: float) -> Array:
     demand = np.empty_like(direct)

@@ -43,6 +43,14 @@ all on the joint side of the gear. *Off* is the value at which an effect vanishe
 This page is generated from `frictid_hil/simulation/effects/`, one file each, by
 `python -m frictid_hil.simulation.catalogue docs/reference`. Adding a file there adds the effect to the simulated joint,
 to robot files, to the diagnosis and to this page.
+
+An effect of your own needs no change of the product: install a package with an entry point of the group
+`frictid_hil.effects`, named like the effect, that leads to an `Effect` as these files hold one.
+
+```toml
+[project.entry-points."frictid_hil.effects"]
+hose_pull = "my_package.hose_pull:EFFECT"
+```
 """
 
 

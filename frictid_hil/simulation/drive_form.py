@@ -8,7 +8,7 @@ composes whatever forms there are and knows none of them by name.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,12 +24,27 @@ class DriveView:
         limit_nm: torque limit that the controller knows of; infinite where it has none.
         demand_nm: the controller's replayed demand, in force from each sample on.
         torque_nm: reported.
+        parts_nm: proportional, integral and derivative part of the demand, (n, 3); empty where no law is known.
     """
 
     step_s: float
     limit_nm: float
     demand_nm: Array
     torque_nm: Array
+    parts_nm: Array = field(default_factory=lambda: np.empty((0, 3)))
+
+
+@dataclass(frozen=True, slots=True)
+class DemandForm:
+    """Columns that an effect adds to the demand itself, before the drive makes torque of it.
+
+    Attributes:
+        parameters: the effect's parameters, one for each column, each its coefficient.
+        regressors: recordings -> per recording the columns (n, k), N m per unit of coefficient.
+    """
+
+    parameters: tuple[str, ...]
+    regressors: Callable[[Sequence[DriveView]], list[Array]]
 
 
 @dataclass(frozen=True, slots=True)

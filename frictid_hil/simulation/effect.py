@@ -4,8 +4,12 @@ The **forward** form is a set of hooks: plain scalar functions that the joint's 
 of ``plant.py``. A hook names what it needs in its own signature: parameters of its effect, ``state`` and ``at`` (the
 flat state vector and the effect's first slot in it), or any quantity the stage knows (``velocity_rad_s``, ``step_s``).
 The **inverse** forms tell the diagnosis how it shows in a recording: as columns of the torque balance (``inverse``),
-between demand and reported torque (``actuation``), in reported position and velocity (``kinematic``), between command
-and position where there is nothing else (``tracking``). Nothing outside an effect's file lists it.
+as columns of the controller's demand (``demand``), between demand and reported torque (``actuation``), in reported
+position and velocity (``kinematic``), between command and position where there is nothing else (``tracking``). Nothing
+outside an effect's file lists it.
+
+An effect that is an error of a believed number names it (``belief``): inside the tolerance of that number it is a
+nuisance, beyond it a cause.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, KinematicForm
+from frictid_hil.simulation.drive_form import ActuationForm, DemandForm, KinematicForm
 from frictid_hil.simulation.inverse import InverseForm
 from frictid_hil.simulation.tracking_form import TrackingForm
 
@@ -156,6 +160,8 @@ class Effect:
         inverse: how it shows in the plant; None for effects of drive and encoder.
         actuation: how it shows between demand and reported torque, where it does.
         kinematic: how it shows in reported position and velocity, where it does.
+        demand: how it shows in the controller's own demand, where it does.
+        belief: the number of a nominal joint that it is an error of, as ``tolerance:`` names it; empty for others.
         tracking: what it makes of a command on its way to the position, where that alone may tell of it.
         parted: what tells it from effects that look like it.
         state_size: number of slots in the state vector.
@@ -172,6 +178,8 @@ class Effect:
     inverse: InverseForm | None = None
     actuation: ActuationForm | None = None
     kinematic: KinematicForm | None = None
+    demand: DemandForm | None = None
+    belief: str = ""
     tracking: TrackingForm | None = None
     parted: tuple[Parting, ...] = ()
     state_size: int = 0

@@ -29,6 +29,8 @@ _IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}
 """Stages of the simulation whose effects are joint parameters."""
 _SENSED = {"encoder", "resolution", "report_velocity", "temperature"}
 """Stages that change what is reported, not what moves."""
+_CONTROLLER = {"proportional_gain", "integral_gain", "derivative_gain"}
+"""Stages of the position loop, which is no part of the exported joint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,8 @@ def _accounts(model: JointModel, soft: bool) -> tuple[dict[str, str], dict[str, 
         stages = {hook.stage for hook in all_effects()[name].hooks} - {"settle"}
         if stages <= _IN_MJCF:
             native[name] = "joint and body parameters"
+        elif stages <= _CONTROLLER:
+            lost.append(f"{name}: it belongs to your controller; change its gains")
         elif stages <= _SENSED:
             callback[name] = "in the position that `reading_rad` returns"
             if "report_velocity" in stages or "temperature" in stages:

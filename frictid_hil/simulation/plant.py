@@ -140,6 +140,9 @@ def friction(
 ) -> tuple[float, float, float]:
     """The three parts of friction: the level that multiplies the slip spring, the rate part, and any other torque."""
     coulomb_nm = parameters[COULOMB]
+    link_kg_m2 = state[LINK_INERTIA]  # noqa: F841 - for effects, like the next two
+    acceleration_rad_s2 = state[LINK_ACCELERATION]  # noqa: F841
+    gear_ratio = parameters[GEAR_RATIO]  # noqa: F841
     level_nm = coulomb_nm
     # effects at level transform level_nm
     level_nm = max(level_nm, 0.0)
@@ -289,6 +292,12 @@ def begin(parameters: Vector, state: Vector, step_s: float) -> None:
 def control(parameters: Vector, state: Vector, commands: Vector, tick: int, mode: int, period_s: float) -> None:
     """The torque that the drive's loops demand for the coming control period."""
     limit_nm = parameters[TORQUE_LIMIT]
+    kp_nm_per_rad = parameters[KP]
+    # effects at proportional_gain transform kp_nm_per_rad
+    ki_nm_per_rad_s = parameters[KI]
+    # effects at integral_gain transform ki_nm_per_rad_s
+    kd_nm_s_per_rad = parameters[KD]
+    # effects at derivative_gain transform kd_nm_s_per_rad
     velocity_measured = state[CONTROL_VELOCITY]
     error_rad = commands[tick, POSITION_COMMAND] - state[MEASURED]
     state[SATURATED] = 0.0
@@ -297,12 +306,12 @@ def control(parameters: Vector, state: Vector, commands: Vector, tick: int, mode
         integral_step_nm = 0.0
     elif mode == VELOCITY_MODE:
         error_rad_s = commands[tick, VELOCITY_COMMAND] - velocity_measured
-        demand_nm = state[INTEGRAL] + parameters[KD] * error_rad_s
-        integral_step_nm = parameters[KP] * error_rad_s * period_s
+        demand_nm = state[INTEGRAL] + kd_nm_s_per_rad * error_rad_s
+        integral_step_nm = kp_nm_per_rad * error_rad_s * period_s
     else:
-        demand_nm = parameters[KP] * error_rad + state[INTEGRAL]
-        demand_nm += parameters[KD] * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
-        integral_step_nm = parameters[KI] * error_rad * period_s
+        demand_nm = kp_nm_per_rad * error_rad + state[INTEGRAL]
+        demand_nm += kd_nm_s_per_rad * (commands[tick, VELOCITY_COMMAND] - velocity_measured)
+        integral_step_nm = ki_nm_per_rad_s * error_rad * period_s
     demand_nm += commands[tick, TORQUE_OFFSET]
     if abs(demand_nm) > limit_nm:
         demand_nm = math.copysign(limit_nm, demand_nm)

@@ -83,6 +83,7 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    belief="current_lag_s",
     actuation=ActuationForm("time_constant_s", guesses, reported, order=40, late=True, believed_as="current_lag_s"),
     state_size=1,
 )

@@ -52,6 +52,7 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION,)),
     hooks=(Hook("encoder", encoder),),
     illustrate=illustrate,
+    belief="zero_offset_rad",
     parted=(
         Parting(
             "gravity_error",

@@ -51,6 +51,7 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
     illustrate=illustrate,
+    belief="gravity_torque_nm",
     parted=(
         Parting(
             "inertia_error",

@@ -53,6 +53,7 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.ACCELERATION, Region.FREQUENCY)),
     hooks=(Hook("inertia", inertia),),
     illustrate=illustrate,
+    belief="inertia_kg_m2",
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,

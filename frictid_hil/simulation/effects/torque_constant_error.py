@@ -59,6 +59,7 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.ACCELERATION, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft, order=10),),
     illustrate=illustrate,
+    belief="torque_constant",
     tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
     inverse=InverseForm(
         shapes=({},),

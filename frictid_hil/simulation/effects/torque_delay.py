@@ -113,6 +113,7 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    belief="torque_delay_s",
     actuation=ActuationForm("delay_s", guesses, reported, order=20, late=True, believed_as="torque_delay_s"),
     inverse=InverseForm(
         shapes=({"sample_s": 0.0},),

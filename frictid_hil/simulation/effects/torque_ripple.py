@@ -11,6 +11,22 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
+LINES = 4
+PREFIXES = ("", "second_", "third_", "fourth_")
+MOST_CYCLES = 600
+"""Highest line looked for; 300 slots times two is more than motors have."""
+MOST_ROWS = 12_000
+"""Rows that lines are looked for in; more tell no more."""
+NEIGHBOURS = 8
+"""Lines on either side that make a line's floor."""
+USUAL: tuple[Shape, ...] = tuple({"first": k} for k in (1.0, 2.0, 4.0)) + tuple(
+    {"first": a, "second": b} for a, b in ((1.0, 2.0), (2.0, 4.0), (1.0, 4.0))
+)
+"""Lines of a wave generator."""
+STANDS_OUT = 25.0
+"""Power over floor of a line worth trying: noise alone passes it at one line in 1e7 (an exponential law's median is
+0.69 of its mean); what passes is judged like every other shape."""
+
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
@@ -24,13 +40,21 @@ def shaft(
     second_amplitude_nm: float,
     second_cycles_per_motor_revolution: float,
     second_phase_rad: float,
+    third_amplitude_nm: float,
+    third_cycles_per_motor_revolution: float,
+    third_phase_rad: float,
+    fourth_amplitude_nm: float,
+    fourth_cycles_per_motor_revolution: float,
+    fourth_phase_rad: float,
 ) -> float:
     """What is left of the motor's torque after the ripple has taken its part."""
-    if amplitude_nm == 0.0 and second_amplitude_nm == 0.0:
+    if amplitude_nm == 0.0 and second_amplitude_nm == 0.0 and third_amplitude_nm == 0.0 and fourth_amplitude_nm == 0.0:
         return torque_nm
     motor_rad = gear_ratio * position_rad
     ripple_nm = amplitude_nm * math.cos(cycles_per_motor_revolution * motor_rad + phase_rad)
     ripple_nm += second_amplitude_nm * math.cos(second_cycles_per_motor_revolution * motor_rad + second_phase_rad)
+    ripple_nm += third_amplitude_nm * math.cos(third_cycles_per_motor_revolution * motor_rad + third_phase_rad)
+    ripple_nm += fourth_amplitude_nm * math.cos(fourth_cycles_per_motor_revolution * motor_rad + fourth_phase_rad)
     return torque_nm - ripple_nm
 
 
@@ -47,15 +71,74 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
 
 
 def ripples(shape: Shape, coefficients: Array) -> dict[str, float]:
-    """Amplitudes and phases of the one or two lines."""
+    """Amplitudes and phases of the lines."""
     found: dict[str, float] = {}
     for index, cycles in enumerate(shape.values()):
         cos, sin = float(coefficients[2 * index]), float(coefficients[2 * index + 1])
-        prefix = "second_" if index else ""
+        prefix = PREFIXES[index]
         found[f"{prefix}amplitude_nm"] = math.hypot(cos, sin)
         found[f"{prefix}cycles_per_motor_revolution"] = cycles
         found[f"{prefix}phase_rad"] = math.atan2(-sin, cos)
     return found
+
+
+def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
+    """The usual lines of a gear, and the lines that stand out of these recordings: one, two, three, four of them."""
+    strongest = lines_seen(views)
+    seen = tuple(_shape(strongest[: k + 1]) for k in range(len(strongest)))
+    single = tuple(_shape((line,)) for line in strongest[1:])
+    return tuple({tuple(shape.values()): shape for shape in (*USUAL, *seen, *single)}.values())
+
+
+def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
+    """Whole cycles per motor revolution whose power stands out, the strongest first; at most ``LINES``.
+
+    A line is in reach where the motor turns by less than half its period from sample to sample, and where the recording
+    covers two of its periods. The floor of a line is the median power of its neighbours, which the friction of a joint
+    that moves to and fro raises too.
+    """
+    parts = [(v.gear_ratio * v.position_rad, _unexplained(v), _step_rad(v)) for v in views]
+    angle, rest, step = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    turns = float(np.ptp(angle)) / (2.0 * np.pi)
+    moving = step > 0.0
+    if turns < 1.0 or not moving.any():
+        return ()
+    highest = int(min(MOST_CYCLES, 0.8 * np.pi / max(float(np.median(step[moving])), 1e-9)))
+    orders = np.arange(max(1, math.ceil(2.0 / turns)), highest + 1)
+    if orders.size < 2 * NEIGHBOURS:
+        return ()
+    thin = max(1, angle.size // MOST_ROWS)
+    angle, rest, step = angle[::thin], rest[::thin], step[::thin]
+    power = np.empty(orders.size)
+    for k, order in enumerate(orders):
+        known = order * step < np.pi
+        power[k] = abs(np.mean(rest[known] * np.exp(-1j * order * angle[known]))) ** 2 * np.sqrt(known.mean())
+    near = [power[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1] for k in range(orders.size)]
+    ratio = power / np.maximum([np.median(part) for part in near], 1e-300)
+    best = [k for k in np.argsort(-power) if ratio[k] > STANDS_OUT][:LINES]
+    return tuple(float(orders[k]) for k in best)
+
+
+def _unexplained(v: View) -> Array:
+    """What the believed joint leaves of the torque, less what a fit of its own constants takes."""
+    motor = v.motor_inertia_kg_m2 * v.acceleration_rad_s2
+    rest = v.torque_nm - v.load_nm - motor - v.coulomb_nm * v.slip - v.rate_nm
+    columns = np.stack(
+        [np.ones_like(rest), v.slip, v.velocity_rad_s, np.cos(v.position_rad), np.sin(v.position_rad)], 1
+    )
+    fitted: Array = rest - columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
+    return fitted
+
+
+def _step_rad(v: View) -> Array:
+    """Motor travel from sample to sample; smooth, so that noise is no motion."""
+    width = max(1, round(0.02 / v.step_s))
+    travel: Array = np.abs(np.convolve(np.gradient(v.gear_ratio * v.position_rad), np.ones(width) / width, "same"))
+    return travel
+
+
+def _shape(lines: Sequence[float]) -> dict[str, float]:
+    return dict(zip(("first", "second", "third", "fourth"), lines, strict=False))
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
@@ -65,10 +148,10 @@ def illustrate(parameters: Mapping[str, float]) -> Illustration:
     """Ripple over two motor revolutions."""
     p = EFFECT.complete(parameters or EFFECT.typical)
     turns = np.linspace(0.0, 2.0, 400)
-    motor_rad = 2.0 * np.pi * turns
-    torque = p["amplitude_nm"] * np.cos(motor_rad * p["cycles_per_motor_revolution"] + p["phase_rad"])
-    second_rad = motor_rad * p["second_cycles_per_motor_revolution"] + p["second_phase_rad"]
-    torque = torque + p["second_amplitude_nm"] * np.cos(second_rad)
+    torque = np.zeros_like(turns)
+    for prefix in PREFIXES:
+        angle = 2.0 * np.pi * turns * p[f"{prefix}cycles_per_motor_revolution"] + p[f"{prefix}phase_rad"]
+        torque += p[f"{prefix}amplitude_nm"] * np.cos(angle)
     return Illustration("motor revolutions", "torque (N m)", (("ripple", turns, torque),))
 
 
@@ -77,30 +160,45 @@ EFFECT = Effect(
     summary="A torque that repeats with the motor angle.",
     documentation=(
         "Cogging, commutation and the wave generator of a harmonic drive add a torque periodic in the motor "
-        "angle: amplitude * cos(k * gear_ratio * q + phase), one line or two; k = 2 per motor "
-        "revolution is the wave generator's "
-        "own, 1 an eccentricity, 4 its overtone. The drive must deliver it, so the measured torque carries it. It "
+        "angle: amplitude * cos(k * gear_ratio * q + phase), up to four lines; k = 2 per motor "
+        "revolution is the wave generator's own, 1 an eccentricity, 4 its overtone, a motor cogs at the least common "
+        "multiple of its slots and poles. The drive must deliver it, so the measured torque carries it. It "
         "shows at slow steady speed, as a line in the spectrum over motor angle. Sources: T. D. Tuttle, W. P. "
         "Seering, 'A nonlinear model of a harmonic drive gear transmission', IEEE Trans. Robotics and Automation "
         "12(3), 1996; F. Ghorbel, P. Gandhi, F. Alpeter, 'On the kinematic error in harmonic drive gears', J. "
         "Mechanical Design 123, 2001."
     ),
     parameters=(
-        Parameter("amplitude_nm", 0.0, 50.0, 0.3, "amplitude, joint side", off=0.0),
-        Parameter("cycles_per_motor_revolution", 0.5, 64.0, 2.0, "spatial frequency k", replayed=False),
-        Parameter("phase_rad", -6.2832, 6.2832, 0.0, "phase at joint position 0"),
-        Parameter("second_amplitude_nm", 0.0, 50.0, 0.1, "amplitude of a second line, joint side", off=0.0),
-        Parameter("second_cycles_per_motor_revolution", 0.5, 64.0, 4.0, "its spatial frequency", replayed=False),
-        Parameter("second_phase_rad", -6.2832, 6.2832, 0.0, "its phase at joint position 0"),
+        *(
+            parameter
+            for prefix, which, typical_nm, cycles in (
+                ("", "", 0.3, 2.0),
+                ("second_", " of a second line", 0.1, 4.0),
+                ("third_", " of a third line", 0.0, 1.0),
+                ("fourth_", " of a fourth line", 0.0, 6.0),
+            )
+            for parameter in (
+                Parameter(f"{prefix}amplitude_nm", 0.0, 50.0, typical_nm, f"amplitude{which}, joint side", off=0.0),
+                Parameter(
+                    f"{prefix}cycles_per_motor_revolution",
+                    0.5,
+                    float(MOST_CYCLES),
+                    cycles,
+                    f"spatial frequency k{which}",
+                    replayed=False,
+                ),
+                Parameter(f"{prefix}phase_rad", -6.2832, 6.2832, 0.0, f"phase{which} at joint position 0"),
+            )
+        ),
     ),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.FREQUENCY)),
     hooks=(Hook("shaft", shaft),),
     illustrate=illustrate,
     inverse=InverseForm(
-        shapes=tuple({"first": k} for k in (1.0, 2.0, 4.0))
-        + tuple({"first": a, "second": b} for a, b in ((1.0, 2.0), (2.0, 4.0), (1.0, 4.0))),
+        shapes=USUAL,
         regressors=regressors,
         parameters=ripples,
         continuous=False,
+        shapes_for=shapes_for,
     ),
 )

@@ -110,6 +110,7 @@ EFFECT = Effect(
         Hook("settle", settle),
     ),
     illustrate=illustrate,
+    belief="velocity_filter_s",
     actuation=ActuationForm("time_constant_s", guesses, None),
     kinematic=KinematicForm("time_constant_s", read),
     state_size=1,

@@ -1,0 +1,76 @@
+"""Gains of the position loop that are not the believed ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import DemandForm, DriveView
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def proportional(kp_nm_per_rad: float, kp_error_share: float) -> float:
+    """The true proportional gain."""
+    return kp_nm_per_rad * (1.0 + kp_error_share)
+
+
+def integral(ki_nm_per_rad_s: float, ki_error_share: float) -> float:
+    """The true integral gain."""
+    return ki_nm_per_rad_s * (1.0 + ki_error_share)
+
+
+def derivative(kd_nm_s_per_rad: float, kd_error_share: float) -> float:
+    """The true gain of the velocity error."""
+    return kd_nm_s_per_rad * (1.0 + kd_error_share)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[DriveView]) -> list[Array]:
+    """The believed parts of the demand, each per share of its gain."""
+    return [v.parts_nm for v in views]
+
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Demand over tracking error of the proportional part."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    error = np.linspace(-1.0, 1.0, 3)
+    return Illustration(
+        "tracking error / its largest",
+        "demand / its largest",
+        (("believed", error, error), ("true", error, (1.0 + p["kp_error_share"]) * error)),
+    )
+
+
+EFFECT = Effect(
+    name="controller_gain_error",
+    summary="The position loop's gains are not the believed ones.",
+    documentation=(
+        "Gains are read in the drive's own units and converted by hand: kp, ki and kd are each (1 + error) times "
+        "what is believed. The replayed demand then differs from the torque reported by a share of its proportional, "
+        "integral and derivative part; the plant itself is innocent. Source: K. J. Astrom, T. Hagglund, 'Advanced "
+        "PID Control', 2006, chapter 3 (the parts of the law and the units that vendors give them in)."
+    ),
+    parameters=(
+        Parameter("kp_error_share", -0.9, 4.0, 0.1, "true over believed proportional gain, minus 1", off=0.0),
+        Parameter("ki_error_share", -0.9, 4.0, 0.1, "true over believed integral gain, minus 1", off=0.0),
+        Parameter("kd_error_share", -0.9, 4.0, 0.1, "true over believed derivative gain, minus 1", off=0.0),
+    ),
+    signature=Signature((Channel.ACTUATION,), (Region.ACTUATION,)),
+    hooks=(
+        Hook("proportional_gain", proportional),
+        Hook("integral_gain", integral),
+        Hook("derivative_gain", derivative),
+    ),
+    illustrate=illustrate,
+    belief="controller_gains",
+    demand=DemandForm(("kp_error_share", "ki_error_share", "kd_error_share"), regressors),
+)

@@ -1,0 +1,75 @@
+"""A friction curve that is believed too low or too high as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
+from frictid_hil.simulation.inverse import InverseForm, Shape, View
+
+# -- forward: what the joint does ---------------------------------------------------------------------------------
+
+
+def level(level_nm: float, coulomb_nm: float, error_share: float) -> float:
+    """The level that multiplies the slip spring."""
+    return level_nm + error_share * coulomb_nm
+
+
+def rate(rate_nm: float, error_share: float) -> float:
+    """What depends on speed."""
+    return rate_nm * (1.0 + error_share)
+
+
+# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
+
+
+def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
+    """The whole believed friction, per share."""
+    return [np.stack([v.coulomb_nm * v.slip + v.rate_nm], axis=1) for v in views]
+
+
+# -- the effect ---------------------------------------------------------------------------------------------------
+
+
+def illustrate(parameters: Mapping[str, float]) -> Illustration:
+    """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
+    p = EFFECT.complete(parameters or EFFECT.typical)
+    velocity = np.linspace(0.01, 1.0, 100)
+    believed = 1.0 + velocity
+    return Illustration(
+        "velocity (rad/s)",
+        "friction / Coulomb level",
+        (("believed", velocity, believed), ("true", velocity, (1.0 + p["error_share"]) * believed)),
+    )
+
+
+EFFECT = Effect(
+    name="friction_level_error",
+    summary="Friction as a whole is larger or smaller than believed.",
+    documentation=(
+        "Friction is (1 + error) times the believed curve, its level F_0 and its part phi_0(v) alike: another sample "
+        "of the joint, another day, another lubricant fill. It shows wherever the joint moves, in both directions and "
+        "at every speed; a torque constant that is off shows in gravity and inertia too. Source: A. C. Bittencourt, S. "
+        "Gunnarsson, 'Static friction in a robot joint - modeling and identification of load and temperature "
+        "effects', J. Dyn. Syst. Meas. Control 134(5), 2012 (how far one joint's friction moves)."
+    ),
+    parameters=(Parameter("error_share", -0.9, 4.0, 0.1, "true over believed friction, minus 1", off=0.0),),
+    signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
+    hooks=(Hook("level", level, order=5), Hook("rate", rate, order=5)),
+    illustrate=illustrate,
+    belief="friction_torque",
+    parted=(
+        Parting(
+            "torque_constant_error", "sines_payload", "a known load shows a wrong torque constant, not friction", 12.0
+        ),
+        Parting("viscous_error", "triangle_slow", "creeping leaves the level alone", 20.0),
+    ),
+    inverse=InverseForm(
+        shapes=({},),
+        regressors=regressors,
+        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
+    ),
+)
