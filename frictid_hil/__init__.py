@@ -1,3 +1,8 @@
 """Identify, compensate and explain the friction of a robot joint on a CAN or serial bus."""
 
-__version__ = "0.1.0"
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("frictid-hil")
+except PackageNotFoundError:  # run from a checkout that was never installed
+    __version__ = "0+unknown"
