@@ -172,8 +172,8 @@ def test_every_command_and_frame_of_the_code_is_on_the_page() -> None:
         assert re.search(rf"\| {flag.value} \|", text)
 
 
-def test_every_option_and_fault_is_on_the_users_page() -> None:
-    text = (PAGE.parents[1] / "guides" / "motoman.md").read_text()
+def test_every_option_and_fault_is_on_the_page_of_settings() -> None:
+    text = (PAGE.parent / "serial-settings.md").read_text()
     for name in [*OCCASIONS, *EMULATOR_OPTIONS, *(entry.name for entry in fields(SerialOptions))]:
         assert f"`{name}`" in text, name
 
