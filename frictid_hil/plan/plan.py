@@ -296,6 +296,7 @@ class JointPlan:
         peak_velocity_rad_s: largest commanded speed of all motions.
         predicted_torque_nm: largest torque expected, by the best model at hand (0 where none is).
         travel_rad: (lowest, highest) commanded position.
+        max_deceleration_rad_s2: highest of a stop on request: what its torque allows, or what the plan asks for itself.
     """
 
     joint: str
@@ -304,6 +305,7 @@ class JointPlan:
     peak_velocity_rad_s: float = 0.0
     predicted_torque_nm: float = 0.0
     travel_rad: tuple[float, float] = (0.0, 0.0)
+    max_deceleration_rad_s2: float = math.inf
 
     @property
     def duration_s(self) -> float:
@@ -363,6 +365,7 @@ def described(plan: Plan) -> dict[str, Any]:
                 "travel_rad": list(joint.travel_rad),
                 "peak_velocity_rad_s": joint.peak_velocity_rad_s,
                 "predicted_torque_nm": joint.predicted_torque_nm or None,
+                "max_deceleration_rad_s2": joint.max_deceleration_rad_s2,
                 "locked_rad": dict(joint.locked),
                 "motions": [
                     {"name": motion.name, "duration_s": motion.duration_s, **motion.details()}
@@ -400,6 +403,10 @@ class Expected:
 
 _ENDLESS_S = 10.0
 """As much of an endless motion is looked at."""
+_CORNER_S = 0.1
+"""A motion of straight lines only is stopped within this, where nothing is known of the joint's torque."""
+_STOPPING_TORQUE = 0.8
+"""Share of a joint's maximum torque that a stop may ask for."""
 
 
 def joint_plan(
@@ -426,7 +433,23 @@ def joint_plan(
     if expected is not None:
         torque_nm = expected.inertia_kg_m2 * peak_rad_s2 + abs(expected.gravity_nm) + abs(expected.friction_nm)
         torque_nm += coupling_nm
-    return JointPlan(joint.name, tuple(motions), dict(locked), peak_rad_s, torque_nm, travel)
+    return JointPlan(
+        joint.name,
+        tuple(motions),
+        dict(locked),
+        peak_rad_s,
+        torque_nm,
+        travel,
+        max(peak_rad_s2 or peak_rad_s / _CORNER_S, _torque_deceleration_rad_s2(joint, expected, coupling_nm)),
+    )
+
+
+def _torque_deceleration_rad_s2(joint: JointSetup, expected: Expected | None, coupling_nm: float) -> float:
+    """What torque and inertia allow beside the weight; friction, which helps, is not counted on."""
+    if expected is None or expected.inertia_kg_m2 <= 0.0:
+        return 0.0
+    left_nm = _STOPPING_TORQUE * joint.max_torque_nm - abs(expected.gravity_nm) - coupling_nm
+    return max(0.0, left_nm) / expected.inertia_kg_m2
 
 
 def coupling_bound_nm(joint: str, motions: Mapping[str, Sequence[Motion]], expected: Mapping[str, Expected]) -> float:

@@ -365,7 +365,10 @@ class Driver(Protocol):
         ...
 
     def close(self) -> None:
-        """Bring everything to rest and release the bus; safe to call twice and after errors."""
+        """Bring everything to rest and release the bus; safe to call twice and after errors.
+
+        Joints whose power was not seen to go off are named afterwards by ``may_be_powered``, where a driver can tell.
+        """
         ...
 
 

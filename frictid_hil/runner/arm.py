@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 
-from frictid_hil.errors import FrictidError, SafetyAbort
+from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Move
 from frictid_hil.plan.setup import JointSetup
@@ -19,6 +19,8 @@ from frictid_hil.runner.supervisor import Supervisor
 
 _POWER_TIMEOUT_S = 3.0
 _STANDSTILL_S = 0.2
+_STOPPING_S = 0.3
+_DISABLING_S = 0.1
 
 
 class Arm:
@@ -59,6 +61,7 @@ class Arm:
         Raises:
             SafetyAbort: a joint does not take it.
         """
+        self._settling()
         for joint in self._joints:
             self._driver.enable(joint.name, Mode.POSITION)
         self._loop.wait_for(
@@ -75,6 +78,7 @@ class Arm:
                 )
         # The bumpless set-point is where the drive stood when it was enabled.
         self._aim_where_it_stands()
+        self._settling()
 
     def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
         """Every other joint at its planned place, locked there; and all of them seen to stand.
@@ -87,14 +91,17 @@ class Arm:
             target_rad = planned_rad.get(joint.name)
             here_rad = self._loop.set_points[index].position_rad
             if index not in moving and target_rad is not None and abs(target_rad - here_rad) > AT_RAD:
-                self._lock([index])
+                self._supervisor.watch(index, Mode.POSITION, self._lock([index]))
                 approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
                 stream(self._loop, index, approach)
-        self._lock(moving)
+        locked_at = self._lock(moving)
+        self._settling()
         self._see_standstill()
+        self._supervisor.watch(list(moving), Mode.POSITION, locked_at)
 
     def power_off(self) -> None:
         """Power off on every joint, and seen to be."""
+        self._settling()
         for joint in self._joints:
             self._driver.unlock(joint.name)
             self._driver.disable(joint.name)
@@ -109,11 +116,11 @@ class Arm:
         loop = self._loop
         self._driver.quick_stop()
         try:
-            loop.settle(round(0.3 / loop.period_s))
+            loop.settle(_STOPPING_S)
             for joint in self._joints:
                 self._driver.disable(joint.name)
-            loop.settle(round(0.1 / loop.period_s))
-        except FrictidError:
+            loop.settle(_DISABLING_S)
+        except Exception:  # whatever it is, it is not what the person must hear of
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
             self._driver.quick_stop()
 
@@ -134,7 +141,13 @@ class Arm:
         )
         self._supervisor.arm_interlock(self._loop.feedback)
 
-    def _lock(self, moving: Collection[int]) -> None:
+    def _settling(self) -> None:
+        """All joints stand near their set-points, whether or not they have power yet."""
+        at_rad = {index: set_point.position_rad for index, set_point in enumerate(self._loop.set_points)}
+        self._supervisor.watch(None, Mode.POSITION, {}, at_rad)
+
+    def _lock(self, moving: Collection[int]) -> dict[int, float]:
+        """Lock the others; where each of them is locked."""
         locked_at: dict[int, float] = {}
         for index, joint in enumerate(self._joints):
             if index in moving:
@@ -142,7 +155,7 @@ class Arm:
             else:
                 self._driver.lock(joint.name)
                 locked_at[index] = self._loop.set_points[index].position_rad
-        self._supervisor.watch(list(moving), Mode.POSITION, locked_at)
+        return locked_at
 
     def _see_standstill(self) -> None:
         loop, care = self._loop, self._care

@@ -204,8 +204,15 @@ class BatchRunner:
         self._supervisor.watch(index, Mode.POSITION, {})
         report = Feedback(state=JointState.ENABLED, mode=Mode.POSITION, valid=True)
         reports, set_points = [report for _ in self._names], [SetPoint() for _ in self._names]
-        for position, velocity, torque, command in zip(*_rows(columns), strict=True):
-            report.position_rad, report.velocity_rad_s, report.torque_nm = position, velocity, torque
+        for time_ns, position, velocity, torque, command in zip(
+            columns["time_ns"].tolist(), *_rows(columns), strict=True
+        ):
+            report.t_ns, report.position_rad, report.velocity_rad_s, report.torque_nm = (
+                time_ns,
+                position,
+                velocity,
+                torque,
+            )
             report.position_command_rad = command
             self._supervisor.check(set_points, reports)
 

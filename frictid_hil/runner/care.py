@@ -26,6 +26,8 @@ class Care:
         approach_rad_s: speed of moves to locked and start positions.
         still_rad: how far a joint may be from where it was locked.
         still_rad_s: speed below which a joint stands.
+        settling_rad: how far a joint may be from its place while power comes on, or before it is seen to stand.
+        settling_rad_s: its speed meanwhile.
         following_error_rad: bound on the following error, beyond what the driver's own delay makes at full speed.
         velocity_margin: measured speed may exceed the planned peak by this factor ...
         velocity_slack_rad_s: ... plus this.
@@ -40,6 +42,8 @@ class Care:
     approach_rad_s: float = math.radians(20.0)
     still_rad: float = math.radians(0.25)
     still_rad_s: float = math.radians(0.5)
+    settling_rad: float = math.radians(1.0)
+    settling_rad_s: float = math.radians(15.0)
     following_error_rad: float = math.radians(5.0)
     velocity_margin: float = 1.25
     velocity_slack_rad_s: float = math.radians(10.0)
@@ -57,13 +61,12 @@ class Care:
         """How far a joint may be from its set-point while it stands."""
         return self.still_rad + self.droop_rad.get(joint, 0.0)
 
-    def limits(self, joint: JointSetup, plan: JointPlan, cycle_hz: float, command_delay_s: float) -> JointLimits:
+    def limits(self, joint: JointSetup, plan: JointPlan, command_delay_s: float) -> JointLimits:
         """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
 
         Args:
             joint: of the robot.
             plan: that runs.
-            cycle_hz: rate of the reports.
             command_delay_s: from set-point to motion, normal for this driver.
         """
         low, high = joint.position_min_rad, joint.position_max_rad
@@ -82,5 +85,7 @@ class Care:
             + plan.peak_velocity_rad_s * command_delay_s
             + self.droop_rad.get(joint.name, 0.0),
             still_rad=self.still_of(joint.name),
-            max_age_cycles=max(3, math.ceil(self.silence_s * cycle_hz)),
+            settling_rad=self.settling_rad + self.droop_rad.get(joint.name, 0.0),
+            settling_rad_s=self.settling_rad_s,
+            silence_s=self.silence_s,
         )

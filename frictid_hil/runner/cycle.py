@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
 from frictid_hil.errors import Interrupted, SafetyAbort
 from frictid_hil.protocol.driver import Driver, Feedback, SetPoint
 from frictid_hil.runner.ring import Ring
+from frictid_hil.runner.stopping import cycles_ahead, stopping_path
 from frictid_hil.runner.supervisor import Supervisor
 
 NOTHING_ASKED, DECELERATE, QUICK_STOP = 0, 1, 2
+GO_ON = "continue with `--resume RUN`, or start again"
 
 
 class StopRequest(Protocol):
@@ -102,6 +104,7 @@ class CyclicLoop:
         cycle_hz: rate.
         stop: read once per cycle.
         joints: how many the driver has.
+        most_rad_s2: highest deceleration of a stop on request, by index of the joint; others may have any.
         offset_ns: added to run time, so that it goes on from one stretch of cyclic traffic to the next.
         pump: called every ``PUMP_CYCLES`` cycles where files are written by this same process (lock-step).
     """
@@ -117,6 +120,7 @@ class CyclicLoop:
         stop: StopRequest,
         *,
         joints: int,
+        most_rad_s2: Mapping[int, float] | None = None,
         offset_ns: int = 0,
         pump: Callable[[], None] | None = None,
     ) -> None:
@@ -126,6 +130,7 @@ class CyclicLoop:
         self._period_ns = round(1e9 / cycle_hz)
         self._stop = stop
         self._pump = pump
+        self._most_rad_s2 = most_rad_s2 or {}
         self._offset_ns = offset_ns
         self._deadline_ns = driver.clock.now_ns() + self._period_ns
         self.set_points = [SetPoint() for _ in range(joints)]
@@ -215,13 +220,8 @@ class CyclicLoop:
         moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
         previous_rad = [set_point.position_rad for _, _, set_point in moving]
         while True:
-            level = self._stop.level
-            if level:
-                steps = {
-                    joint: set_point.position_rad - before
-                    for (joint, _, set_point), before in zip(moving, previous_rad, strict=True)
-                }
-                self._end_early(steps, level, ending)
+            if self._stop.level:
+                self._end_early(moving, previous_rad, ending)
             for k, (joint, source, set_point) in enumerate(moving):
                 previous_rad[k] = set_point.position_rad
                 if not source.update(self.feedback[joint], set_point):
@@ -229,6 +229,26 @@ class CyclicLoop:
             feedback = self.cycle()
             self.count.streamed += 1
             self.count.limited += any(feedback[joint].limited for joint in sources)
+
+    def hold(self, cycles: int) -> None:
+        """Cycle with unchanged set-points.
+
+        Raises:
+            SafetyAbort: by the supervisor.
+            Interrupted: asked to stop.
+        """
+        for _ in range(cycles):
+            self.go_on()
+            self.cycle()
+
+    def go_on(self) -> None:
+        """Nothing, unless a stop was asked for.
+
+        Raises:
+            Interrupted: it was.
+        """
+        if self._stop.level:
+            raise Interrupted("stopped on request", next_step=GO_ON)
 
     def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
         """Keep cycling with unchanged set-points until ``done(feedback)``.
@@ -238,36 +258,52 @@ class CyclicLoop:
             Interrupted: asked to stop.
         """
         for _ in range(max(1, round(timeout_s / self.period_s))):
-            if self._stop.level:
-                raise Interrupted("stopped on request before the motion began")
-            feedback = self.cycle(supervised=False)
-            self._supervisor.check_interlock(feedback)
-            if done(feedback):
+            self.go_on()
+            if done(self.cycle()):
                 return
         raise SafetyAbort(f"{what} not seen within {timeout_s:g} s", next_step="run `frictid-hil check`")
 
-    def settle(self, cycles: int) -> None:
+    def settle(self, duration_s: float) -> None:
         """Cycle with unchanged set-points, unsupervised and uninterruptible (used while ending)."""
-        for _ in range(cycles):
+        for _ in range(max(1, round(duration_s / self.period_s))):
             self.cycle(supervised=False)
 
-    def _end_early(self, steps_rad: Mapping[int, float], level: int, ending: SetPointSource | None) -> None:
-        """Bring the commanded positions to rest at constant deceleration within a tenth of a second."""
+    def _end_early(
+        self,
+        moving: Sequence[tuple[int, SetPointSource, SetPoint]],
+        previous_rad: Sequence[float],
+        ending: SetPointSource | None,
+    ) -> NoReturn:
+        """Bring the commanded positions to rest along their planned path, unless a quick stop is asked for."""
         if ending is not None:
-            (joint,) = steps_rad
-            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], self.set_points[joint]):
+            ((joint, _, set_point),) = moving
+            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], set_point):
                 self.cycle()
-        elif level < QUICK_STOP and any(steps_rad.values()):
-            steps = max(2, round(0.1 / self.period_s))
-            for k in range(steps):
+        else:
+            for row in self._stopping_path(moving, previous_rad):
                 if self._stop.level >= QUICK_STOP:
                     break
-                for joint, step_rad in steps_rad.items():
-                    slower_rad = step_rad * (1.0 - (k + 1) / steps)
-                    self.set_points[joint].position_rad += slower_rad
-                    self.set_points[joint].velocity_rad_s = slower_rad / self.period_s
+                for (_, _, set_point), position_rad in zip(moving, row, strict=True):
+                    set_point.velocity_rad_s = (position_rad - set_point.position_rad) / self.period_s
+                    set_point.position_rad = position_rad
                 self.cycle()
-        raise Interrupted(
-            "stopped on request; the joint was brought to rest",
-            next_step="continue with `--resume RUN`, or start again",
-        )
+        raise Interrupted("stopped on request; the joint was brought to rest", next_step=GO_ON)
+
+    def _stopping_path(
+        self, moving: Sequence[tuple[int, SetPointSource, SetPoint]], previous_rad: Sequence[float]
+    ) -> list[list[float]]:
+        """Set-points of the stop; none where only a quick stop is fast enough."""
+        path = [list(previous_rad), [set_point.position_rad for _, _, set_point in moving]]
+        if path[0] == path[1]:
+            return []
+        scratch = SetPoint()
+        for _ in range(cycles_ahead(self.period_s)):
+            row = list(path[-1])
+            for k, (joint, source, _) in enumerate(moving):
+                scratch.position_rad = row[k]
+                if source.update(self.feedback[joint], scratch):
+                    row[k] = scratch.position_rad
+            path.append(row)
+        most = [self._most_rad_s2.get(joint, math.inf) for joint, _, _ in moving]
+        stop = stopping_path(np.array(path), self.period_s, most)
+        return [] if stop is None else stop.tolist()

@@ -19,25 +19,29 @@ class Interlock:
         joint: whose drive reports it.
         bit: of 60FD.
         closed_when: level of the bit when the cell is closed.
-        max_age_cycles: a report older than this is as good as none.
+        silence_s: a report older than this is as good as none.
     """
 
     joint: str
     bit: int
     closed_when: int = 1
-    max_age_cycles: int = 100
+    silence_s: float = 0.1
 
-    def check(self, report: Feedback) -> None:
+    def check(self, report: Feedback, cycle_hz: float) -> None:
         """Pass one report of that joint.
+
+        Args:
+            report: of that joint.
+            cycle_hz: rate of reports.
 
         Raises:
             SafetyAbort: open, or not reported.
         """
         where = f"interlock (joint {self.joint}, input bit {self.bit})"
         inputs = report.digital_inputs
-        if inputs is None or report.digital_inputs_age_cycles > self.max_age_cycles:
+        if inputs is None or report.digital_inputs_age_cycles > self.silence_s * cycle_hz:
             raise SafetyAbort(
-                f"its input was not reported for {report.digital_inputs_age_cycles} cycles",
+                f"its input was not reported for {report.digital_inputs_age_cycles / cycle_hz:.3g} s",
                 where=where,
                 cause="the drive does not send its digital inputs (60FD), or frames are lost",
                 next_step="run `frictid-hil check`; correct `policy.unattended.interlock_input` in the robot file",

@@ -104,7 +104,7 @@ class LawRunner:
         offset_nm = set_point.torque_offset_nm
         for k in range(steps):
             set_point.torque_offset_nm = offset_nm * (1.0 - (k + 1) / steps)
-            loop.cycle()
+            loop.hold(1)
         return True
 
     def _enter(self, motion: Compensated) -> Controller:
@@ -117,7 +117,8 @@ class LawRunner:
         cycles = max(1, round(_LISTEN_S / loop.period_s))
         holding_nm = 0.0
         for _ in range(cycles):
-            torque_nm = loop.cycle()[index].torque_nm
+            loop.hold(1)
+            torque_nm = loop.feedback[index].torque_nm
             holding_nm += (torque_nm if math.isfinite(torque_nm) else 0.0) / cycles
         limit_nm = motion.law.torque_limit_nm
         set_point.torque_nm = holding_nm = min(limit_nm, max(-limit_nm, holding_nm))
@@ -129,12 +130,13 @@ class LawRunner:
             share = (k + 1) / steps
             gravity_nm = motion.law.gravity.torque_nm(loop.feedback[index].position_rad)
             set_point.torque_nm = (1.0 - share) * holding_nm + share * min(limit_nm, max(-limit_nm, gravity_nm))
-            loop.cycle()
+            loop.hold(1)
         return Controller(motion.law, loop.period_s, set_point.torque_nm)
 
     def _take_mode(self, mode: Mode) -> None:
         """Ask for a mode and cycle until the drive shows it; the set-point stays where the joint is."""
         loop, index = self._loop, self._index
+        self._supervisor.expect_mode(self._drive_mode, mode)
         self._driver.enable(self._joint.name, mode)
 
         def shown(feedback: Sequence[Feedback]) -> bool:

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
-from frictid_hil.errors import HardwareError, PlanRefused
+from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Severity
@@ -28,7 +28,7 @@ from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.batch import BatchDriver, BatchRunner
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.cycle import CyclicLoop, StopRequest
+from frictid_hil.runner.cycle import GO_ON, CyclicLoop, StopRequest
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.in_step import InStep
 from frictid_hil.runner.motions import Motions
@@ -111,6 +111,8 @@ class Scheduler:
             if not self._proceed(preflight):
                 raise PlanRefused("not confirmed; nothing has moved")
             for session, stretch in enumerate(self._plan.stretches):
+                if self._stop.level:
+                    raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
                 for run in self._run_stretch(session, stretch):
                     self._notify(run)
         finally:
@@ -166,7 +168,7 @@ class Scheduler:
         limits = [self._limits(joint, moving.get(at, plans[0])) for at, joint in enumerate(self._setup.joints)]
         box = self._setup.workspace
         watch = None if box is None else WorkspaceWatch(box, self._names, self._plan.cycle_hz)
-        supervisor = Supervisor(self._names, limits, self._care.interlock, watch)
+        supervisor = Supervisor(self._names, limits, self._plan.cycle_hz, self._care.interlock, watch)
         for index in range(len(self._names)):
             if index not in moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
@@ -180,6 +182,7 @@ class Scheduler:
             self._plan.cycle_hz,
             self._stop,
             joints=len(self._names),
+            most_rad_s2={at: plan.max_deceleration_rad_s2 for at, plan in moving.items()},
             offset_ns=self._recorder.offset_ns,
             pump=self._pump,
         )
@@ -238,7 +241,7 @@ class Scheduler:
         return run
 
     def _limits(self, joint: JointSetup, plan: JointPlan) -> JointLimits:
-        return self._care.limits(joint, plan, self._plan.cycle_hz, self._command_delay_s)
+        return self._care.limits(joint, plan, self._command_delay_s)
 
     def _make_ready(self, arm: Arm, moving: Mapping[int, JointPlan], name: str) -> None:
         """Everything seen, powered, at its planned place and still; only the joints to be moved are not locked."""

@@ -1,5 +1,8 @@
 """The supervisor: every sample passes it, and the first one that is out of bounds ends the motion.
 
+Every joint with power has one of three postures, each with bounds of its own: it settles (power comes or goes, or it
+was not yet seen to stand), it is locked, or it moves. Tolerances are times; the rate says how many cycles that is.
+
 It compares what the drives report with what the plan allows. It is a check on top of the drives' own limits and of the
 robot's emergency stop, and replaces neither.
 """
@@ -7,7 +10,7 @@ robot's emergency stop, and replaces neither.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from frictid_hil.errors import SafetyAbort
@@ -16,8 +19,12 @@ from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.protocol.error_words import told_error
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.runaway import RunawayWatch
+from frictid_hil.runner.sensor_watch import SensorWatch
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
 from frictid_hil.units import degrees, format_angle, format_torque, format_velocity
+
+_POSITION = (Mode.POSITION,)
+_WITHOUT_POWER = (JointState.DISABLED, JointState.FAULT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +35,14 @@ class JointLimits:
         position_min_rad: lowest position, a little outside the planned travel.
         position_max_rad: highest position.
         velocity_rad_s: largest measured speed.
-        torque_nm: largest measured torque; exceeding it for ``torque_cycles`` in a row trips.
+        torque_nm: largest measured torque; exceeding it for ``torque_s`` without a break trips.
         following_error_rad: largest distance between command and position (position mode only).
         still_rad: how far a locked joint may be from where it was locked.
+        settling_rad: how far a settling joint may be from its place.
+        settling_rad_s: its speed.
         power_w: largest mechanical power, torque times speed.
-        torque_cycles: how many cycles in a row the torque may stay above its limit.
-        max_age_cycles: how many cycles a report may be old.
+        torque_s: how long the torque may stay above its limit.
+        silence_s: how old a report may be; never less than three cycles.
     """
 
     position_min_rad: float
@@ -42,9 +51,11 @@ class JointLimits:
     torque_nm: float
     following_error_rad: float = 0.1
     still_rad: float = math.radians(0.25)
+    settling_rad: float = math.radians(1.0)
+    settling_rad_s: float = math.radians(15.0)
     power_w: float = math.inf
-    torque_cycles: int = 20
-    max_age_cycles: int = 3
+    torque_s: float = 0.02
+    silence_s: float = 0.02
 
 
 class Supervisor:
@@ -53,6 +64,7 @@ class Supervisor:
     Args:
         names: joint names, order of the feedback.
         limits: one per joint, same order.
+        cycle_hz: rate of reports.
         interlock: must be closed from ``arm_interlock`` on.
         workspace: the box that the arm may not leave while a joint moves.
     """
@@ -61,36 +73,50 @@ class Supervisor:
         self,
         names: Sequence[str],
         limits: Sequence[JointLimits],
+        cycle_hz: float,
         interlock: Interlock | None = None,
         workspace: WorkspaceWatch | None = None,
     ) -> None:
         self._names = list(names)
         self._limits = list(limits)
+        self._cycle_hz = cycle_hz
         self._moving: tuple[int, ...] = ()
-        self._mode = Mode.POSITION
+        self._modes: tuple[Mode, ...] = (Mode.POSITION,)
         self._locked_at: dict[int, float] = {}
+        self._settling_at: dict[int, float] = {}
         self._torque_high = [0] * len(self._names)
-        self._max_age = [limit.max_age_cycles for limit in limits]
+        self._max_age = [max(3, math.ceil(limit.silence_s * cycle_hz)) for limit in limits]
+        self._sensors = [SensorWatch() for _ in self._names]
         self._runaway: RunawayWatch | None = None
         self._interlock = interlock
         self._interlock_armed = False
         self._workspace = workspace
 
-    def watch(self, moving: int | Sequence[int] | None, mode: Mode, locked_at: dict[int, float]) -> None:
+    def watch(
+        self,
+        moving: int | Sequence[int] | None,
+        mode: Mode,
+        locked_at: Mapping[int, float],
+        settling_at: Mapping[int, float] | None = None,
+    ) -> None:
         """Say what is allowed from now on.
 
         Args:
             moving: index of the joint that may move, several where they move together, None while all stand.
             mode: their commanded mode.
             locked_at: position of every locked joint by index, rad.
+            settling_at: where joints are that get or lose power, or come to rest, by index, rad.
         """
         self._moving = () if moving is None else (moving,) if isinstance(moving, int) else tuple(moving)
-        self._mode = mode
+        self._modes = (mode,)
         self._locked_at = dict(locked_at)
+        self._settling_at = dict(settling_at or {})
+        for index in self._moving:
+            self._sensors[index].restart()
 
-    def expect_mode(self, mode: Mode) -> None:
-        """The moving joint is in another mode from now on."""
-        self._mode = mode
+    def expect_mode(self, *modes: Mode) -> None:
+        """The moving joint is in this mode from now on; while it changes, in either of two."""
+        self._modes = modes
 
     def watch_runaway(self, watch: RunawayWatch | None) -> None:
         """The moving joint is free, held by nothing but friction, from now on; None when it no longer is."""
@@ -112,7 +138,7 @@ class Supervisor:
             SafetyAbort: the interlock is open, or its input was not reported for too long.
         """
         if self._interlock is not None and self._interlock_armed:
-            self._interlock.check(feedback[self._names.index(self._interlock.joint)])
+            self._interlock.check(feedback[self._names.index(self._interlock.joint)], self._cycle_hz)
 
     def set_limits(self, joint: int, limits: JointLimits) -> None:
         """Replace one joint's bounds (rehearsal is watched more closely)."""
@@ -121,7 +147,7 @@ class Supervisor:
 
     def set_report_interval(self, joint: int, cycles: int) -> None:
         """A joint that reports every ``cycles`` cycles may be three times as old."""
-        self._max_age[joint] = max(self._limits[joint].max_age_cycles, 3 * cycles)
+        self._max_age[joint] = max(self._max_age[joint], 3 * cycles)
 
     def check(self, set_points: Sequence[SetPoint], feedback: Sequence[Feedback]) -> None:
         """Pass one cycle's feedback.
@@ -132,6 +158,8 @@ class Supervisor:
         self.check_interlock(feedback)
         for moving in self._moving:
             self._check_moving(moving, set_points[moving], feedback[moving])
+        for index, at_rad in self._settling_at.items():
+            self._check_settling(index, at_rad, feedback[index])
         if self._workspace is not None and self._moving:
             self._workspace.check(feedback)
         for index, held_rad in self._locked_at.items():
@@ -151,14 +179,32 @@ class Supervisor:
                     next_step="check the brake and the locked position, then start again",
                 )
 
+    def _check_settling(self, index: int, at_rad: float, report: Feedback) -> None:
+        limits = self._limits[index]
+        if report.age_cycles > self._max_age[index]:
+            raise self._stale(index, report)
+        if report.state in _WITHOUT_POWER:
+            return
+        moved_rad, velocity = report.position_rad - at_rad, report.velocity_rad_s
+        if not abs(moved_rad) <= limits.settling_rad or not abs(velocity) <= limits.settling_rad_s:
+            raise self._abort(
+                index,
+                f"moves while it should stand at {degrees(at_rad):.3f} deg: {format_angle(moved_rad)} off at "
+                f"{format_velocity(velocity)} (bounds {format_angle(limits.settling_rad)} and "
+                f"{format_velocity(limits.settling_rad_s)})",
+                cause="torque or encoder have the wrong sign in the drive, or the brake opens and nothing holds",
+                next_step="check motor direction, encoder and brake in the drive before it gets power again",
+            )
+
     def _check_moving(self, index: int, set_point: SetPoint, report: Feedback) -> None:
         limits = self._limits[index]
         if report.age_cycles > self._max_age[index]:
             raise self._stale(index, report)
         if not report.valid or report.error_code or report.state is not JointState.ENABLED:
             self._check_health(index, report)
-        if report.mode is not self._mode and report.mode is not Mode.NONE:
-            raise self._abort(index, f"drive shows mode {report.mode.name}, commanded {self._mode.name}")
+        if report.mode not in self._modes and report.mode is not Mode.NONE:
+            commanded = " or ".join(mode.name for mode in self._modes)
+            raise self._abort(index, f"drive shows mode {report.mode.name}, commanded {commanded}")
         position, velocity, torque = report.position_rad, report.velocity_rad_s, report.torque_nm
         # Written so that NaN fails every comparison.
         if not limits.position_min_rad <= position <= limits.position_max_rad:
@@ -173,11 +219,11 @@ class Supervisor:
             )
         if not abs(torque) <= limits.torque_nm:
             self._torque_high[index] += 1
-            if math.isnan(torque) or self._torque_high[index] > limits.torque_cycles:
+            if math.isnan(torque) or self._torque_high[index] > limits.torque_s * self._cycle_hz:
                 raise self._abort(
                     index,
                     f"torque {format_torque(torque)} above the bound {format_torque(limits.torque_nm)} for "
-                    f"{self._torque_high[index]} cycles",
+                    f"{self._torque_high[index] / self._cycle_hz:.3g} s",
                     cause="a collision, a wrong travel, or a heavier load than planned",
                 )
         else:
@@ -194,7 +240,17 @@ class Supervisor:
                     "high a ratio R; or gravity is not what the profile says",
                     next_step="calibrate the joint again, or lower --compensation-ratio",
                 )
-        if self._mode is Mode.POSITION:
+        in_position = self._modes == _POSITION
+        if not report.age_cycles:
+            wrong = self._sensors[index].verdict(report, limits.velocity_rad_s, held=in_position)
+            if wrong:
+                raise self._abort(
+                    index,
+                    wrong,
+                    cause="an encoder that stands or jumps, a wrong gear ratio, or a drive that reports old figures",
+                    next_step="check the encoder, its cable, and what the drive knows of its gear (608F, 6091, 6092)",
+                )
+        if in_position:
             # Judged against what is in force, where the driver tells: a set-point may be due many ticks later.
             in_force = report.position_command_rad
             error = (set_point.position_rad if math.isnan(in_force) else in_force) - position

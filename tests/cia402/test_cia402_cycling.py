@@ -318,6 +318,80 @@ def test_close_survives_a_dead_bus():
     b.bus.fail = 10**9
     b.driver.close()
     assert b.bus.closed
+    assert b.driver.may_be_powered == ("0",)
+
+
+class DeafDrive(ScriptedDrive):
+    """It does not hear its PDOs any more, and perhaps no SDO either."""
+
+    deaf: tuple[int, ...] = ()
+
+    def receive(self, can_id, data):
+        return () if can_id in self.deaf else super().receive(can_id, data)
+
+
+def test_a_drive_that_misses_its_pdo_is_stopped_by_sdo_and_then_by_nmt_within_300_ms():
+    drive = DeafDrive(1)
+    b = Bench(drive).open().start()
+    b.power()
+    drive.deaf = (0x201,)
+    b.driver.quick_stop()
+    b.cycle(80)
+    assert drive.values[0x6041, 0] & 0x6F == 0x27, "deaf, indeed"
+    b.cycle(20)
+    assert drive.values[0x6041, 0] & 0x6F == 0x07, "stopped by SDO"
+    drive.values[0x6041, 0] = 0x0237  # and on again, by another master
+    sent = len(b.frames)
+    b.cycle(200)
+    assert [data.hex() for _, can_id, data, out in b.frames[sent:] if out and can_id == 0] == ["8001"]
+    assert drive.values[0x6041, 0] & 0x4F == 0x40
+
+
+def test_a_drive_that_keeps_its_power_keeps_its_watchdog_and_is_named():
+    drive = DeafDrive(1)
+    b = Bench(drive, options={"sdo_timeout_s": 0.02}).open().start()
+    b.power()
+    drive.deaf = (0x201, 0x601)
+    b.driver.close()
+    assert b.driver.may_be_powered == ("0",)
+    assert drive.values[0x1016, 1] != 0
+    assert drive.values[0x6041, 0] & 0x6F == 0x27
+
+
+@pytest.mark.parametrize("error", [OSError("network is down"), RuntimeError("driver"), ValueError("bad frame")])
+def test_whatever_a_bus_raises_in_motion_is_a_hardware_error(error):
+    b = bench(1).open().start()
+    b.power()
+
+    def broken(message, timeout=None):
+        raise error
+
+    b.bus.send = broken
+    with pytest.raises(HardwareError, match="in a row failed"):
+        b.cycle(3)
+    del b.bus.send
+    b.driver.close()
+    assert b.driver.may_be_powered == ()
+
+
+def test_an_emergency_before_the_report_of_the_same_cycle_is_seen():
+    drive = ScriptedDrive(1)
+    b = Bench(drive).open().start()
+    b.power()
+    send = b.bus.send
+
+    def announced(message, timeout=None):
+        if message.arbitration_id == 0x80:
+            b.bus.put(0x81, bytes.fromhex("1023010000000000"))
+            b.bus.put(0x81, bytes(8))
+        send(message, timeout)
+
+    b.bus.send = announced
+    (report,) = b.cycle()
+    assert report.error_code == 0x2310
+    b.bus.send = send
+    (report,) = b.cycle()
+    assert report.error_code == 0
 
 
 @pytest.mark.parametrize("call", ["exchange", "start_cycling", "enable", "set_limits", "frame_map", "identify"])

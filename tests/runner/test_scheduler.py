@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, load_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import Stream
-from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
+from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
 
@@ -29,8 +30,10 @@ ROBOT = load_robot("hp3j.yaml")
 class Stop:
     """Asks to stop once a phase has begun and some cycles of it have passed."""
 
-    def __init__(self, level: int = 0) -> None:
+    def __init__(self, level: int = 0, phase: str = "cycles", after: int = 200) -> None:
         self.wanted = level
+        self.phase = phase
+        self.after = after
         self.armed = False
         self.reads = 0
 
@@ -38,7 +41,7 @@ class Stop:
     def level(self) -> int:
         if self.armed:
             self.reads += 1
-        return self.wanted if self.reads > 200 else 0
+        return self.wanted if self.reads > self.after else 0
 
 
 def run(
@@ -49,9 +52,12 @@ def run(
     stop: Stop | None = None,
     together: bool = False,
     cycle_hz: float = 1000.0,
+    amplitude_rad: float = 6 * DEG,
+    velocity_rad_s: float = 40 * DEG,
+    tamper: Callable[[Any, str], None] = lambda driver, phase: None,
 ) -> tuple[list[Event], Rows, Driver, FrictidError | None]:
     setup = replace(ROBOT.to_setup(), cycle_hz=cycle_hz)
-    procedures = {name: Procedure(6 * DEG, 40 * DEG, cycles=2) for name in joints}
+    procedures = {name: Procedure(amplitude_rad, velocity_rad_s, cycles=2) for name in joints}
     plan: Plan = calibration_plan(ROBOT, setup, procedures, expected_of(ROBOT), rehearse=joints, together=together)
     setup = change(setup)
     stop = stop or Stop()
@@ -59,8 +65,9 @@ def run(
 
     def notify(event: Event) -> None:
         events.append(event)
-        if isinstance(event, PhaseStarted) and event.phase == "cycles":
-            stop.armed = True
+        if isinstance(event, PhaseStarted):
+            tamper(driver, event.phase)
+            stop.armed = stop.armed or event.phase == stop.phase
 
     driver = load_driver("virtual")(setup)  # type: ignore[call-arg]
     samples = sample_ring(1 << 17)
@@ -224,6 +231,47 @@ def test_care_takes_bounds_of_the_robot_file_and_droop_of_the_driver() -> None:
         ROBOT, setup, {"3": Procedure(6 * DEG, 40 * DEG, cycles=2)}, expected_of(ROBOT), rehearse=()
     )
     care = Care().of_robot(setup.care, {"3": 0.03})
-    limits = care.limits(setup.joint("3"), plan.joints[0], 1000.0, 0.0)
+    limits = care.limits(setup.joint("3"), plan.joints[0], 0.0)
     assert limits.still_rad == pytest.approx(0.04) and limits.following_error_rad == pytest.approx(0.23)
-    assert care.limits(setup.joint("2"), plan.joints[0], 1000.0, 0.0).still_rad == pytest.approx(0.01)
+    assert care.limits(setup.joint("2"), plan.joints[0], 0.0).still_rad == pytest.approx(0.01)
+
+
+MS = 1_000_000
+TRAVEL = (ROBOT.file.joints["3"].start_position_rad, ROBOT.file.joints["3"].start_position_rad + 4 * DEG)
+
+
+@pytest.mark.parametrize("after", [40, 100, 130, 170, 230, 290])
+def test_a_stop_on_request_stays_within_the_planned_travel_and_in_time(after: int) -> None:
+    """A short, fast travel: the stop has less room than a tenth of a second at full speed would take."""
+    stop = Stop(1, after=after)
+    events, rows, _, ended = run(stop=stop, amplitude_rad=4 * DEG, velocity_rad_s=100 * DEG)
+    assert isinstance(ended, Interrupted)
+    begun_ns = [event for event in events if isinstance(event, Marked)][-1].mark.end_ns
+    mine = rows[(rows["joint"] == 3) & (rows["t_ns"] >= begun_ns)]
+    commanded, measured = mine["position_command_rad"], mine["position_rad"]
+    assert TRAVEL[0] - 1e-4 <= commanded.min() and commanded.max() <= TRAVEL[1] + 1e-4
+    # The servo's own lag and overshoot, which the planned motion shows as well.
+    assert TRAVEL[0] - 0.35 * DEG <= measured.min() and measured.max() <= TRAVEL[1] + 0.35 * DEG
+    moving = np.flatnonzero(np.abs(mine["velocity_rad_s"]) > 1 * DEG)[-1]
+    assert mine["t_ns"][moving] - begun_ns < (after + 500) * MS
+
+
+def runs_away(driver: Any, phase: str) -> None:
+    """The position loop of the drive drives the joint away from its set-point as soon as it has power."""
+    if phase != "enable":
+        return
+    axis = driver._rack.servos["3"].axis
+    told = axis.command_until
+    axis.command_until = lambda end_ns: (axis._plant.measured_position_rad + 0.5, *told(end_ns)[1:])
+
+
+def test_a_joint_that_runs_away_at_power_on_is_stopped_within_50_ms_of_the_first_bad_sample() -> None:
+    _, rows, _, ended = run(tamper=runs_away)
+    assert isinstance(ended, SafetyAbort)
+    assert "joint 3" in str(ended) and "should stand" in str(ended)
+    mine = rows[rows["joint"] == 3]
+    moved = np.abs(mine["position_rad"] - mine["position_rad"][0])
+    bad = np.flatnonzero((moved > 1 * DEG) | (np.abs(mine["velocity_rad_s"]) > 15 * DEG))[0]
+    still = mine["t_ns"] > mine["t_ns"][bad] + 50 * MS
+    assert np.abs(mine["velocity_rad_s"][still]).max() < 1 * DEG
+    assert np.ptp(mine["position_rad"]) < 5 * DEG

@@ -8,7 +8,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
-LIMITS = JointLimits(-0.1, 0.5, 2.5, 100.0, following_error_rad=0.05, power_w=150.0, torque_cycles=3)
+LIMITS = JointLimits(-0.1, 0.5, 2.5, 100.0, following_error_rad=0.05, power_w=150.0, torque_s=0.003)
 
 
 def healthy(**changes: object) -> Feedback:
@@ -27,7 +27,7 @@ def healthy(**changes: object) -> Feedback:
 
 
 def supervisor() -> Supervisor:
-    watching = Supervisor(["0", "1"], [LIMITS, LIMITS])
+    watching = Supervisor(["0", "1"], [LIMITS, LIMITS], 1000.0)
     watching.watch(0, Mode.POSITION, {1: 0.0})
     return watching
 
@@ -56,7 +56,7 @@ def test_a_healthy_cycle_passes() -> None:
         ({"state": JointState.FAULT}, "fault"),
         ({"state": JointState.DISABLED}, "expected enabled"),
         ({"mode": Mode.TORQUE}, "mode TORQUE"),
-        ({"age_cycles": 4}, "no report for 4 cycles"),
+        ({"age_cycles": 21}, "no report for 21 cycles"),
         ({"valid": False}, "could not be decoded"),
         ({"position_rad": 0.1}, "following error"),
     ],
@@ -86,7 +86,7 @@ def test_torque_may_spike_but_not_stay() -> None:
         ({"position_rad": math.radians(0.3)}, "while locked"),
         ({"position_rad": math.nan}, "while locked"),
         ({"error_code": 1}, "0x0001"),
-        ({"age_cycles": 4}, "no report"),
+        ({"age_cycles": 21}, "no report"),
     ],
 )
 def test_a_locked_joint_that_moves_or_fails_ends_the_motion(changes: dict[str, object], reason: str) -> None:

@@ -28,6 +28,10 @@ from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
+_FASTER_SHARE, _FASTER_RAD_S = 1.1, 0.1
+"""A joint that is this much faster than when its quick stop began is not being stopped ..."""
+_SLOWED_SHARE = 0.95
+"""... nor is one that has lost less than the rest of this within a tenth of a second."""
 
 
 class Axis:
@@ -41,7 +45,7 @@ class Axis:
         feedback: the decoder's own object of this joint.
         max_torque_nm: no torque beyond this is commanded.
         standstill_rad_s: below this the joint stands.
-        reset_cycles: how long the drive may take to leave a fault.
+        reset_cycles: how long the drive may take to leave a fault; a quick stop is looked at five times as often.
     """
 
     def __init__(
@@ -74,6 +78,10 @@ class Axis:
         self._target_units: int | None = None
         self._held_at_rad: float | None = None
         self._emergency = (Command(primary), Command(secondary))
+        self._stop_look_cycles = max(2, reset_cycles // 5)
+        self._stop_cycles = 0
+        self._stop_from_rad_s = 0.0
+        self._power_cut = False
 
     def limit_torque(self, torque_nm: float) -> None:
         """No torque beyond this is commanded from now on."""
@@ -83,11 +91,14 @@ class Axis:
         """Ask for power in a mode; a fault that stands now is reset once."""
         self.mode = mode
         self.target = Target.ENABLED
+        self._power_cut = False
         self._reset_wanted = True
         self._steady_status = _NEVER
 
     def disable(self) -> None:
         """Ask for power off."""
+        if self.target is Target.ENABLED:
+            self._stop_cycles = 0
         self.target = Target.DISABLED
         self._reset_wanted = False
         self._steady_status = _NEVER
@@ -115,6 +126,11 @@ class Axis:
         return drive_state(self.feedback.status_raw)
 
     @property
+    def power_was_cut(self) -> bool:
+        """Its quick stop did not slow it down, so that its voltage was disabled in motion."""
+        return self._power_cut
+
+    @property
     def standing(self) -> bool:
         """The joint does not move."""
         return abs(self.feedback.velocity_rad_s) <= self._standstill_rad_s
@@ -140,6 +156,8 @@ class Axis:
             controlword = next_controlword(
                 state, self.target, standing=self.standing, may_enable=healthy and shown is mode
             )
+            if controlword == QUICK_STOP and self._runs_on():
+                controlword = DISABLE_VOLTAGE
         enabled = state is DriveState.ENABLED
         if enabled:
             self._reset_wanted = False
@@ -182,6 +200,8 @@ class Axis:
 
     def emergency(self) -> tuple[Command, Command]:
         """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
+        if self.target is Target.ENABLED:
+            self._stop_cycles = 0
         self.target = Target.STOPPED
         self._steady_status = _NEVER
         self._reset_wanted = False
@@ -192,6 +212,21 @@ class Axis:
         primary.pack()
         secondary.pack()
         return primary, secondary
+
+    def _runs_on(self) -> bool:
+        """The quick stop does not slow the joint down: only taking its power away will."""
+        if self._power_cut or self.feedback.age_cycles:
+            return self._power_cut
+        speed = abs(self.feedback.velocity_rad_s)
+        before = self._stop_from_rad_s
+        look = self._stop_cycles % self._stop_look_cycles == 0
+        if self._stop_cycles and not self.standing:
+            faster = speed > _FASTER_SHARE * before + _FASTER_RAD_S
+            self._power_cut = faster or (look and speed > _SLOWED_SHARE * before)
+        if look:
+            self._stop_from_rad_s = speed
+        self._stop_cycles += 1
+        return self._power_cut
 
     def _follow(self, position_rad: float) -> None:
         """The joint holds where power came on until its set-point moves: the runner may still know an older place."""

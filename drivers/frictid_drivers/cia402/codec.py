@@ -80,6 +80,7 @@ class _Joint:
 
     __slots__ = (
         "cyclic", "emergency", "feedback", "heartbeat_ns", "inputs", "position_at", "restarted", "taken_cycle", "told",
+        "untold",
     )  # fmt: skip
 
     def __init__(self, frames: JointFrames) -> None:
@@ -92,6 +93,7 @@ class _Joint:
         self.restarted = False
         self.told = 0
         self.emergency = 0
+        self.untold = 0
 
     def judge(self) -> None:
         """What is wrong now: an emergency that was not taken back, or 603F in the state of fault.
@@ -151,7 +153,7 @@ class Decoder:
             joint.taken_cycle = -1
             joint.heartbeat_ns = None
             joint.restarted = False
-            joint.told = joint.emergency = 0
+            joint.told = joint.emergency = joint.untold = 0
             for field in fields(Feedback):
                 setattr(joint.feedback, field.name, getattr(blank, field.name))
 
@@ -217,6 +219,11 @@ class Decoder:
                     for at, attribute, factor in report.figures:
                         setattr(feedback, attribute, values[at] * factor)
             feedback.age_cycles = cycle - joint.taken_cycle
+            if joint.untold:
+                # An emergency is shown in its row, whatever 603F or the next emergency said right after it.
+                feedback.error_code, joint.untold = joint.untold, 0
+            elif feedback.error_code:
+                joint.judge()
             if joint.inputs is not None:
                 feedback.digital_inputs_age_cycles = cycle - joint.inputs.cycle
         return self.feedback
@@ -250,6 +257,7 @@ class Decoder:
         code = int.from_bytes(data[:2], "little") if len(data) >= 2 else MALFORMED_EMERGENCY
         # Codes 00xx say that the error is gone.
         joint.emergency = code if code & 0xFF00 else 0
+        joint.untold = joint.emergency or joint.untold
         joint.judge()
         return True
 

@@ -9,6 +9,10 @@ the other kind of frame ends the run: the bus load was computed for this one, an
 
 A cycle never sends more than the layout's bus load allows for: every active joint's command, and at most one more
 frame, to whichever other joint or command changed.
+
+A stop goes out as a PDO. Where it is not seen to be followed - the drive missed its PDO, is not operational, reports
+nothing, or hears another master - it goes out again by SDO, and then after the drive's PDOs were ended by NMT; without
+waiting for any answer.
 """
 
 from __future__ import annotations
@@ -25,14 +29,22 @@ from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import BUS_OFF, CONTROLLER_STATES, controller_state, logged_id
 from frictid_drivers.cia402.settings import BusSettings
-from frictid_drivers.cia402.state import DISABLE_VOLTAGE
-from frictid_hil.errors import HardwareError, SafetyAbort
+from frictid_drivers.cia402.state import DISABLE_VOLTAGE, QUICK_STOP, DriveState, Target
+from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Clock, Feedback, FrameSink, SetPoint
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
 _WIRE_FAILURES = 3
+BUS_ERRORS = (can.CanError, OSError, RuntimeError, ValueError)
+"""What python-can's interfaces raise from send and receive, whatever their vendor's library is."""
+_INSIST_NS = 90_000_000
+"""By SDO after so long, by NMT after twice, disabled voltage after three times of it."""
+_BRAKE_NS = 400_000_000
+_UNHEARD_NS = 50_000_000
+_NO_POWER = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.READY, DriveState.FAULT)
+_NMT_PRE_OPERATIONAL = 0x80
 
 
 @dataclass(slots=True)
@@ -131,6 +143,9 @@ class Cycle:
         self._failures = 0
         self._alarmed = False
         self._controller = ""
+        self._insisted = [0] * len(self._axes)
+        self._bad_since_ns: list[int | None] = [None] * len(self._axes)
+        self._bad_ns = [0] * len(self._axes)
 
     def exchange(self, set_points: Sequence[SetPoint]) -> list[Feedback]:
         """One cycle.
@@ -160,13 +175,19 @@ class Cycle:
                 self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
                 self._send(self._heartbeat, clock.now_ns())
             self._failures = 0
-        except can.CanError as error:
+        except FrictidError:
+            raise
+        except BUS_ERRORS as error:
             self._wire_failed(error)
             if not begun:
                 # A row in which nobody was asked: every report is a cycle older.
                 decoder.begin(clock.now_ns())
         feedback = decoder.finish()
-        self._check(clock.now_ns())
+        now_ns = clock.now_ns()
+        for at, axis in enumerate(self._axes):
+            if axis.target is not Target.ENABLED:
+                self._insist(at, axis, now_ns)
+        self._check(now_ns)
         return feedback
 
     def quick_stop(self) -> None:
@@ -187,11 +208,44 @@ class Cycle:
 
     def cut_power(self) -> None:
         """Controlword 00 to all joints: the last resort where a joint would not come to rest; never raises."""
-        for axis in self._axes:
+        for at, axis in enumerate(self._axes):
             axis.primary.set("controlword", DISABLE_VOLTAGE)
             axis.primary.set("torque_offset", 0)
             self._send_whatever_happens(axis.primary.cob_id, axis.primary.pack(), fd=self._fd)
+            self._send_controlword(at, DISABLE_VOLTAGE)
         self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
+
+    def _insist(self, at: int, axis: Axis, now_ns: int) -> None:
+        """A stop or a disabled power stage that is not seen: by SDO, then without PDOs, then without voltage."""
+        report = axis.feedback
+        unheard = report.age_cycles > 0 and now_ns - report.t_ns > _UNHEARD_NS
+        stopping = axis.target is Target.STOPPED
+        followed = axis.state in _NO_POWER or (axis.state is not DriveState.ENABLED and (stopping or not axis.standing))
+        if unheard or not followed:
+            self._bad_ns[at] = now_ns
+            if self._bad_since_ns[at] is None:
+                self._bad_since_ns[at] = now_ns
+        elif now_ns - self._bad_ns[at] > _INSIST_NS:
+            # Not sooner: with another master on the bus it obeys now and then.
+            self._bad_since_ns[at] = None
+            self._insisted[at] = 0
+        since_ns = self._bad_since_ns[at]
+        # A power stage that is switched off in good order closes its brake first, which takes a while.
+        patience_ns = _INSIST_NS if stopping or unheard else _BRAKE_NS
+        if since_ns is None or report.t_ns == 0 or self._insisted[at] == 3:
+            return
+        if now_ns - since_ns < (self._insisted[at] + 1) * patience_ns:
+            return
+        self._insisted[at] += 1
+        if self._insisted[at] == 2:
+            self._send_whatever_happens(0, bytes([_NMT_PRE_OPERATIONAL, self._nodes[at]]))
+        standing = axis.standing and not unheard and not stopping
+        self._send_controlword(at, DISABLE_VOLTAGE if standing or self._insisted[at] == 3 else QUICK_STOP)
+
+    def _send_controlword(self, at: int, controlword: int) -> None:
+        """6040 by SDO; nobody waits for the answer."""
+        request = bytes([0x2B, 0x40, 0x60, 0x00, controlword, 0x00, 0x00, 0x00])
+        self._send_whatever_happens(0x600 + self._nodes[at], request)
 
     # -- sending ------------------------------------------------------------------------------------------------
 
@@ -250,7 +304,7 @@ class Cycle:
             if self._sink is not None:
                 self._sink(self._clock.now_ns(), logged_id(message), bytes(data), True)
 
-    def _wire_failed(self, error: can.CanError) -> None:
+    def _wire_failed(self, error: Exception) -> None:
         """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
         self._failures += 1
         if self._failures >= _WIRE_FAILURES:

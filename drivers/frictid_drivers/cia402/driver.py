@@ -16,15 +16,16 @@ from typing import Any
 import can
 
 from frictid_drivers.cia402 import configure, inspection
+from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import Decoder
-from frictid_drivers.cia402.cycle import Cycle
+from frictid_drivers.cia402.cycle import BUS_ERRORS, Cycle
 from frictid_drivers.cia402.fleet import NMT_PRE_OPERATIONAL, NMT_START, Fleet
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
 from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, open_bus
 from frictid_drivers.cia402.settings import read_settings
-from frictid_drivers.cia402.state import DriveState
+from frictid_drivers.cia402.state import DriveState, drive_state
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
@@ -44,7 +45,9 @@ from frictid_hil.protocol.driver import (
 _SETTLE_S = 2.0
 _RESET_S = 0.5
 _MODES = (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE)
-_WIRE_ERRORS = (FrictidError, can.CanError, OSError)
+_WIRE_ERRORS = (FrictidError, *BUS_ERRORS)
+_LAST_LOOK_S = 0.1
+"""An answer to the question whether a drive still has power may take this long."""
 
 _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.FAULT, DriveState.UNKNOWN)
 """States without motor power from which nothing more can be asked; UNKNOWN: never reported, never enabled."""
@@ -82,6 +85,7 @@ class Cia402Driver:
         self._decoder: Decoder | None = None
         self._axes: dict[str, Axis] = {}
         self._cycle: Cycle | None = None
+        self.may_be_powered: tuple[str, ...] = ()
 
     # -- reaching the drives ------------------------------------------------------------------------------------
 
@@ -240,6 +244,7 @@ class Cia402Driver:
             self._heartbeat.stop()
         self._decoder.restart()
         fleet.nmt(NMT_START)
+        self.may_be_powered = tuple(self._axes)
         restart = getattr(self.clock, "restart", None)
         if restart is not None:
             restart()
@@ -305,8 +310,8 @@ class Cia402Driver:
         """Bring every joint to standstill and power off, then end cyclic traffic.
 
         Raises:
-            SafetyAbort: a joint did not come to rest or keeps its power; its voltage was disabled and the drives are
-                pre-operational all the same.
+            SafetyAbort: a joint did not come to rest; its voltage was disabled. ``may_be_powered`` names those that
+                were not seen to obey. The drives are pre-operational all the same.
         """
         cycle = self._cycle
         if cycle is None:
@@ -319,23 +324,32 @@ class Cia402Driver:
                 cycle.cut_power()
             self._cycle = None
             self._end_operation()
-        if powered:
+            self.may_be_powered = self._seen_powered(powered)
+        cut = [name for name, axis in self._axes.items() if axis.power_was_cut or name in powered]
+        if cut:
             raise SafetyAbort(
-                f"did not come to rest and off within {_SETTLE_S:g} s",
-                where=", ".join(f"joint {name}" for name in powered),
-                next_step="press the emergency stop, then look at the drive",
+                f"did not come to rest within {_SETTLE_S:g} s; its voltage was disabled",
+                where=", ".join(f"joint {name}" for name in cut),
+                cause="the drive does not follow a quick stop: another master, a lost connection, or a joint that runs "
+                "away",
+                next_step="look at the drive before anything gets power again",
             )
 
     def close(self) -> None:
-        """Bring everything to rest and release the bus; safe to call twice and after errors."""
+        """Bring everything to rest and release the bus; safe to call twice and after errors.
+
+        A drive that was not seen without power keeps its watch over us, so that it stops by itself once we are silent;
+        ``may_be_powered`` names it.
+        """
         if self._cycle is not None:
             self.quick_stop()
             with contextlib.suppress(*_WIRE_ERRORS):
                 self.stop_cycling()
         if self._heartbeat is not None and self._fleet is not None:
-            for drive in self._fleet.drives.values():
-                with contextlib.suppress(*_WIRE_ERRORS):
-                    configure.release_watchdog(drive)
+            for name, drive in self._fleet.drives.items():
+                if name not in self.may_be_powered:
+                    with contextlib.suppress(*_WIRE_ERRORS):
+                        configure.release_watchdog(drive)
             self._heartbeat.stop()
         if self._bus is not None:
             with contextlib.suppress(*_WIRE_ERRORS):
@@ -345,6 +359,18 @@ class Cia402Driver:
         self._lock = self._bus = self._fleet = self._heartbeat = None
         self._layout = self._frame_map = self._decoder = None
         self._axes = {}
+
+    def _seen_powered(self, doubtful: Sequence[str]) -> tuple[str, ...]:
+        """Those of the joints whose drives do not say by SDO that they are without power."""
+        fleet = self._fleet
+        powered = []
+        for name in doubtful:
+            status = None
+            with contextlib.suppress(*_WIRE_ERRORS):
+                status = None if fleet is None else fleet.drives[name].asked_quickly(od.STATUSWORD, _LAST_LOOK_S)
+            if status is None or drive_state(status) not in _OFF:
+                powered.append(name)
+        return tuple(powered)
 
     # -- parts --------------------------------------------------------------------------------------------------
 

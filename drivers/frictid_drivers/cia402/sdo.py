@@ -74,6 +74,18 @@ class Drive:
                 cause="the drive's object has another type than CiA 402 gives it",
             ) from error
 
+    def asked_quickly(self, item: Object, timeout_s: float) -> int | None:
+        """Value of an object, waiting for it no longer than this.
+
+        Raises:
+            HardwareError: no answer, or refused.
+        """
+        usual_s, self._sdo.RESPONSE_TIMEOUT = self._sdo.RESPONSE_TIMEOUT, timeout_s
+        try:
+            return self.find(item)
+        finally:
+            self._sdo.RESPONSE_TIMEOUT = usual_s
+
     def find_text(self, index: int) -> str:
         """A string object, "" where the drive does not have it."""
         data = self._upload(index, 0, f"{index:04X}:00")

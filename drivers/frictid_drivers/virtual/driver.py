@@ -105,6 +105,11 @@ class VirtualDriver:
                 self._lock.release()
                 self._lock = None
 
+    @property
+    def may_be_powered(self) -> tuple[str, ...]:
+        """As ``driver.Driver``."""
+        return self._host.may_be_powered
+
     def capabilities(self) -> Capabilities:
         """What the host driver says of these drives, and whether time is theirs."""
         return replace(self._host.capabilities(), lock_step=not self._setup.realtime)

@@ -1,0 +1,92 @@
+"""Do a joint's own figures agree? Position against reported velocity, torque against the direction of motion.
+
+A frozen or jumping encoder, a velocity that stays at zero or is upside down, and a torque that is not measured any more
+pass every bound on a single figure, and would give a wrong curve, or a snap where a position loop takes over again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from frictid_hil.protocol.driver import Feedback
+from frictid_hil.units import format_angle, format_torque
+
+_WINDOW_S = 0.1
+_OFF_SHARE = 0.25
+"""Position and velocity may differ by so much of the longer way ..."""
+_OFF_S = 0.015
+"""... and by what delays and filters of the velocity make while it changes ..."""
+_OFF_RAD = math.radians(0.4)
+"""... and by rounded figures."""
+_JUMP_SHARE = 2.0
+_JUMP_RAD = math.radians(0.3)
+"""From one report to the next a joint moves no further than its highest speed lets it, twice, and this."""
+_BOTH_WAYS_RAD_S = math.radians(4.0)
+_BOTH_WAYS_RAD = math.radians(0.5)
+"""A torque has been seen in a direction once the joint moved so far at such a speed."""
+
+
+class SensorWatch:
+    """Judges one joint, report by report."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was reported: the joint stands, or another mode begins."""
+        self._rows: deque[tuple[int, float, float, float]] = deque()
+        self._integral_rad = 0.0
+        self._torque_nm = math.nan
+        self._seen_rad = [0.0, 0.0]
+
+    def verdict(self, report: Feedback, most_rad_s: float, *, held: bool) -> str:
+        """What is wrong, in a sentence; empty while all is well.
+
+        Args:
+            report: new.
+            most_rad_s: highest speed that the joint may have.
+            held: by a position loop, whose torque depends on the direction of motion.
+        """
+        t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
+        rows = self._rows
+        if not rows:
+            rows.append((t_ns, position, 0.0, velocity))
+            return ""
+        last_ns, last_rad, _, last_rad_s = rows[-1]
+        step_s = (t_ns - last_ns) * 1e-9
+        if step_s <= 0.0:
+            return ""
+        if step_s > _WINDOW_S:
+            self.restart()
+            return ""
+        jump_rad = position - last_rad
+        if not abs(jump_rad) <= _JUMP_SHARE * most_rad_s * step_s + _JUMP_RAD:
+            return f"position jumped by {format_angle(jump_rad)} within {step_s * 1e3:.3g} ms"
+        self._integral_rad += 0.5 * (velocity + last_rad_s) * step_s
+        rows.append((t_ns, position, self._integral_rad, velocity))
+        while rows[1][0] <= t_ns - _WINDOW_S * 1e9:
+            rows.popleft()
+        first_ns, first_rad, first_integral_rad, first_rad_s = rows[0]
+        if t_ns - first_ns >= 0.9e9 * _WINDOW_S:
+            went_rad, said_rad = position - first_rad, self._integral_rad - first_integral_rad
+            off_rad = abs(went_rad - said_rad)
+            changed_rad_s = max(abs(velocity - first_rad_s), abs(velocity - rows[len(rows) // 2][3]))
+            allowed_rad = _OFF_SHARE * max(abs(went_rad), abs(said_rad)) + _OFF_S * changed_rad_s + _OFF_RAD
+            if off_rad > allowed_rad:
+                return (
+                    f"position went {format_angle(went_rad)} within {_WINDOW_S:g} s, its reported velocity says "
+                    f"{format_angle(said_rad)} (may differ by {format_angle(allowed_rad)})"
+                )
+        return self._frozen(report.torque_nm, velocity, jump_rad) if held else ""
+
+    def _frozen(self, torque_nm: float, velocity_rad_s: float, step_rad: float) -> str:
+        """The very same torque in both directions: friction changes its sign, a reading that stands does not."""
+        if torque_nm != self._torque_nm:
+            self._torque_nm = torque_nm
+            self._seen_rad = [0.0, 0.0]
+        elif abs(velocity_rad_s) > _BOTH_WAYS_RAD_S:
+            self._seen_rad[velocity_rad_s < 0] += abs(step_rad)
+            if min(self._seen_rad) > _BOTH_WAYS_RAD:
+                return f"torque stands at exactly {format_torque(torque_nm)} whichever way the joint moves"
+        return ""
