@@ -7,7 +7,7 @@ import logging
 import typer
 
 from frictid_hil import __version__
-from frictid_hil.cli import calibrate, compensate, emulate, gap, jobs, profiles, replay, reports
+from frictid_hil.cli import calibrate, compensate, emulate, gap, jobs, new, profiles, replay, reports
 
 app = typer.Typer(
     name="frictid-hil",
@@ -24,6 +24,7 @@ jobs.register(app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 app.add_typer(emulate.app, name="emulate")
+app.add_typer(new.app, name="new")
 
 
 def _version(wanted: bool) -> None:

@@ -1,0 +1,204 @@
+"""``frictid-hil new robot``: a commented robot file from a few answers, and from what the drives say of themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.errors import UsageError
+from frictid_hil.files import write_whole
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import Driver, kind_of, load_driver
+
+
+@dataclass(frozen=True, slots=True)
+class JointAnswers:
+    """What a person says of one joint.
+
+    Attributes:
+        name: in the file and on every page.
+        address: node, axis or id, as the driver calls it.
+        travel_rad: lowest and highest position.
+        max_velocity_rad_s: limit of the joint.
+        max_torque_nm: limit of the joint, joint side.
+        gear_ratio: motor revolutions per joint revolution; None where the drive shall say.
+        rated_torque_nm: joint side; None where the drive shall say.
+    """
+
+    name: str
+    address: int
+    travel_rad: tuple[float, float]
+    max_velocity_rad_s: float
+    max_torque_nm: float
+    gear_ratio: float | None = None
+    rated_torque_nm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NewRobot:
+    """The file that was written, and what of it the drives said.
+
+    Attributes:
+        path: of the file.
+        read: per joint the figures that its drive gave, by key of the robot file.
+    """
+
+    path: Path
+    read: Mapping[str, Mapping[str, float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "outcome": "ok",
+            "robot_file": str(self.path.resolve()),
+            "joints": {name: {"read": dict(figures)} for name, figures in self.read.items()},
+        }
+
+
+def new_robot(
+    path: Path,
+    *,
+    driver: str,
+    bus: str,
+    joints: Sequence[JointAnswers],
+    cycle_hz: float = 1000.0,
+    read: bool = False,
+    force: bool = False,
+) -> NewRobot:
+    """Write a robot file that loads; nothing moves, and drives are only read.
+
+    Args:
+        path: of the file; the robot is named after it.
+        driver: entry-point name.
+        bus: ``interface:channel``.
+        joints: in the order of the file.
+        cycle_hz: set-points per second.
+        read: ask the drives for gear ratio and rated torque.
+        force: replace a file that is there.
+
+    Raises:
+        UsageError: the file exists, or a figure is missing that no drive gave.
+        ConfigError: the answers make no robot; every problem with its place.
+        HardwareError: the bus or a drive cannot be reached.
+    """
+    refuse_to_replace(path, force=force)
+    found = _read(path.stem, driver, bus, joints, cycle_hz) if read else {joint.name: {} for joint in joints}
+    text = _text(path.stem, driver, bus, joints, cycle_hz, found)
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        write_whole(draft, text)
+        load_robot(draft).to_setup()
+    finally:
+        draft.unlink(missing_ok=True)
+    write_whole(path, text)
+    return NewRobot(path, found)
+
+
+def refuse_to_replace(path: Path, *, force: bool) -> None:
+    """Raise ``UsageError`` where a file is there that nobody allowed to replace."""
+    if path.exists() and not force:
+        raise UsageError("the file exists", where=str(path), next_step="another name, or `--force` to replace it")
+
+
+def _read(
+    name: str, driver: str, bus: str, joints: Sequence[JointAnswers], cycle_hz: float
+) -> dict[str, dict[str, float]]:
+    """What each drive says of its gear and rated torque."""
+    setup = RobotSetup(name, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))
+    drives: Driver = load_driver(driver)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    try:
+        drives.open()
+        identities = drives.identify()
+    finally:
+        drives.close()
+    return {
+        joint: {
+            key: value
+            for key in ("gear_ratio", "rated_torque_nm")
+            if math.isfinite(value := getattr(identity, key)) and value > 0
+        }
+        for joint, identity in identities.items()
+    }
+
+
+def _provisional(joint: JointAnswers) -> JointSetup:
+    low, high = joint.travel_rad
+    return JointSetup(
+        name=joint.name,
+        address=joint.address,
+        gear_ratio=joint.gear_ratio or 1.0,
+        direction=1,
+        max_velocity_rad_s=joint.max_velocity_rad_s,
+        max_torque_nm=joint.max_torque_nm,
+        rated_torque_nm=joint.rated_torque_nm or joint.max_torque_nm,
+        position_min_rad=low,
+        position_max_rad=high,
+        start_position_rad=(low + high) / 2,
+        locked_position_rad=(low + high) / 2,
+    )
+
+
+def _text(
+    name: str,
+    driver: str,
+    bus: str,
+    joints: Sequence[JointAnswers],
+    cycle_hz: float,
+    found: Mapping[str, Mapping[str, float]],
+) -> str:
+    """The file: what was answered, what was read, and what is still to be looked at."""
+    travel = min(high - low for low, high in (joint.travel_rad for joint in joints))
+    speed = min(joint.max_velocity_rad_s for joint in joints)
+    lines = [
+        "# Written by `frictid-hil new robot`. Look at every line before the robot moves.",
+        "schema: frictid.robot/1",
+        f"name: {name}",
+        f"driver: {driver}",
+        f"bus: {bus}",
+        f"cycle_hz: {cycle_hz:g}",
+        "procedure:",
+        f"  amplitude_rad: {_degrees(min(travel / 4, math.radians(20)))}   # travel of a cycle, peak-to-peak",
+        f"  velocity_rad_s: {_degrees(0.5 * speed, '/s')}   # peak speed of the last cycle; half of the lowest limit",
+        "  cycles: 10",
+        "joints:",
+    ]
+    for joint in joints:
+        lines += _joint(joint, driver, found[joint.name], min(travel / 4, math.radians(20)))
+    return "\n".join(lines) + "\n"
+
+
+def _joint(joint: JointAnswers, driver: str, found: Mapping[str, float], amplitude_rad: float) -> list[str]:
+    low, high = joint.travel_rad
+    middle = (low + high) / 2
+    figures = []
+    for key, answered in (("gear_ratio", joint.gear_ratio), ("rated_torque_nm", joint.rated_torque_nm)):
+        value = answered if answered is not None else found.get(key)
+        if value is None:
+            raise UsageError(
+                f"joint {joint.name}: no {key}, and the drive was not asked or did not say",
+                next_step=f"`--{key.removesuffix('_nm').replace('_', '-')}`, or `--read` with the drives on",
+            )
+        source = "read from the drive" if answered is None else "as given"
+        figures.append(f"    {key}: {value:.6g}   # {source}")
+    return [
+        f'  "{joint.name}":',
+        f"    {kind_of(driver).addressed_by}: {joint.address}",
+        *figures,
+        f"    max_velocity_rad_s: {_degrees(joint.max_velocity_rad_s, '/s')}",
+        f"    max_torque_nm: {joint.max_torque_nm:.6g}   # joint side",
+        f"    position_min_rad: {_degrees(low)}",
+        f"    position_max_rad: {_degrees(high)}",
+        f"    start_position_rad: {_degrees(middle - amplitude_rad / 2)}   # the travel runs from here to here + A",
+        f"    locked_position_rad: {_degrees(middle)}   # where it stands while others move",
+        "    direction: 1   # -1 where the drive counts the other way",
+        "    # A rough guess lets the plan predict the peak torque before the first run:",
+        "    # expected: {inertia_kg_m2: 0.5, gravity_nm: 5.0, friction_nm: 5.0}",
+    ]
+
+
+def _degrees(value_rad: float, per: str = "") -> str:
+    return f"{math.degrees(value_rad):.6g}deg{per}"
