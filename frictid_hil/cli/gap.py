@@ -24,11 +24,38 @@ app = typer.Typer(
 )
 
 
+LogsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SET | LOG...", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
+    ),
+]
+ColumnsOption = Annotated[
+    str | None, typer.Option("--columns", metavar="FILE", help="Column map of a foreign logger (emps.yaml).")
+]
+JointNameOption = Annotated[
+    str | None, typer.Option("--joint", "-j", metavar="JOINT", help="The joint, where logs or profile hold several.")
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
+
+
 @app.command("diagnose")
 def diagnose(
-    experiment_set: Annotated[
-        Path, typer.Argument(metavar="SET", help="Folder with nominal.yaml and one CSV per log.")
-    ],
+    logs: LogsArgument,
+    columns: ColumnsOption = None,
+    nominal: Annotated[
+        Path | None, typer.Option("--nominal", metavar="FILE", help="What the simulator believes (nominal.yaml).")
+    ] = None,
+    profile: Annotated[
+        Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
+    ] = None,
+    joint: JointNameOption = None,
+    validation: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--validation", metavar="LOG", help="Log to judge on, by name; unless told, what was recorded last."
+        ),
+    ] = None,
     write_model: Annotated[
         Path | None, typer.Option("--write-model", metavar="FILE", help="Write the improved joint as a robot file.")
     ] = None,
@@ -44,18 +71,47 @@ def diagnose(
         bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
+    from frictid_hil.jobs.gap_diagnose import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
 
+    source = Source(logs, columns, nominal, profile, joint, validation or ())
     output = Output(as_json, quiet)
     output.run(
         "gap_diagnose",
-        lambda: job(experiment_set, write_model=write_model, mujoco=mujoco, apply=apply, out=out),
+        lambda: job(source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force),
         lambda result: _print_diagnosis(output, result),
     )
+
+
+@app.command("draft")
+def draft(
+    logs: LogsArgument,
+    columns: ColumnsOption = None,
+    joint: JointNameOption = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("nominal.yaml"),
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Draft a first nominal.yaml, with tolerances, from recordings where nothing is believed yet."""
+    from frictid_hil.jobs.gap_diagnose import Source
+    from frictid_hil.jobs.gap_diagnose import draft as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        table = Table("number", "value", "one-sigma")
+        for name, found in result["draft"]["numbers"].items():
+            table.add_row(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}")
+        output.out.print(table)
+        output.out.print(f"nominal: {result['nominal']}", soft_wrap=True, markup=False)
+
+    output.run("gap_draft", lambda: job(Source(logs, columns, joint=joint), out, force=force), show)
 
 
 @app.command("check")

@@ -209,7 +209,7 @@ class NominalFile(Open):
     drive: Drive | None = None
     encoder: Encoder | None = None
     tolerance: Tolerance | None = None
-    experiments: Annotated[tuple[Experiment, ...], BeforeValidator(as_tuple), Field(min_length=1)]
+    experiments: Annotated[tuple[Experiment, ...], BeforeValidator(as_tuple)] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,11 +225,12 @@ class NominalSet:
     document: Document
 
 
-def load_nominal(path: Path) -> NominalSet:
+def load_nominal(path: Path, *, logs: bool = True) -> NominalSet:
     """Read and check a ``nominal.yaml``.
 
     Args:
         path: of the file, or of the folder that holds it.
+        logs: it must list experiments.
 
     Raises:
         ConfigError: unreadable or wrong, every problem with file:line:column.
@@ -243,6 +244,8 @@ def load_nominal(path: Path) -> NominalSet:
     misspelt = list(_misspelt(file, ()))
     if misspelt:
         raise document.error(misspelt, at_key=[problem.path for problem in misspelt])
+    if logs and not file.experiments:
+        raise document.error([FieldProblem(("experiments",), "missing: at least one log must be listed")])
     twice = list(_named_twice(file))
     if twice:
         raise document.error(twice)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.config import nominal as config
-from frictid_hil.config.nominal import NominalFile, NominalSet, load_nominal
+from frictid_hil.config.nominal import NominalFile, load_nominal
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -218,11 +218,25 @@ class ExperimentSet:
         """
         told = load_nominal(folder / "nominal.yaml")
         logs = [(entry, read_log(_log_of(folder, entry))) for entry in sorted_by_run(told.file.experiments)]
-        return experiment_set(told, str(told.document.data.get("case", folder.name)), logs)
+        data = told.document.data
+        return experiment_set(told.file, data, str(told.document.path), str(data.get("case", folder.name)), logs)
 
 
-def experiment_set(told: NominalSet, name: str, logs: Sequence[tuple[config.Experiment, Samples]]) -> ExperimentSet:
+def experiment_set(
+    told: NominalFile,
+    data: Mapping[str, Any],
+    where: str,
+    name: str,
+    logs: Sequence[tuple[config.Experiment, Samples]],
+) -> ExperimentSet:
     """A set from a checked ``nominal.yaml`` and its recordings, in run order.
+
+    Args:
+        told: what the file says.
+        data: the same as a plain mapping, further keys included.
+        where: the file, for errors.
+        name: of the set.
+        logs: entries of the file, each with its recording.
 
     Raises:
         ConfigError: a believed number makes no sense.
@@ -233,13 +247,13 @@ def experiment_set(told: NominalSet, name: str, logs: Sequence[tuple[config.Expe
     moving = tuple(piece for piece in pieces if piece.travel_rad > REST_SHARE * longest)
     if not moving:
         raise InputFileError("column position_rad never changes", where=name, cause="a sensor or a mapping is dead")
-    nominal = _nominal(told.file, told.document.data, str(told.document.path))
+    nominal = _nominal(told, data, where)
     if nominal.inertia_kg_m2 == 0.0:
         absent = [piece.name for piece in moving if piece.rigid_body_torque_nm is None]
         if absent:
             raise ConfigError(
                 f"inertia_kg_m2 is 0, and {absent[0]} has no column rigid_body_torque_nm that would bring it",
-                where=str(told.document.path),
+                where=where,
                 next_step="give the inertia, leave it out, or add the column to every log",
             )
         nominal = replace(nominal, inertia_kg_m2=None)

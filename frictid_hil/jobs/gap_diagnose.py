@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,42 +15,116 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.jobs.gap.export_mujoco import export_mujoco
 from frictid_hil.jobs.gap.improved_robot import improved_robot
+from frictid_hil.jobs.gap.logs import set_from_logs
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.simulation.joint import JointModel
 
 
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What is diagnosed: a set's folder, or recordings with a belief; see ``set_from_logs``.
+
+    Attributes:
+        paths: one folder, or logs.
+        columns: column map of foreign logs.
+        nominal: what the simulator believes; a set's own ``nominal.yaml`` unless told.
+        profile: friction profile, whose numbers overrule it.
+        joint: its name in recordings and profile that hold several.
+        validation: logs to judge on.
+    """
+
+    paths: Sequence[Path]
+    columns: str | None = None
+    nominal: Path | None = None
+    profile: Path | None = None
+    joint: str | None = None
+    validation: Sequence[str] = ()
+
+    def load(self) -> ExperimentSet:
+        """The set.
+
+        Raises:
+            UsageError: a folder beside other paths or with options of single logs.
+            InputFileError, ConfigError: it is unusable.
+        """
+        folders = [path for path in self.paths if (path / "nominal.yaml").exists()]
+        options = (self.columns, self.nominal, self.profile, self.joint, *self.validation)
+        if not folders and len(self.paths) == 1 and self.paths[0].is_dir() and not any(options):
+            folders = list(self.paths)
+        if not folders:
+            return set_from_logs(
+                self.paths,
+                columns=self.columns,
+                nominal=self.nominal,
+                profile=self.profile,
+                joint=self.joint,
+                validation=self.validation,
+            )
+        if len(self.paths) > 1 or any(options):
+            raise UsageError(
+                "an experiment set says by itself what is believed and which logs are judged on",
+                where=str(folders[0]),
+                next_step="give the set alone, or its logs with --nominal",
+            )
+        return ExperimentSet.load(folders[0])
+
+
+def draft(source: Source, out: Path, *, force: bool = False) -> dict[str, Any]:
+    """Write a first ``nominal.yaml`` from recordings.
+
+    Raises:
+        UsageError: ``out`` exists and ``force`` is not given.
+        InputFileError: an unusable recording.
+
+    Returns:
+        The JSON of the verb.
+    """
+    _must_be_new(out, force)
+    document = drafted(source.load())
+    write_whole(out, dump(document))
+    return {"outcome": "ok", "nominal": str(out.resolve()), **document}
+
+
 def diagnose(
-    folder: Path,
+    source: Source | Path,
     *,
     write_model: Path | None = None,
     mujoco: Path | None = None,
     apply: bool = False,
     out: Path | None = None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Diagnose a set.
 
     Args:
-        folder: experiment set (``nominal.yaml`` and one CSV per log).
+        source: what is diagnosed; a path stands for the folder of an experiment set.
         write_model: robot file to write the improved joint to.
         mujoco: MJCF file to export the improved joint to; its callback script is written beside it.
         apply: write it even where the verdict does not recommend it.
         out: folder for the report page; None writes none.
+        force: write over files that are there.
 
     Raises:
         InputFileError, ConfigError: the set is unusable.
-        UsageError: the page cannot be written.
+        UsageError: the page cannot be written, or a file is there already.
 
     Returns:
         The JSON of the verb. Any verdict is a result: where a model was asked for and none is written, ``model`` is
         null and ``model_refused`` says why and what to do.
     """
-    experiments = ExperimentSet.load(folder)
+    for path in (write_model, mujoco, None if out is None else out / "gap.html"):
+        _must_be_new(path, force)
+    experiments = (Source((source,)) if isinstance(source, Path) else source).load()
     found = find_causes(experiments)
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
     del result["schema"]  # the command line's own
+    result["tolerances"] = list(experiments.nominal.tolerances.lines())
+    if experiments.at_rest:
+        result["at_rest"] = list(experiments.at_rest)
     if write_model is not None:
         refused = _why_no_model(found, apply)
         result["model"] = None if refused else str(_write_model(write_model, experiments, found, apply).resolve())
@@ -68,6 +144,11 @@ def diagnose(
         page = gap_page(found, _side_by_side(experiments, found), missing_torque(experiments))
         result["report"] = str(write_page(page, out / "gap.html").resolve())
     return result
+
+
+def _must_be_new(path: Path | None, force: bool) -> None:
+    if path is not None and path.exists() and not force:
+        raise UsageError("is there already", where=str(path), next_step="name another file, or add --force")
 
 
 def _side_by_side(experiments: ExperimentSet, found: Diagnosis) -> tuple[SideBySide, ...]:

@@ -59,7 +59,7 @@ def belief_of(
         sections = _of_model(JointModel.of(joint, joint.name), simulated_drive=simulated_drive)
         sources.append("robot file, `simulated` without its effects")
     if profile is not None:
-        sections["joint"] = {**sections["joint"], **_measured(profile)}
+        sections["joint"] = {**sections["joint"], **measured_by(profile)}
         sections["tolerance"] = stated_by(profile)
         sources.append(f"profile {profile_name}".strip())
     sections.setdefault("drive", {})["rated_torque_nm"] = joint.rated_torque_nm
@@ -132,7 +132,8 @@ def _of_model(model: JointModel, *, simulated_drive: bool) -> dict[str, Any]:
     return sections
 
 
-def _measured(profile: JointProfile) -> dict[str, Any]:
+def measured_by(profile: JointProfile) -> dict[str, Any]:
+    """``joint`` of ``nominal.yaml`` as far as a profile knows it."""
     friction: dict[str, Any] = {
         "velocity_rad_s": list(profile.velocity_rad_s),
         "torque_nm": list(profile.torque_nm),

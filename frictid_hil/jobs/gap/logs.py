@@ -1,0 +1,142 @@
+"""An experiment set without a folder: recordings as they come, a belief from a file or a profile, or none at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.config.columns import load_columns
+from frictid_hil.config.nominal import Experiment as Entry
+from frictid_hil.config.nominal import NominalFile, load_nominal
+from frictid_hil.config.profile import JointProfile, load_profile, profile_file
+from frictid_hil.errors import InputFileError, UsageError
+from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set, read_log
+from frictid_hil.gap.tolerances import stated_by
+from frictid_hil.jobs.gap.belief import measured_by
+from frictid_hil.recording.read import read
+from frictid_hil.recording.samples import Samples
+
+VALIDATION_SHARE = 1.0 / 3.0
+"""Part of the recorded time, its end, that is judged on where nobody says what to judge on."""
+
+
+def set_from_logs(
+    logs: Sequence[Path],
+    *,
+    columns: str | None = None,
+    nominal: Path | None = None,
+    profile: Path | None = None,
+    joint: str | None = None,
+    validation: Sequence[str] = (),
+) -> ExperimentSet:
+    """A set of recordings that lie anywhere.
+
+    Roles come from ``validation``, else from what ``nominal`` says of logs of the same name, else from time: the last
+    log, or the last third of a single one, is judged on.
+
+    Args:
+        logs: recordings of one joint.
+        columns: column map of a foreign logger, by path or name.
+        nominal: a ``nominal.yaml``; it need not list the logs.
+        profile: friction profile or run folder, whose numbers overrule the file's.
+        joint: its name in recordings and profile that hold several.
+        validation: names of logs (file names without ending) to judge on.
+
+    Raises:
+        UsageError: several joints and none named, or a validation log that is not there.
+        InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
+    """
+    read_logs = [(_name_of(path), _samples(path, columns, joint)) for path in logs]
+    names = [name for name, _ in read_logs]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise UsageError(f"two logs are called {twice[0]}", next_step="rename one of the files")
+    absent = [name for name in validation if name not in names]
+    if absent:
+        raise UsageError(
+            f"no log is called {absent[0]}", where="--validation", next_step=f"name of: {', '.join(names)}"
+        )
+    data, told, where = _belief(nominal, profile, joint)
+    entries = {entry.name: entry for entry in told.experiments}
+    if not validation:
+        validation = [name for name in names if name in entries and entries[name].role == "validation"]
+    if validation:
+        parts = [(name, samples, name in validation) for name, samples in read_logs]
+    else:
+        parts = _split_by_time(read_logs)
+    listed = []
+    for order, (name, samples, judged) in enumerate(parts):
+        payload = entries[name].payload if name in entries else False
+        entry = Entry(name=name, role="validation" if judged else "identification", payload=payload, run_order=order)
+        listed.append((entry, samples))
+    return experiment_set(told, data, where, logs[0].resolve().parent.name, listed)
+
+
+def _split_by_time(logs: Sequence[tuple[str, Samples]]) -> list[tuple[str, Samples, bool]]:
+    """(name, samples, judged on): the last third of one log, else the last logs that make up a quarter or more."""
+    if len(logs) == 1:
+        ((name, samples),) = logs
+        cut = samples.time_s[0] + (1.0 - VALIDATION_SHARE) * (samples.time_s[-1] - samples.time_s[0])
+        early = samples.time_s < cut
+        return [(name, samples.select(early), False), (f"{name}, last third", samples.select(~early), True)]
+    spans = [float(samples.time_s[-1] - samples.time_s[0]) for _, samples in logs]
+    after = [sum(spans[k:]) for k in range(len(spans))]
+    first = max(k for k in range(1, len(logs)) if after[k] >= 0.75 * VALIDATION_SHARE * after[0] or k == 1)
+    return [(name, samples, k >= first) for k, (name, samples) in enumerate(logs)]
+
+
+def _belief(nominal: Path | None, profile: Path | None, joint: str | None) -> tuple[dict[str, Any], NominalFile, str]:
+    """(the mapping, the same checked, where it comes from)."""
+    data: dict[str, Any] = {"joint": {}}
+    where = "no nominal joint"
+    if nominal is not None:
+        loaded = load_nominal(nominal, logs=False)
+        data, where = loaded.document.data, str(loaded.document.path)
+    if profile is not None:
+        measured = _joint_of(profile, joint)
+        numbers = measured_by(measured)
+        kept = {name: value for name, value in data["joint"].items() if name != "gravity_torque_nm"}
+        if "gravity_cos_nm" not in numbers:
+            kept = data["joint"]
+        data = {
+            **data,
+            "joint": {**kept, **numbers},
+            "tolerance": {**stated_by(measured), **(data.get("tolerance") or {})},
+        }
+        where = str(profile)
+    return data, NominalFile.model_validate(data), where
+
+
+def _joint_of(profile: Path, joint: str | None) -> JointProfile:
+    loaded = load_profile(profile_file(profile))
+    if joint is None and len(loaded.joints) == 1:
+        return next(iter(loaded.joints.values()))
+    if joint is None or joint not in loaded.joints:
+        raise UsageError(
+            f"holds joints {', '.join(loaded.joints)}", where=str(profile), next_step="name one with --joint"
+        )
+    return loaded.joints[joint]
+
+
+def _samples(path: Path, columns: str | None, joint: str | None) -> Samples:
+    if columns is None and path.name.lower().endswith((".csv", ".csv.gz")):
+        return read_log(path)
+    found = read(path, load_columns(columns) if columns is not None else None, joint)
+    if len(found) > 1:
+        raise UsageError(
+            f"holds joints {', '.join(samples.joint for samples in found)}",
+            where=str(path),
+            next_step="name one with --joint",
+        )
+    if not found:
+        raise InputFileError("no joint in this recording", where=str(path))
+    return replace(found[0], prismatic=False)  # a linear axis is diagnosed like a rotary one, m for rad, N for N m
+
+
+def _name_of(path: Path) -> str:
+    name = path.name
+    for ending in (".gz", ".csv", ".txt", ".mat", ".mcap"):
+        name = name.removesuffix(ending)
+    return name or str(path)
