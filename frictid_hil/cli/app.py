@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import logging
+import sys
+from typing import Any
 
 import typer
 
 from frictid_hil import __version__
 from frictid_hil.cli import calibrate, compensate, emulate, gap, jobs, new, profiles, replay, reports
+from frictid_hil.cli.output import Output
+from frictid_hil.errors import UsageError
 
 app = typer.Typer(
     name="frictid-hil",
@@ -25,6 +29,9 @@ app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 app.add_typer(emulate.app, name="emulate")
 app.add_typer(new.app, name="new")
+
+_WRONG_USAGE: Any = typer.BadParameter.__bases__[0]
+"""Typer's error for every option that is missing, unknown or wrong; it has no public name."""
 
 
 def _version(wanted: bool) -> None:
@@ -44,7 +51,15 @@ def main() -> None:
     """Entry point of the console script."""
     # Libraries log what we tell better as errors with cause and next step.
     logging.getLogger().addHandler(logging.NullHandler())
-    app()
+    if "--json" not in sys.argv[1:]:
+        app()
+    try:
+        sys.exit(app(standalone_mode=False))
+    except _WRONG_USAGE as error:
+        words = error.ctx.command_path.split()[1:] if error.ctx else []
+        help_of = " ".join(["frictid-hil", *words, "--help"])
+        told = UsageError(error.format_message(), next_step=f"`{help_of}`")
+        Output(as_json=True).refuse("-".join(words) or "usage", told)
 
 
 if __name__ == "__main__":

@@ -106,6 +106,13 @@ class Output:
             self._explain(error_text)
         raise typer.Exit(code)
 
+    def refuse(self, verb: str, error: FrictidError) -> NoReturn:
+        """End a command that never began, as ``run`` ends one that failed."""
+        try:
+            self._fail(verb, error)
+        except typer.Exit as ended:
+            sys.exit(ended.exit_code)
+
     def _fail(self, verb: str, error: FrictidError) -> NoReturn:
         described = describe(error)
         failure = {"schema": f"frictid.{verb}/1", "outcome": error.outcome, "error": described}

@@ -85,6 +85,23 @@ def test_a_users_mistake_is_exit_2_with_a_reason(arguments: list[str], said: str
     assert not list(tmp_path.rglob("samples*")), "nothing may have been started"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said", "schema"),
+    [
+        (("calibrate", "--json"), "Missing option '--robot'", "frictid.calibrate/1"),
+        (("calibrate", "--robot", "hp3j.yaml", "--json", "--bogus"), "No such option", "frictid.calibrate/1"),
+        (("calibrate", "--json", "-A", "3"), "has no unit", "frictid.calibrate/1"),
+        (("profile", "shwo", "--json"), "No such command", "frictid.profile/1"),
+    ],
+)
+def test_json_is_one_object_for_a_mistyped_command_too(arguments: tuple[str, ...], said: str, schema: str) -> None:
+    result = run(*arguments)
+    told = as_json(result)
+    assert (result.returncode, told["outcome"], told["schema"]) == (2, "refused", schema)
+    assert said in told["error"]["what"] and "--help" in told["error"]["next_step"]
+    assert said in result.stderr and "Traceback" not in result.stderr
+
+
 def test_a_travel_too_short_for_the_torque_is_refused_beforehand(tmp_path: Path) -> None:
     result = run("calibrate", "--robot", "hp3j", "--joint", "1", "--amplitude", "5deg", "--yes", "--json", cwd=tmp_path)
     assert result.returncode == 2
