@@ -81,7 +81,7 @@ def errors_of(robot: Mapping[str, Any], amplitude_deg: float, folder: Path) -> d
     out = folder / f"{robot['name']}-{amplitude_deg:g}"
     bus = f"virtual:{robot['name']}-{amplitude_deg:g}"
     options = CalibrateOptions(str(path), bus=bus, amplitude_rad=amplitude_deg * DEG, out=out)
-    result = calibrate(options, Silent())
+    result = calibrate(options, Silent()).to_json()
     loaded, profile = load_robot(path), load_profile(result["profile"])
     found = {}
     for name, joint in profile.joints.items():

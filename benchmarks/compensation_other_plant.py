@@ -57,7 +57,7 @@ def main() -> None:
             hand, track = (
                 compensate(
                     CompensateOptions(robot, profile, joint, wanted, out=Path(folder) / wanted.task, **common), Silent()
-                )
+                ).to_json()
                 for wanted in (Wanted("hand", ("nc", "mop")), Wanted("track", ("nc", "mop-reference")))
             )
             entry = load_profile(profile).joints[joint]

@@ -173,7 +173,7 @@ def outcome_of(effect: str, folder: Path, seed: int = SEED) -> Outcome:
     """Record, diagnose, write, simulate again."""
     folder.mkdir()
     robot = robot_with({effect: drawn(effect, seed)}, folder)
-    recorded = record(GapRecordOptions(str(robot), "0", short=True, seed=seed, out=folder / "set"), Silent())
+    recorded = record(GapRecordOptions(str(robot), "0", short=True, seed=seed, out=folder / "set"), Silent()).to_json()
     if recorded["outcome"] != "ok":
         return Outcome(effect, recorded["error"]["what"], "", (), 0.0, 1.0)
     improved = folder / "improved.yaml"

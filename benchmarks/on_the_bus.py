@@ -88,7 +88,7 @@ def plant(kind: str) -> dict[str, Any]:
 
 def calibrated(robot: Variant, out: Path, **options: Any) -> dict[str, Any]:
     """The JSON of ``calibrate`` on this robot's own virtual bus, in lock-step."""
-    return calibrate(CalibrateOptions(str(robot.path), out=out, **options), Silent())
+    return calibrate(CalibrateOptions(str(robot.path), out=out, **options), Silent()).to_json()
 
 
 def profiles(result: Mapping[str, Any]) -> dict[str, JointProfile]:

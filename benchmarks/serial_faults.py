@@ -208,7 +208,7 @@ def inject(layer: str, faults: Sequence[str], *, limit_s: float, told: Callable[
         INJECTED.append(runs)
         options = CalibrateOptions(str(robot), out=out, program="quick", joints=(JOINT,))
         try:
-            result = calibrate(options, Watch())
+            result = calibrate(options, Watch()).to_json()
         except FrictidError as refused:
             result = {"exit_code": refused.exit_code, "error": {"what": str(refused), "cause": refused.cause}}
         except Exception:  # a defect: the very thing this benchmark looks for; it counts as wrong and is told

@@ -86,7 +86,7 @@ def measure_in_virtual_time(robot: Path, joint: str, out: Path) -> bool:
 
     module: Any = run_module
     module.load_driver = lambda name: driver
-    result = calibrate(CalibrateOptions(str(robot), out=out, joints=(joint,)), Silent())
+    result = calibrate(CalibrateOptions(str(robot), out=out, joints=(joint,)), Silent()).to_json()
     entry = result["joints"][joint]
     percent = compare(out, None, str(robot))["joints"].get(joint, {}).get("e_percent_measured_range")
     shown = "-" if percent is None else f"{percent:.2f} %"

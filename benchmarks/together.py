@@ -63,7 +63,7 @@ def calibrated(robot: str, out: Path, seed: int, joints: tuple[str, ...], *, tog
         robot, bus=f"virtual:bench-{out.name}", out=out, seed=seed, joints=joints, together=together
     )
     if not (out / "profile.yaml").exists():
-        result = calibrate(options, Silent())
+        result = calibrate(options, Silent()).to_json()
         if result["outcome"] not in ("ok", "gate_failed"):
             raise SystemExit(f"{out}: {result}")
     profile: FrictionProfile = load_profile(out / "profile.yaml")

@@ -44,6 +44,10 @@ class FrictidError(Exception):
     def __str__(self) -> str:
         return f"{self.where}: {self.what}" if self.where else self.what
 
+    def to_json(self) -> dict[str, str]:
+        """The four sentences of the error."""
+        return {"what": self.what, "where": self.where, "cause": self.cause, "next_step": self.next_step}
+
     def __reduce__(self) -> tuple[object, ...]:
         # Errors cross process borders (the cyclic loop is a process of its own).
         return (_rebuild, (type(self), self.what, self.where, self.cause, self.next_step))

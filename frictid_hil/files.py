@@ -1,13 +1,44 @@
-"""Files on disk: replaced whole or not at all, and a full disk told as such."""
+"""Files on disk: replaced whole or not at all, a full disk told as such, and no name that leads out of a folder."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
-from frictid_hil.errors import FrictidError
+from frictid_hil.errors import FrictidError, UsageError
+
+PLAIN_NAME = r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,63}"
+"""What may name a joint or a robot, and so a file: no separator, no leading dot."""
+
+
+def part_of_path(name: str) -> str:
+    """The name itself, where it may be part of a path.
+
+    Raises:
+        UsageError: it leads elsewhere (``../x``, ``left/elbow``), or is no plain name.
+    """
+    if re.fullmatch(PLAIN_NAME, name) is None:
+        raise UsageError(f"{name!r} cannot name a file; letters, digits, '_', '-', '.' and spaces can")
+    return name
+
+
+def refuse_overwriting(paths: Iterable[Path], *, force: bool = False) -> None:
+    """Refuse to write over what is there, before any work is done for it.
+
+    Raises:
+        UsageError: naming every file that exists, unless ``force``.
+    """
+    there = [str(path) for path in paths if path.exists()]
+    if there and not force:
+        raise UsageError(
+            "exists already, and would be overwritten",
+            where=", ".join(there),
+            next_step="choose another place, or add --force to replace it",
+        )
 
 
 def write_whole(path: Path, text: str | bytes) -> None:

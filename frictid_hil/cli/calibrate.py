@@ -31,7 +31,7 @@ from frictid_hil.cli.options import (
     one_of,
     robot_files,
 )
-from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.output import Output, Result, Told
 from frictid_hil.units import degrees, format_duration
 
 
@@ -151,7 +151,7 @@ def calibrate(
 
         output.run("calibrate", plan_only)
 
-    def run() -> Result:
+    def run() -> Told:
         with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
             return job(options, watcher)
 

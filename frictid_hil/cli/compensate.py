@@ -24,7 +24,7 @@ from frictid_hil.cli.options import (
     one_of,
     quantity,
 )
-from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.output import Output, Result, Told
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.mode import Mode
 from frictid_hil.units import degrees
@@ -156,7 +156,7 @@ def compensate(
 
         output.run("compensate", plan_only)
 
-    def run() -> Result:
+    def run() -> Told:
         with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
             return job(options(), watcher, live=watcher.note)
 

@@ -17,7 +17,7 @@ from frictid_hil.cli.options import (
     SeedOption,
     YesOption,
 )
-from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.output import Output, Result, Told
 
 app = typer.Typer(
     help="Where the simulator differs from the machine, why, and how far it closes.", no_args_is_help=True
@@ -197,7 +197,7 @@ def record(
         out=out,
     )
 
-    def run() -> Result:
+    def run() -> Told:
         try:
             return job(options, watcher)
         finally:

@@ -12,12 +12,12 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 import typer
 from rich.console import Console
 
-from frictid_hil.errors import Defect, FrictidError
+from frictid_hil.errors import Defect, FrictidError, Interrupted
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
 
@@ -30,6 +30,14 @@ NOTIFY_TIMEOUT_S = 60.0
 """A command of ``--notify`` may take this long."""
 
 Result = Mapping[str, Any]
+
+
+class Told(Protocol):
+    """A typed result."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of its verb, without the schema."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +79,19 @@ class Output:
 
         return count
 
-    def run(self, verb: str, job: Callable[[], Result], show: Callable[[Result], None] | None = None) -> NoReturn:
+    def run(
+        self, verb: str, job: Callable[[], Result | Told], show: Callable[[Result], None] | None = None
+    ) -> NoReturn:
         """Call a job, print its result, leave with its exit code.
 
         Args:
             verb: names the schema (``frictid.<verb>/1``).
-            job: returns a mapping with ``outcome``; may raise ``FrictidError``.
+            job: returns a typed result, or a mapping with ``outcome``; may raise ``FrictidError``.
             show: prints the result for a person.
         """
         try:
-            result = dict(job())
+            done = job()
+            result = dict(done) if isinstance(done, Mapping) else done.to_json()
         except FrictidError as error:
             self._fail(verb, error)
         except BrokenPipeError:
@@ -91,9 +102,7 @@ class Output:
             traceback.print_exc()
             self._fail(verb, Defect.of(error))
         except KeyboardInterrupt:
-            from frictid_hil.errors import Interrupted
-
-            self._fail(verb, Interrupted("interrupted before anything moved"))
+            self._fail(verb, Interrupted("interrupted"))
         result.setdefault("outcome", "ok")
         code = int(result.pop("exit_code", EXIT_OF_OUTCOME[str(result["outcome"])]))
         self._tell({"schema": f"frictid.{verb}/1", **result})
@@ -114,7 +123,7 @@ class Output:
             sys.exit(ended.exit_code)
 
     def _fail(self, verb: str, error: FrictidError) -> NoReturn:
-        described = describe(error)
+        described = error.to_json()
         failure = {"schema": f"frictid.{verb}/1", "outcome": error.outcome, "error": described}
         self._tell(failure)
         if self.as_json:
@@ -151,11 +160,6 @@ class Output:
             console.print(f"  likely cause: {_plain(str(error['cause']))}")
         if error.get("next_step"):
             console.print(f"  next step: {_plain(str(error['next_step']))}")
-
-
-def describe(error: FrictidError) -> dict[str, str]:
-    """The four sentences of an error, as they stand in JSON."""
-    return {"what": error.what, "where": error.where, "cause": error.cause, "next_step": error.next_step}
 
 
 def _plain(text: str) -> str:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.config.policy import WarmUp
-from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance, git_revision, utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
@@ -30,22 +30,24 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.protocol.driver import planned_quantum_s
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.events import Event, JointRun, Preflight
+from frictid_hil.runner.events import JointRun
 from frictid_hil.runner.interlock import Interlock
-from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runs.folder import kept_joints, manifest_of
+from frictid_hil.runs.life import Ended, Order, Run
+from frictid_hil.runs.options import kept_options, restored
 from frictid_hil.runs.rehearsals import Rehearsals
-from frictid_hil.runs.run import run_plan
 from frictid_hil.units import format_velocity
 
 VERB = "calibrate"
+_CONTINUED = (VERB, "recalibrate")
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrateOptions:
-    """What a person asked for; None and () mean the robot file's own.
+    """What a person asked for; what is left at its default is the robot file's own, or that of the run continued.
 
     Attributes:
-        robot: robot file, by path or name.
+        robot: robot file, by path or name; not needed with ``resume``.
         bus: ``interface:channel``.
         joints: names; all joints when empty.
         amplitude_rad: A.
@@ -53,7 +55,7 @@ class CalibrateOptions:
         cycles: N.
         ratio: c.
         method: estimator; None for the programme's.
-        program: ``thorough``, ``standard`` or ``quick``.
+        program: ``thorough``, ``standard`` or ``quick``; None for ``thorough``.
         together: all joints move at once, in phase.
         measure_skew: every joint also shakes to show by how much its torque is late; None for the robot file's choice.
         rate_hz: rate of set-points.
@@ -67,7 +69,7 @@ class CalibrateOptions:
         store: folder of the profile store, whose active profile the page compares with; None for the user's own.
     """
 
-    robot: str
+    robot: str = ""
     bus: str | None = None
     joints: tuple[str, ...] = ()
     amplitude_rad: float | None = None
@@ -75,12 +77,12 @@ class CalibrateOptions:
     cycles: int | None = None
     ratio: float | None = None
     method: str | None = None
-    program: str = "thorough"
-    together: bool = False
+    program: str | None = None
+    together: bool | None = None
     measure_skew: bool | None = None
     rate_hz: float | None = None
-    realtime: bool = False
-    seed: int = 0
+    realtime: bool | None = None
+    seed: int | None = None
     resume: Path | None = None
     out: Path | None = None
     verb: str = VERB
@@ -89,56 +91,91 @@ class CalibrateOptions:
     store: Path | None = None
 
 
-@dataclass(slots=True)
-class _Progress:
-    """What a run has come to, so that an error halfway loses nothing."""
-
-    joints: dict[str, JointProfile] = field(default_factory=dict)
-    results: dict[str, dict[str, Any]] = field(default_factory=dict)
-    ended: FrictidError | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class Planned:
     """A calibration that was checked and not yet begun.
 
     Attributes:
-        robot: its file.
-        setup: as the driver knows it.
-        plan: within every limit.
+        order: robot, folder and options.
+        plan: within every limit; without joints where the run continued has measured all.
         method: estimator.
-        resumed: the run folder to go on with.
+        options: complete.
+        kept: joints that the run continued has finished.
     """
 
-    robot: Robot
-    setup: RobotSetup
+    order: Order
     plan: Plan
     method: str
-    resumed: RunFolder | None
+    options: CalibrateOptions
+    kept: Mapping[str, tuple[JointProfile, dict[str, Any]]]
+
+    @property
+    def robot(self) -> Robot:
+        """Its file."""
+        return self.order.robot
+
+    @property
+    def setup(self) -> RobotSetup:
+        """As the driver knows it."""
+        return self.order.setup
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What a calibration came to.
+
+    Attributes:
+        ended: how the run ended.
+        joints: each joint's figures, in the order of the robot file.
+        profile: of all joints that were identified; None where none was.
+        profile_file: where it is.
+        report: page of the run.
+    """
+
+    ended: Ended
+    joints: Mapping[str, Mapping[str, Any]]
+    profile: FrictionProfile | None = None
+    profile_file: Path | None = None
+    report: Path | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the verb."""
+        return {
+            **self.ended.to_json(),
+            "profile": str(self.profile_file.resolve()) if self.profile_file else None,
+            "joints": {name: dict(joint) for name, joint in self.joints.items()},
+            **({"report": str(self.report.resolve())} if self.report else {}),
+        }
 
 
 def plan_calibration(options: CalibrateOptions) -> Planned:
     """Read the robot file and plan; opens no bus and writes nothing.
 
     Raises:
-        UsageError: refused (arguments, files, limits).
+        UsageError: refused (arguments, files, limits, options other than those of the run continued).
     """
+    if options.resume and options.out and options.out.resolve() != options.resume.resolve():
+        raise UsageError("--out and --resume both name a folder", next_step="leave --out out: a run stays in its own")
+    options = restored(options, _CONTINUED)
     robot = load_robot(options.robot)
-    chosen = programme(options.program)
+    chosen = programme(options.program or "thorough")
     method = options.method or chosen.method
     if method not in METHODS:
         raise UsageError(f"no estimator {method!r}; there are {', '.join(METHODS)}")
     if chosen.shares and options.cycles is not None:
         raise UsageError(f"programme {chosen.name} has {len(chosen.shares)} cycles; leave --cycles out")
-    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    together = bool(options.together)
+    setup = robot.to_setup(options.bus, realtime=bool(options.realtime), seed=options.seed or 0)
     if options.rate_hz is not None:
         setup = replace(setup, cycle_hz=options.rate_hz)
     if options.interlock is not None:
         setup = _reporting_inputs(setup, options.interlock.joint)
     wanted = options.joints or robot.joint_names
     robot.check_joints(wanted)
-    resumed = RunFolder.resume(options.resume, robot) if options.resume else None
-    kept = resumed.kept_joints() if resumed else {}
+    kept = {}
+    if options.resume is not None:
+        manifest_of(options.resume, robot)
+        kept = kept_joints(options.resume)
     with robot.document.locating():
         quantum_s = planned_quantum_s(robot.driver(options.bus), setup)
     procedures = {
@@ -149,14 +186,14 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     expected = expected_of(robot)
     measure_skew = robot.file.procedure.measure_skew if options.measure_skew is None else options.measure_skew
     if measure_skew:
-        refuse_where_the_bus_is_too_slow(setup, quantum_s, together=options.together)
-    rehearsals = Rehearsals(robot, options.bus)
-    rehearse = _unseen(rehearsals, setup, procedures, together=options.together)
-    notes = [chosen.note(procedure) for procedure in list(procedures.values())[:1]]
+        refuse_where_the_bus_is_too_slow(setup, quantum_s, together=together)
+    rehearse = _unseen(Rehearsals(robot, options.bus), setup, procedures, together=together)
+    first = list(procedures.values())[:1]
+    notes = [chosen.note(procedure) for procedure in first]
     if quantum_s:
-        notes += [_tick_note(procedure, quantum_s) for procedure in list(procedures.values())[:1]]
+        notes += [_tick_note(procedure, quantum_s) for procedure in first]
     notes += _notes(procedures, expected, rehearse)
-    if options.together:
+    if together:
         notes += _together_notes(setup)
     if measure_skew:
         notes.append(shaking_note())
@@ -168,14 +205,24 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         rehearse=rehearse,
         notes=notes,
         warm_up=options.warm_up,
-        together=options.together,
+        together=together,
         measure_skew=measure_skew,
     )
     refuse_beyond_limits(plan, setup, expected)
-    return Planned(robot, setup, plan, method, resumed)
+    order = Order(
+        options.verb,
+        robot,
+        setup,
+        options.bus,
+        kept_options(options),
+        options.out,
+        options.resume,
+        continued_by="frictid-hil calibrate --resume",
+    )
+    return Planned(order, plan, method, options, kept)
 
 
-def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
+def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
     """Plan, check, ask, run, identify, write.
 
     Raises:
@@ -183,57 +230,104 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> dict[str, Any]:
         HardwareError: hardware unreachable.
 
     Returns:
-        The JSON of the verb. A safety abort or an interruption after motion began is an outcome, not an exception: what
-        was measured until then is in the run folder and in the result.
+        Its ending and the joints. A refusal, a safety abort or an interruption after motion began is an ending, not an
+        exception: what was measured until then is in the run folder and in the result.
     """
     planned = plan_calibration(options)
-    robot, setup, plan = planned.robot, planned.setup, planned.plan
-    watcher.plan(plan, setup)
-    folder = planned.resumed or RunFolder.create(robot, options.verb, options.out)
-    kept = folder.kept_joints()
-    progress = _Progress(
-        joints={name: profile for name, (profile, _) in kept.items()},
-        results={name: result for name, (_, result) in kept.items()},
-    )
-    lost = _run(planned, folder, options, watcher, progress)
-    return _finish(robot, setup, folder, options, progress, lost)
+    with Run(planned.order, watcher) as run:
+        measured = _Measured(planned, run, watcher)
+        error = None
+        if planned.plan.joints:
+            error = run.move(planned.plan, each=measured.identify, care=Care(interlock=planned.options.interlock))
+        else:
+            run.reopen()
+        return measured.concluded(error)
 
 
-def _run(planned: Planned, folder: RunFolder, options: CalibrateOptions, watcher: Watcher, progress: _Progress) -> int:
-    """Move the joints; every finished joint is identified and kept before the next one begins."""
-    setup, plan = planned.setup, planned.plan
+class _Measured:
+    """The joints that are identified; every one is kept before the next one moves."""
 
-    before = dict(folder.manifest["identities"])
-    rehearsals = Rehearsals(planned.robot, options.bus)
+    def __init__(self, planned: Planned, run: Run, watcher: Watcher) -> None:
+        self._planned = planned
+        self._run = run
+        self._watcher = watcher
+        self._profiles = {name: profile for name, (profile, _) in planned.kept.items()}
+        self._results = {name: result for name, (_, result) in planned.kept.items()}
 
-    def notify(event: Event) -> None:
-        watcher.event(event)
-        if isinstance(event, Preflight):
-            _refuse_other_drives(before, event, folder)
-        folder.note(event)
-        rehearsals.heed(event, plan)
-        if isinstance(event, JointRun):
-            _identify(event, folder, planned, watcher, progress)
-
-    with folder.keeping(setup, watcher.rows) as keeper:
+    def identify(self, moved: JointRun) -> None:
+        """Identify a joint from what it has just done."""
+        result: dict[str, Any] = {
+            "duration_s": moved.duration_s,
+            "rate_hz": moved.rate_hz,
+            "late_cycles": moved.late_cycles,
+            "missed_cycles": moved.missed_cycles,
+        }
         try:
-            with planned.robot.document.locating():
-                return run_plan(
-                    planned.robot.driver(options.bus),
-                    setup,
-                    plan,
-                    keeper,
-                    notify=notify,
-                    proceed=lambda preflight: watcher.confirm(plan, preflight),
-                    care=Care(interlock=options.interlock),
-                )
-        except FrictidError as error:
-            if isinstance(error, UsageError) or not keeper.rows:
-                if options.resume is None:
-                    folder.discard()
-                raise
-            progress.ended = error
-            return 0
+            profile = identify_joint(
+                self._run.samples(moved),
+                self._planned.setup.joint(moved.joint),
+                method=self._planned.method,
+                late_cycles=moved.late_cycles + moved.missed_cycles,
+                company=self._company(moved),
+            )
+        except IdentificationError as error:
+            self._results[moved.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
+            self._watcher.joint(moved.joint, str(error), ok=False)
+            return
+        self._profiles[moved.joint] = profile
+        self._results[moved.joint] = {**joint_result(profile), **result}
+        self._run.folder.keep_joint(moved.joint, profile, self._results[moved.joint])
+        outcome = self._results[moved.joint]["outcome"]
+        self._watcher.joint(moved.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
+
+    def concluded(self, error: FrictidError | None) -> Calibrated:
+        """Profile, manifest and page."""
+        robot, folder = self._planned.robot, self._run.folder
+        joints = {name: self._results[name] for name in robot.joint_names if name in self._results}
+        failed = [name for name, result in joints.items() if result["outcome"] != "ok"]
+        if error is None and failed:
+            error = GateFailed(
+                f"joints {', '.join(failed)} failed a quality gate; see their remarks",
+                next_step="nothing was promoted; the recording is kept",
+            )
+        profile = profile_file = report = None
+        if self._profiles:
+            ordered = {name: self._profiles[name] for name in robot.joint_names if name in self._profiles}
+            profile = FrictionProfile(robot=robot.name, joints=ordered, provenance=self._provenance())
+            profile_file = folder.path / "profile.yaml"
+            profile.save(profile_file)
+        folder.manifest["active_profile"] = _active_file(robot, self._planned.options.store)
+        ended = self._run.end(error)
+        if profile is not None:
+            report = write_run_page(folder.path, profile, folder.manifest)
+        return Calibrated(ended, joints, profile, profile_file, report)
+
+    def _company(self, moved: JointRun) -> list[Samples]:
+        """Samples of the joints that moved together with this one."""
+        plan = self._planned.plan
+        others = [entry.joint for entry in plan.joints if plan.together and entry.joint != moved.joint]
+        return [self._run.samples(replace(moved, joint=other)) for other in others]
+
+    def _provenance(self) -> Provenance:
+        order, setup, folder = self._planned.order, self._planned.setup, self._run.folder
+        temperatures = {name: joint.temperature_c for name, joint in self._profiles.items()}
+        return Provenance(
+            created_utc=utc_now(),
+            git_revision=git_revision(),
+            robot_file=order.robot.path.name,
+            config_sha256=order.robot.digest,
+            driver=order.driver,
+            bus=setup.bus,
+            settings={"cycle_hz": setup.cycle_hz, "together": self._planned.plan.together, **dict(setup.options)},
+            realtime=setup.realtime or not order.simulated,
+            seed=setup.seed if order.simulated else None,
+            run=str(folder.path.resolve()),
+            log_sha256=folder.log_digests(),
+            temperatures_c={f"joint {name}": value for name, value in temperatures.items() if value is not None},
+        )
+
+
+_NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
 
 
 def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:
@@ -245,143 +339,13 @@ def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:
     return replace(setup, joints=joints)
 
 
-def _refuse_other_drives(before: Mapping[str, Any], preflight: Preflight, folder: RunFolder) -> None:
-    """A run is continued with the drives it began with.
-
-    Raises:
-        UsageError: a serial number differs.
-    """
-    for name, identity in preflight.identities.items():
-        was = before.get(name, {}).get("serial", identity.serial)
-        if was != identity.serial:
-            raise UsageError(
-                f"the drive has serial number {identity.serial or 'none'}, this run began with {was or 'none'}",
-                where=f"joint {name}",
-                cause="a drive was exchanged, or this is another robot",
-                next_step=f"start a new run; what was measured before is in {folder.path}",
-            )
-
-
-def _identify(run: JointRun, folder: RunFolder, planned: Planned, watcher: Watcher, progress: _Progress) -> None:
-    samples = folder.samples(run)
-    result: dict[str, Any] = {
-        "duration_s": run.duration_s,
-        "rate_hz": run.rate_hz,
-        "late_cycles": run.late_cycles,
-        "missed_cycles": run.missed_cycles,
-    }
-    try:
-        profile = identify_joint(
-            samples,
-            planned.setup.joint(run.joint),
-            method=planned.method,
-            late_cycles=run.late_cycles + run.missed_cycles,
-            company=_company(run, folder, planned),
-        )
-    except IdentificationError as error:
-        progress.results[run.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
-        watcher.joint(run.joint, str(error), ok=False)
-        return
-    progress.joints[run.joint] = profile
-    progress.results[run.joint] = {**joint_result(profile), **result}
-    folder.keep_joint(run.joint, profile, progress.results[run.joint])
-    outcome = progress.results[run.joint]["outcome"]
-    watcher.joint(run.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
-
-
-def _company(run: JointRun, folder: RunFolder, planned: Planned) -> list[Samples]:
-    """Samples of the joints that moved together with this one."""
-    if not planned.plan.together:
-        return []
-    return [
-        folder.samples(replace(run, joint=entry.joint)) for entry in planned.plan.joints if entry.joint != run.joint
-    ]
-
-
-_NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
-
-
-def _finish(
-    robot: Robot,
-    setup: RobotSetup,
-    folder: RunFolder,
-    options: CalibrateOptions,
-    progress: _Progress,
-    lost: int,
-) -> dict[str, Any]:
-    profile_path: Path | None = None
-    if progress.joints:
-        ordered = {name: progress.joints[name] for name in robot.joint_names if name in progress.joints}
-        profile = FrictionProfile(
-            robot=robot.name, joints=ordered, provenance=_provenance(robot, setup, folder, options, progress)
-        )
-        profile_path = folder.write_profile(profile)
-    ended = progress.ended
-    failed = [name for name, result in progress.results.items() if result["outcome"] != "ok"]
-    if ended is None and lost:
-        ended = GateFailed(
-            f"{lost} rows were lost because files were written too slowly",
-            cause="a slow disk or an overloaded computer",
-        )
-    if ended is None and failed:
-        ended = GateFailed(
-            f"joints {', '.join(failed)} failed a quality gate; see their remarks",
-            next_step="nothing was promoted; the recording is kept",
-        )
-    result: dict[str, Any] = {
-        "outcome": ended.outcome if ended else "ok",
-        "exit_code": ended.exit_code if ended else 0,
-        "robot": robot.name,
-        "run": str(folder.path.resolve()),
-        "profile": str(profile_path.resolve()) if profile_path else None,
-        "joints": {name: progress.results[name] for name in robot.joint_names if name in progress.results},
-    }
-    if ended is not None:
-        result["error"] = {
-            "what": ended.what,
-            "where": ended.where,
-            "cause": ended.cause,
-            "next_step": ended.next_step,
-        }
-    folder.compared_with(_active_file(robot, options.store))
-    folder.finish(result)
-    if profile_path is not None:
-        result["report"] = str(write_run_page(folder.path, load_profile(profile_path), folder.manifest).resolve())
-    return result
-
-
-def _active_file(robot: Robot, store: Path | None) -> Path | None:
+def _active_file(robot: Robot, store: Path | None) -> str | None:
     """The profile in force when the run ended, for the page; None where there is none to be read."""
     with contextlib.suppress(FrictidError):
         kept = ProfileStore(store)
         active = kept.active(robot.name)
-        return None if active is None else kept.path(robot.name, active.id).resolve()
+        return None if active is None else str(kept.path(robot.name, active.id).resolve())
     return None
-
-
-def _provenance(
-    robot: Robot, setup: RobotSetup, folder: RunFolder, options: CalibrateOptions, progress: _Progress
-) -> Provenance:
-    simulated = robot.kind(options.bus).simulated
-    temperatures = {
-        f"joint {name}": joint.temperature_c
-        for name, joint in progress.joints.items()
-        if joint.temperature_c is not None
-    }
-    return Provenance(
-        created_utc=utc_now(),
-        git_revision=git_revision(),
-        robot_file=robot.path.name,
-        config_sha256=robot.digest,
-        driver=robot.driver(options.bus),
-        bus=setup.bus,
-        settings={"cycle_hz": setup.cycle_hz, "together": options.together, **dict(setup.options)},
-        realtime=setup.realtime or not simulated,
-        seed=setup.seed if simulated else None,
-        run=str(folder.path.resolve()),
-        log_sha256=folder.log_digests(),
-        temperatures_c=temperatures,
-    )
 
 
 def _procedure(

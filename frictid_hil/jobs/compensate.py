@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from frictid_hil.config.profile import load_profile, profile_file
 from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import FrictidError, Interrupted, UsageError
+from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
 from frictid_hil.jobs.compensation.figures import mode_run
 from frictid_hil.jobs.compensation.plan import compensation_plan
 from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of_file, refuse
-from frictid_hil.jobs.compensation.result import Asked, Progress, result_of
+from frictid_hil.jobs.compensation.result import Asked, CompensationResult, Progress, result_of
 from frictid_hil.jobs.compensation.wanted import MODES, Wanted
 from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.watch import Watcher
@@ -26,12 +25,10 @@ from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION
-from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
-from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
+from frictid_hil.runs.life import Order, Run
 from frictid_hil.runs.rehearsals import Rehearsals
-from frictid_hil.runs.run import run_plan
 
 VERB = "compensate"
 
@@ -95,78 +92,57 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     return Asked(robot, setup, joint.name, profile_path, entry, wanted, planned)
 
 
-def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> dict[str, Any]:
+def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> CompensationResult:
     """Check, plan, ask, rehearse, probe, compensate, compare.
 
     Raises:
         UsageError: refused before anything moved (arguments, files, limits, another drive's profile, the person said
-            no), or by the probe.
+            no).
         HardwareError: hardware unreachable.
 
     Returns:
-        The JSON of the verb. A safety abort or an interruption after motion began is an outcome, not an exception.
+        Its ending and each mode's figures. A refusal by the probe, a safety abort or an interruption after motion began
+        is an ending, not an exception.
     """
     asked = plan_compensation(options)
-    watcher.plan(asked.plan, asked.setup)
-    folder = RunFolder.create(asked.robot, VERB, options.out)
-    progress = _run(asked, folder, options, watcher, live)
-    return result_of(asked, folder, progress)
-
-
-def _run(asked: Asked, folder: RunFolder, options: CompensateOptions, watcher: Watcher, live: Live | None) -> Progress:
+    order = Order(VERB, asked.robot, asked.setup, options.bus, {"profile": str(asked.profile)}, options.out)
     progress = Progress()
     hand = Hand(asked.joint, asked.planned, asked.wanted, watcher)
-    rehearsals = Rehearsals(asked.robot, options.bus)
 
-    def proceed(preflight: Preflight) -> bool:
+    def doubt(preflight: Preflight) -> None:
         doubts = doubts_of_drive(asked.entry, preflight.identities[asked.joint])
         if not asked.wanted.force:
             refuse(doubts, asked.joint)
-        for doubt in doubts:
-            watcher.note(f"forced in spite of: {doubt}")
+        for one in doubts:
+            watcher.note(f"forced in spite of: {one}")
         _refuse_mode(asked.wanted.drive_mode, preflight)
-        return watcher.confirm(asked.plan, preflight)
 
-    def notify(event: Event) -> None:
-        watcher.event(event)
-        folder.note(event)
-        rehearsals.heed(event, asked.plan)
-        hand.follow(event)
-        if isinstance(event, PhaseStarted) and event.phase.partition(" ")[2] in MODES:
-            progress.begun = figures_live.counting = True
-        elif isinstance(event, Marked):
-            progress.marks.append(event.mark)
-        elif isinstance(event, JointRun):
-            progress.run = event
-            _measure(folder.samples(event), asked, progress)
+    with Run(order, watcher) as run:
+        figures = LiveFigures(asked.setup, asked.joint, asked.wanted, live)
 
-    with folder.keeping(asked.setup, watcher.rows) as keeper:
-        figures_live = LiveFigures(keeper, asked.setup, asked.joint, asked.wanted, live)
-        try:
-            run_plan(
-                asked.robot.driver(options.bus),
-                asked.setup,
-                asked.plan,
-                figures_live if asked.wanted.endless else keeper,
-                notify=notify,
-                proceed=proceed,
-                care=Care(tolerated=frozenset({OWN_FRICTION_COMPENSATION} if asked.wanted.force else ())),
-                prepare=hand.take_driver,
-            )
-        except FrictidError as error:
-            if not progress.begun and (isinstance(error, UsageError) or not keeper.rows):
-                folder.discard()
-                raise
-            progress.ended = error
-            half = JointRun(asked.joint, 0, tuple(progress.marks), 0.0, 0, 0, 0, 0.0, 0.0)
-            if isinstance(error, Interrupted):
-                # A service has no other end; what it rehearsed was seen whole.
-                rehearsals.heed(half, asked.plan)
-            if asked.wanted.endless:
-                progress.marks.append(figures_live.mark())
-            elif progress.run is None and progress.marks:
-                _measure(folder.samples(half), asked, progress)
-    return progress
+        def noticed(event: Event) -> None:
+            hand.follow(event)
+            if isinstance(event, PhaseStarted) and event.phase.partition(" ")[2] in MODES:
+                figures.counting = True
+
+        error = run.move(
+            asked.plan,
+            each=lambda moved: _measure(moved, run, asked, progress),
+            asked=doubt,
+            noticed=noticed,
+            through=figures.before if asked.wanted.endless else lambda keeper: keeper,
+            prepare=hand.take_driver,
+            care=Care(tolerated=frozenset({OWN_FRICTION_COMPENSATION} if asked.wanted.force else ())),
+        )
+        half = run.so_far(asked.joint) if error is not None else None
+        if half is not None and isinstance(error, Interrupted):
+            # A service has no other end; what it rehearsed was seen whole.
+            run.rehearsed(half, asked.plan)
+        if asked.wanted.endless:
+            progress.service = figures.mark()
+        elif half is not None and progress.run is None:
+            _measure(half, run, asked, progress)
+        return result_of(asked, run, progress, error)
 
 
 def _refuse_mode(mode: Mode, preflight: Preflight) -> None:
@@ -176,8 +152,10 @@ def _refuse_mode(mode: Mode, preflight: Preflight) -> None:
         raise UsageError(f"these drives have no {mode.name.lower()} mode (6502)")
 
 
-def _measure(samples: Samples, asked: Asked, progress: Progress) -> None:
-    """Cut each mode's task out of the samples."""
+def _measure(moved: JointRun, run: Run, asked: Asked, progress: Progress) -> None:
+    """Cut each mode's task out of what the joint has done."""
+    progress.run = moved if moved.cycles else None
+    samples = run.samples(moved)
     motions = {m.name: m for m in asked.plan.joints[0].motions if isinstance(m, Compensated)}
     for mark in samples.marks:
         task, _, mode = mark.name.partition(" ")

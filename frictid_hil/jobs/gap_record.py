@@ -1,13 +1,15 @@
 """``gap record``: the diagnostic experiments on the bus, and the experiment set that comes of them.
 
 Same scheduler, supervisor and recording as a calibration. Experiments without the payload run first, then the person
-is asked to mount it (a simulated robot mounts its own) and the rest follow.
+is asked to mount it (a simulated robot mounts its own) and the rest follow. A recording that was interrupted is gone on
+with, or a set is made of what it has, moving nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ import yaml
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.errors import FrictidError, GateFailed, InputFileError, PlanRefused, UsageError
+from frictid_hil.errors import FrictidError, InputFileError, PlanRefused, UsageError
 from frictid_hil.gap.experiments import (
     FULL,
     SHORT,
@@ -33,24 +35,16 @@ from frictid_hil.jobs.gap.set import existing_set, write_set
 from frictid_hil.jobs.plans import APPROACH_RAD_S, expected_of
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
-from frictid_hil.plan.plan import (
-    REHEARSAL,
-    Expected,
-    Hold,
-    JointPlan,
-    Motion,
-    Move,
-    Plan,
-    Sine,
-    joint_plan,
-)
+from frictid_hil.plan.plan import REHEARSAL, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Driver, JointIdentity, load_driver
+from frictid_hil.protocol.driver import Driver, load_driver
+from frictid_hil.recording.mcap_reader import read_mcap
 from frictid_hil.recording.samples import Samples
-from frictid_hil.runner.events import Event, JointRun, Preflight
-from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runner.events import JointRun, Preflight
+from frictid_hil.runs.folder import manifest_of, parts_of
+from frictid_hil.runs.life import Ended, Order, Run
+from frictid_hil.runs.options import kept_options, restored
 from frictid_hil.runs.rehearsals import Rehearsals
-from frictid_hil.runs.run import run_plan
 
 VERB = "gap-record"
 
@@ -60,8 +54,8 @@ class GapRecordOptions:
     """What a person asked for.
 
     Attributes:
-        robot: robot file, by path or name.
-        joint: name.
+        robot: robot file, by path or name; not needed with ``resume``.
+        joint: name; not needed with ``resume``.
         bus: ``interface:channel``.
         short: the short set.
         plan: plan file of a diagnosis that could not decide; overrules ``short``.
@@ -73,10 +67,11 @@ class GapRecordOptions:
         realtime: wall clock for the virtual robot.
         seed: of simulated noise and of the validation moves.
         out: folder of the set; what a plan file asks for is added to the set of the same joint that is there.
+        resume: run folder to continue.
     """
 
-    robot: str
-    joint: str
+    robot: str = ""
+    joint: str = ""
     bus: str | None = None
     short: bool = False
     plan: Path | None = None
@@ -87,88 +82,167 @@ class GapRecordOptions:
     realtime: bool = False
     seed: int = 0
     out: Path | None = None
+    resume: Path | None = None
 
 
-def record(options: GapRecordOptions, watcher: Watcher) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a recording came to.
+
+    Attributes:
+        ended: how the run ended.
+        joint: name.
+        place: folder of the set; None where no experiment was finished.
+        experiments: in the set, in the order in which they ran.
+        skipped: experiments left out, each with its reason.
+        duration_s: of the experiments.
+        belief: where the belief of the simulator comes from.
+    """
+
+    ended: Ended
+    joint: str
+    place: Path | None
+    experiments: tuple[str, ...]
+    skipped: Mapping[str, str]
+    duration_s: float
+    belief: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the verb."""
+        return {
+            **self.ended.to_json(),
+            "joint": self.joint,
+            "set": str(self.place.resolve()) if self.place else None,
+            "experiments": list(self.experiments),
+            "skipped": [{"experiment": name, "reason": why} for name, why in self.skipped.items()],
+            "duration_s": self.duration_s,
+            "belief": list(self.belief),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Planned:
+    """A recording, decided before a bus is opened.
+
+    Attributes:
+        order: robot, folder and options.
+        joint: as the driver knows it.
+        belief: of the simulator.
+        experiments: all that belong to the set.
+        plans: of those that are still to be recorded, without the payload and with it.
+        loaded: for each plan, whether the payload is mounted.
+        logs: recorded by the run that is continued.
+        skipped: left out, with reasons.
+        earlier: the set that is added to.
+    """
+
+    order: Order
+    joint: JointSetup
+    belief: Belief
+    experiments: tuple[Experiment, ...]
+    plans: tuple[Plan, ...]
+    loaded: tuple[bool, ...]
+    logs: Mapping[str, Samples]
+    skipped: Mapping[str, str]
+    earlier: Mapping[str, Any] | None
+
+
+def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) -> Recorded:
     """Plan, check, ask, run, write the set.
+
+    Args:
+        options: what a person asked for.
+        watcher: follows it.
+        move: record what is missing; else a set is made of what the run ``options.resume`` has, and no bus is opened.
 
     Raises:
         UsageError: refused before anything moved.
         HardwareError: hardware unreachable.
 
     Returns:
-        The JSON of the verb: ``outcome``, ``set`` (None where no experiment was finished), ``experiments``, ``skipped``
-        (with reasons), ``run``, ``robot``, ``joint``, ``duration_s``, ``belief``. A safety abort after motion began is
-        an outcome; experiments finished before it are kept.
+        Its ending and the set. A safety abort or an interruption after motion began is an ending; experiments finished
+        before it are in the set.
     """
+    planned = _planned(options, move=move)
+    with Run(planned.order, watcher) as run:
+        recording = _Recording(planned, run, watcher)
+        error = recording.everything()
+        return recording.concluded(error)
+
+
+def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
+    if options.resume is not None and not move and not options.robot:
+        options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
+    options = restored(options, (VERB,))
     robot = load_robot(options.robot)
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     robot.check_joints([options.joint])
     joint = setup.joint(options.joint)
-    driver_name = robot.driver(options.bus)
     simulated = robot.kind(options.bus).simulated
     profile = load_profile(options.profile).joint(options.joint) if options.profile else None
     belief = belief_of(
         joint, profile, profile_name=options.profile.name if options.profile else "", simulated_drive=simulated
     )
     without = _why_no_payload(options, belief, simulated=simulated)
-    asked = _asked(options, envelope_of(robot, joint, options))
+    envelope = envelope_of(robot, joint, options)
+    names = manifest_of(options.resume, robot)["options"]["names"] if options.resume else _names(options, envelope)
+    asked = chosen(names, envelope, seed=options.seed)
     experiments = asked if without is None else _unloaded(asked)
     skipped = {e.name: without for e in asked if without is not None and e.name not in {x.name for x in experiments}}
     if not experiments:
         raise UsageError(f"all experiments asked for need the payload: {without}", where=options.robot)
     earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
-    if earlier is not None and options.plan is None:
+    if earlier is not None and options.plan is None and options.resume is None:
         raise UsageError(
             "holds an experiment set already",
             where=str(options.out),
             next_step="choose another --out, or add what a diagnosis asked for with --plan",
         )
-    rehearsals = Rehearsals(robot, setup.bus)
-    plans = _plans(robot, setup, joint, experiments, belief, rehearsals)
+    logs = recorded_logs(options.resume, joint.name, experiments) if options.resume else {}
+    missing = [e for e in experiments if e.name not in logs] if move else []
+    plans = _plans(robot, setup, joint, missing, belief, Rehearsals(robot, setup.bus))
     for plan, expected in plans:
         refuse_beyond_limits(plan, setup, expected)
-    folder = RunFolder.create(robot, VERB, None)
-    loaded = [payload for payload in (False, True) if any(e.payload == payload for e in experiments)]
-    run = _Run(driver_name, rehearsals, setup, joint.name, watcher, folder, loaded, mounts_itself=simulated)
-    try:
-        run.everything([plan for plan, _ in plans])
-    finally:
-        if not run.rows:
-            folder.discard()
-    if not run.rows:
-        raise run.ended or UsageError(f"{run.unloaded}; nothing has moved", where=options.robot)
-    done = [e for payload in loaded for e in experiments if e.payload == payload and e.name in run.logs]
-    skipped |= {e.name: run.unloaded for e in experiments if run.unloaded and e.payload and e.name not in run.logs}
-    for name, why in skipped.items():
-        watcher.note(f"{name} was left out: {why}")
-    place: Path | None = None
-    if done and run.identity is not None:
-        place = options.out or folder.path / "set"
-        belief = dataclasses.replace(belief, sections=read_back(belief.sections, run.identity))
-        write_set(place, robot.name, joint.name, belief, [(e, run.logs[e.name]) for e in done], earlier=earlier)
-    result: dict[str, Any] = {
-        "outcome": run.ended.outcome if run.ended else "ok",
-        "exit_code": run.ended.exit_code if run.ended else 0,
-        "robot": robot.name,
-        "joint": joint.name,
-        "run": str(folder.path.resolve()),
-        "set": str(place.resolve()) if place else None,
-        "experiments": [e.name for e in done],
-        "skipped": [{"experiment": name, "reason": why} for name, why in skipped.items()],
-        "duration_s": sum(e.duration_s for e in done),
-        "belief": list(belief.sources),
-    }
-    if run.ended is not None:
-        ended = run.ended
-        result["error"] = {
-            "what": ended.what,
-            "where": ended.where,
-            "cause": ended.cause,
-            "next_step": ended.next_step,
-        }
-    folder.finish(result)
-    return result
+    written = {"out": str(options.out.resolve())} if options.out else {}
+    order = Order(
+        VERB,
+        robot,
+        setup,
+        options.bus,
+        {**kept_options(options), **written, "names": list(names)},
+        resume=options.resume,
+        outputs=(options.out,) if options.out else (),
+        continued_by="frictid-hil gap record --resume",
+    )
+    return _Planned(
+        order,
+        joint,
+        belief,
+        experiments,
+        tuple(plan for plan, _ in plans),
+        tuple(loaded for loaded in (False, True) if any(e.payload == loaded for e in missing)),
+        logs,
+        skipped,
+        earlier,
+    )
+
+
+def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> dict[str, Samples]:
+    """The experiments that a run folder holds whole, from all of its parts.
+
+    Args:
+        run: folder.
+        joint: name.
+        experiments: wanted.
+
+    Raises:
+        InputFileError: a recording is unreadable.
+    """
+    logs: dict[str, Samples] = {}
+    for path, _ in parts_of(run):
+        if path.suffix == ".mcap":
+            logs |= _cut(read_mcap(path, joint)[0], experiments)
+    return logs
 
 
 def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> Envelope:
@@ -187,15 +261,11 @@ def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> E
     )
 
 
-def _asked(options: GapRecordOptions, envelope: Envelope) -> tuple[Experiment, ...]:
+def _names(options: GapRecordOptions, envelope: Envelope) -> tuple[str, ...]:
     """The experiments that the options name."""
     if options.plan is not None:
-        names = _read_plan(options.plan)
-    elif options.short:
-        names = SHORT
-    else:
-        names = (*FULL, *(name for name in ("second_posture",) if name in catalogue(envelope)))
-    return chosen(names, envelope, seed=options.seed)
+        return _read_plan(options.plan)
+    return SHORT if options.short else (*FULL, *(name for name in ("second_posture",) if name in catalogue(envelope)))
 
 
 def _unloaded(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
@@ -297,117 +367,125 @@ def _travel(experiments: Sequence[Experiment]) -> tuple[float, float]:
     return min(float(p.min()) for p in positions), max(float(p.max()) for p in positions)
 
 
-class _Run:
+class _Recording:
     """The plans on the hardware, one after the other, and the logs that come of them.
 
     A lock-step robot runs them in one go, so that it stays as warm as a real one would; its payload is mounted between
     two stretches of cyclic traffic. Everybody else is asked again before the plan with the payload.
     """
 
-    def __init__(
-        self,
-        driver_name: str,
-        rehearsals: Rehearsals,
-        setup: RobotSetup,
-        joint: str,
-        watcher: Watcher,
-        folder: RunFolder,
-        loaded: list[bool],
-        *,
-        mounts_itself: bool,
-    ) -> None:
-        self._driver_name = driver_name
-        self._rehearsals = rehearsals
-        self._setup = setup
-        self._joint = joint
+    def __init__(self, planned: _Planned, run: Run, watcher: Watcher) -> None:
+        self._planned = planned
+        self._run = run
         self._watcher = watcher
-        self._folder = folder
-        self._loaded = loaded
-        self._mounts_itself = mounts_itself
         self._session = 0
         self._driver: Driver | None = None
-        self.identity: JointIdentity | None = None
-        self.logs: dict[str, Samples] = {}
-        self.rows = 0
-        self.ended: FrictidError | None = None
-        self.unloaded = ""
+        self._logs = dict(planned.logs)
+        self._unloaded = ""
         """Why no recording with the payload was made although it was planned."""
 
-    def everything(self, plans: Sequence[Plan]) -> None:
-        """Run all plans; what ends them early is in ``ended``."""
-        together = [_joined(plans)] if self._in_lock_step() else list(plans)
-        for plan in together:
+    def everything(self) -> FrictidError | None:
+        """Run all plans; returns what ended them early.
+
+        Raises:
+            FrictidError: before anything could move.
+        """
+        plans = self._planned.plans
+        if not plans:
+            self._run.reopen()
+        for plan in [_joined(plans)] if plans and self._in_lock_step() else plans:
             if not self._ready_for(plan):
-                return
+                break
             try:
-                self._one(plan)
+                error = self._run.move(plan, each=self._keep, asked=self._mount, prepare=self._remember)
             except PlanRefused as refused:
-                if not self.logs:
+                if not self._session:
                     raise
-                self.unloaded = refused.what
-                return
-            except FrictidError as error:
-                self.ended = error
-                return
+                self._unloaded = refused.what
+                break
+            if error is not None:
+                self._keep_whole_experiments()
+                return error
+        return None
+
+    def concluded(self, error: FrictidError | None) -> Recorded:
+        """The set, and how the run ended."""
+        planned, folder = self._planned, self._run.folder
+        experiments = {e.name: e for payload in (False, True) for e in planned.experiments if e.payload == payload}
+        done = [e for name, e in experiments.items() if name in self._logs]
+        skipped = dict(planned.skipped)
+        if self._unloaded:
+            skipped |= {name: self._unloaded for name, e in experiments.items() if e.payload and name not in self._logs}
+        for name, why in skipped.items():
+            self._watcher.note(f"{name} was left out: {why}")
+        place: Path | None = None
+        if done:
+            place = planned.order.outputs[0] if planned.order.outputs else folder.path / "set"
+            self._write(place, done)
+        return Recorded(
+            self._run.end(error),
+            planned.joint.name,
+            place,
+            tuple(e.name for e in done),
+            skipped,
+            sum(e.duration_s for e in done),
+            planned.belief.sources,
+        )
+
+    def _write(self, place: Path, done: Sequence[Experiment]) -> None:
+        """The experiments that this run has not put into the set yet."""
+        planned, manifest = self._planned, self._run.folder.manifest
+        joint, robot = planned.joint.name, planned.order.robot.name
+        belief = dataclasses.replace(
+            planned.belief, sections=read_back(planned.belief.sections, manifest["identities"].get(joint, {}))
+        )
+        earlier = planned.earlier or (existing_set(place, robot, joint) if planned.order.resume else None)
+        before = manifest.get("in_set", {}).get(str(place.resolve()), []) if earlier else []
+        fresh = [(e, self._logs[e.name]) for e in done if e.name not in before]
+        write_set(place, robot, joint, belief, fresh, earlier=earlier)
+        manifest.setdefault("in_set", {})[str(place.resolve())] = [e.name for e in done]
+
+    def _keep(self, moved: JointRun) -> None:
+        self._logs.update(_cut(self._run.samples(moved), self._planned.experiments))
+        self._session += 1
+        if self._in_lock_step() and self._session < len(self._planned.loaded):
+            self._mount()
+
+    def _keep_whole_experiments(self) -> None:
+        """Of a stretch that was ended early."""
+        half = self._run.so_far(self._planned.joint.name)
+        if half is not None:
+            self._logs.update(_cut(self._run.samples(half), self._planned.experiments))
 
     def _ready_for(self, plan: Plan) -> bool:
-        """Ask for the payload where a person has to mount it; without a yes its experiments are left out."""
-        if self._mounts_itself or not self._loaded[self._session]:
+        """Ask for the payload where a person has to mount it; without a yes its experiments are left out.
+
+        Raises:
+            UsageError: there are no others.
+        """
+        if self._planned.order.simulated or not self._planned.loaded[self._session]:
             return True
         for note in plan.notes:
             if not self._watcher.ask(f"{note[:1].upper()}{note[1:]}. Is it mounted?"):
-                self.unloaded = "nobody mounted the payload"
+                self._unloaded = "nobody mounted the payload"
+                if not self._session:
+                    raise UsageError(f"{self._unloaded}; nothing has moved", where=str(self._planned.order.robot.path))
                 return False
         return True
-
-    def _one(self, plan: Plan) -> None:
-        self._watcher.plan(plan, self._setup)
-        with self._folder.keeping(self._setup, self._watcher.rows) as keeper:
-            try:
-                lost = run_plan(
-                    self._driver_name,
-                    self._setup,
-                    plan,
-                    keeper,
-                    notify=lambda event: self._notice(event, plan),
-                    proceed=lambda preflight: self._proceed(plan, preflight),
-                    prepare=self._remember,
-                )
-            finally:
-                self.rows += keeper.rows
-        if lost:
-            raise GateFailed(f"{lost} rows were lost because files were written too slowly", cause="a slow disk")
 
     def _remember(self, driver: Driver) -> None:
         self._driver = driver
 
-    def _proceed(self, plan: Plan, preflight: Preflight) -> bool:
-        if not self._watcher.confirm(plan, preflight):
-            return False
-        self._mount()
-        return True
-
-    def _notice(self, event: Event, plan: Plan) -> None:
-        self._watcher.event(event)
-        self._folder.note(event)
-        self._rehearsals.heed(event, plan)
-        if isinstance(event, Preflight):
-            self.identity = event.identities[self._joint]
-        elif isinstance(event, JointRun):
-            self.logs.update(_cut(self._folder.samples(event)))
-            self._session += 1
-            if self._in_lock_step() and self._session < len(self._loaded):
-                self._mount()
-
-    def _mount(self) -> None:
+    def _mount(self, _: Preflight | None = None) -> None:
         """Put the payload on a simulated joint, or take it off; a real one has been prepared by the person."""
-        driver = self._driver or _new_driver(self._driver_name, self._setup)
+        order = self._planned.order
+        driver = self._driver or _new_driver(order.driver, order.setup)
         mount: Callable[[str, bool], None] | None = getattr(driver, "mount_payload", None)
         if mount is not None:
-            mount(self._joint, self._loaded[self._session])
+            mount(self._planned.joint.name, self._planned.loaded[self._session])
 
     def _in_lock_step(self) -> bool:
-        return _new_driver(self._driver_name, self._setup).clock.lock_step
+        return _new_driver(self._planned.order.driver, self._planned.order.setup).clock.lock_step
 
 
 def _new_driver(name: str, setup: RobotSetup) -> Driver:
@@ -424,16 +502,17 @@ def _joined(plans: Sequence[Plan]) -> Plan:
     )
 
 
-def _cut(samples: Samples) -> dict[str, Samples]:
-    """The rows of every experiment of a session, time counted from the experiment's start."""
+def _cut(samples: Samples, experiments: Sequence[Experiment]) -> dict[str, Samples]:
+    """The rows of every experiment that was done whole, time counted from its start."""
     spans: dict[str, list[int]] = {}
     for mark in samples.marks:
         name, slash, _ = mark.name.partition("/")
         if slash:
-            span = spans.setdefault(name, [mark.start_ns, mark.end_ns])
-            span[1] = mark.end_ns
+            spans.setdefault(name, [mark.start_ns, mark.end_ns])[1] = mark.end_ns
+    done = Counter(mark.name.partition("/")[0] for mark in samples.marks)
     logs = {}
-    for name, (start_ns, end_ns) in spans.items():
+    for name in (e.name for e in experiments if done[e.name] == len(e.motions)):
+        start_ns, end_ns = spans[name]
         rows = samples.select((samples.time_ns >= start_ns) & (samples.time_ns < end_ns))
         logs[name] = dataclasses.replace(rows, time_ns=rows.time_ns - start_ns, marks=())
     return logs

@@ -24,11 +24,11 @@ from typing import Any, NoReturn
 import filelock
 
 from frictid_hil.config.policy import Policy, WarmUp
-from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
-from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.calibrate import Calibrated, CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.profiles.attempts import Attempt, note_attempt
@@ -141,17 +141,12 @@ def _warm_up(policy: Policy) -> WarmUp | None:
     return None if policy.warm_up.fixed_s == 0.0 else policy.warm_up
 
 
-def _concluded(
-    options: RecalibrateOptions, robot: Robot, store: ProfileStore, measured: dict[str, Any]
-) -> dict[str, Any]:
+def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, measured: Calibrated) -> dict[str, Any]:
     """Compare, decide, promote or refuse; the active profile changes here or not at all."""
     active, baseline = _active_and_baseline(store, robot.name)
+    told = measured.to_json()
     result: dict[str, Any] = {
-        "outcome": measured["outcome"],
-        "exit_code": measured["exit_code"],
-        "robot": robot.name,
-        "run": measured["run"],
-        "profile": measured["profile"],
+        **{key: told[key] for key in ("outcome", "exit_code", "robot", "run", "profile")},
         "stored": None,
         "drift": {},
         "drifted": [],
@@ -159,25 +154,24 @@ def _concluded(
         "active": None,
         "reason": "",
         "next_step": "",
-        "joints": {name: _short(joint) for name, joint in measured["joints"].items()},
-        "report": measured.get("report"),
+        "joints": {name: _short(joint) for name, joint in told["joints"].items()},
+        "report": told.get("report"),
     }
-    if "error" in measured:
-        result["error"] = {**measured["error"], "next_step": measured["error"]["next_step"] or _UNTOLD}
-        result["reason"] = measured["error"]["what"]
-        result["next_step"] = result["error"]["next_step"]
-    if measured["profile"] is not None:
-        newer = load_profile(measured["profile"])
+    if "error" in told:
+        result["error"] = {**told["error"], "next_step": told["error"]["next_step"] or _UNTOLD}
+        result |= {"reason": told["error"]["what"], "next_step": result["error"]["next_step"]}
+    newer = measured.profile
+    if newer is not None:
         failed = {
             name: "; ".join(joint.get("remarks") or [joint["outcome"]])
-            for name, joint in measured["joints"].items()
+            for name, joint in measured.joints.items()
             if joint["outcome"] != "ok"
         }
         by_hand = _promote_by_hand(result["run"], options.store)
         verdict = judge(robot.policy, newer, active, baseline, failed=failed, promote_by_hand=by_hand)
         result |= {"drift": dict(verdict.joints), "drifted": list(verdict.drifted)}
         # What an aborted night got done stays in its run folder: half a robot is no point of a trend.
-        if measured["outcome"] in ("ok", "gate_failed"):
+        if measured.ended.outcome in ("ok", "gate_failed"):
             result["stored"] = identity = store.add(newer)
             _apply(verdict, result, store, robot.name, identity, options.by)
         _write_page(result, robot, store, newer, active, baseline)

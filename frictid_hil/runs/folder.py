@@ -4,142 +4,77 @@
 
     runs/<robot>/<UTC>-<verb>/
         config.yaml       the robot file's values as used
-        manifest.json     what was done, by what, when, how it ended; rewritten whole at every step
+        manifest.json     what was asked and done, by what, when, how it ended; rewritten whole at every step
         samples.mcap      every report of every joint, and the marks
         bus.blf           every frame
         joints/<j>.json   each finished joint's result
         profile.yaml      the profile
         report.html       for a person
+
+A run that is continued gets another part: ``samples-2.mcap`` and ``bus-2.blf``, then ``-3``. No part is ever written to
+again. What a folder held before the run is never touched, and only what the run made itself is ever removed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import os
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 
 import frictid_hil
-from frictid_hil.config.profile import FrictionProfile, JointProfile
+from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.provenance import file_sha256, utc_now
 from frictid_hil.config.robot import Robot
 from frictid_hil.config.write import dump, plain
-from frictid_hil.errors import ConfigError, FrictidError, UsageError
-from frictid_hil.files import write_whole
-from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.recording.bus_log import BusLogWriter
-from frictid_hil.recording.mcap import SampleWriter
+from frictid_hil.errors import ConfigError, FrictidError, HardwareBusy, UsageError
+from frictid_hil.files import could_not_write, part_of_path, write_whole
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, Preflight, Warned
 from frictid_hil.runner.ring import Rows
+from frictid_hil.runs.keeper import RowKeeper
 
 SCHEMA = "frictid.run/1"
-_FLUSH_S = 0.25
 _WHERE_RUNS_ARE = "every run tells its folder when it ends; unless --out was given it lies below runs/<robot>/"
-
-
-class RowKeeper:
-    """Writes rows as they come and remembers them for the identification.
-
-    Args:
-        samples: file of samples.
-        frames: file of frames.
-        joints: names, order of the driver.
-        seen: given the rows, once they are kept.
-    """
-
-    def __init__(
-        self, samples: SampleWriter, frames: BusLogWriter, joints: list[str], seen: Callable[[Rows], None]
-    ) -> None:
-        self._samples = samples
-        self._frames = frames
-        self._joints = joints
-        self._seen = seen
-        self._kept: list[Rows] = []
-        self._flushed_at = time.monotonic()
-        self.rows = 0
-
-    def samples(self, rows: Rows) -> None:
-        """Keep and write rows of ``ring.SAMPLE_ROW``."""
-        self.rows += int(rows.size)
-        self._kept.append(rows)
-        for index in np.unique(rows["joint"]):
-            self._samples.append(self._joints[int(index)], rows[rows["joint"] == index])
-        self._seen(rows)
-        self._flush()
-
-    def frames(self, rows: Rows) -> None:
-        """Write rows of ``ring.FRAME_ROW``."""
-        self._frames.append(rows)
-        self._flush()
-
-    def mark(self, joint: str, mark: Mark) -> None:
-        """Write a mark."""
-        self._samples.mark(joint, mark)
-
-    def identify(self, identities: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write what each drive says of itself into the recording."""
-        for joint, identity in identities.items():
-            self._samples.metadata(f"joint/{joint}", identity)
-
-    def taken(self, joint: int, start_ns: int, end_ns: int) -> Rows:
-        """One joint's rows in a stretch of run time; everything older than its start is forgotten.
-
-        Joints that moved together are taken one after the other from the same stretch.
-        """
-        every = np.concatenate(self._kept) if self._kept else np.empty(0, dtype=[("joint", "<u2"), ("t_ns", "<i8")])
-        self._kept = [every[every["t_ns"] >= start_ns]]
-        mine = (every["joint"] == joint) & (every["t_ns"] >= start_ns) & (every["t_ns"] < end_ns)
-        taken: Rows = every[mine]
-        return taken
-
-    def close(self) -> None:
-        """Finish both files."""
-        self._samples.close()
-        self._frames.close()
-
-    def _flush(self) -> None:
-        now = time.monotonic()
-        if now - self._flushed_at >= _FLUSH_S:
-            self._samples.flush()
-            self._frames.flush()
-            self._flushed_at = now
+_OURS = re.compile(r"(manifest\.json|config\.yaml|profile\.yaml|report\.html|joints|(samples|bus)(-\d+)?\.(mcap|blf))")
+_PART = re.compile(r"(?:samples|bus)(?:-(\d+))?\.(?:mcap|blf)")
 
 
 class RunFolder:
     """One run on disk; made by ``create`` or ``resume``."""
 
-    def __init__(self, path: Path, robot: Robot, manifest: dict[str, Any]) -> None:
+    def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
         self.path = path
-        self._robot = robot
         self.manifest = manifest
+        self._made: list[Path] = []
+        self._lock: int | None = None
         self._keeper: RowKeeper | None = None
-        self._joints: list[str] = []
-        self._bus_log = ""
+        self._part = 0
 
     @staticmethod
-    def create(robot: Robot, verb: str, out: Path | None = None) -> RunFolder:
+    def create(robot: Robot, verb: str, options: Mapping[str, Any], out: Path | None = None) -> RunFolder:
         """A new folder, ``runs/<robot>/<UTC>-<verb>`` unless told.
 
+        Args:
+            robot: its file.
+            verb: that the run is of.
+            options: what was asked for, plain values; a run is continued with them.
+            out: folder to use; it may hold other things, but nothing of a run.
+
         Raises:
-            UsageError: ``out`` holds a run already.
-            FrictidError: no permission, or no space.
+            UsageError: ``out`` holds a run, or a file that a run would write.
+            FrictidError: no permission, or no space; nothing is left behind.
         """
-        path = out or _unused(Path("runs") / robot.name, f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{verb}")
-        if (path / "manifest.json").exists():
-            raise UsageError(
-                "holds a run already", where=str(path), next_step="choose another --out, or continue it with --resume"
-            )
-        try:
-            (path / "joints").mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FrictidError(f"cannot be created: {error.strerror}", where=str(path)) from error
         manifest: dict[str, Any] = {
             "schema": SCHEMA,
             "verb": verb,
@@ -149,55 +84,76 @@ class RunFolder:
             "tool_version": frictid_hil.__version__,
             "started_utc": utc_now(),
             "ended_utc": None,
+            "state": "preflight",
             "outcome": None,
+            "options": dict(options),
             "identities": {},
             "sessions": [],
             "warnings": [],
         }
-        folder = RunFolder(path, robot, manifest)
-        values = {key: value for key, value in robot.document.data.items() if key != "extends"}
-        write_whole(path / "config.yaml", dump(values))
-        folder._save()
+        folder = RunFolder(out or _unused(Path("runs") / robot.name, verb), manifest)
+        try:
+            folder._claim()
+            folder._write("config.yaml", dump(robot.values()))
+            folder.save()
+        except BaseException:
+            folder.withdraw()
+            raise
         return folder
 
     @staticmethod
     def resume(path: Path, robot: Robot) -> RunFolder:
-        """A folder of an earlier run, to be continued.
+        """A folder of an earlier run, to be continued; nothing in it changes until ``begin``.
 
         Raises:
             UsageError: not a run folder, or of another configuration.
+            HardwareBusy: the run is at work.
         """
-        manifest = load_manifest(path)
-        if manifest["config_sha256"] != robot.digest:
-            raise UsageError(
-                "the robot file has changed since this run began",
-                where=str(path),
-                next_step="start a new run, or restore the robot file (the run's own copy is config.yaml)",
-            )
-        return RunFolder(path, robot, manifest)
+        folder = RunFolder(path, manifest_of(path, robot))
+        folder._hold()
+        return folder
 
-    @contextmanager
-    def keeping(self, setup: RobotSetup, seen: Callable[[Rows], None]) -> Iterator[RowKeeper]:
-        """The files of a run, closed whatever happens."""
-        self._joints = [joint.name for joint in setup.joints]
-        part = len(self.manifest["sessions"])
-        suffix = f"-{part}" if part else ""
-        meta = {"robot": self._robot.name, "config_sha256": self._robot.digest, "started_utc": utc_now()}
-        self._bus_log = f"bus{suffix}.blf"
-        keeper = RowKeeper(
-            SampleWriter(self.path / f"samples{suffix}.mcap", self._joints, meta),
-            BusLogWriter(self.path / self._bus_log),
-            self._joints,
-            seen,
-        )
-        self._keeper = keeper
-        try:
-            yield keeper
-        finally:
-            keeper.close()
+    # -- while it runs ------------------------------------------------------------------------------------------
+
+    def add_part(self, joints: list[str], seen: Callable[[Rows], None]) -> RowKeeper:
+        """New files for samples and frames, beside those of earlier parts.
+
+        Args:
+            joints: names, order of the driver.
+            seen: given the rows, once they are kept.
+
+        Raises:
+            FrictidError: they cannot be created, or the folder cannot take a result; only what is new was removed.
+        """
+        self._part = max((number for _, number in parts_of(self.path)), default=0) + 1
+        suffix = "" if self._part == 1 else f"-{self._part}"
+        samples, frames = self.path / f"samples{suffix}.mcap", self.path / f"bus{suffix}.blf"
+        meta = {key: self.manifest[key] for key in ("robot", "config_sha256")} | {"started_utc": utc_now()}
+        for path in (samples, frames):
+            try:
+                path.touch(exist_ok=False)
+            except OSError as error:
+                raise could_not_write(path, error) from error
+            self._made.append(path)
+        self._keeper = RowKeeper(samples, frames, joints, meta, seen)
+        return self._keeper
+
+    def claim_output(self, path: Path) -> None:
+        """Make a folder that a result will be written to, or see that one can be written to.
+
+        Raises:
+            FrictidError: it cannot.
+        """
+        self._make_folder(path)
+
+    def begin(self) -> None:
+        """From here on something may have moved: whatever happens, nothing is removed any more."""
+        self.manifest |= {"state": "measuring", "outcome": None, "ended_utc": None}
+        self.save()
+        self._made.clear()
 
     def note(self, event: Event) -> None:
-        """Write what happened into the manifest."""
+        """Take down what happened; it is in the manifest from ``begin`` on."""
         if isinstance(event, Preflight):
             identities = {name: _finite(asdict(identity)) for name, identity in event.identities.items()}
             self.manifest["identities"] = identities
@@ -207,77 +163,106 @@ class RunFolder:
                 {"severity": f.severity.value, "subject": f.subject, "message": f.message} for f in event.findings
             ]
         elif isinstance(event, Configured):
-            # One per part of a resumed run: the drives may have been mapped otherwise in between.
-            self.manifest.setdefault("frame_maps", {})[self._bus_log] = event.frame_map
+            # One per part: the drives may have been mapped otherwise in between.
+            suffix = "" if self._part == 1 else f"-{self._part}"
+            self.manifest.setdefault("frame_maps", {})[f"bus{suffix}.blf"] = event.frame_map
         elif isinstance(event, JointRun):
-            self.manifest["sessions"].append(_finite(asdict(event)))
+            self.manifest["sessions"].append({**_finite(asdict(event)), "part": self._part})
         elif isinstance(event, Warned):
             self.manifest["warnings"].append(event.message)
-        else:
-            if isinstance(event, Marked) and self._keeper is not None:
-                self._keeper.mark(event.joint, event.mark)
-            return
-        self._save()
+        elif isinstance(event, Marked) and self._keeper is not None:
+            self._keeper.mark(event.joint, event.mark)
+        if self.manifest["state"] == "measuring" and not isinstance(event, Marked):
+            self.save()
 
     def samples(self, run: JointRun) -> Samples:
         """The moving joint's samples of one session, with its marks."""
-        assert self._keeper is not None, "inside `keeping`"
-        start_ns, end_ns = run.marks[0].start_ns, run.marks[-1].end_ns
-        rows = self._keeper.taken(self._joints.index(run.joint), start_ns, end_ns)
+        assert self._keeper is not None, "after `add_part`"
+        rows = self._keeper.taken(run.joint, run.marks[0].start_ns, run.marks[-1].end_ns)
         identity = self.manifest["identities"][run.joint]
-        return samples_from_rows(run.joint, rows, run.marks, identity, self._robot.name)
+        return samples_from_rows(run.joint, rows, run.marks, identity, self.manifest["robot"])
 
     def keep_joint(self, joint: str, profile: JointProfile, result: Mapping[str, Any]) -> None:
         """Keep a finished joint, so that a later crash cannot lose it and `--resume` finds it."""
-        write_whole(
-            self.path / "joints" / f"{joint}.json",
-            json.dumps({"profile": profile.model_dump(mode="json"), "result": result}, indent=1),
-        )
-
-    def kept_joints(self) -> dict[str, tuple[JointProfile, dict[str, Any]]]:
-        """Finished joints of this folder."""
-        kept = {}
-        for path in sorted((self.path / "joints").glob("*.json")):
-            try:
-                values = json.loads(path.read_text())
-                kept[path.stem] = (JointProfile.model_validate(values["profile"]), values["result"])
-            except (ValueError, KeyError, TypeError) as error:
-                raise ConfigError(f"not a finished joint of a run: {error}", where=str(path)) from error
-        return kept
-
-    def write_profile(self, profile: FrictionProfile) -> Path:
-        """Write ``profile.yaml``."""
-        path = self.path / "profile.yaml"
-        profile.save(path)
-        return path
+        (self.path / "joints").mkdir(exist_ok=True)
+        kept = {"profile": profile.model_dump(mode="json"), "result": result}
+        self._write(f"joints/{part_of_path(joint)}.json", json.dumps(kept, indent=1))
 
     def log_digests(self) -> dict[str, str]:
         """SHA-256 of the recordings, by file name."""
-        return {
-            path.name: file_sha256(path)
-            for path in sorted(self.path.iterdir())
-            if path.suffix in (".mcap", ".blf", ".asc")
-        }
+        return {path.name: file_sha256(path) for path, _ in parts_of(self.path)}
 
-    def compared_with(self, profile: Path | None) -> None:
-        """Note the profile that was in force, so that the page can be written again as it was."""
-        self.manifest["active_profile"] = None if profile is None else str(profile)
+    def finish(self, outcome: str, error: Mapping[str, str] | None) -> None:
+        """Write how the run ended, and let go of the folder."""
+        self.manifest |= {"state": "ended", "ended_utc": utc_now(), "outcome": outcome, "error": error}
+        try:
+            self.save()
+        finally:
+            self._release()
 
-    def finish(self, result: Mapping[str, Any]) -> None:
-        """Write how the run ended."""
-        self.manifest["ended_utc"] = utc_now()
-        self.manifest["outcome"] = result["outcome"]
-        self.manifest["error"] = result.get("error")
-        self._save()
+    def withdraw(self) -> None:
+        """Remove what this run made since ``create``, ``resume`` or ``begin``, and nothing else."""
+        for path in reversed(self._made):
+            with contextlib.suppress(OSError):  # gone already, or a folder into which somebody has put something
+                path.rmdir() if path.is_dir() else path.unlink()
+        self._made.clear()
+        self._release()
 
-    def discard(self) -> None:
-        """Remove a folder in which nothing was measured."""
-        for path in sorted(self.path.rglob("*"), reverse=True):
-            path.rmdir() if path.is_dir() else path.unlink()
-        self.path.rmdir()
+    def save(self) -> None:
+        """Write the manifest."""
+        self._write("manifest.json", json.dumps(self.manifest, indent=1))
 
-    def _save(self) -> None:
-        write_whole(self.path / "manifest.json", json.dumps(self.manifest, indent=1))
+    # -- inside -------------------------------------------------------------------------------------------------
+
+    def _claim(self) -> None:
+        """Make the folder, or take one that holds nothing of a run; alone in it from here on."""
+        self._make_folder(self.path)
+        taken = sorted(path.name for path in self.path.iterdir() if _OURS.fullmatch(path.name))
+        if "manifest.json" in taken:
+            raise UsageError(
+                "holds a run already", where=str(self.path), next_step="choose another --out, or continue it (--resume)"
+            )
+        if taken:
+            raise UsageError(
+                f"holds {', '.join(taken)}, which the run would overwrite",
+                where=str(self.path),
+                next_step="choose another --out",
+            )
+        self._hold()
+
+    def _make_folder(self, path: Path) -> None:
+        try:
+            for folder in reversed([folder for folder in (path, *path.parents) if not folder.exists()]):
+                folder.mkdir(exist_ok=True)
+                self._made.append(folder)
+            with TemporaryFile(dir=path):
+                pass
+        except OSError as error:
+            raise FrictidError(f"cannot be written to: {error.strerror}", where=str(path)) from error
+
+    def _hold(self) -> None:
+        self._lock = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._release()
+            raise HardwareBusy(
+                "another process is at work on this run", where=str(self.path), next_step="wait for it to end"
+            ) from None
+        except OSError:
+            pass  # a network file system without locks
+
+    def _release(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _write(self, name: str, text: str) -> None:
+        path = self.path / name
+        new = not path.exists()
+        write_whole(path, text)
+        if new:
+            self._made.append(path)
 
 
 def load_manifest(path: Path) -> dict[str, Any]:
@@ -296,6 +281,44 @@ def load_manifest(path: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("schema") != SCHEMA:
         raise UsageError(f"not a run of schema {SCHEMA}", where=str(path))
     return manifest
+
+
+def manifest_of(path: Path, robot: Robot) -> dict[str, Any]:
+    """The manifest of a run that shall be continued.
+
+    Raises:
+        UsageError: not a run folder, or of another configuration.
+    """
+    manifest = load_manifest(path)
+    if manifest["config_sha256"] != robot.digest:
+        raise UsageError(
+            "the robot file has changed since this run began",
+            where=str(path),
+            next_step="start a new run, or restore the robot file (the run's own copy is config.yaml)",
+        )
+    return manifest
+
+
+def kept_joints(run: Path) -> dict[str, tuple[JointProfile, dict[str, Any]]]:
+    """Finished joints of a run, each with its result.
+
+    Raises:
+        ConfigError: a file among them is something else.
+    """
+    kept = {}
+    for path in sorted((run / "joints").glob("*.json")):
+        try:
+            values = json.loads(path.read_text())
+            kept[path.stem] = (JointProfile.model_validate(values["profile"]), values["result"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"not a finished joint of a run: {error}", where=str(path)) from error
+    return kept
+
+
+def parts_of(folder: Path) -> list[tuple[Path, int]]:
+    """Recordings of a run, each with the number of its part, in the order in which they were made."""
+    found = [(path, int(match[1] or 1)) for path in folder.iterdir() if (match := _PART.fullmatch(path.name))]
+    return sorted(found, key=lambda part: (part[1], part[0].name))
 
 
 def samples_from_rows(
@@ -332,9 +355,6 @@ def _finite(value: Any) -> Any:
     return plain(value)
 
 
-def _unused(parent: Path, name: str) -> Path:
-    path, k = parent / name, 1
-    while path.exists():
-        k += 1
-        path = parent / f"{name}-{k}"
-    return path
+def _unused(parent: Path, verb: str) -> Path:
+    name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{verb}"
+    return next(path for k in count(1) if not (path := parent / (name if k == 1 else f"{name}-{k}")).exists())

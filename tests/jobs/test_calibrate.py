@@ -26,7 +26,7 @@ from frictid_hil.runs.folder import load_manifest
 
 def run(out: Path, **changes: object) -> dict[str, object]:
     options = CalibrateOptions("hp3j.yaml", bus=f"virtual:{out.name}", out=out, **changes)  # type: ignore[arg-type]
-    return calibrate(options, Silent())
+    return calibrate(options, Silent()).to_json()
 
 
 @pytest.fixture(scope="module")
@@ -130,14 +130,14 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     values["procedure"] |= {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3}
     robot = place / "two.yaml"
     robot.write_text(dump(values))
-    result = calibrate(CalibrateOptions(str(robot), out=place / "run"), StoppedAt("5"))
+    result = calibrate(CalibrateOptions(str(robot), out=place / "run"), StoppedAt("5")).to_json()
     assert (result["outcome"], result["exit_code"]) == ("interrupted", 130)
     assert list(result["joints"]) == ["4"] and load_profile(result["profile"]).joints.keys() == {"4"}
     return str(robot), place / "run"
 
 
 def resume(robot: str, run: Path) -> dict[str, Any]:
-    return calibrate(CalibrateOptions(robot, resume=run), Silent())
+    return calibrate(CalibrateOptions(robot, resume=run), Silent()).to_json()
 
 
 def test_a_run_is_continued_with_the_joints_it_lacks(interrupted: tuple[str, Path], tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def profile(robot: Path) -> Path:
-    result = calibrate(CalibrateOptions(str(robot), out=robot.parent / "calibration"), Silent())
+    result = calibrate(CalibrateOptions(str(robot), out=robot.parent / "calibration"), Silent()).to_json()
     assert result["outcome"] == "ok", result
     return Path(result["profile"])
 
@@ -59,7 +59,7 @@ def go(robot: Path, profile: Path, tmp_path: Path) -> Callable[..., dict[str, An
     def run(task: str = "hand", modes: tuple[str, ...] = ("nc", "mop"), **changes: Any) -> dict[str, Any]:
         wanted = Wanted(task, modes, duration_s=6.0)
         options = CompensateOptions(str(robot), profile, JOINT, wanted, out=tmp_path / "run")
-        return compensate(changed(options, **changes), Silent())
+        return compensate(changed(options, **changes), Silent()).to_json()
 
     return run
 
@@ -135,7 +135,7 @@ def test_as_an_offset_it_helps_the_drives_own_loop(go: Callable[..., dict[str, A
 
 def test_lock_step_is_bit_identical(robot: Path, profile: Path, tmp_path: Path) -> None:
     options = CompensateOptions(str(robot), profile, JOINT, Wanted("track", ("mop",), duration_s=3.0))
-    first, second = (compensate(replace(options, out=tmp_path / name), Silent()) for name in ("a", "b"))
+    first, second = (compensate(replace(options, out=tmp_path / name), Silent()).to_json() for name in ("a", "b"))
     assert first["modes"] == second["modes"]
 
 
@@ -151,12 +151,12 @@ def test_a_run_keeps_its_profile_when_another_is_promoted(robot: Path, profile: 
                 store.promote(name, other)
 
     options = CompensateOptions(str(robot), store.path(name, first), JOINT, Wanted("hand", ("mop",), duration_s=2.0))
-    kept = compensate(replace(options, out=tmp_path / "kept"), Promotes())
+    kept = compensate(replace(options, out=tmp_path / "kept"), Promotes()).to_json()
     active = store.active(name)
     assert active is not None and active.id == other
-    alone = compensate(replace(options, out=tmp_path / "alone"), Silent())
+    alone = compensate(replace(options, out=tmp_path / "alone"), Silent()).to_json()
     assert kept["modes"] == alone["modes"] and kept["profile"] == str(store.path(name, first).resolve())
-    after = compensate(replace(options, profile=store.path(name, other), out=tmp_path / "after"), Silent())
+    after = compensate(replace(options, profile=store.path(name, other), out=tmp_path / "after"), Silent()).to_json()
     assert after["modes"] != alone["modes"], "the two profiles can be told apart"
 
 
@@ -398,7 +398,7 @@ def test_on_a_bus_that_never_saw_this_travel_it_is_rehearsed_slowly_and_whole(as
 @pytest.mark.usefixtures("real")
 def test_what_was_rehearsed_is_not_rehearsed_again_and_a_longer_travel_is(asked: CompensateOptions) -> None:
     assert rehearses(plan_compensation(asked).plan)
-    result = compensate(asked, Silent())
+    result = compensate(asked, Silent()).to_json()
     assert result["outcome"] == "ok", result
     assert [mark.name for mark in next(iter(read(asked.out or Path()))).marks][1:4] == [REHEARSAL, "hold", "probe"]
     again = plan_compensation(asked).plan
@@ -419,7 +419,7 @@ def test_a_service_that_is_interrupted_has_rehearsed_and_a_run_that_tripped_has_
 
     doubled = scaled(profile, tmp_path / "doubled.yaml", 1.0 if ending else 2.0)
     by_hand = changed(asked, task="hand", profile=doubled, force=True)
-    result = compensate(by_hand, Ends())
+    result = compensate(by_hand, Ends()).to_json()
     assert result["outcome"] == ("interrupted" if ending else "aborted"), result
     assert rehearses(plan_compensation(by_hand).plan) is not kept
 

@@ -25,7 +25,7 @@ def test_torque_four_milliseconds_late_changes_nothing_where_the_drive_declares_
     options = CalibrateOptions(
         str(robot), bus="virtual:late", joints=("4",), amplitude_rad=0.1745, out=tmp_path / "run"
     )
-    profile = load_profile(calibrate(options, Silent())["profile"]).joint("4")
+    profile = load_profile(calibrate(options, Silent()).to_json()["profile"]).joint("4")
     assert profile.time_skew_s == pytest.approx(0.0045)
     assert profile.procedure is not None and profile.published is not None
     velocity = profile.procedure.velocity_rad_s

@@ -57,7 +57,7 @@ def columns(folder: Path, name: str) -> dict[str, np.ndarray[Any, Any]]:
 
 def test_a_recorded_set_loads_and_its_rows_are_timed_as_it_says(robot: str, tmp_path: Path) -> None:
     out = tmp_path / "set"
-    result = record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "chirp"), out=out), Silent())
+    result = record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "chirp"), out=out), Silent()).to_json()
     assert result["outcome"] == "ok"
     assert result["experiments"] == ["chirp"]
     assert result["set"] == str(out)
@@ -101,7 +101,7 @@ def test_the_payload_is_mounted_for_its_experiments_alone(robot: str, tmp_path: 
 def test_without_a_payload_validation_runs_bare_and_the_rest_is_left_out(robot: str, tmp_path: Path) -> None:
     out = tmp_path / "set"
     plan = plan_file(tmp_path, "sines_payload", "moves_payload")
-    result = record(GapRecordOptions(robot, "0", plan=plan, payload=False, out=out), Silent())
+    result = record(GapRecordOptions(robot, "0", plan=plan, payload=False, out=out), Silent()).to_json()
     assert result["experiments"] == ["moves_payload"]
     assert not ExperimentSet.load(out).experiments[0].payload
 
@@ -126,12 +126,12 @@ def test_what_was_left_out_is_told_with_its_reason(robot: str, tmp_path: Path, m
     plan = plan_file(tmp_path, "breakaway", "sines_payload")
     options = GapRecordOptions(robot, "0", plan=plan, payload=False, out=tmp_path / "a")
     person = Mounting(True)
-    result = record(options, person)
+    result = record(options, person).to_json()
     assert result["skipped"] == [{"experiment": "sines_payload", "reason": "asked for without the payload"}]
     assert person.notes == ["sines_payload was left out: asked for without the payload"] and not person.questions
     # A machine whose payload nobody announced.
     monkeypatch.setattr(VirtualDriver, "kind", replace(VirtualDriver.kind, simulated=False))
-    unannounced = record(GapRecordOptions(robot, "0", plan=plan, out=tmp_path / "b"), Mounting(True))
+    unannounced = record(GapRecordOptions(robot, "0", plan=plan, out=tmp_path / "b"), Mounting(True)).to_json()
     assert "--payload" in unannounced["skipped"][0]["reason"]
     assert unannounced["experiments"] == ["breakaway"]
     with pytest.raises(UsageError, match="all experiments asked for need the payload"):
@@ -153,7 +153,7 @@ def test_a_person_is_asked_to_mount_the_payload_before_it_moves(
             record(options, person)
         assert not (tmp_path / "set").exists()
     else:
-        result = record(options, person)
+        result = record(options, person).to_json()
         assert result["experiments"] == ["chirp_payload"] and result["skipped"] == []
     (question,) = person.questions
     assert question.startswith("Mount the payload on joint 0 now") and "kg m2" in question

@@ -80,7 +80,7 @@ def test_a_client_sees_every_joint_and_its_samples(tmp_path: Path) -> None:
     robot.write_text(dump(values))
     client = Client(port := free_port())
     with live(WithClient(client), f"127.0.0.1:{port}") as watcher:
-        result = calibrate(CalibrateOptions(str(robot), out=tmp_path / "run"), watcher)
+        result = calibrate(CalibrateOptions(str(robot), out=tmp_path / "run"), watcher).to_json()
     assert result["outcome"] == "ok"
     client.join(10.0)
     (channel,) = client.channels.values()

@@ -64,7 +64,7 @@ def test_a_wrong_declaration_is_measured_over_the_bus_flagged_and_kept(tmp_path:
     options = CalibrateOptions(
         str(robot), bus="virtual:unaware", joints=("4",), program="quick", measure_skew=True, out=tmp_path / "run"
     )
-    result = calibrate(options, Silent())
+    result = calibrate(options, Silent()).to_json()
     entry = result["joints"]["4"]
     assert result["outcome"] == "gate_failed"
     assert "measured" in entry["remarks"][0] and "0.500 +- 0.400 ms as declared" in entry["remarks"][0]

@@ -21,7 +21,7 @@ from frictid_hil.plan.plan import Cycles
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("programmes") / "quick"
     options = CalibrateOptions("hp3j.yaml", bus="virtual:quick", joints=("5",), program="quick", out=out)
-    result = calibrate(options, Silent())
+    result = calibrate(options, Silent()).to_json()
     assert result["outcome"] == "ok", result
     return out
 

@@ -43,7 +43,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(scope="module")
 def run(robot: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("runs") / "run"
-    result = calibrate(CalibrateOptions(robot, out=place), Silent())
+    result = calibrate(CalibrateOptions(robot, out=place), Silent()).to_json()
     assert result["outcome"] == "ok", result
     return place
 

@@ -41,7 +41,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> str:
 def together(tmp_path_factory: pytest.TempPathFactory, site: str) -> tuple[Path, dict[str, object]]:
     out = tmp_path_factory.mktemp("together") / "run"
     options = CalibrateOptions(site, bus="virtual:test-together", out=out, joints=JOINTS, together=True)
-    return out, calibrate(options, Silent())
+    return out, calibrate(options, Silent()).to_json()
 
 
 def test_three_joints_take_the_time_of_one(together: tuple[Path, dict[str, object]]) -> None:
@@ -79,7 +79,7 @@ def test_the_inertia_that_couples_them_is_that_of_the_arm(together: tuple[Path, 
 def test_together_is_as_one_by_one(together: tuple[Path, dict[str, object]], site: str, tmp_path: Path) -> None:
     """Joint 4 has most to lose: without the other joints' accelerations taken off, it is 0.47 % away."""
     options = CalibrateOptions(site, bus="virtual:test-alone", out=tmp_path / "run", joints=("4",))
-    assert calibrate(options, Silent())["outcome"] == "ok"
+    assert calibrate(options, Silent()).to_json()["outcome"] == "ok"
     distance = compare(together[0], tmp_path / "run", None)["joints"]["4"]
     assert distance["e_percent_measured_range"] <= 0.25
 
@@ -112,7 +112,7 @@ def test_can_fd_carries_them_faster_and_its_log_replays(tmp_path: Path, site: st
     path.write_text(f"schema: frictid.robot/1\nextends: {site}\ncycle_hz: 500\noptions: {{fd: true}}\n")
     run, bus, every = tmp_path / "run", "virtual:test-together-fd", tuple("012345")
     wanted = CalibrateOptions(str(path), bus=bus, out=run, joints=every, together=True, program="quick")
-    result = calibrate(wanted, Silent())
+    result = calibrate(wanted, Silent()).to_json()
     assert result["outcome"] == "ok", result
     assert {entry["rate_hz"] for entry in result["joints"].values()} == {500.0}
     frames = read_frames(run / "bus.blf")

@@ -80,7 +80,7 @@ def test_one_joint_in_batch_at_19200_is_within_the_bar(robot: Callable[..., Path
         def event(self, event: Event) -> None:
             events.append(event)
 
-    result = calibrate(options(path, tmp_path / "run", joints=("1",), program="thorough"), Watching())
+    result = calibrate(options(path, tmp_path / "run", joints=("1",), program="thorough"), Watching()).to_json()
     assert result["outcome"] == "ok", result["joints"]["1"]["remarks"]
     distance = compare(tmp_path / "run", None, str(path))["joints"]["1"]
     assert distance["e_percent_measured_range"] < 0.5
@@ -110,7 +110,7 @@ def test_a_fault_in_batch_keeps_the_recording_and_resumes(
     robot: Callable[..., Path], tmp_path: Path, fault: str, exit_code: int, told: str
 ) -> None:
     path = robot(faults=(fault,))
-    result = calibrate(options(path, tmp_path / "run"), Silent())
+    result = calibrate(options(path, tmp_path / "run"), Silent()).to_json()
     assert result["exit_code"] == exit_code, result
 
     assert re.search(told, result["error"]["what"] + result["error"]["cause"]), result["error"]
@@ -118,7 +118,7 @@ def test_a_fault_in_batch_keeps_the_recording_and_resumes(
     assert len(kept.time_ns) > 100
     assert np.all(np.diff(kept.time_ns) > 0)
     path = robot()
-    resumed = calibrate(options(path, tmp_path / "run", resume=tmp_path / "run"), Silent())
+    resumed = calibrate(options(path, tmp_path / "run", resume=tmp_path / "run"), Silent()).to_json()
     assert resumed["outcome"] == "ok", resumed
     assert resumed["joints"]["5"]["rate_hz"] == 250.0
 
@@ -138,7 +138,7 @@ def test_an_averaging_filter_of_150_ms_ends_in_the_gates_refusal(
             amplitude_rad=0.349,
         ),
         Silent(),
-    )
+    ).to_json()
     assert (result["outcome"], result["exit_code"]) == ("gate_failed", 5), result
     (remark,) = [text for text in result["joints"]["3"]["remarks"] if text.startswith("tracking")]
     assert "averag" in remark

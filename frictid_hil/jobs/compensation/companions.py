@@ -15,7 +15,7 @@ from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.events import Event, Marked, PhaseStarted
 from frictid_hil.runner.ring import Rows
-from frictid_hil.runs.folder import RowKeeper
+from frictid_hil.runs.keeper import RowKeeper
 from frictid_hil.units import degrees
 
 _LIVE_NS = 500_000_000
@@ -86,9 +86,8 @@ class Hand:
 class LiveFigures:
     """Keeps rows as the keeper does, forgets them, and tells what they say."""
 
-    def __init__(self, keeper: RowKeeper, setup: RobotSetup, joint: str, wanted: Wanted, live: Live | None) -> None:
-        self._keeper = keeper
-        self._index = [one.name for one in setup.joints].index(joint)
+    def __init__(self, setup: RobotSetup, joint: str, wanted: Wanted, live: Live | None) -> None:
+        self._joint = joint
         self._wanted = wanted
         self._live = live
         self._sums = np.zeros(3)
@@ -97,11 +96,16 @@ class LiveFigures:
         self._seen_ns = 0
         self.counting = False
 
+    def before(self, keeper: RowKeeper) -> LiveFigures:
+        """Stand between the rows and their keeper."""
+        self._keeper = keeper
+        return self
+
     def samples(self, rows: Rows) -> None:
         """Keep rows, count those of the joint, forget them, and tell now and then."""
         self._keeper.samples(rows)
         now_ns = int(rows["t_ns"][-1]) + 1
-        mine = self._keeper.taken(self._index, self._seen_ns, now_ns)
+        mine = self._keeper.taken(self._joint, self._seen_ns, now_ns)
         self._seen_ns = now_ns
         if not (mine.size and self.counting):
             return

@@ -10,7 +10,7 @@ from typing import Any
 
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.robot import Robot
-from frictid_hil.errors import FrictidError, Interrupted
+from frictid_hil.errors import FrictidError
 from frictid_hil.jobs.compensation.figures import DOMINATED_PERCENT, ModeFigures, ModeRun, figures, friction_dominates
 from frictid_hil.jobs.compensation.plan import CompensationPlan
 from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
@@ -23,7 +23,7 @@ from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.words import plain
 from frictid_hil.runner.events import JointRun
-from frictid_hil.runs.folder import RunFolder
+from frictid_hil.runs.life import Ended, Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,33 +59,43 @@ class Progress:
     """What a run has come to, so that an error halfway loses nothing.
 
     Attributes:
-        marks: of finished motions.
         runs: by mode.
-        begun: a law has commanded the joint.
         run: the joint's, once it is done.
-        ended: what ended it early.
+        service: the sums of a service.
     """
 
-    marks: list[Mark] = field(default_factory=list)
     runs: dict[str, ModeRun] = field(default_factory=dict)
-    begun: bool = False
     run: JointRun | None = None
-    ended: FrictidError | None = None
+    service: Mark | None = None
 
 
-def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, Any]:
-    """The JSON of the verb; manifest and page are written."""
-    wanted = asked.wanted
+@dataclass(frozen=True, slots=True)
+class CompensationResult:
+    """What a compensation came to.
+
+    Attributes:
+        ended: how the run ended.
+        figures: everything told of it, as in the JSON of the verb.
+        report: its page; None where no mode was finished.
+    """
+
+    ended: Ended
+    figures: Mapping[str, Any]
+    report: Path | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the verb."""
+        report = {"report": str(self.report.resolve())} if self.report else {}
+        return {**self.ended.to_json(), **self.figures, **report}
+
+
+def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | None) -> CompensationResult:
+    """The result; manifest and page are written."""
+    wanted, moved = asked.wanted, progress.run
     inertia, source = _inertia(asked)
     found = figures(progress.runs, wanted.task, inertia, _floors(asked, inertia))
-    modes: dict[str, Any] = {mode: figure.values() for mode, figure in found.items()}
-    modes |= _service_figures(wanted, progress)
     friction = next((law.friction for law in asked.planned.laws.values() if law.friction is not None), None)
-    run, ended = progress.run, progress.ended
-    result: dict[str, Any] = {
-        "outcome": ended.outcome if ended else "ok",
-        "exit_code": ended.exit_code if ended else 0,
-        "robot": asked.robot.name,
+    told: dict[str, Any] = {
         "joint": asked.joint,
         "task": wanted.task,
         "setting": wanted.setting,
@@ -95,39 +105,33 @@ def result_of(asked: Asked, folder: RunFolder, progress: Progress) -> dict[str, 
         "inertia_kg_m2": inertia,
         "inertia_source": source,
         "seed": asked.setup.seed if wanted.simulated else None,
-        "rate_hz": run.rate_hz if run else None,
-        "late_cycles": run.late_cycles if run else None,
-        "missed_cycles": run.missed_cycles if run else None,
+        "rate_hz": moved.rate_hz if moved else None,
+        "late_cycles": moved.late_cycles if moved else None,
+        "missed_cycles": moved.missed_cycles if moved else None,
         "warnings": list(asked.planned.warnings),
         "profile": str(asked.profile.resolve()),
-        "run": str(folder.path.resolve()),
-        "modes": modes,
+        "modes": {
+            **{mode: figure.values() for mode, figure in found.items()},
+            **_service_figures(wanted, progress.service),
+        },
         "friction_dominates": friction_dominates(found),
         "remarks": _remarks(found),
     }
-    if ended is not None:
-        result["error"] = {
-            "what": ended.what,
-            "where": ended.where,
-            "cause": ended.cause,
-            # A run of modes has nothing to resume.
-            "next_step": "" if isinstance(ended, Interrupted) else ended.next_step,
-        }
-    folder.finish(result)
-    if progress.runs:
-        page = compensation_page(
-            asked.robot.name,
-            asked.joint,
-            wanted.task,
-            progress.runs,
-            modes,
-            facts=_facts(result),
-            remarks=result["remarks"],
-            outcome=str(result["outcome"]),
-            error=ended.what if ended else "",
-        )
-        result["report"] = str(write_page(page, folder.path / "report.html").resolve())
-    return result
+    ended = run.end(error)
+    if not progress.runs:
+        return CompensationResult(ended, told)
+    page = compensation_page(
+        asked.robot.name,
+        asked.joint,
+        wanted.task,
+        progress.runs,
+        told["modes"],
+        facts=_facts({**told, "run": str(ended.run.resolve())}),
+        remarks=told["remarks"],
+        outcome=ended.outcome,
+        error=error.what if error else "",
+    )
+    return CompensationResult(ended, told, write_page(page, ended.run / "report.html"))
 
 
 def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
@@ -172,11 +176,10 @@ def _floors(asked: Asked, inertia_kg_m2: float | None) -> dict[str, float]:
     }
 
 
-def _service_figures(wanted: Wanted, progress: Progress) -> dict[str, Any]:
-    sums = [mark.details["count_v2_t2"] for mark in progress.marks if mark.name == "service"]
-    if not sums or not sums[0][0]:
+def _service_figures(wanted: Wanted, service: Mark | None) -> dict[str, Any]:
+    count, velocity, torque = service.details["count_v2_t2"] if service else (0, 0.0, 0.0)
+    if not count:
         return {}
-    count, velocity, torque = sums[0]
     return {
         wanted.modes[0]: {
             "velocity_rms_rad_s": math.sqrt(velocity / count),

@@ -14,7 +14,6 @@ from typing import Any
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.gap.tolerances import stated_by
 from frictid_hil.plan.setup import JointSetup
-from frictid_hil.protocol.driver import JointIdentity
 from frictid_hil.simulation.joint import CoulombViscous, JointModel
 
 SIMULATED_CONTROL_HZ = 1000
@@ -66,15 +65,15 @@ def belief_of(
     return Belief(sections, tuple(sources))
 
 
-def read_back(sections: Mapping[str, Any], identity: JointIdentity) -> dict[str, Any]:
-    """The sections with what the drive itself says of its torque and its encoder."""
+def read_back(sections: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[str, Any]:
+    """The sections with what the drive itself says of its torque and its encoder (fields of ``JointIdentity``)."""
     drive, encoder = dict(sections.get("drive", {})), dict(sections.get("encoder", {}))
     for section, key, value in (
-        (drive, "rated_torque_nm", identity.rated_torque_nm),
-        (drive, "torque_quantum_nm", identity.torque_resolution_nm),
-        (encoder, "resolution_rad", identity.position_resolution_rad),
+        (drive, "rated_torque_nm", identity.get("rated_torque_nm")),
+        (drive, "torque_quantum_nm", identity.get("torque_resolution_nm")),
+        (encoder, "resolution_rad", identity.get("position_resolution_rad")),
     ):
-        if math.isfinite(value) and value > 0.0:
+        if value is not None and math.isfinite(value) and value > 0.0:
             section[key] = value
     return {**sections, "drive": drive, **({"encoder": encoder} if encoder else {})}
 

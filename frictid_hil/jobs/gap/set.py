@@ -67,7 +67,9 @@ def write_set(
         raise FrictidError(f"cannot be created: {error.strerror}", where=str(folder)) from error
     listed = list(earlier["experiments"]) if earlier else []
     for experiment, samples in logs:
-        name = _unused(experiment.name, {str(entry["name"]) for entry in listed})
+        # Also a log that no list names: whoever put it there did not ask for another in its place.
+        taken = {str(entry["name"]) for entry in listed} | {path.stem for path in folder.glob("*.csv")}
+        name = _unused(experiment.name, taken)
         write_csv(folder / f"{name}.csv", samples)
         listed.append(
             {

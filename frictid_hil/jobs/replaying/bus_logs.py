@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,9 @@ from frictid_hil.protocol.frames import frame_decoders
 from frictid_hil.recording.bus_log import LOG_SUFFIXES
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Mark
-from frictid_hil.runs.folder import load_manifest
+from frictid_hil.runs.folder import load_manifest, parts_of
 
 _EDS_SCHEMA = "frictid.frames/1"
-_NUMBERED = re.compile(r"bus(?:-(\d+))?\.blf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +94,7 @@ def logs_of(source: Path, given: Mapping[str, Any] | None) -> list[Log]:
     folder = source if source.is_dir() else source.parent
     manifest = load_manifest(folder) if (folder / "manifest.json").exists() else None
     logs = []
-    for path in _parts(folder) if source.is_dir() else [source]:
+    for path in [part for part, _ in parts_of(folder) if part.suffix == ".blf"] if source.is_dir() else [source]:
         frame_map = given
         if frame_map is None and manifest is not None:
             frame_map = manifest.get("frame_maps", {}).get(path.name)
@@ -112,38 +110,22 @@ def logs_of(source: Path, given: Mapping[str, Any] | None) -> list[Log]:
     return logs
 
 
-def _parts(folder: Path) -> list[Path]:
-    """The logs of a run, in the order in which it was resumed."""
-    return sorted((path for path in folder.glob("bus*.blf") if _first_session(path) is not None), key=_order)
-
-
-def _order(path: Path) -> int:
-    return _first_session(path) or 0
-
-
-def _first_session(path: Path) -> int | None:
-    """``bus-3.blf`` begins with the session of number 3; None for a file of another name."""
-    match = _NUMBERED.fullmatch(path.name)
-    return int(match.group(1) or 0) if match else None
-
-
 def _motions(manifest: Mapping[str, Any], folder: Path, log: str) -> tuple[Motion, ...]:
     """What a run did during one of its logs; where it was cut off, what its samples say."""
-    first = _first_session(folder / log)
-    if first is None:
-        return ()
-    following = [start for path in _parts(folder) if (start := _order(path)) > first]
-    sessions = manifest["sessions"][first : following[0] if following else None]
+    parts = parts_of(folder)
+    part = next((number for path, number in parts if path.name == log), None)
     motions = [
         Motion(
             session["joint"],
             tuple(Mark(**mark) for mark in session["marks"]),
             session["late_cycles"] + session["missed_cycles"],
         )
-        for session in sessions
+        for session in manifest["sessions"]
+        if session["part"] == part
     ]
     finished = {motion.joint for motion in motions}
     samples = folder / log.replace("bus", "samples").replace(".blf", ".mcap")
-    if manifest.get("outcome") != "ok" and not following and samples.exists():
+    last = part is not None and part == parts[-1][1]
+    if last and manifest.get("outcome") != "ok" and samples.exists():
         motions += [Motion(one.joint, one.marks) for one in read(samples) if one.marks and one.joint not in finished]
     return tuple(motions)
