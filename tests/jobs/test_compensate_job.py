@@ -32,6 +32,7 @@ from frictid_hil.plan.plan import REHEARSAL, Plan
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.read import read
 from frictid_hil.runner.events import Event, PhaseStarted
+from frictid_hil.runs.folder import load_manifest
 from frictid_hil.runs.rehearsals import Rehearsals
 
 JOINT = "3"
@@ -206,7 +207,6 @@ def test_r_falls_where_gravity_is_uncertain_and_the_plan_says_so(robot: Path, pr
         ({"drive": {"rated_torque_nm": 38.0}}, "38 N m"),
         ({"drive": {"gear_ratio": 100.0}}, "gear ratio is 120, the profile was identified with 100"),
         ({"provenance": {"created_utc": "2020-01-01T00:00:00Z"}}, "max_age_days is 180"),
-        ({"temperature_c": 80.0}, "80.0 degC"),
     ],
 )
 def test_a_profile_of_something_else_is_refused_with_both_values(
@@ -288,11 +288,24 @@ def test_a_stale_profile_may_be_forced(go: Callable[..., dict[str, Any]], profil
     assert any("days old" in warning for warning in result["warnings"])
 
 
+def refused_by_the_probe(result: dict[str, Any], words: str, run: Path) -> None:
+    """The joint has moved by then: what was measured is kept, and the refusal is how the run ended."""
+    assert (result["outcome"], result["exit_code"], result["modes"]) == ("refused", 2, {})
+    assert words in result["error"]["what"] and "--force" in result["error"]["next_step"]
+    assert result["run"] == str(run) and load_manifest(run)["outcome"] == "refused"
+    assert [mark.name for mark in read(run)[0].marks][-1] == "hold", "up to the probe"
+
+
 def test_a_doubled_profile_is_refused_by_the_probe(
     go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ProfileMismatch, match="friction at slow motion"):
-        go(profile=scaled(profile, tmp_path / "doubled.yaml", 2.0))
+    result = go(profile=scaled(profile, tmp_path / "doubled.yaml", 2.0))
+    refused_by_the_probe(result, "friction at slow motion", tmp_path / "run")
+
+
+def test_a_cold_joint_is_refused_by_the_probe(go: Callable[..., dict[str, Any]], profile: Path, tmp_path: Path) -> None:
+    warm = edited(profile, tmp_path / "warm.yaml", temperature_c=80.0)
+    refused_by_the_probe(go(profile=warm), "80.0 degC", tmp_path / "run")
 
 
 @pytest.mark.parametrize("task", ["hand", "track"])
@@ -339,8 +352,8 @@ def test_gravity_with_the_wrong_sign_is_found_by_the_probe(
 ) -> None:
     entry = load_profile(profile).joints[JOINT]
     wrong = type(entry.bias_nm)(value=-2.0)
-    with pytest.raises(ProfileMismatch, match="holding torque"):
-        go(profile=edited(profile, tmp_path / "wrong.yaml", bias_nm=wrong))
+    result = go(profile=edited(profile, tmp_path / "wrong.yaml", bias_nm=wrong))
+    refused_by_the_probe(result, "holding torque", tmp_path / "run")
 
 
 def test_wrong_gravity_that_is_forced_trips_at_once(
