@@ -1,0 +1,509 @@
+"""The driver for MIT-mode actuators: one CAN bus, one frame out and one back per joint and cycle.
+
+This file is the life cycle. ``frames`` and ``families`` know the bytes, ``models`` the ranges, ``settings`` the
+options, ``actuator`` one joint; ``protocol.wishes`` knows what is asked of a joint, ``protocol.rows`` which report
+belongs to which cycle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from frictid_drivers.mit.actuator import Actuator, Reader
+from frictid_drivers.mit.families import Motor, Parameter, RobStride
+from frictid_drivers.mit.frames import FULL, TWELVE, Motion, step
+from frictid_drivers.mit.logs import frame_map_values, row_decoder
+from frictid_drivers.mit.models import MODELS
+from frictid_drivers.mit.settings import JointSettings, read_settings
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.can_line import BUSIEST, BusFactory, CanLine, highest_rate_hz
+from frictid_hil.protocol.driver import (
+    Capabilities,
+    Clock,
+    DriverKind,
+    Feedback,
+    Finding,
+    FrameSink,
+    JointIdentity,
+    JointState,
+    SetPoint,
+    Severity,
+    Timing,
+    WallClock,
+)
+from frictid_hil.protocol.rows import RowDecoder
+
+_ANSWER_S = 0.05
+_TRIES = 3
+_SETTLE_S = 1.5
+_USABLE = 0.9
+"""Share of the position range that is used: beyond its end a motor's numbers start again from the other side."""
+
+
+class MitDriver:
+    """A robot of MIT-mode actuators on one CAN bus.
+
+    Args:
+        setup: the robot; ``settings`` lists the options it may carry.
+        bus_factory: opens the bus instead of python-can (a simulated one).
+        clock: run time.
+
+    Raises:
+        InvalidFields: an option of the robot file is wrong.
+    """
+
+    kind = DriverKind(line="can", addressed_by="id", addresses=(1, 0x7F), elsewhere={"virtual": "virtual-mit"})
+
+    def __init__(self, setup: RobotSetup, *, bus_factory: BusFactory | None = None, clock: Clock | None = None) -> None:
+        self.setup = setup
+        self.clock: Clock = WallClock() if clock is None else clock
+        self._bus_settings, self._settings = read_settings(setup)
+        self._bus_factory = bus_factory
+        self._line: CanLine | None = None
+        self._figures: dict[str, dict[str, float]] = {}
+        self._restore: list[tuple[str, Parameter, float]] = []
+        self._watched: set[str] = set()
+        self._decoder: RowDecoder | None = None
+        self._actuators: dict[str, Actuator] = {}
+        self._cycle_hz = 0.0
+
+    # -- reaching them ------------------------------------------------------------------------------------------
+
+    def open(self, frame_sink: FrameSink | None = None) -> None:
+        """Take the bus and hear from every motor. Families that answer nothing else are told `off`.
+
+        Raises:
+            HardwareBusy: another process holds the bus.
+            HardwareError: no such bus, or a motor does not answer.
+        """
+        try:
+            self._line = CanLine(self.setup.bus, self.setup.options, frame_sink, self.clock, self._bus_factory)
+            for joint in self.setup.joints:
+                self._meet(joint)
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> dict[str, JointIdentity]:
+        """What every motor told of itself when it was reached, and what its numbers are worth."""
+        self._open_line()
+        return {joint.name: self._identity(joint) for joint in self.setup.joints}
+
+    def capabilities(self) -> Capabilities:
+        """Torque mode needs the motors' own watchdog, confirmed by ``configure``, or an explicit permission."""
+        self._open_line()
+        watchdog = all(settings.family.watchdog is not None for settings in self._settings.values())
+        torque = watchdog or self._bus_settings.allow_torque_without_watchdog
+        return Capabilities(
+            max_cycle_hz=self._highest_rate_hz(),
+            modes=frozenset({Mode.POSITION, Mode.VELOCITY} | ({Mode.TORQUE} if torque else set())),
+            torque_offset=True,
+            drive_watchdog=watchdog,
+            lock_step=self.clock.lock_step,
+            temperature=True,
+            droop_rad={
+                joint.name: joint.rated_torque_nm / self._settings[joint.name].kp for joint in self.setup.joints
+            },
+        )
+
+    def check(self, plan: Plan | None) -> list[Finding]:
+        """Everything that can be said without moving or writing."""
+        self._open_line()
+        cycle_hz = self.setup.cycle_hz if plan is None else plan.cycle_hz
+        most_hz = self._highest_rate_hz()
+        severity = Severity.OK if cycle_hz <= most_hz else Severity.ERROR
+        count = len(self.setup.joints)
+        findings = [
+            Finding(
+                severity,
+                "bus load",
+                f"{count} motors, one frame out and one back each: at most {most_hz:g} Hz within {BUSIEST:.0%} of "
+                f"{self._bus_settings.bitrate / 1000:g} kbit/s, {cycle_hz:g} Hz asked",
+                "" if severity is Severity.OK else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz`)",
+            )
+        ]
+        for joint in self.setup.joints:
+            findings += self._joint_findings(joint, plan)
+        return findings
+
+    # -- configuring --------------------------------------------------------------------------------------------
+
+    def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
+        """Mode and watchdog written and read back; every joint reports in every cycle, active or not.
+
+        Raises:
+            PlanRefused: more frames than the bus carries; the message has the highest rate.
+            HardwareError: a motor does not take a setting.
+        """
+        self._open_line()
+        for name in active:
+            self.setup.joint(name)
+        most_hz = self._highest_rate_hz()
+        if cycle_hz > most_hz:
+            raise PlanRefused(
+                f"{len(self.setup.joints)} motors at {cycle_hz:g} Hz overload the bus: at most {most_hz:g} Hz",
+                where="bus load",
+                cause=f"one frame out and one back per motor and cycle, within {BUSIEST:.0%} of the bus",
+                next_step=f"use a rate of at most {most_hz:g} Hz (`calibrate --rate`, or `cycle_hz` in the robot file)",
+            )
+        for joint in self.setup.joints:
+            family = self._settings[joint.name].family
+            for what, (parameter, value) in family.settings.items():
+                self._set(joint, parameter, value, what)
+            if family.watchdog is not None:
+                shortest_s = 3.0 / cycle_hz
+                value = round(max(self._bus_settings.watchdog_s, shortest_s) * family.watchdog_per_s)
+                self._set(joint, family.watchdog, value, "watchdog")
+                self._watched.add(joint.name)
+        self._cycle_hz = cycle_hz
+        readers = [
+            Reader(at, joint.direction, self._settings[joint.name]) for at, joint in enumerate(self.setup.joints)
+        ]
+        self._decoder = row_decoder(readers)
+        self._actuators = {
+            joint.name: Actuator(joint, self._settings[joint.name], reader, 1.0 / cycle_hz)
+            for joint, reader in zip(self.setup.joints, readers, strict=True)
+        }
+
+    def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
+        """Kept by the host in every frame: these motors have no limits of their own but their ranges.
+
+        Raises:
+            HardwareError: a limit lies outside what the motor's numbers can say.
+        """
+        settings, end_rad = self._settings[joint], self._usable_rad(joint)
+        if max(abs(position_min_rad), abs(position_max_rad)) > end_rad:
+            raise HardwareError(
+                f"limits {position_min_rad:g}..{position_max_rad:g} rad reach beyond {end_rad:.3g} rad, "
+                f"{_USABLE:.0%} of the range that its frames can say",
+                where=f"joint {joint}",
+                next_step="narrow the limits in the robot file, or set the motor's zero nearer to the middle",
+            )
+        self._actuator(joint).limit(min(torque_nm, settings.motor.ranges.torque_nm), position_min_rad, position_max_rad)
+
+    def frame_map_values(self) -> Mapping[str, Any]:
+        """As ``driver.FrameMapped``: with the ranges that are in force."""
+        return frame_map_values(self.setup, self._settings)
+
+    # -- cycling ------------------------------------------------------------------------------------------------
+
+    def start_cycling(self) -> None:
+        """Run time zero."""
+        line, decoder = self._open_line(), self._decoder
+        if decoder is None:
+            raise HardwareError("start_cycling before configure")
+        for _ in line.received():
+            pass
+        restart: Callable[[], None] | None = getattr(self.clock, "restart", None)
+        if restart is not None:
+            restart()
+        for actuator in self._actuators.values():
+            actuator.wish.disable()
+
+    def enable(self, joint: str, mode: Mode) -> None:
+        """Ask for power; progress is in the feedback.
+
+        Raises:
+            HardwareError: torque mode without a watchdog, or no such mode.
+        """
+        if mode not in self.capabilities().modes:
+            raise HardwareError(
+                f"mode {mode.name} refused",
+                where=f"joint {joint}",
+                cause="without a watchdog of its own the motor would keep the last torque if this program died"
+                if mode is Mode.TORQUE
+                else "these motors know position, velocity and torque",
+                next_step="use position mode; or set `allow_torque_without_watchdog: true` in options and keep the "
+                "emergency stop in your hand",
+            )
+        self._actuator(joint).enable(mode)
+
+    def disable(self, joint: str) -> None:
+        """Ask for power off; a joint that moves is braked first."""
+        self._actuator(joint).wish.disable()
+
+    def lock(self, joint: str) -> None:
+        """Hold the present target."""
+        self._actuator(joint).wish.lock()
+
+    def unlock(self, joint: str) -> None:
+        """Follow the set-point again."""
+        self._actuator(joint).wish.unlock()
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """One cycle: all commands, then the answers as they come.
+
+        Raises:
+            SafetyAbort: a set-point is not a number; every joint was told to stop.
+            HardwareError: frames cannot be sent.
+        """
+        line, decoder = self._open_line(), self._decoder
+        if decoder is None:
+            raise HardwareError("exchange before configure")
+        for heard in line.received():
+            decoder.feed(*heard)
+        deadline_ns = self.clock.now_ns() + round(self._bus_settings.reply_window * 1e9 / self._cycle_hz)
+        refused: SafetyAbort | None = None
+        for actuator, set_point in zip(self._actuators.values(), set_points, strict=True):
+            try:
+                frame = actuator.frame(set_point)
+            except SafetyAbort as abort:
+                refused, frame = abort, actuator.brake()
+            decoder.feed(line.send(*frame), *frame)
+        if refused is not None:
+            self.quick_stop()
+            raise refused
+        if decoder.waiting():
+            for heard in line.received(deadline_ns):
+                decoder.feed(*heard)
+                if not decoder.waiting():
+                    break
+        return decoder.feedback
+
+    def quick_stop(self) -> None:
+        """Damping alone for every joint under power, off for the others; never raises."""
+        line, decoder = self._line, self._decoder
+        if line is None or decoder is None:
+            return
+        for actuator in self._actuators.values():
+            with contextlib.suppress(Exception):
+                actuator.wish.stop()
+                line.send(*actuator.brake())
+
+    def stop_cycling(self) -> None:
+        """Bring every joint to rest and off.
+
+        Raises:
+            SafetyAbort: a joint still reports power; it was told to let go all the same.
+        """
+        if not self._actuators:
+            return
+        try:
+            powered = self._settle()
+        finally:
+            self._let_go()
+            self._actuators, self._decoder = {}, None
+        if powered:
+            raise SafetyAbort(
+                f"did not come to rest and off within {_SETTLE_S:g} s",
+                where=", ".join(f"joint {name}" for name in powered),
+                next_step="switch its supply off, then look at the motor",
+            )
+
+    def close(self) -> None:
+        """Everything to rest, settings as they were, the bus released; safe to call twice and after errors."""
+        if self._line is None:
+            return
+        if self._actuators:
+            self.quick_stop()
+            with contextlib.suppress(FrictidError):
+                self.stop_cycling()
+        for name, parameter, value in reversed(self._restore):
+            with contextlib.suppress(FrictidError):
+                settings = self._settings[name]
+                self._line.send(*settings.family.write(settings.motor, parameter, value))
+        self._restore.clear()
+        self._line.close()
+        self._line = None
+
+    # -- parts --------------------------------------------------------------------------------------------------
+
+    def _open_line(self) -> CanLine:
+        if self._line is None:
+            raise HardwareError("the bus is not open", where=self.setup.bus)
+        return self._line
+
+    def _actuator(self, joint: str) -> Actuator:
+        name = self.setup.joint(joint).name
+        if name not in self._actuators:
+            raise HardwareError("not configured yet", where=f"joint {name}")
+        return self._actuators[name]
+
+    def _meet(self, joint: JointSetup) -> None:
+        """Read what the motor can tell; where it tells its ranges, they are taken."""
+        settings = self._settings[joint.name]
+        figures = {name: self._ask(joint, parameter) for name, parameter in settings.family.figures.items()}
+        told = [figures.get(f"{what} range", math.nan) for what in ("position", "velocity", "torque")]
+        if all(math.isfinite(value) and value > 0 for value in told):
+            ranges = replace(settings.motor.ranges, position_rad=told[0], velocity_rad_s=told[1], torque_nm=told[2])
+            settings = replace(settings, motor=replace(settings.motor, ranges=ranges))
+            self._settings[joint.name] = settings
+        elif any("range" in name for name in figures):
+            raise HardwareError(f"its ranges read {told}", where=_where(joint), cause="not a motor of this family")
+        position_rad = self._answer(
+            joint,
+            settings.family.poll(settings.motor),
+            lambda can_id, data: _position(settings, settings.motor, can_id, data),
+            "a report",
+        )
+        self._figures[joint.name] = {**figures, "reported position": position_rad}
+
+    def _ask(self, joint: JointSetup, parameter: Parameter) -> float:
+        settings = self._settings[joint.name]
+        family, motor = settings.family, settings.motor
+        return self._answer(
+            joint,
+            family.read(motor, parameter),
+            lambda can_id, data: family.told(motor, parameter, can_id, data),
+            f"parameter {parameter.index:#x}",
+        )
+
+    def _set(self, joint: JointSetup, parameter: Parameter, value: float, what: str) -> None:
+        """Write where it differs, read back, and remember what to restore.
+
+        Raises:
+            HardwareError: not taken.
+        """
+        settings = self._settings[joint.name]
+        before = self._ask(joint, parameter)
+        if before == value:
+            return
+        self._open_line().send(*settings.family.write(settings.motor, parameter, value))
+        after = self._ask(joint, parameter)
+        if after != value:
+            raise HardwareError(
+                f"{what} (parameter {parameter.index:#x}) reads {after:g} after {value:g} was written",
+                where=_where(joint),
+                cause="a firmware that does not have it, or a wrong `protocol`",
+                next_step="set it with the maker's tool, or compare the firmware's manual",
+            )
+        self._restore.append((joint.name, parameter, before))
+
+    def _answer(
+        self, joint: JointSetup, frame: tuple[int, bytes], match: Callable[[int, bytes], float | None], what: str
+    ) -> float:
+        line = self._open_line()
+        for _ in range(_TRIES):
+            line.send(*frame)
+            for _, can_id, data in line.received(self.clock.now_ns() + round(_ANSWER_S * 1e9)):
+                value = match(can_id, data)
+                if value is not None:
+                    return value
+        raise HardwareError(
+            f"does not answer: {what} not seen",
+            where=_where(joint),
+            cause="no supply, a wrong id or reply id, another bit rate, or a motor that speaks another protocol",
+            next_step="compare id and protocol with the maker's tool; check supply and termination",
+        )
+
+    def _identity(self, joint: JointSetup) -> JointIdentity:
+        settings, figures = self._settings[joint.name], self._figures[joint.name]
+        ranges, sixteen = settings.motor.ranges, isinstance(settings.family, RobStride)
+        serial, firmware = figures.get("serial"), figures.get("firmware")
+        return JointIdentity(
+            joint=joint.name,
+            serial="" if serial is None else f"{int(serial)}",
+            firmware="" if firmware is None else f"{int(firmware)}",
+            product=f"{settings.model} ({settings.family.name})",
+            rated_torque_nm=joint.rated_torque_nm,
+            gear_ratio=joint.gear_ratio,
+            position_resolution_rad=step(ranges.position_rad, FULL),
+            torque_resolution_nm=step(ranges.torque_nm, FULL if sixteen else TWELVE),
+            torque_source="the motor's own estimate, current times its torque constant",
+            timing=Timing(
+                torque_delay_s=settings.torque_delay_s,
+                uncertainty_s=0.0005,
+                source="robot file" if "torque_delay_s" in joint.options else "assumed",
+            ),
+            settings={
+                "kp": settings.kp,
+                "kd": settings.kd,
+                "velocity_range_rad_s": ranges.velocity_rad_s,
+                "torque_range_nm": ranges.torque_nm,
+            },
+        )
+
+    def _joint_findings(self, joint: JointSetup, plan: Plan | None) -> list[Finding]:
+        settings, figures = self._settings[joint.name], self._figures[joint.name]
+        subject, ranges = f"joint {joint.name}", settings.motor.ranges
+        findings = [Finding(Severity.OK, subject, f"{settings.model} answers ({settings.family.name})")]
+
+        def say(severity: Severity, message: str, next_step: str = "") -> None:
+            findings.append(Finding(severity, subject, message, next_step))
+
+        end_rad = self._usable_rad(joint.name)
+        if max(abs(joint.position_min_rad), abs(joint.position_max_rad)) > end_rad:
+            say(Severity.ERROR, f"its limits reach beyond {end_rad:.3g} rad, {_USABLE:.0%} of what its frames can say")
+        if joint.max_torque_nm > ranges.torque_nm:
+            say(Severity.ERROR, f"its frames end at {ranges.torque_nm:g} N m, max_torque_nm is {joint.max_torque_nm:g}")
+        exact = figures.get("position")
+        if exact is not None and abs(exact - figures["reported position"]) > 0.002 + 0.004 * abs(exact):
+            say(
+                Severity.ERROR,
+                f"frames of a {settings.model} would say {figures['reported position']:.4f} rad, "
+                f"its own parameter says {exact:.4f} rad",
+                "correct `model`: ranges that do not fit make every torque wrong",
+            )
+        table = MODELS[settings.model].ranges
+        if (ranges.velocity_rad_s, ranges.torque_nm) != (table.velocity_rad_s, table.torque_nm):
+            say(
+                Severity.WARNING,
+                f"it says {ranges.velocity_rad_s:g} rad/s and {ranges.torque_nm:g} N m where a {settings.model} "
+                f"usually has {table.velocity_rad_s:g} and {table.torque_nm:g}; its own figures are used",
+            )
+        if settings.family.watchdog is None:
+            say(
+                Severity.WARNING,
+                "this family has no watchdog that is known: if this program or its computer dies, the motor keeps what "
+                "it was told last",
+                "keep the emergency stop in your hand",
+            )
+        return findings
+
+    def _usable_rad(self, joint: str) -> float:
+        return _USABLE * self._settings[joint].motor.ranges.position_rad
+
+    def _highest_rate_hz(self) -> float:
+        cycle = []
+        for settings in self._settings.values():
+            can_id, data = settings.family.command(settings.motor, Motion())
+            cycle += [(can_id, len(data)), (can_id, 8)]
+        most_hz = highest_rate_hz(cycle, self._bus_settings.bitrate)
+        if self._bus_settings.tty_baudrate and self.setup.bus.startswith("slcan:"):
+            # A real UART: a letter, identifier, length and data in hex, carriage return; 10 bits each.
+            letters = sum(27 if can_id >> 31 else 22 for can_id, _ in cycle) / 2
+            most_hz = min(most_hz, float(int(self._bus_settings.tty_baudrate / 10.0 / letters)))
+        return most_hz
+
+    def _settle(self) -> list[str]:
+        """Cycle until every joint is off; names of those that are not in time."""
+        for actuator in self._actuators.values():
+            actuator.wish.disable()
+        set_points = [SetPoint() for _ in self._actuators]
+        period_ns = round(1e9 / self._cycle_hz)
+        powered: list[str] = []
+        for _ in range(max(2, math.ceil(_SETTLE_S * self._cycle_hz))):
+            self.clock.wait_until(self.clock.now_ns() + period_ns)
+            reports = self.exchange(set_points)
+            powered = [
+                joint.name
+                for joint, report in zip(self.setup.joints, reports, strict=True)
+                if report.age_cycles or report.state is JointState.ENABLED
+            ]
+            if not powered:
+                break
+        return powered
+
+    def _let_go(self) -> None:
+        """Off, twice: a lost frame must not keep a joint under power."""
+        line = self._line
+        for actuator in (*self._actuators.values(), *self._actuators.values()):
+            if line is not None:
+                with contextlib.suppress(FrictidError):
+                    line.send(*actuator.off())
+
+
+def _where(joint: JointSetup) -> str:
+    return f"joint {joint.name} (id {joint.address})"
+
+
+def _position(settings: JointSettings, motor: Motor, can_id: int, data: bytes) -> float | None:
+    answer = settings.family.answered(motor, can_id, data)
+    return None if answer is None else answer.position_rad

@@ -1,0 +1,355 @@
+"""What differs between families: identifiers, answers, states, parameters and watchdogs. One class each, no state.
+
+=================  ======  =====================  ================================  ===============================
+family             ids     state in each answer   watchdog                          what it can tell of itself
+=================  ======  =====================  ================================  ===============================
+damiao             11 bit  nibble of byte 0       register 9, in steps of 50 us     ranges, serial number, mode
+robstride          29 bit  bits 16-23 of the id   parameter 7028h, 20000 = 1 s      position as a float, unit id
+cybergear          29 bit  bits 16-23 of the id   parameter 200Ch, 20000 = 1 s      position as a float, unit id
+robstride-mit      11 bit  none                   none before the firmware of 2026  nothing
+cubemars           11 bit  error in byte 7        none documented                   nothing
+=================  ======  =====================  ================================  ===============================
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from frictid_drivers.mit import frames
+from frictid_drivers.mit.frames import FULL, Motion, Ranges
+from frictid_hil.protocol.can_line import EXTENDED
+from frictid_hil.protocol.driver import JointState
+
+Frame = tuple[int, bytes]
+"""Identifier with its flags, and data."""
+
+ON, OFF, CLEAR = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd", b"\xff" * 7 + b"\xfb"
+
+
+@dataclass(frozen=True, slots=True)
+class Motor:
+    """Where one actuator is and what its numbers mean.
+
+    Attributes:
+        id: its own.
+        reply_id: identifier (11 bit) or host id (29 bit) that its answers carry.
+        ranges: of its frames.
+    """
+
+    id: int
+    reply_id: int
+    ranges: Ranges
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer, in the motor's own direction; ``state`` None where the family's answers carry none."""
+
+    position_rad: float
+    velocity_rad_s: float
+    torque_nm: float
+    temperature_c: float
+    state: JointState | None
+    status_raw: int
+    error_code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number in the motor's memory.
+
+    Attributes:
+        index: register or parameter index.
+        layout: ``struct`` code of its four bytes, little endian.
+    """
+
+    index: int
+    layout: str = "I"
+
+
+class Family(Protocol):
+    """One kind of actuator on the wire.
+
+    Attributes:
+        name: as the robot file has it.
+        reply_id: usual ``Motor.reply_id``; None for the motor's id + 10h.
+        watchdog: the parameter that makes the motor let go without its host; None where there is none.
+        watchdog_per_s: its worth of one second.
+        settings: what must be set before power, by name of what it is.
+        figures: what it can tell of itself, by name.
+    """
+
+    name: ClassVar[str]
+    reply_id: ClassVar[int | None]
+    watchdog: ClassVar[Parameter | None]
+    watchdog_per_s: ClassVar[float]
+    settings: ClassVar[Mapping[str, tuple[Parameter, int]]]
+    figures: ClassVar[Mapping[str, Parameter]]
+
+    def command(self, motor: Motor, motion: Motion) -> Frame:
+        """The frame of one cycle."""
+        ...
+
+    def special(self, motor: Motor, what: bytes) -> Frame:
+        """``ON``, ``OFF`` or ``CLEAR``."""
+        ...
+
+    def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
+        """What a frame tells this motor: a motion, one of the specials, or nothing."""
+        ...
+
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """What a frame says of this motor."""
+        ...
+
+    def poll(self, motor: Motor) -> Frame:
+        """Ask for an answer before anything is to move: without effect where the family has such a frame, else OFF."""
+        ...
+
+    def read(self, motor: Motor, parameter: Parameter) -> Frame:
+        """Ask for a parameter."""
+        ...
+
+    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
+        """Set a parameter until power is lost."""
+        ...
+
+    def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
+        """The parameter's value, where a frame answers ``read`` or ``write`` of it."""
+        ...
+
+
+def _packed(parameter: Parameter, value: float) -> bytes:
+    return struct.pack("<f", value) if parameter.layout == "f" else int(value).to_bytes(4, "little")
+
+
+def _unpacked(parameter: Parameter, data: bytes) -> float:
+    return float(struct.unpack(f"<{parameter.layout}", data[: struct.calcsize(parameter.layout)])[0])
+
+
+class _ElevenBit:
+    """What the families with Mini Cheetah's frames share."""
+
+    name: ClassVar[str]
+    reply_id: ClassVar[int | None]
+    watchdog: ClassVar[Parameter | None] = None
+    watchdog_per_s: ClassVar[float] = 0.0
+    settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {}
+    figures: ClassVar[Mapping[str, Parameter]] = {}
+
+    def command(self, motor: Motor, motion: Motion) -> Frame:
+        """As ``Family.command``."""
+        return motor.id, frames.pack_motion(motion, motor.ranges)
+
+    def special(self, motor: Motor, what: bytes) -> Frame:
+        """As ``Family.special``."""
+        return motor.id, what
+
+    def poll(self, motor: Motor) -> Frame:
+        """As ``Family.poll``."""
+        return self.special(motor, OFF)
+
+    def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
+        """As ``Family.commanded``."""
+        if can_id != motor.id or len(data) != 8:
+            return None
+        return data if data in (ON, OFF, CLEAR) else frames.unpack_motion(data, motor.ranges)
+
+    def read(self, motor: Motor, parameter: Parameter) -> Frame:
+        """As ``Family.read``."""
+        raise NotImplementedError("this family tells no parameters")
+
+    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
+        """As ``Family.write``."""
+        raise NotImplementedError("this family takes no parameters")
+
+    def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
+        """As ``Family.told``."""
+        return None
+
+
+_DAMIAO_PORT = 0x7FF
+
+
+class Damiao(_ElevenBit):
+    """DM-J motors. Register answers share the identifier of the cyclic ones: they are read before and after only."""
+
+    name = "damiao"
+    reply_id: ClassVar[int | None] = None
+    watchdog: ClassVar[Parameter | None] = Parameter(9)
+    watchdog_per_s = 20_000.0
+    settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {"MIT mode": (Parameter(10), 1)}
+    figures: ClassVar[Mapping[str, Parameter]] = {
+        "position range": Parameter(21, "f"),
+        "velocity range": Parameter(22, "f"),
+        "torque range": Parameter(23, "f"),
+        "serial": Parameter(15),
+        "firmware": Parameter(14),
+    }
+
+    def poll(self, motor: Motor) -> Frame:
+        """As ``Family.poll``."""
+        return _DAMIAO_PORT, motor.id.to_bytes(2, "little") + bytes([0xCC, 0, 0, 0, 0, 0])
+
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """Status in the high nibble of byte 0: 0 off, 1 on, 8 and more are faults."""
+        if can_id != motor.reply_id or len(data) != 8 or data[0] & 0x0F != motor.id & 0x0F:
+            return None
+        status = data[0] >> 4
+        state = JointState.FAULT if status >= 8 else JointState.ENABLED if status else JointState.DISABLED
+        figures = frames.unpack_report(data[1:6], motor.ranges)
+        return Answer(*figures, float(data[7]), state, status, status if status >= 8 else 0)
+
+    def read(self, motor: Motor, parameter: Parameter) -> Frame:
+        """As ``Family.read``."""
+        return _DAMIAO_PORT, motor.id.to_bytes(2, "little") + bytes([0x33, parameter.index, 0, 0, 0, 0])
+
+    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
+        """As ``Family.write``."""
+        head = motor.id.to_bytes(2, "little") + bytes([0x55, parameter.index])
+        return _DAMIAO_PORT, head + _packed(parameter, value)
+
+    def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
+        """As ``Family.told``."""
+        ours = can_id == motor.reply_id and len(data) == 8 and data[:2] == motor.id.to_bytes(2, "little")
+        if not ours or data[2] not in (0x33, 0x55) or data[3] != parameter.index:
+            return None
+        return _unpacked(parameter, data[4:])
+
+
+class RobStride:
+    """RobStride's own protocol with 29-bit identifiers: type in bits 28-24, content in 23-8, target in 7-0."""
+
+    name: ClassVar[str] = "robstride"
+    reply_id: ClassVar[int | None] = 0xFD
+    watchdog: ClassVar[Parameter | None] = Parameter(0x7028)
+    watchdog_per_s: ClassVar[float] = 20_000.0
+    settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {"motion control mode": (Parameter(0x7005, "B"), 0)}
+    figures: ClassVar[Mapping[str, Parameter]] = {"position": Parameter(0x7019, "f")}
+
+    def command(self, motor: Motor, motion: Motion) -> Frame:
+        """As ``Family.command``."""
+        ranges = motor.ranges
+        torque = frames.symmetric(motion.torque_nm, ranges.torque_nm, FULL)
+        data = struct.pack(
+            ">4H",
+            frames.symmetric(motion.position_rad, ranges.position_rad, FULL),
+            frames.symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, FULL),
+            frames.to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, FULL),
+            frames.to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, FULL),
+        )
+        return _id(1, torque, motor.id), data
+
+    def special(self, motor: Motor, what: bytes) -> Frame:
+        """As ``Family.special``."""
+        kind, data = (3, bytes(8)) if what == ON else (4, bytes([what == CLEAR, *bytes(7)]))
+        return _id(kind, motor.reply_id, motor.id), data
+
+    def poll(self, motor: Motor) -> Frame:
+        """As ``Family.poll``."""
+        return self.special(motor, OFF)
+
+    def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
+        """As ``Family.commanded``."""
+        kind, content, target = _parts(can_id)
+        if target != motor.id or len(data) != 8:
+            return None
+        if kind == 1:
+            p, v, kp, kd = struct.unpack(">4H", data)
+            ranges = motor.ranges
+            return Motion(
+                frames.from_symmetric(p, ranges.position_rad, FULL),
+                frames.from_symmetric(v, ranges.velocity_rad_s, FULL),
+                frames.to_value(kp, 0.0, ranges.kp_nm_per_rad, FULL),
+                frames.to_value(kd, 0.0, ranges.kd_nm_s_per_rad, FULL),
+                frames.from_symmetric(content, ranges.torque_nm, FULL),
+            )
+        return {3: ON, 4: CLEAR if data[0] else OFF}.get(kind)
+
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """Mode in bits 22-23 of the identifier (2 runs), faults in 16-21."""
+        kind, content, target = _parts(can_id)
+        if kind != 2 or target != motor.reply_id or content & 0xFF != motor.id or len(data) != 8:
+            return None
+        faults, mode = content >> 8 & 0x3F, content >> 14 & 3
+        state = JointState.FAULT if faults else JointState.ENABLED if mode == 2 else JointState.DISABLED
+        p, v, t, temperature = struct.unpack(">4H", data)
+        ranges = motor.ranges
+        return Answer(
+            frames.from_symmetric(p, ranges.position_rad, FULL),
+            frames.from_symmetric(v, ranges.velocity_rad_s, FULL),
+            frames.from_symmetric(t, ranges.torque_nm, FULL),
+            temperature / 10.0,
+            state,
+            content >> 8,
+            faults,
+        )
+
+    def read(self, motor: Motor, parameter: Parameter) -> Frame:
+        """As ``Family.read``."""
+        return _id(17, motor.reply_id, motor.id), parameter.index.to_bytes(2, "little") + bytes(6)
+
+    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
+        """Not confirmed on the wire but by an answer of type 2: read it back."""
+        return _id(18, motor.reply_id, motor.id), struct.pack("<HH", parameter.index, 0) + _packed(parameter, value)
+
+    def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
+        """As ``Family.told``."""
+        kind, content, target = _parts(can_id)
+        ours = kind == 17 and target == motor.reply_id and content & 0xFF == motor.id and len(data) == 8
+        if not ours or content >> 8 or data[:2] != parameter.index.to_bytes(2, "little"):
+            return None
+        return _unpacked(parameter, data[4:])
+
+
+class CyberGear(RobStride):
+    """Xiaomi's motor speaks the same protocol; its watchdog has another index (one source)."""
+
+    name = "cybergear"
+    watchdog: ClassVar[Parameter | None] = Parameter(0x200C)
+
+
+class RobStrideMit(_ElevenBit):
+    """RobStride in MIT mode: no state and no parameters in what every firmware answers."""
+
+    name = "robstride-mit"
+    reply_id: ClassVar[int | None] = 0xFD
+
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """As ``Family.answered``."""
+        if can_id != motor.reply_id or len(data) != 8 or data[0] != motor.id:
+            return None
+        figures = frames.unpack_report(data[1:6], motor.ranges)
+        return Answer(*figures, int.from_bytes(data[6:8], "big") / 10.0, None, 0, 0)
+
+
+class CubeMars(_ElevenBit):
+    """AK motors with V2 firmware in MIT mode; answers of 6 bytes (old) or of 8 with temperature and error."""
+
+    name = "cubemars"
+    reply_id: ClassVar[int | None] = 0
+
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """As ``Family.answered``."""
+        if can_id != motor.reply_id or len(data) not in (6, 8) or data[0] != motor.id:
+            return None
+        temperature = float(int.from_bytes(data[6:7], "big", signed=True)) if len(data) == 8 else float("nan")
+        error = data[7] if len(data) == 8 else 0
+        state = JointState.FAULT if error else None
+        return Answer(*frames.unpack_report(data[1:6], motor.ranges), temperature, state, error, error)
+
+
+_ALL: tuple[Family, ...] = (Damiao(), RobStride(), CyberGear(), RobStrideMit(), CubeMars())
+FAMILIES: Mapping[str, Family] = {family.name: family for family in _ALL}
+
+
+def _id(kind: int, content: int, target: int) -> int:
+    return EXTENDED | kind << 24 | content << 8 | target
+
+
+def _parts(can_id: int) -> tuple[int, int, int]:
+    """Type, content and target; type -1 of a frame with an 11-bit identifier."""
+    return (can_id >> 24 & 0x1F) if can_id & EXTENDED else -1, can_id >> 8 & 0xFFFF, can_id & 0xFF

@@ -1,0 +1,98 @@
+"""The frame that all MIT-mode actuators share, and the ranges without which it means nothing.
+
+Position, velocity, gains and torque travel as fractions of ranges that are set in the motor; nothing on the wire says
+which. Layout of a command, most significant bit first: position 16, velocity 12, kp 12, kd 12, torque 12.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FULL = 0xFFFF
+TWELVE = 0xFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """What the ends of the number ranges mean; position, velocity and torque are symmetric, gains begin at 0."""
+
+    position_rad: float
+    velocity_rad_s: float
+    torque_nm: float
+    kp_nm_per_rad: float = 500.0
+    kd_nm_s_per_rad: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What an actuator is told in its own direction: torque = kp (p - p_now) + kd (v - v_now) + torque."""
+
+    position_rad: float = 0.0
+    velocity_rad_s: float = 0.0
+    kp_nm_per_rad: float = 0.0
+    kd_nm_s_per_rad: float = 0.0
+    torque_nm: float = 0.0
+
+
+def to_number(value: float, low: float, high: float, most: int) -> int:
+    """The nearest of the numbers 0..most that stand for low..high; the makers' own code truncates."""
+    return min(max(round((value - low) / (high - low) * most), 0), most)
+
+
+def to_value(number: int, low: float, high: float, most: int) -> float:
+    """What a number stands for."""
+    return low + number * (high - low) / most
+
+
+def symmetric(value: float, end: float, most: int) -> int:
+    """``to_number`` for -end..end."""
+    return to_number(value, -end, end, most)
+
+
+def from_symmetric(number: int, end: float, most: int) -> float:
+    """``to_value`` for -end..end."""
+    return to_value(number, -end, end, most)
+
+
+def step(end: float, most: int) -> float:
+    """One number's worth of a symmetric range."""
+    return 2.0 * end / most
+
+
+def pack_motion(motion: Motion, ranges: Ranges) -> bytes:
+    """The eight bytes of a command."""
+    p = symmetric(motion.position_rad, ranges.position_rad, FULL)
+    v = symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, TWELVE)
+    kp = to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, TWELVE)
+    kd = to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, TWELVE)
+    t = symmetric(motion.torque_nm, ranges.torque_nm, TWELVE)
+    return (p << 48 | v << 36 | kp << 24 | kd << 12 | t).to_bytes(8, "big")
+
+
+def unpack_motion(data: bytes, ranges: Ranges) -> Motion:
+    """The command in eight bytes."""
+    word = int.from_bytes(data, "big")
+    return Motion(
+        from_symmetric(word >> 48, ranges.position_rad, FULL),
+        from_symmetric(word >> 36 & TWELVE, ranges.velocity_rad_s, TWELVE),
+        to_value(word >> 24 & TWELVE, 0.0, ranges.kp_nm_per_rad, TWELVE),
+        to_value(word >> 12 & TWELVE, 0.0, ranges.kd_nm_s_per_rad, TWELVE),
+        from_symmetric(word & TWELVE, ranges.torque_nm, TWELVE),
+    )
+
+
+def pack_report(position_rad: float, velocity_rad_s: float, torque_nm: float, ranges: Ranges) -> bytes:
+    """The five bytes of position 16, velocity 12, torque 12 that answers carry."""
+    p = symmetric(position_rad, ranges.position_rad, FULL)
+    v = symmetric(velocity_rad_s, ranges.velocity_rad_s, TWELVE)
+    return (p << 24 | v << 12 | symmetric(torque_nm, ranges.torque_nm, TWELVE)).to_bytes(5, "big")
+
+
+def unpack_report(data: bytes, ranges: Ranges) -> tuple[float, float, float]:
+    """Position, velocity and torque of five bytes."""
+    word = int.from_bytes(data[:5], "big")
+    return (
+        from_symmetric(word >> 24, ranges.position_rad, FULL),
+        from_symmetric(word >> 12 & TWELVE, ranges.velocity_rad_s, TWELVE),
+        from_symmetric(word & TWELVE, ranges.torque_nm, TWELVE),
+    )

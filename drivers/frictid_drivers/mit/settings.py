@@ -1,0 +1,157 @@
+"""Options of the robot file for MIT-mode actuators.
+
+::
+
+    driver: mit
+    options: {watchdog_ms: 100}        # of the whole bus; also bitrate and what else python-can takes
+    joints:
+      "0":
+        id: 1                          # the motor's own (Damiao: ESC_ID)
+        options: {model: DM-J4310, kp: 100, kd: 2}
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from frictid_drivers.mit.families import FAMILIES, Family, Motor
+from frictid_drivers.mit.models import MODELS
+from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import unknown_options
+
+BUS_OPTIONS = frozenset(
+    {"bitrate", "tty_baudrate", "sleep_after_open", "port", "app_name", "serial", "index", "host", "tcp_tune"}
+    | {"watchdog_ms", "allow_torque_without_watchdog", "reply_window"}
+)
+JOINT_OPTIONS = frozenset({"model", "protocol", "kp", "kd", "brake_kd", "reply_id", "torque_delay_s"})
+
+_PROTOCOLS = {
+    "damiao": ("damiao",),
+    "robstride": ("robstride", "robstride-mit", "cybergear"),
+    "cubemars": ("cubemars",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """Of the whole bus.
+
+    Attributes:
+        bitrate: bit/s.
+        watchdog_s: without a command for so long, a motor that has a watchdog lets go.
+        allow_torque_without_watchdog: torque mode also where nothing stops the motor when the host dies.
+        reply_window: share of a cycle that answers are waited for.
+        tty_baudrate: of a serial adapter's real UART; 0 where there is none.
+    """
+
+    bitrate: int
+    watchdog_s: float
+    allow_torque_without_watchdog: bool
+    reply_window: float
+    tty_baudrate: int
+
+
+@dataclass(frozen=True, slots=True)
+class JointSettings:
+    """Of one joint.
+
+    Attributes:
+        model: as the catalogue has it.
+        family: what it speaks.
+        motor: where it is.
+        kp: stiffness of position control, N m/rad.
+        kd: damping of position and velocity control, N m s/rad.
+        brake_kd: damping of a quick stop.
+        torque_delay_s: by how much the reported torque is late, where somebody measured it.
+    """
+
+    model: str
+    family: Family
+    motor: Motor
+    kp: float
+    kd: float
+    brake_kd: float
+    torque_delay_s: float
+
+
+def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
+    """All options, checked.
+
+    Raises:
+        InvalidFields: every option that is unknown or impossible.
+    """
+    problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "mit")
+    joints: dict[str, JointSettings] = {}
+    for joint in setup.joints:
+        problems += unknown_options(joint.options, JOINT_OPTIONS, ("joints", joint.name, "options"), "mit")
+        settings = _joint(joint, problems)
+        if settings is not None:
+            joints[joint.name] = settings
+    options, at = setup.options, ("options",)
+    bus = BusSettings(
+        bitrate=int(_number(options, "bitrate", 1_000_000, 10_000, 1_000_000, at, problems)),
+        watchdog_s=_number(options, "watchdog_ms", 100.0, 5.0, 10_000.0, at, problems) / 1000.0,
+        allow_torque_without_watchdog=options.get("allow_torque_without_watchdog") is True,
+        reply_window=_number(options, "reply_window", 0.8, 0.1, 0.95, at, problems),
+        tty_baudrate=int(_number(options, "tty_baudrate", 0, 0, 10_000_000, at, problems)),
+    )
+    if problems:
+        raise InvalidFields(problems)
+    return bus, joints
+
+
+def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | None:
+    at = ("joints", joint.name, "options")
+    options = joint.options
+    model = MODELS.get(str(options.get("model")))
+    if model is None:
+        known = ", ".join(MODELS)
+        problems.append(FieldProblem((*at, "model"), f"expected the model written on the motor, one of {known}"))
+        return None
+    usual = "cybergear" if options["model"] == "CyberGear" else _PROTOCOLS[model.maker][0]
+    protocol = options.get("protocol", usual)
+    if protocol not in _PROTOCOLS[model.maker]:
+        known = " or ".join(_PROTOCOLS[model.maker])
+        problems.append(FieldProblem((*at, "protocol"), f"a {options['model']} speaks {known}, found {protocol!r}"))
+        return None
+    family, ranges = FAMILIES[protocol], model.ranges
+    usual_reply = joint.address + 0x10 if family.reply_id is None else family.reply_id
+    reply_id = int(_number(options, "reply_id", usual_reply, 0, 0x7FF, at, problems))
+    if reply_id == joint.address:
+        problems.append(FieldProblem((*at, "reply_id"), "must differ from the motor's own id"))
+    if joint.max_torque_nm > ranges.torque_nm:
+        problems.append(
+            FieldProblem(
+                ("joints", joint.name, "max_torque_nm"), f"a {options['model']} tells {ranges.torque_nm:g} N m"
+            )
+        )
+    kd = _number(options, "kd", min(1.0, ranges.kd_nm_s_per_rad), 0.0, ranges.kd_nm_s_per_rad, at, problems)
+    return JointSettings(
+        model=str(options["model"]),
+        family=family,
+        motor=Motor(joint.address, reply_id, ranges),
+        kp=_number(options, "kp", 50.0, 0.0, ranges.kp_nm_per_rad, at, problems) or math.nan,
+        kd=kd,
+        brake_kd=_number(options, "brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad, at, problems),
+        torque_delay_s=_number(options, "torque_delay_s", 0.0, 0.0, 0.1, at, problems),
+    )
+
+
+def _number(
+    options: Mapping[str, Any],
+    name: str,
+    usual: float,
+    low: float,
+    high: float,
+    at: tuple[str, ...],
+    problems: list[FieldProblem],
+) -> float:
+    value = options.get(name, usual)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        problems.append(FieldProblem((*at, name), f"expected a number from {low:g} to {high:g}, found {value!r}"))
+        return usual
+    return float(value)

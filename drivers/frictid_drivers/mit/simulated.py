@@ -1,0 +1,297 @@
+"""MIT-mode actuators that are not there: frames in, frames out, a simulated joint behind each.
+
+Written against the makers' frame tables and not against the driver: the two share no codec, only the catalogue of
+ranges. Numbers are truncated on the way out, as the makers' firmware does. The torque is the mean of what was applied,
+with the plant's noise, in the 12 or 16 bits of the family.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable
+from typing import Protocol
+
+from frictid_drivers.mit.driver import MitDriver
+from frictid_drivers.mit.frames import Ranges
+from frictid_drivers.mit.settings import JointSettings, read_settings
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import Clock, DriverKind, WallClock
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.servo_loop import ServoLoop
+from frictid_hil.testing.wire import FakeCanBus, Frame, ManualClock
+
+_LOOP_NS = 500_000
+_TORQUE_MODE = 10
+_LONG_ID = 1 << 31
+
+
+class VirtualMitDriver(MitDriver):
+    """The ``mit`` driver with simulated actuators on its bus."""
+
+    kind = DriverKind(simulated=True, line="virtual", addressed_by="id", addresses=(1, 0x7F), elsewhere={"can": "mit"})
+
+    def __init__(self, setup: RobotSetup) -> None:
+        self.rack = Rack(setup)
+        clock: Clock = WallClock() if setup.realtime else ManualClock(self.rack.advance)
+        super().__init__(setup, bus_factory=lambda: FakeCanBus(self.rack, clock), clock=clock)
+
+    def mount_payload(self, joint: str, mounted: bool) -> None:
+        """Put the payload of the robot file on a joint, or take it off."""
+        self.rack.actuators[joint].plant.mount_payload(mounted)
+
+
+class Actuator:
+    """One motor: its control law, its plant, its memory and its watchdog.
+
+    Args:
+        joint: of the robot file.
+        seed: of the noise.
+        ranges: of its frames.
+        id: its own.
+
+    Attributes:
+        on: under power.
+        fault: code that it shows; 0 when healthy.
+        timeout_ns: without a command for so long it lets go; 0 for never.
+        asked: position, velocity, kp, kd, torque in force.
+    """
+
+    def __init__(self, joint: JointSetup, seed: int, ranges: Ranges, id: int) -> None:
+        self.plant = ServoLoop(
+            JointModel.of(joint, joint.name),
+            period_s=_LOOP_NS * 1e-9,
+            seed=seed,
+            position_rad=joint.locked_position_rad,
+        )
+        self.plant.set_mode(_TORQUE_MODE)
+        self.plant.brake(False)
+        self.id, self.ranges, self.direction = id, ranges, joint.direction
+        self.on, self.fault, self.timeout_ns = False, 0, 0
+        self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self._now_ns = self._heard_ns = 0
+
+    def switch(self, on: bool) -> None:
+        """Power; a fault keeps it off."""
+        self.on = on and not self.fault
+        self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.plant.power(self.on)
+
+    def heard(self) -> None:
+        """Somebody talks to it."""
+        self._heard_ns = self._now_ns
+
+    def advance(self, to_ns: int) -> None:
+        """Its own loop, period by period."""
+        while self._now_ns + _LOOP_NS <= to_ns:
+            if self.on and self.timeout_ns and self._now_ns - self._heard_ns > self.timeout_ns:
+                self.fault = 0xD
+                self.switch(False)
+            p, v, kp, kd, t = self.asked
+            torque = kp * (p - self.position) + kd * (v - self.velocity) + t if self.on else 0.0
+            most = self.ranges.torque_nm
+            self.plant.advance(_LOOP_NS * 1e-9, torque_nm=self.direction * min(max(torque, -most), most))
+            self._now_ns += _LOOP_NS
+
+    @property
+    def position(self) -> float:
+        """In the motor's direction."""
+        return self.direction * self.plant.measured_position_rad
+
+    @property
+    def velocity(self) -> float:
+        """In the motor's direction."""
+        return self.direction * self.plant.velocity_rad_s
+
+    @property
+    def torque(self) -> float:
+        """In the motor's direction, as it believes."""
+        return self.direction * self.plant.torque_nm
+
+
+class Wire(Protocol):
+    """How one family speaks; returns None for a frame that is not meant for this motor."""
+
+    def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
+        """A frame arrives."""
+        ...
+
+
+class Rack:
+    """All actuators of a robot on one bus.
+
+    Args:
+        setup: with ``simulated`` of every joint.
+    """
+
+    def __init__(self, setup: RobotSetup) -> None:
+        self.actuators: dict[str, Actuator] = {}
+        self._wires: list[tuple[Actuator, Wire]] = []
+        settings = read_settings(setup)[1]
+        for joint in setup.joints:
+            mine = settings[joint.name]
+            seed = zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode())
+            actuator = Actuator(joint, seed, mine.motor.ranges, joint.address)
+            self.actuators[joint.name] = actuator
+            self._wires.append((actuator, _wire_of(mine, seed)))
+
+    def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
+        """A frame of the host; the answer of the motor that it is meant for."""
+        for actuator, wire in self._wires:
+            answer = wire(actuator, can_id, data)
+            if answer is not None:
+                actuator.heard()
+                return answer
+        return []
+
+    def advance(self, to_ns: int) -> None:
+        """Run time goes on."""
+        for actuator in self.actuators.values():
+            actuator.advance(to_ns)
+
+
+def _wire_of(settings: JointSettings, seed: int) -> Wire:
+    name, reply_id = settings.family.name, settings.motor.reply_id
+    if name == "damiao":
+        return _DamiaoWire(settings.motor.ranges, reply_id, seed)
+    if name in ("robstride", "cybergear"):
+        return _RobStrideWire(reply_id, 0x200C if name == "cybergear" else 0x7028)
+    return _PlainWire(reply_id, 8 if name == "robstride-mit" else 6, deci=name == "robstride-mit")
+
+
+def _to_bits(value: float, end: float, bits: int) -> int:
+    full = (1 << bits) - 1
+    return max(0, min(full, int((value + end) * full / (2 * end))))
+
+
+def _from_bits(number: int, low: float, high: float, bits: int) -> float:
+    return number * (high - low) / ((1 << bits) - 1) + low
+
+
+def _mit_command(motor: Actuator, data: bytes) -> None:
+    """As in the table: p 16, v 12, kp 12, kd 12, t 12 bits; the four special frames."""
+    if data[:7] == b"\xff" * 7 and data[7] in (0xFB, 0xFC, 0xFD):
+        if data[7] == 0xFB:
+            motor.fault = 0
+        else:
+            motor.switch(data[7] == 0xFC)
+        return
+    r = motor.ranges
+    motor.asked = (
+        _from_bits(data[0] << 8 | data[1], -r.position_rad, r.position_rad, 16),
+        _from_bits(data[2] << 4 | data[3] >> 4, -r.velocity_rad_s, r.velocity_rad_s, 12),
+        _from_bits((data[3] & 15) << 8 | data[4], 0.0, r.kp_nm_per_rad, 12),
+        _from_bits(data[5] << 4 | data[6] >> 4, 0.0, r.kd_nm_s_per_rad, 12),
+        _from_bits((data[6] & 15) << 8 | data[7], -r.torque_nm, r.torque_nm, 12),
+    )
+
+
+def _mit_report(motor: Actuator, first: int) -> bytes:
+    r = motor.ranges
+    p = _to_bits(motor.position, r.position_rad, 16)
+    v = _to_bits(motor.velocity, r.velocity_rad_s, 12)
+    t = _to_bits(motor.torque, r.torque_nm, 12)
+    return bytes([first, p >> 8, p & 255, v >> 4, (v & 15) << 4 | t >> 8, t & 255])
+
+
+class _DamiaoWire:
+    """Register numbers and status nibble as in the J4310 manual."""
+
+    def __init__(self, ranges: Ranges, reply_id: int, seed: int) -> None:
+        self._reply_id = reply_id
+        self._floats = {21: ranges.position_rad, 22: ranges.velocity_rad_s, 23: ranges.torque_nm}
+        self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: seed}
+
+    def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
+        if can_id == 0x7FF and len(data) == 8 and data[0] | data[1] << 8 == motor.id:
+            return self._service(motor, data)
+        if can_id != motor.id or len(data) != 8:
+            return None
+        if self._words[10] == 1:
+            _mit_command(motor, data)
+        return [self._report(motor)]
+
+    def _service(self, motor: Actuator, data: bytes) -> list[Frame]:
+        kind, register = data[2], data[3]
+        if kind == 0xCC:
+            return [self._report(motor)]
+        if kind == 0x55 and register in self._words:
+            self._words[register] = struct.unpack("<I", data[4:])[0]
+            motor.timeout_ns = self._words[9] * 50_000
+        if register in self._floats:
+            value = struct.pack("<f", self._floats[register])
+        else:
+            value = struct.pack("<I", self._words.get(register, 0))
+        return [(self._reply_id, bytes([*data[:4], *value]))]
+
+    def _report(self, motor: Actuator) -> Frame:
+        status = motor.fault or int(motor.on)
+        return self._reply_id, _mit_report(motor, status << 4 | motor.id & 15) + bytes([31, 28])
+
+
+class _PlainWire:
+    """Mini Cheetah's answers: the id, figures, and on some a temperature."""
+
+    def __init__(self, reply_id: int, length: int, *, deci: bool) -> None:
+        self._reply_id, self._length, self._deci = reply_id, length, deci
+
+    def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
+        if can_id != motor.id or len(data) != 8:
+            return None
+        _mit_command(motor, data)
+        tail = struct.pack(">H", 285) if self._deci else b""
+        return [(self._reply_id, _mit_report(motor, motor.id) + tail)]
+
+
+class _RobStrideWire:
+    """29-bit identifiers as in the RS manuals of 2026-04."""
+
+    def __init__(self, host: int, timeout_index: int) -> None:
+        self._host = host
+        self._timeout_index = timeout_index
+        self._words: dict[int, int] = {0x7005: 0, timeout_index: 0}
+
+    def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
+        if not can_id & _LONG_ID or can_id & 0xFF != motor.id or len(data) != 8:
+            return None
+        kind = can_id >> 24 & 0x1F
+        if kind == 1 and self._words[0x7005] == 0:
+            r = motor.ranges
+            p, v, kp, kd = (data[k] << 8 | data[k + 1] for k in (0, 2, 4, 6))
+            motor.asked = (
+                _from_bits(p, -r.position_rad, r.position_rad, 16),
+                _from_bits(v, -r.velocity_rad_s, r.velocity_rad_s, 16),
+                _from_bits(kp, 0.0, r.kp_nm_per_rad, 16),
+                _from_bits(kd, 0.0, r.kd_nm_s_per_rad, 16),
+                _from_bits(can_id >> 8 & 0xFFFF, -r.torque_nm, r.torque_nm, 16),
+            )
+        elif kind == 3:
+            motor.switch(True)
+        elif kind == 4:
+            motor.switch(False)
+            motor.fault = 0 if data[0] == 1 else motor.fault
+        elif kind == 17:
+            return [self._parameter(motor, data)]
+        elif kind == 18:
+            self._words[data[0] | data[1] << 8] = struct.unpack("<I", data[4:])[0]
+            motor.timeout_ns = self._words[self._timeout_index] * 50_000
+        return [self._report(motor)]
+
+    def _parameter(self, motor: Actuator, data: bytes) -> Frame:
+        index = data[0] | data[1] << 8
+        value = struct.pack("<f", motor.position) if index == 0x7019 else struct.pack("<I", self._words.get(index, 0))
+        unknown = index != 0x7019 and index not in self._words
+        return self._id(17, motor, unknown), bytes([data[0], data[1], 0, 0]) + value
+
+    def _report(self, motor: Actuator) -> Frame:
+        r, state = motor.ranges, (2 if motor.on else 0) << 6 | (1 if motor.fault else 0)
+        figures = (
+            _to_bits(motor.position, r.position_rad, 16),
+            _to_bits(motor.velocity, r.velocity_rad_s, 16),
+            _to_bits(motor.torque, r.torque_nm, 16),
+            285,
+        )
+        return self._id(2, motor, state), struct.pack(">4H", *figures)
+
+    def _id(self, kind: int, motor: Actuator, content: int) -> int:
+        return _LONG_ID | kind << 24 | content << 16 | motor.id << 8 | self._host

@@ -1,0 +1,70 @@
+"""One joint of every family from unknown friction to compensated, against its simulated device at the wire."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mit_bench import FAMILIES, robot_file
+
+from frictid_hil.config.profile import load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.steady import true_curve_nm
+
+COULOMB_NM = 0.24
+
+
+def unit(folder: Path, family: str, *, noise_per_mille: float, scale: float) -> Path:
+    path = robot_file(folder, family)
+    values: dict[str, Any] = yaml.safe_load(path.read_text())
+    simulated = values["joints"]["0"]["simulated"]
+    simulated["friction"] = {"coulomb_nm": COULOMB_NM * scale, "viscous_nm_s_per_rad": 0.035 * scale}
+    simulated["drive"]["torque_noise_per_mille"] = noise_per_mille
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def calibrated(path: Path, out: Path, seed: int) -> None:
+    result = calibrate(CalibrateOptions(str(path), out=out, seed=seed, cycles=5), Silent())
+    assert result["outcome"] == "ok", result
+    joint = load_profile(out / "profile.yaml").joint("0")
+    setup = load_robot(path).to_setup()
+    model = JointModel.of(setup.joint("0"), "0")
+    coulomb_nm = model.friction.coulomb_nm
+    assert joint.coulomb_nm.value == pytest.approx(coulomb_nm, rel=0.05)
+    assert joint.coulomb_nm.low < coulomb_nm < joint.coulomb_nm.high
+    truth_nm = true_curve_nm(model, np.array(joint.velocity_rad_s))
+    assert np.allclose(joint.torque_nm, truth_nm, rtol=0.03)
+    low_nm, high_nm = np.array(joint.torque_interval_nm).T
+    assert np.mean((low_nm <= truth_nm) & (truth_nm <= high_nm)) >= 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+@pytest.mark.parametrize(("seed", "noise_per_mille", "scale"), [(1, 4.0, 1.0), (2, 8.0, 0.9), (3, 15.0, 1.15)])
+def test_three_units_of_a_family(tmp_path: Path, family: str, seed: int, noise_per_mille: float, scale: float) -> None:
+    path = unit(tmp_path, family, noise_per_mille=noise_per_mille, scale=scale)
+    calibrated(path, tmp_path / "run", seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_compensation_follows_better_than_none(tmp_path: Path, family: str) -> None:
+    options = {"allow_torque_without_watchdog": True}  # nothing here can be hurt
+    path = robot_file(tmp_path, family, {"options": options})
+    calibrated(path, tmp_path / "run", 4)
+    wanted = Wanted("track", ("nc", "mop"), duration_s=4.0)
+    result = compensate(
+        CompensateOptions(str(path), tmp_path / "run" / "profile.yaml", "0", wanted, out=tmp_path / "compensated"),
+        Silent(),
+    )
+    assert result["outcome"] == "ok", result
+    assert result["modes"]["mop"]["reduction_percent"] >= 50.0
