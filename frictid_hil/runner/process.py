@@ -1,8 +1,8 @@
 """On the wall clock the cyclic loop is a process of its own; this file is both of its ends.
 
 The child touches the driver, the supervisor and two shared rings, nothing else. The parent writes files, shows progress
-and asks people. When the parent disappears, the child brings the joint to rest and ends; when the child disappears, the
-drives' own heartbeat watchdogs do.
+and asks people. When the parent disappears, the child brings the joint to rest and ends; when the child disappears or
+hangs, the drives' own heartbeat watchdogs do, and the parent says what may still have power.
 
 ::
 
@@ -10,7 +10,7 @@ drives' own heartbeat watchdogs do.
     go / no  ------------------------------------------------->  Scheduler(driver, ...)
     <------------------  Preflight, PhaseStarted, JointRun, ...
     <------------------  outcome (None or a FrictidError)
-    stop level (one shared byte) ------------------------------>  read once per cycle
+    signals, as their handler gets them ------- pipe ---------->  read once per cycle
     <=========  sample and frame rings in shared memory
 """
 
@@ -22,28 +22,34 @@ import gc
 import multiprocessing
 import os
 import signal
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING
+from multiprocessing.context import SpawnProcess
 
-from frictid_hil.errors import FrictidError, HardwareError, Interrupted, SafetyAbort
+from frictid_hil.errors import Defect, FrictidError, Interrupted, SafetyAbort
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import load_driver
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.cycle import DECELERATE, QUICK_STOP
-from frictid_hil.runner.events import Event, Preflight, Warned
+from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
-
-if TYPE_CHECKING:
-    from multiprocessing.sharedctypes import Synchronized
+from frictid_hil.runner.stop_signals import HeardStop, StopSignals
 
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.05
 _FIFO_PRIORITY = 60
+_SILENT_S = 30.0
+"""Configuring drives may take its time; what lasts longer without a word hangs ..."""
+_SILENT_STOPPING_S = 5.0
+"""... and so does what is silent for so long after a stop was asked for."""
+_ENDING_S = 15.0
+"""Longest way from a stop to the end of the process."""
+_WITHOUT_POWER = ("configure", "reference")
+"""Phases of a joint in which no drive has power."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,20 +65,23 @@ class _Order:
     parent_pid: int
 
 
-class _SharedStop:
-    """The stop level in shared memory, raised also when the parent is gone."""
+class _Life:
+    """Signs of life of the child: rows and messages. Only the time counts in which this process could have seen one."""
 
-    def __init__(self, level: Synchronized[int], parent_pid: int) -> None:
-        self._raw = level.get_obj()
-        self._parent_pid = parent_pid
-        self.terminated = False
+    def __init__(self) -> None:
+        self._seen_rows = 0
+        self._looked_s = time.monotonic()
+        self._silent_s = 0.0
+        self._asked_s = 0.0
 
-    @property
-    def level(self) -> int:
-        """The highest level asked for so far."""
-        if self.terminated or os.getppid() != self._parent_pid:
-            return max(DECELERATE, self._raw.value)
-        return int(self._raw.value)
+    def look(self, rows: int, *, heard: bool, stop_asked: bool) -> bool:
+        """Whether it can be hoped for any longer."""
+        passed_s = min(2 * _POLL_S, time.monotonic() - self._looked_s)
+        self._looked_s = time.monotonic()
+        self._silent_s = 0.0 if heard or rows != self._seen_rows else self._silent_s + passed_s
+        self._asked_s += passed_s * stop_asked
+        self._seen_rows = rows
+        return self._silent_s < (_SILENT_STOPPING_S if stop_asked else _SILENT_S) and self._asked_s < _ENDING_S
 
 
 def run_in_own_process(
@@ -83,7 +92,7 @@ def run_in_own_process(
     *,
     notify: Callable[[Event], None],
     proceed: Callable[[Preflight], bool],
-    stop_level: Callable[[], int],
+    stop: StopSignals,
     drain: Callable[[], None],
     care: Care,
 ) -> None:
@@ -96,68 +105,97 @@ def run_in_own_process(
         recorder: made of shared rings.
         notify: called in this process for each event.
         proceed: asked in this process.
-        stop_level: polled; passed on to the child.
+        stop: passed on to the child.
         drain: called every 50 ms to empty the rings.
         care: bounds.
 
     Raises:
         FrictidError: whatever ended the run in the child.
-        HardwareError: the child died without a word.
+        SafetyAbort: the child died without a word, or hangs and was ended.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    level: Synchronized[int] = context.Value("b", 0)
+    heard, wire = context.Pipe(duplex=False)
     order = _Order(driver, setup, plan, care, recorder.samples.name, recorder.frames.name, os.getpid())
-    child = context.Process(target=_child, args=(order, theirs, level), name="frictid-hil-cycle")
-    child.start()
-    theirs.close()
+    child = context.Process(target=_child, args=(order, theirs, heard), name="frictid-hil-cycle")
     outcome: FrictidError | None = None
-    finished = False
-    try:
-        while not finished:
-            # ``level.get_obj()`` needs no lock: one byte, one writer.
-            level.get_obj().value = max(level.get_obj().value, stop_level())
-            if ours.poll(_POLL_S):
-                try:
-                    message = ours.recv()
-                except EOFError:
+    finished = hangs = powered = False
+    life = _Life()
+    with stop.written_to(wire.fileno()):
+        child.start()
+        theirs.close()
+        heard.close()
+        try:
+            while not finished:
+                told = ours.poll(_POLL_S)
+                if told:
+                    try:
+                        message = ours.recv()
+                    except EOFError:
+                        break
+                    if isinstance(message, Preflight):
+                        notify(message)
+                        answer = stop.while_asking(lambda preflight=message: proceed(preflight))  # type: ignore[misc]
+                        ours.send(answer)
+                    elif isinstance(message, tuple):
+                        (outcome,) = message
+                        finished = True
+                    else:
+                        if isinstance(message, PhaseStarted | JointRun):
+                            powered = isinstance(message, PhaseStarted) and message.phase not in _WITHOUT_POWER
+                        drain()
+                        notify(message)
+                drain()
+                if not life.look(recorder.samples.drained, heard=told, stop_asked=stop.level > 0):
+                    hangs = True
                     break
-                if isinstance(message, Preflight):
-                    notify(message)
-                    ours.send(proceed(message))
-                elif isinstance(message, tuple):
-                    (outcome,) = message
-                    finished = True
-                else:
-                    drain()
-                    notify(message)
+            child.join(_ENDING_S if finished else 0.0)
+        finally:
+            _end(child, hangs=hangs)
             drain()
-        child.join(10.0)
-    finally:
-        if child.is_alive():
-            child.terminate()
-            child.join(2.0)
-        drain()
-        ours.close()
+            ours.close()
+            wire.close()
     if outcome is not None:
         raise outcome
     if not finished:
-        raise SafetyAbort(
-            f"the cyclic process ended without a word (exit code {child.exitcode})",
-            cause="it was killed, or ran out of memory",
-            next_step="the drives stop by their own heartbeat watchdogs; samples up to here are kept",
-        )
+        raise _lost(child.exitcode, setup, hangs=hangs, powered=powered)
 
 
-def _child(order: _Order, pipe: Connection, level: Synchronized[int]) -> None:
+def _end(child: SpawnProcess, *, hangs: bool) -> None:
+    """Bring the child to its end, whatever it does."""
+    if child.is_alive() and not hangs:
+        child.terminate()
+        child.join(_ENDING_S)
+    if child.is_alive():
+        child.kill()
+        child.join()
+
+
+def _lost(exit_code: int | None, setup: RobotSetup, *, hangs: bool, powered: bool) -> SafetyAbort:
+    what = "hung, and was ended" if hangs else f"ended without a word (exit code {exit_code})"
+    names = ", ".join(joint.name for joint in setup.joints)
+    return SafetyAbort(
+        f"the cyclic process {what}",
+        cause="it was suspended, or a driver's library never returned"
+        if hangs
+        else "it was killed, or ran out of memory",
+        next_step=f"joints {names} may still have power: press the emergency stop, then look at them; where the drives "
+        "watch over their host they have stopped by themselves. Samples up to here are kept"
+        if powered
+        else "nothing had power by then; samples up to here are kept",
+    )
+
+
+def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
     """The cyclic process."""
-    stop = _SharedStop(level, order.parent_pid)
+    stop = HeardStop(heard.fileno(), order.parent_pid)
 
     def terminated(_signal: int, _frame: object) -> None:
         stop.terminated = True
 
-    # Ctrl-C reaches the whole process group; only the parent decides what it means.
+    # Ctrl-C and a closed terminal reach the whole process group; only the parent decides what they mean.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, terminated)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     outcome: FrictidError | None = None
@@ -197,7 +235,8 @@ def _child(order: _Order, pipe: Connection, level: Synchronized[int]) -> None:
     except FrictidError as error:
         outcome = error
     except Exception as error:  # the parent must learn of a defect here too
-        outcome = HardwareError(f"defect in the cyclic process: {error}\n{traceback.format_exc()}")
+        traceback.print_exc()
+        outcome = Defect.of(error)
     finally:
         samples.close()
         frames.close()
@@ -216,6 +255,3 @@ def _raise_priority() -> str:
             "Allow it with: sudo setcap cap_sys_nice+ep $(readlink -f $(which python3)), or LimitRTPRIO=99 in systemd"
         )
     return ""
-
-
-__all__ = ["QUICK_STOP", "run_in_own_process"]

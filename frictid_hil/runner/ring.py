@@ -3,16 +3,23 @@
 One process appends, another (or the same, in lock-step) drains. The loop never waits for a file: where the reader falls
 a whole ring behind, rows are dropped and **counted**, and the count fails the run's quality gate.
 
-Layout of the memory: ``head`` (i64, rows ever appended), ``tail`` (i64, rows ever drained), ``dropped`` (i64), padding
-to 64 bytes, then ``capacity`` rows. One writer per counter, so no lock is needed where 8 bytes are stored at once: an
-element of a memoryview is. ``struct.pack_into`` is not: it fills its bytes one by one, and a reader in between would
-find no rows, or those of long ago.
+Layout of the memory: ``tail`` (i64, rows ever drained), ``dropped`` (i64), padding to 64 bytes, then ``capacity`` rows,
+then ``capacity`` check words. One writer per counter; 8 aligned bytes are stored at once, as an element of a memoryview
+is (``struct.pack_into`` fills bytes one by one).
+
+Processors other than x86 may show another process a row's bytes in any order, and later than a counter that was written
+after them. So no counter says that a row is there: its check word does, the CRC of the row's bytes begun with the row's
+number. A reader copies the next row and takes it only if the word fits the copy; a row of the last lap has another
+number, and a row that has not arrived as a whole another CRC. Whichever store becomes visible first, the row is taken
+when all of it is there, at the next look. The other way round the writer may not write before the reader has copied:
+``tail`` is stored after the copy was compared, and no processor stores what hangs on a comparison before it.
 """
 
 from __future__ import annotations
 
 import mmap
 import struct
+import zlib
 from multiprocessing import shared_memory
 from pathlib import Path
 from typing import Any
@@ -44,7 +51,8 @@ PACK_FRAME = struct.Struct("<qIBBH64s")
 _SHARED = Path("/dev/shm")
 """Where Linux keeps shared memory by name."""
 _HEADER_BYTES = 64
-_HEAD, _TAIL, _DROPPED = range(3)
+_WORD = 0xFFFFFFFF
+_TAIL, _DROPPED = range(2)
 
 Rows = NDArray[np.void]
 
@@ -64,7 +72,8 @@ class Ring:
         self, row: np.dtype[Any], pack: struct.Struct, capacity: int, *, shared: bool = False, name: str | None = None
     ) -> None:
         assert row.itemsize == pack.size, f"row of {row.itemsize} bytes, packed {pack.size}"
-        size = _HEADER_BYTES + capacity * row.itemsize
+        checks_at = _HEADER_BYTES + capacity * row.itemsize
+        size = checks_at + capacity * 4
         self._own: shared_memory.SharedMemory | None = None
         self._attached: mmap.mmap | None = None
         if name is not None:
@@ -83,13 +92,20 @@ class Ring:
         self._row = row
         self._capacity = capacity
         self._head = 0
+        self._checked = shared or name is not None
         self._counters = whole[:_HEADER_BYTES].cast("q")
+        self._checks = whole[checks_at:size].cast("I")
 
     @property
     def name(self) -> str:
         """Name of the shared memory."""
         assert self._own is not None, "this ring is private to its process, or another's"
         return self._own.name
+
+    @property
+    def drained(self) -> int:
+        """Rows that were ever taken out."""
+        return self._counters[_TAIL]
 
     @property
     def dropped(self) -> int:
@@ -102,23 +118,46 @@ class Ring:
         if head - self._counters[_TAIL] >= self._capacity:
             self._counters[_DROPPED] += 1
             return
-        self._pack_into(self._buffer, _HEADER_BYTES + (head % self._capacity) * self._row.itemsize, *values)
+        slot, size = head % self._capacity, self._row.itemsize
+        at = _HEADER_BYTES + slot * size
+        self._pack_into(self._buffer, at, *values)
         self._head = head + 1
-        self._counters[_HEAD] = head + 1
+        if self._checked:
+            self._checks[slot] = zlib.crc32(self._buffer[at : at + size], self._head & _WORD)
 
     def drain(self) -> Rows:
         """All rows since the last drain, in order, as a copy."""
-        head, tail = self._counters[_HEAD], self._counters[_TAIL]
+        tail = self._counters[_TAIL]
+        first = tail % self._capacity
         rows = np.frombuffer(self._buffer, dtype=self._row, count=self._capacity, offset=_HEADER_BYTES)
-        first, last = tail % self._capacity, head % self._capacity
-        if head == tail:
-            taken = rows[:0].copy()
-        elif first < last:
-            taken = rows[first:last].copy()
+        if self._checked:
+            parts = [self._arrived(rows, first, self._capacity, tail)]
+            if parts[0].size == self._capacity - first:
+                parts.append(self._arrived(rows, 0, first, tail + parts[0].size))
         else:
-            taken = np.concatenate([rows[first:], rows[:last]])
-        self._counters[_TAIL] = head
+            count = self._head - tail
+            parts = [rows[first : first + count], rows[: max(0, first + count - self._capacity)]]
+        taken = np.concatenate(parts)
+        self._counters[_TAIL] = tail + taken.size
         return taken
+
+    def _arrived(self, rows: Rows, first: int, last: int, number: int) -> Rows:
+        """A copy of the slots from ``first`` up to ``last``, as far as they hold row ``number`` and those after it."""
+        size, count, step = self._row.itemsize, 0, 64
+        copies = []
+        while first + count < last:
+            copy = rows[first + count : min(last, first + count + step)].copy()
+            data, words = copy.tobytes(), self._checks[first + count : first + count + copy.size]
+            fit = 0
+            for word in words:
+                if zlib.crc32(data[fit * size : (fit + 1) * size], (number + count + fit + 1) & _WORD) != word:
+                    break
+                fit += 1
+            copies.append(copy[:fit])
+            count += fit
+            if fit < copy.size:
+                break
+        return np.concatenate(copies) if copies else rows[:0].copy()
 
     def __enter__(self) -> Ring:
         return self
@@ -133,6 +172,7 @@ class Ring:
         if own is None and attached is None:
             return
         self._counters.release()
+        self._checks.release()
         self._buffer.release()
         if attached is not None:
             attached.close()

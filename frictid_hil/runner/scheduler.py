@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
-from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
+from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Severity
@@ -103,20 +103,33 @@ class Scheduler:
             SafetyAbort: something unexpected; everything was stopped.
             Interrupted: asked to stop; everything was stopped.
         """
-        driver = self._driver
+        first: FrictidError | None = None
         try:
-            driver.open(self._recorder.frame)
-            preflight = self._preflight()
-            self._notify(preflight)
-            if not self._proceed(preflight):
-                raise PlanRefused("not confirmed; nothing has moved")
-            for session, stretch in enumerate(self._plan.stretches):
-                if self._stop.level:
-                    raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
-                for run in self._run_stretch(session, stretch):
-                    self._notify(run)
+            self._run_all()
+        except FrictidError as error:
+            first = error
+        except OSError as error:
+            first = HardwareError(f"the bus failed: {error}", where=self._setup.bus)
+            first.__cause__ = error
         finally:
-            driver.close()
+            self._driver.close()
+        powered = getattr(self._driver, "may_be_powered", ())
+        if powered:
+            first = _with_power_left(first, powered)
+        if first is not None:
+            raise first
+
+    def _run_all(self) -> None:
+        self._driver.open(self._recorder.frame)
+        preflight = self._preflight()
+        self._notify(preflight)
+        if not self._proceed(preflight):
+            raise PlanRefused("not confirmed; nothing has moved")
+        for session, stretch in enumerate(self._plan.stretches):
+            if self._stop.level:
+                raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
+            for run in self._run_stretch(session, stretch):
+                self._notify(run)
 
     def _preflight(self) -> Preflight:
         identities = self._driver.identify()
@@ -284,3 +297,16 @@ class Scheduler:
                 self._notify(Marked(self._names[index], mark))
                 marks[index].append(mark)
         return marks
+
+
+def _with_power_left(first: FrictidError | None, joints: Sequence[str]) -> FrictidError:
+    """What ended the run, with the word that must come last: which joints were not seen to lose their power."""
+    last_word = f"joint {', '.join(joints)} may still have power: press the emergency stop before you go near"
+    if first is None or isinstance(first, Interrupted):
+        return SafetyAbort(
+            "the drives did not say that their power is off",
+            cause="the bus or a drive was lost while the joints were brought to rest",
+            next_step=last_word,
+        )
+    first.next_step = f"{first.next_step}; {last_word}" if first.next_step else last_word
+    return first

@@ -6,21 +6,18 @@ Lock-step drivers run in this process, rings drained between cycles. Wall-clock 
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections.abc import Callable
-from types import FrameType
 from typing import Protocol
 
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver, load_driver
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.cycle import QUICK_STOP
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.process import run_in_own_process
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
+from frictid_hil.runner.stop_signals import StopSignals
 
 
 class Keeper(Protocol):
@@ -33,31 +30,6 @@ class Keeper(Protocol):
     def frames(self, rows: Rows) -> None:
         """Rows of ``ring.FRAME_ROW``, in order."""
         ...
-
-
-class Interrupts:
-    """Ctrl-C and SIGTERM as stop levels: the first decelerates, the second stops quickly.
-
-    A context manager; handlers are restored on leaving. Outside the main thread it only holds ``level``.
-    """
-
-    def __init__(self) -> None:
-        self.level = 0
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> Interrupts:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._raise)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]  # exactly what signal.signal returned
-        self._previous.clear()
-
-    def _raise(self, _signal: int, _frame: FrameType | None) -> None:
-        self.level = min(QUICK_STOP, self.level + 1)
 
 
 def run_plan(
@@ -110,7 +82,7 @@ def run_plan(
 
         if prepare is not None:
             prepare(driver)
-        with Interrupts() as interrupts:
+        with StopSignals() as stop:
             try:
                 if own_process:
                     run_in_own_process(
@@ -120,7 +92,7 @@ def run_plan(
                         recorder,
                         notify=after_draining,
                         proceed=proceed,
-                        stop_level=lambda: interrupts.level,
+                        stop=stop,
                         drain=drain,
                         care=care,
                     )
@@ -131,8 +103,8 @@ def run_plan(
                         plan,
                         recorder,
                         notify=after_draining,
-                        proceed=proceed,
-                        stop=interrupts,
+                        proceed=lambda preflight: stop.while_asking(lambda: proceed(preflight)),
+                        stop=stop,
                         pump=drain,
                         care=care,
                     ).run()

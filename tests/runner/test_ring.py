@@ -40,6 +40,21 @@ def test_a_full_ring_drops_and_counts_instead_of_overwriting() -> None:
     assert ring.drain()["t_ns"].tolist() == [20, 21]
 
 
+def test_a_row_that_has_not_arrived_as_a_whole_waits_and_those_after_it_too() -> None:
+    """Whatever order the stores of a writer become visible in, here by taking some bytes away again."""
+    with Ring(SAMPLE_ROW, PACK_SAMPLE, 4, shared=True) as ring:
+        fill(ring, 0, 3)
+        assert ring.drain().size == 3
+        fill(ring, 3, 3)
+        late = 64 + (4 % 4) * SAMPLE_ROW.itemsize + 8
+        there, ring._buffer[late : late + 8] = bytes(ring._buffer[late : late + 8]), bytes(8)
+        assert ring.drain()["t_ns"].tolist() == [3]
+        assert ring.drain().size == 0
+        ring._buffer[late : late + 8] = there
+        assert ring.drain()["t_ns"].tolist() == [4, 5]
+        assert ring.drained == 6
+
+
 def test_columns_keep_their_values() -> None:
     ring = Ring(SAMPLE_ROW, PACK_SAMPLE, 8)
     fill(ring, 0, 1)

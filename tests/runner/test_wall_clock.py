@@ -159,6 +159,33 @@ def test_a_killed_loop_leaves_the_joint_to_the_drives_watchdog(running: Running)
     assert running.last_run_time_s() > 3.0
 
 
+def shared_memory() -> set[str]:
+    return {path.name for path in Path("/dev/shm").glob("psm_*")}
+
+
+def test_a_suspended_loop_does_not_hang_its_parent(running: Running) -> None:
+    loop = running.child()
+    mine = {path.split("/")[-1] for path in (m.path for m in loop.memory_maps()) if "/dev/shm/psm_" in path}
+    assert mine
+    loop.send_signal(signal.SIGSTOP)
+    running.parent.send_signal(signal.SIGINT)
+    said, _ = running.parent.communicate(timeout=60)
+    assert running.parent.returncode == 4, said
+    assert "hung" in said and "may still have power" in said
+    assert "Traceback" not in said
+    assert not loop.is_running() or loop.status() == psutil.STATUS_ZOMBIE
+    assert not mine & shared_memory()
+
+
+def test_a_closed_terminal_stops_the_run_like_ctrl_c(running: Running) -> None:
+    mine = {m.path.split("/")[-1] for m in running.child().memory_maps() if "/dev/shm/psm_" in m.path}
+    running.parent.send_signal(signal.SIGHUP)
+    said, _ = running.parent.communicate(timeout=30)
+    assert running.parent.returncode == 130, said
+    assert "brought to rest" in said
+    assert mine and not mine & shared_memory()
+
+
 def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> None:
     running.parent.send_signal(signal.SIGINT)
     said, _ = running.parent.communicate(timeout=30)

@@ -28,10 +28,10 @@ from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
-_FASTER_SHARE, _FASTER_RAD_S = 1.1, 0.1
+_FASTER_SHARE, _FASTER_RAD_S = 1.1, 0.3
 """A joint that is this much faster than when its quick stop began is not being stopped ..."""
-_SLOWED_SHARE = 0.95
-"""... nor is one that has lost less than the rest of this within a tenth of a second."""
+_SLOWED_SHARE, _SLOWED_RAD_S = 0.95, 0.1
+"""... nor is one that has lost less than the rest of this within a tenth of a second, and does not just swing back."""
 
 
 class Axis:
@@ -220,9 +220,9 @@ class Axis:
         speed = abs(self.feedback.velocity_rad_s)
         before = self._stop_from_rad_s
         look = self._stop_cycles % self._stop_look_cycles == 0
-        if self._stop_cycles and not self.standing:
+        if self._stop_cycles:
             faster = speed > _FASTER_SHARE * before + _FASTER_RAD_S
-            self._power_cut = faster or (look and speed > _SLOWED_SHARE * before)
+            self._power_cut = faster or (look and speed > _SLOWED_SHARE * before and speed > _SLOWED_RAD_S)
         if look:
             self._stop_from_rad_s = speed
         self._stop_cycles += 1

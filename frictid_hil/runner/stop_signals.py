@@ -1,0 +1,108 @@
+"""Ctrl-C, SIGTERM and SIGHUP as stop levels: the first decelerates, the second stops quickly.
+
+A signal reaches the cyclic loop from its handler, whatever this process is busy with: in lock-step the handler raises
+the level that the loop reads, and where the loop is a process of its own, the interpreter's C handler writes the
+signal's number into the pipe that the loop reads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import TypeVar
+
+from frictid_hil.errors import Interrupted
+from frictid_hil.runner.cycle import DECELERATE, NOTHING_ASKED, QUICK_STOP
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""A closed terminal hangs up."""
+
+Answer = TypeVar("Answer")
+
+
+class StopSignals:
+    """The level that signals have asked for so far.
+
+    A context manager; handlers are restored on leaving. Outside the main thread it only holds ``level``. A signal that
+    was ignored before (``nohup``) stays so.
+    """
+
+    def __init__(self) -> None:
+        self.level = NOTHING_ASKED
+        self._asking = False
+        self._previous: dict[int, object] = {}
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for number in STOP_SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._previous[number] = signal.signal(number, self._raise)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]  # exactly what signal.signal returned
+        self._previous.clear()
+
+    def while_asking(self, question: Callable[[], Answer]) -> Answer:
+        """The answer to a question; a signal ends it, because nothing moves that would have to be stopped first.
+
+        Raises:
+            Interrupted: by a signal.
+        """
+        self._asking = True
+        try:
+            return question()
+        finally:
+            self._asking = False
+
+    @contextlib.contextmanager
+    def written_to(self, pipe: int) -> Iterator[None]:
+        """Every signal's number goes into this pipe, too, from the interpreter's own handler."""
+        if not self._previous:
+            yield
+            return
+        os.set_blocking(pipe, False)
+        before = signal.set_wakeup_fd(pipe, warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(before)
+
+    def _raise(self, _signal: int, _frame: FrameType | None) -> None:
+        self.level = min(QUICK_STOP, self.level + 1)
+        if self._asking:
+            raise Interrupted("stopped by a signal; nothing has moved")
+
+
+class HeardStop:
+    """The other end of that pipe, in the process of the loop; the level also rises when the parent is gone.
+
+    Args:
+        pipe: to read signal numbers from.
+        parent_pid: who writes them.
+
+    Attributes:
+        terminated: this process itself was asked to end.
+    """
+
+    def __init__(self, pipe: int, parent_pid: int) -> None:
+        os.set_blocking(pipe, False)
+        self._pipe = pipe
+        self._parent_pid = parent_pid
+        self._level = NOTHING_ASKED
+        self.terminated = False
+
+    @property
+    def level(self) -> int:
+        """The highest level asked for so far."""
+        with contextlib.suppress(BlockingIOError):
+            asked = sum(number in STOP_SIGNALS for number in os.read(self._pipe, 64))
+            self._level = min(QUICK_STOP, self._level + asked)
+        if self.terminated or os.getppid() != self._parent_pid:
+            return max(DECELERATE, self._level)
+        return self._level
