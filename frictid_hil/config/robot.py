@@ -347,6 +347,7 @@ class Robot:
             simulated_arm=self.file.simulated_arm,
             workspace=_workspace(self.file),
             care=self.file.care.model_dump(exclude_none=True),
+            folder=self.path.resolve().parent,
         )
 
 

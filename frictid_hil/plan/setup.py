@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import FieldProblem, InvalidFields
@@ -62,6 +63,7 @@ class RobotSetup:
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
         workspace: the box that the arm may not leave; None where the robot file names none.
         care: bounds of the supervisor that the robot file sets, by name; see ``runner.care.Care``.
+        folder: of the robot file; file names in options count from there.
     """
 
     name: str
@@ -74,6 +76,7 @@ class RobotSetup:
     simulated_arm: Mapping[str, Any] = field(default_factory=dict)
     workspace: Workspace | None = None
     care: Mapping[str, float] = field(default_factory=dict)
+    folder: Path | None = None
 
     def joint(self, name: str) -> JointSetup:
         """The joint of that name.

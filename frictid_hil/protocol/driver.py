@@ -382,6 +382,15 @@ class FrameMapped(Protocol):
 
 
 @runtime_checkable
+class Remarking(Protocol):
+    """A driver that goes on without settings which hardware does not take, and says so."""
+
+    def remarks(self) -> list[Finding]:
+        """What could not be set, and what that means; after ``configure``."""
+        ...
+
+
+@runtime_checkable
 class Batched(Protocol):
     """A driver whose controller runs whole motions by itself and hands over what it recorded (``batch_only``).
 

@@ -23,13 +23,13 @@ from typing import cast
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Severity
+from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Remarking, Severity
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.batch import BatchDriver, BatchRunner
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import GO_ON, CyclicLoop, StopRequest
-from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight
+from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.in_step import InStep
 from frictid_hil.runner.motions import Motions
 from frictid_hil.runner.ring import Ring
@@ -169,6 +169,9 @@ class Scheduler:
         name = stretch_name(plans)
         self._notify(PhaseStarted(name, "configure", 0.0))
         driver.configure(self._plan.cycle_hz, [plan.joint for plan in plans])
+        if session == 0 and isinstance(driver, Remarking):
+            for remark in driver.remarks():
+                self._notify(Warned(f"{remark.subject}: {remark.message}"))
         if session == 0 and isinstance(driver, FrameMapped):
             self._notify(Configured(driver.frame_map_values()))
         for joint in self._setup.joints:

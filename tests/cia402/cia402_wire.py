@@ -205,7 +205,7 @@ class ScriptedDrive:
             self.values[0x6041, 0] = 0x0250
             self.values[0x603F, 0] = 0
         else:
-            self.values[0x6041, 0] = NEXT[status & 0xF7FF].get(controlword, status)
+            self.values[0x6041, 0] = NEXT[status & 0xF7FF].get(controlword & ~0x10, status)
         if self.values[0x6041, 0] == 0x0237 and self.values[0x6060, 0] == 8:
             self.values[0x6064, 0] = self.values[0x607A, 0]
 

@@ -7,9 +7,10 @@ import struct
 
 import pytest
 from cia402_bench import RAD, Bench, bench
-from cia402_wire import ScriptedDrive
+from cia402_wire import OBJECTS, ScriptedDrive
 
 from frictid_hil.errors import HardwareError, PlanRefused
+from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Severity
 
 
@@ -25,8 +26,8 @@ def test_everything_is_written_and_read_back():
         (0x6007, 0): 3,
         (0x605A, 0): 6,
         (0x60A9, 0): 0xFDB44700,
-        (0x60C2, 2): -5,
-        (0x60C2, 1): 200,
+        (0x60C2, 2): -3,
+        (0x60C2, 1): 2,
         (0x6060, 0): 8,
         (0x6072, 0): 800,
         (0x607D, 1): round(-1.0 / RAD),
@@ -72,7 +73,7 @@ def test_limits_follow_the_direction(direction):
     assert (drive.values[0x607D, 1], drive.values[0x607D, 2]) == (round(low / RAD), round(high / RAD))
 
 
-@pytest.mark.parametrize("key", [(0x6007, 0), (0x605A, 0), (0x1016, 1), (0x1A00, 2), (0x1800, 2), (0x6065, 0)])
+@pytest.mark.parametrize("key", [(0x1017, 0), (0x1A00, 2), (0x1800, 2)])
 def test_a_value_that_reads_back_otherwise_is_refused(key):
     drive = ScriptedDrive(4, reads_back={key: 5})
     b = Bench(drive).open()
@@ -93,10 +94,144 @@ def test_a_limit_that_reads_back_otherwise_is_refused(key):
 
 
 def test_a_refused_write_is_named():
-    b = Bench(ScriptedDrive(1, refuses={(0x6007, 0): 0x06090030})).open()
-    with pytest.raises(HardwareError, match=r"refuses abort connection option code = 3.*0609") as caught:
+    b = Bench(ScriptedDrive(1, refuses={(0x1017, 0): 0x06090030})).open()
+    with pytest.raises(HardwareError, match=r"refuses heartbeat producer, ms = 100.*0609") as caught:
         b.driver.configure(1000.0, ["0"])
-    assert "6007:00" in caught.value.where
+    assert "1017:00" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ((0x6007, 0), "does not stop when the host is lost"),
+        ((0x1016, 1), "does not watch over the host"),
+        ((0x6065, 0), "only the host watches the following error"),
+        ((0x1006, 0), "does not know the period of SYNC"),
+    ],
+)
+@pytest.mark.parametrize("how", ["refuses", "reads_back"])
+def test_what_is_nice_to_have_is_gone_without_and_told(key, words, how):
+    drive = ScriptedDrive(1, **{how: {key: 0x06010002 if how == "refuses" else 77}})
+    b = Bench(drive).open()
+    b.driver.configure(500.0, ["0"])
+    (remark,) = b.driver.remarks()
+    assert words in remark.message and remark.subject == "joint 0"
+    watched = key[0] not in (0x1016, 0x6007)
+    assert b.driver.capabilities().drive_watchdog is watched
+    assert (Mode.TORQUE in b.driver.capabilities().modes) is watched
+
+
+def test_a_stop_that_would_do_as_well_is_no_remark():
+    drive = ScriptedDrive(1, refuses={(0x605A, 0): 0x06090030, (0x6066, 0): 0x06090031})
+    b = Bench(drive).open()
+    b.driver.configure(500.0, ["0"])
+    assert not b.driver.remarks() and drive.values[0x605A, 0] == 2 and drive.values[0x6066, 0] == 0
+
+
+def test_what_was_changed_is_put_back():
+    drive = ScriptedDrive(1)
+    drive.values[0x1016, 1] = 127 << 16 | 200  # left over from a run that was cut off
+    before = dict(drive.values)
+    b = Bench(drive).open().start().power()
+    b.driver.stop_cycling()
+    b.driver.configure(500.0, [])
+    b.driver.set_limits("0", torque_nm=20.0, position_min_rad=-1.0, position_max_rad=1.0)
+    b.driver.close()
+    changed = {f"{i:04X}:{s:02X}" for (i, s), value in drive.values.items() if value != before[i, s]}
+    assert changed <= {"1016:01", "6060:00", "6061:00", "6064:00", "6040:00", "607A:00"}
+    assert drive.values[0x1016, 1] == 0
+
+
+def test_the_interpolation_time_is_written_in_ms_and_only_where_it_differs():
+    drive = ScriptedDrive(1, refuses={(0x60C2, 1): 0x06010002, (0x60C2, 2): 0x06010002})
+    b = Bench(drive).open()
+    b.driver.configure(1000.0, ["0"])
+    assert not b.driver.remarks()
+    with pytest.raises(HardwareError, match=r"interpolates over 1 ms \(60C2\), the cycle is 2 ms") as caught:
+        b.driver.configure(500.0, ["0"])
+    assert "1000 Hz" in caught.value.next_step
+
+
+def test_a_rate_without_whole_milliseconds_takes_a_finer_unit():
+    drive = ScriptedDrive(1)
+    Bench(drive).open().driver.configure(400.0, ["0"])
+    assert (drive.values[0x60C2, 1], drive.values[0x60C2, 2]) == (25, -4)
+
+
+def test_a_tighter_torque_limit_stays_unless_the_robot_file_says_otherwise():
+    for options, per_mille in (({}, 100), ({"raise_torque_limit": True}, 1200)):
+        drive = ScriptedDrive(1)
+        drive.values[0x6072, 0] = 100
+        b = Bench(drive, joint_options=options).open()
+        b.driver.configure(1000.0, ["0"])
+        b.driver.set_limits("0", torque_nm=60.0, position_min_rad=-1.0, position_max_rad=1.0)
+        assert drive.values[0x6072, 0] == per_mille
+
+
+def test_position_limits_are_never_widened_without_a_key_and_never_written_empty():
+    drive = ScriptedDrive(1)
+    drive.values[0x607D, 1], drive.values[0x607D, 2] = -1000, 1000
+    b = Bench(drive).open()
+    b.driver.configure(1000.0, ["0"])
+    b.driver.set_limits("0", torque_nm=60.0, position_min_rad=-1.0, position_max_rad=500 * RAD)
+    assert (drive.values[0x607D, 1], drive.values[0x607D, 2]) == (-1000, 500)
+    with pytest.raises(HardwareError, match=r"are 0\.\.0 in the drive's units"):
+        b.driver.set_limits("0", torque_nm=60.0, position_min_rad=-RAD / 9, position_max_rad=RAD / 9)
+
+
+def test_an_object_that_cannot_be_mapped_is_left_out():
+    class Strict(ScriptedDrive):
+        def sdo(self, request):
+            if request[0] >> 5 == 1 and request[4:] == bytes.fromhex("10003F60"):
+                return self.abort(*struct.unpack_from("<HB", request, 1), 0x06040041)
+            return super().sdo(request)
+
+    b = Bench(Strict(1)).open().start().power()
+    reports = b.driver.frame_map().joints[0].reports
+    assert [str(entry) for entry in reports[-1].entries] == ["6061:00 i8"]
+
+
+def test_a_drive_that_takes_few_transmission_types_reports_on_every_sync():
+    class Strict(ScriptedDrive):
+        def sdo(self, request):
+            index, sub = struct.unpack_from("<HB", request, 1)
+            if request[0] >> 5 == 1 and 0x1800 <= index < 0x1810 and sub == 2 and request[4] not in (1, 253, 255):
+                return self.abort(index, sub, 0x06090030)
+            return super().sdo(request)
+
+    b = Bench(Strict(1), Strict(2)).open()
+    b.driver.configure(500.0, ["0"])
+    assert b.drives[1].values[0x1800, 2] == b.drives[1].values[0x1802, 2] == 1
+    with pytest.raises(PlanRefused):
+        b.driver.configure(1000.0, ["0"])
+
+
+def test_interpolated_position_mode_takes_the_place_of_csp():
+    drive = ScriptedDrive(1)
+    drive.values[0x6502, 0] = 0x43
+    for sub, form in ((0, "<B"), (1, "<i")):
+        OBJECTS[0x60C1, sub] = (form, 1)
+        drive.values[0x60C1, sub] = 0
+    b = Bench(drive).open().start().power()
+    b.cycle()
+    assert drive.values[0x6060, 0] == 7 and drive.controlwords[-1] == 0x1F
+    b.set_points[0].position_rad = 50 * RAD
+    b.cycle(2)
+    assert drive.values[0x60C1, 1] == 50 and b.feedback[0].mode is Mode.POSITION
+    del OBJECTS[0x60C1, 0], OBJECTS[0x60C1, 1]
+
+
+def test_a_drive_that_supervises_its_rpdos_hears_them_again():
+    OBJECTS[0x1400, 5] = ("<H", 0)
+    drive = ScriptedDrive(1)
+    drive.values[0x1400, 5] = 60
+    b = Bench(drive, ScriptedDrive(2)).open().start(active=["1"]).power()
+    b.driver.lock("0")
+    b.cycle(100)
+    drive.commands.clear()
+    b.cycle(200)
+    assert 8 <= sum(number == 0 for number, _ in drive.commands) <= 12
+    del OBJECTS[0x1400, 5]
 
 
 def test_a_powered_drive_is_not_touched():
@@ -130,10 +265,9 @@ def test_a_drive_that_stays_in_quick_stop_is_told():
 
 def test_a_layout_that_no_wire_can_carry_is_refused_with_the_rate_that_fits():
     b = bench(*range(1, 7)).open()
-    before = len(b.bus.sent)
     with pytest.raises(PlanRefused, match=r"6 of 6 joints.*% on average") as caught:
         b.driver.configure(1000.0, [str(joint) for joint in range(6)])
-    assert len(b.bus.sent) == before
+    assert not [data for can_id, data in b.bus.sent if can_id < 0x600 or data[0] >> 5 == 1]
     rate = float(caught.value.next_step.split("at most ")[1].split(" Hz")[0])
     assert 250 <= rate < 340
     b.driver.configure(rate, [str(joint) for joint in range(6)])

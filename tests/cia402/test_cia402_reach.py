@@ -159,7 +159,7 @@ def test_check_finds_what_is_wrong():
         f"{finding.severity.value}: {finding.message}" for finding in Bench(drive).open().driver.check(None)
     )
     for words in (
-        "error: error 0x7305 is pending",
+        "error: error 0x7305 (sensor",
         "warning: no cyclic synchronous torque mode",
         "warning: no heartbeat consumer (1016)",
         "warning: no SYNC counter (1019, 18xx:06) on joint 0",

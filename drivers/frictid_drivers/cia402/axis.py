@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 
 from frictid_drivers.cia402.codec import Command
-from frictid_drivers.cia402.facts import Scale
 from frictid_drivers.cia402.frame_map import Frame
+from frictid_drivers.cia402.objects import INTERPOLATED
+from frictid_drivers.cia402.scale import Scale
 from frictid_drivers.cia402.state import (
     DISABLE_VOLTAGE,
+    ENABLE,
     FAULT_RESET,
     QUICK_STOP,
     DriveState,
@@ -27,6 +29,8 @@ from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
+_INTERPOLATE = 0x10
+"""Controlword bit 4 in interpolated position mode: follow the set-points."""
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 _FASTER_SHARE, _FASTER_RAD_S = 1.1, 0.3
 """A joint that is this much faster than when its quick stop began is not being stopped ..."""
@@ -46,6 +50,8 @@ class Axis:
         max_torque_nm: no torque beyond this is commanded.
         standstill_rad_s: below this the joint stands.
         reset_cycles: how long the drive may take to leave a fault; a quick stop is looked at five times as often.
+        position_mode: 6060 for positions: 8, or 7 (interpolated position).
+        mode_when_enabled: the drive shows its mode only once power is on; until then nothing is followed.
     """
 
     def __init__(
@@ -59,6 +65,8 @@ class Axis:
         max_torque_nm: float,
         standstill_rad_s: float,
         reset_cycles: int,
+        position_mode: int = Mode.POSITION,
+        mode_when_enabled: bool = False,
     ) -> None:
         self.joint = joint
         self.feedback = feedback
@@ -73,6 +81,8 @@ class Axis:
         self._torque_units = math.floor(max_torque_nm / abs(scale.torque_nm))
         self._standstill_rad_s = standstill_rad_s
         self._reset_cycles = reset_cycles
+        self._position_mode = position_mode
+        self._mode_when_enabled = mode_when_enabled
         self._reset_wanted = False
         self._resetting = 0
         self._target_units: int | None = None
@@ -154,7 +164,10 @@ class Axis:
         else:
             self._resetting = 0
             controlword = next_controlword(
-                state, self.target, standing=self.standing, may_enable=healthy and shown is mode
+                state,
+                self.target,
+                standing=self.standing,
+                may_enable=healthy and (shown is mode or self._mode_when_enabled),
             )
             if controlword == QUICK_STOP and self._runs_on():
                 controlword = DISABLE_VOLTAGE
@@ -184,11 +197,14 @@ class Axis:
             # Going over to torque mode while enabled: the torque must be there when the mode changes.
             torque = self._torque(set_point.torque_nm + set_point.torque_offset_nm)
         primary, secondary = self.primary, self.secondary
+        if controlword == ENABLE and enabled and self._mode_value(mode) == INTERPOLATED:
+            controlword |= _INTERPOLATE
         primary.set("controlword", controlword)
         primary.set("target_position", self._target_units)
         primary.set("torque_offset", offset)
         primary.pack()
-        secondary.set("target_mode", mode)
+        secondary.set("torque_offset", offset)
+        secondary.set("target_mode", self._mode_value(mode))
         secondary.set("target_torque", torque)
         secondary.set("target_velocity", velocity)
         secondary.pack()
@@ -208,7 +224,7 @@ class Axis:
         primary, secondary = self._emergency
         primary.set("controlword", QUICK_STOP)
         primary.set("target_position", self._target_units or 0)
-        secondary.set("target_mode", self.mode)
+        secondary.set("target_mode", self._mode_value(self.mode))
         primary.pack()
         secondary.pack()
         return primary, secondary
@@ -227,6 +243,9 @@ class Axis:
             self._stop_from_rad_s = speed
         self._stop_cycles += 1
         return self._power_cut
+
+    def _mode_value(self, mode: Mode) -> int:
+        return self._position_mode if mode is Mode.POSITION else mode
 
     def _follow(self, position_rad: float) -> None:
         """The joint holds where power came on until its set-point moves: the runner may still know an older place."""

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 from frictid_drivers.cia402.frame_map import ERROR, FIGURES, INPUTS, MODE, STATUS, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.objects import INTERPOLATED
 from frictid_drivers.cia402.packing import packing
 from frictid_drivers.cia402.state import JOINT_STATES
 from frictid_hil.plan.mode import Mode
@@ -30,7 +31,7 @@ _ATTRIBUTES = {
     "external_torque": "external_torque_nm",
     "temperature": "temperature_c",
 }
-_MODES = {mode.value: mode for mode in Mode}
+_MODES = {mode.value: mode for mode in Mode} | {INTERPOLATED: Mode.POSITION}
 _LIMIT_ACTIVE = 0x0800
 """Statusword bit 11: a set-point or the torque is cut by a limit of the drive."""
 

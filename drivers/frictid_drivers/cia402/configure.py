@@ -1,21 +1,27 @@
-"""Writing a drive's settings, each read back and compared; what cannot be confirmed is not used.
+"""Every setting that a drive gets, as lists of writes: ``configure`` applies them, and `check` foresees what they meet.
 
-Everything is written in NMT pre-operational with the power stage off. The second joint of a run costs only what
-differs from the first: transmission types, start values and following-error windows.
+The lists are formed by reading alone, so that what `check` says of them is what ``configure`` does. A setting that is
+already as it shall be is not written; what was changed is put back when the bus is left. Everything is written in NMT
+pre-operational with the power stage off, read back and compared.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.facts import Scale, velocity_unit_rad_s
+from frictid_drivers.cia402.facts import Facts
 from frictid_drivers.cia402.frame_map import Frame
 from frictid_drivers.cia402.layout import Layout, Pdo
-from frictid_drivers.cia402.sdo import Drive
+from frictid_drivers.cia402.scale import Scale, velocity_unit_rad_s
+from frictid_drivers.cia402.sdo import Drive, RefusedByDrive, Write
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, DriveState, drive_state
 from frictid_hil.errors import HardwareError
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.units import format_angle, format_torque
 
 _NOT_VALID = 1 << 31
 _NO_REMOTE = 1 << 30
@@ -23,6 +29,25 @@ _COB_ID_MASK = _NOT_VALID | 0x1FFFFFFF
 """Bit 30 (remote frames) is a drive's own business."""
 
 _ALL = tuple((transmit, number) for transmit in (False, True) for number in (1, 2, 3, 4))
+_VELOCITIES = (od.MAX_PROFILE_VELOCITY, od.PROFILE_VELOCITY)
+_ACCELERATIONS = (
+    od.PROFILE_ACCELERATION,
+    od.PROFILE_DECELERATION,
+    od.QUICK_STOP_DECELERATION,
+    od.MAX_ACCELERATION,
+    od.MAX_DECELERATION,
+)
+_PERIOD_TOLERANCE = 0.01
+
+NEEDED = {
+    od.CONTROLWORD: "it cannot be switched on",
+    od.STATUSWORD: "its state cannot be seen",
+    od.POSITION_ACTUAL: "its position cannot be seen",
+    od.VELOCITY_ACTUAL: "its speed cannot be watched",
+    od.TORQUE_ACTUAL: "there is no torque to identify friction from",
+    od.HEARTBEAT_PRODUCER_MS: "nobody would notice when it is gone",
+}
+"""Objects without which no run begins, and why."""
 
 
 def refuse_if_powered(drive: Drive) -> None:
@@ -40,6 +65,21 @@ def refuse_if_powered(drive: Drive) -> None:
         )
 
 
+def refuse_if_lacking(drive: Drive) -> None:
+    """A drive without these objects cannot be used.
+
+    Raises:
+        HardwareError: naming the first that is missing.
+    """
+    for item, why in NEEDED.items():
+        if not drive.has(item):
+            raise HardwareError(
+                f"the drive has no {item}: {why}",
+                where=drive.where(item.address),
+                next_step="use another firmware or drive",
+            )
+
+
 def end_quick_stop(drive: Drive) -> None:
     """Switch off a drive that its watchdog stopped when an earlier run was cut off: it stands and holds until told.
 
@@ -54,207 +94,337 @@ def end_quick_stop(drive: Drive) -> None:
             "does not leave quick stop",
             where=drive.where(od.STATUSWORD.address),
             cause="an earlier run was cut off, and the drive is not in remote control",
-            next_step="switch the drive off and on, then start again",
+            next_step="`frictid-hil reset`, or switch the drive off and on, then start again",
         )
 
 
-def configure_velocity_unit(drive: Drive, told: int | None) -> int | None:
-    """The finest unit that friction work needs, 0.001 rpm, where the drive lets us; 60A9.
+def velocity_unit_writes(drive: Drive) -> list[Write]:
+    """The finest unit that friction work needs, 0.001 rpm (60A9), where the drive lets us.
 
-    Decelerations (6084, 6085) are in these units per second wherever a drive has no unit of its own for them (60AA);
-    they keep their physical value, or a quick stop would take a thousand times as long.
-
-    Args:
-        drive: power stage off.
-        told: 60A9 as it was found, None where there is none.
-
-    Returns:
-        60A9 as it is now.
+    Speeds and accelerations (607F, 6081, 6083 to 6085, 60C5, 60C6) are in these units, and in these units per second
+    wherever a drive has no unit of its own for them (60AA); they keep their physical value, or a quick stop would take
+    a thousand times as long (``dependent_writes``).
     """
+    told = drive.known(od.VELOCITY_UNIT)
     before = None if told is None else velocity_unit_rad_s(told)
-    if told is None or told == od.MILLI_RPM or before is None:
-        return told
     after = velocity_unit_rad_s(od.MILLI_RPM)
     assert after is not None  # it is an angle per time
-    dependent = [] if drive.has(od.ACCELERATION_UNIT) else [od.PROFILE_DECELERATION, od.QUICK_STOP_DECELERATION]
-    found = {item: drive.find(item) for item in dependent}
-    try:
-        drive.write(od.VELOCITY_UNIT, od.MILLI_RPM)
-    except HardwareError:
-        # Fixed by the vendor: the coarse unit stays, and ``check`` says so.
-        return drive.read(od.VELOCITY_UNIT)
-    for item, value in found.items():
-        if value is not None and drive.read(item) == value:
-            drive.write(item, min(item.type.high, round(value * before / after)))
-    return od.MILLI_RPM
+    if told is None or before is None or told == od.MILLI_RPM:
+        return []
+    return [Write(od.VELOCITY_UNIT, od.MILLI_RPM, "velocity stays in the drive's own, coarser unit")]
 
 
-def configure_timing(drive: Drive, cycle_hz: float, sync_overflow: int) -> None:
-    """SYNC and interpolation period: 1005, 1006, 1019, 60C2.
+def dependent_writes(drive: Drive, told: int | None, found: dict[od.Object, int]) -> list[Write]:
+    """What keeps its physical value after 60A9 was changed from ``told``; ``found`` are the values from before."""
+    before = None if told is None else velocity_unit_rad_s(told)
+    after = velocity_unit_rad_s(drive.known(od.VELOCITY_UNIT) or 0)
+    if before is None or after is None or before == after:
+        return []
+    return [
+        Write(item, min(item.type.high, round(value * before / after)), f"{item.name} has lost its value")
+        for item, value in found.items()
+        if drive.read(item) == value
+    ]
 
-    Raises:
-        HardwareError: refused or not confirmed.
-    """
-    if drive.has(od.SYNC_COB_ID) and drive.read(od.SYNC_COB_ID) != 0x80:
-        drive.write(od.SYNC_COB_ID, 0x80)
-    if drive.has(od.SYNC_OVERFLOW) and drive.confirmed(od.SYNC_OVERFLOW) != sync_overflow:
+
+def velocity_dependent(drive: Drive) -> dict[od.Object, int]:
+    """Objects in units of 60A9, with their values."""
+    items = [*_VELOCITIES, *([] if drive.has(od.ACCELERATION_UNIT) else _ACCELERATIONS)]
+    return {item: value for item in items if (value := drive.known(item))}
+
+
+def timing_writes(drive: Drive, cycle_hz: float, sync_overflow: int) -> list[Write]:
+    """SYNC and interpolation period: 1005, 1006, 1019, 60C2."""
+    writes = []
+    if drive.has(od.SYNC_COB_ID):
+        writes.append(Write(od.SYNC_COB_ID, 0x80, mask=0x7FF))
+    if drive.has(od.SYNC_OVERFLOW) and drive.known(od.SYNC_OVERFLOW) != sync_overflow:
         # 1019 may only change while 1006 is zero.
         if drive.has(od.SYNC_PERIOD_US):
-            drive.write(od.SYNC_PERIOD_US, 0)
-        drive.write(od.SYNC_OVERFLOW, sync_overflow)
+            writes.append(Write(od.SYNC_PERIOD_US, 0))
+        writes.append(Write(od.SYNC_OVERFLOW, sync_overflow))
     if drive.has(od.SYNC_PERIOD_US):
-        drive.write(od.SYNC_PERIOD_US, round(1e6 / cycle_hz))
-    if drive.has(od.INTERPOLATION_VALUE):
-        value, index = interpolation_period(cycle_hz)
-        drive.write(od.INTERPOLATION_INDEX, index)
-        drive.write(od.INTERPOLATION_VALUE, value)
+        writes.append(Write(od.SYNC_PERIOD_US, round(1e6 / cycle_hz), "the drive does not know the period of SYNC"))
+    return writes + interpolation_writes(drive, cycle_hz)
 
 
-def interpolation_period(cycle_hz: float) -> tuple[int, int]:
-    """60C2 for a rate: value (1..255) and power of ten, as exact as eight bits allow."""
+def interpolation_writes(drive: Drive, cycle_hz: float) -> list[Write]:
+    """60C2 for a rate, only where it differs: in the drive's own power of ten, else in ms, else as exact as can be."""
+    if not drive.has(od.INTERPOLATION_VALUE):
+        return []
+    present = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
+    if abs(present * cycle_hz - 1.0) < 1e-9:
+        return []
+    value, index = interpolation_period(drive, cycle_hz)
+    said = "the interpolation time stays as it is"
+    return [Write(od.INTERPOLATION_INDEX, index, said), Write(od.INTERPOLATION_VALUE, value, said)]
+
+
+def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
+    """60C2 for a rate: value (1..255) and power of ten.
+
+    Milliseconds come first where the period is whole in them: some drives take no other power of ten.
+    """
     period_s = 1.0 / cycle_hz
-    for index in range(-6, 0):
-        value = round(period_s * 10.0**-index)
-        if 1 <= value <= 255:
-            return value, index
-    return 255, -1
+    own = drive.known(od.INTERPOLATION_INDEX)
+    for index in (-3, *(() if own is None else (own,)), -4, -5, -6, -2, -1):
+        value = period_s * 10.0**-index
+        exact = 1 <= round(value) <= 255 and abs(value - round(value)) < _PERIOD_TOLERANCE * value
+        if exact and (index == own or not drive.quirks.refusal(od.INTERPOLATION_INDEX, index)):
+            return round(value), index
+    return min(255, max(1, round(period_s * 1e3))), -3
 
 
-def configure_safety(drive: Drive, settings: BusSettings) -> None:
-    """Watchdogs both ways and what the drive does when ours expires: 1016, 1017, 6007, 605A.
+def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> None:
+    """What the drive takes as interpolation time must be our period, whoever set it.
+
+    Args:
+        drive: after its settings were written, or as they are foreseen to be.
+        cycle_hz: rate.
+        lost: what the drive did not take.
 
     Raises:
-        HardwareError: refused or not confirmed.
+        HardwareError: it interpolates over another time.
     """
-    drive.write(od.HEARTBEAT_PRODUCER_MS, settings.drive_heartbeat_ms)
+    if not drive.has(od.INTERPOLATION_VALUE) or not any("interpolation time" in one for one in lost):
+        return
+    found = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
+    if abs(found * cycle_hz - 1.0) > _PERIOD_TOLERANCE:
+        raise HardwareError(
+            f"the drive interpolates over {found * 1e3:g} ms (60C2), the cycle is {1e3 / cycle_hz:g} ms",
+            where=drive.where(od.INTERPOLATION_VALUE.address),
+            cause="the drive's interpolation time is fixed, or takes other values",
+            next_step=f"use {1.0 / found:g} Hz (`calibrate --rate`, or `cycle_hz` in the robot file)"
+            if found > 0.0
+            else "set 60C2 with the vendor's tool",
+        )
+
+
+def _period_s(value: int | None, index: int | None) -> float:
+    return 0.0 if value is None else value * 10.0 ** (-3 if index is None else index)
+
+
+def safety_writes(drive: Drive, settings: BusSettings) -> list[Write]:
+    """Watchdogs both ways and what the drive does when ours expires: 1016, 1017, 6007, 605A."""
+    writes = [Write(od.HEARTBEAT_PRODUCER_MS, settings.drive_heartbeat_ms)]
     if drive.has(od.ABORT_CONNECTION):
-        drive.write(od.ABORT_CONNECTION, settings.abort_option)
+        other = 5 - settings.abort_option
+        writes.append(
+            Write(
+                od.ABORT_CONNECTION, settings.abort_option, "the drive does not stop when the host is lost", (other, 1)
+            )
+        )
     if drive.has(od.QUICK_STOP_OPTION):
-        drive.write(od.QUICK_STOP_OPTION, settings.quick_stop_option)
+        own = tuple(option for option in (6, 5, 7, 2, 1) if option != settings.quick_stop_option)
+        writes.append(
+            Write(od.QUICK_STOP_OPTION, settings.quick_stop_option, "how it stops quickly cannot be set", own)
+        )
     if drive.has(od.HEARTBEAT_CONSUMER):
-        drive.write(od.HEARTBEAT_CONSUMER, settings.host_node << 16 | settings.watchdog_ms)
+        consumer = _free_consumer(drive, settings.host_node)
+        said = "the drive does not watch over the host; torque mode is refused"
+        writes.append(Write(consumer, settings.host_node << 16 | settings.watchdog_ms, said))
+    return writes
 
 
-def configure_frame_format(drive: Drive, switch: od.Object | None, *, fd: bool) -> None:
+def _free_consumer(drive: Drive, host_node: int) -> od.Object:
+    """The entry of 1016 that watches over us already, else the first free one, else the first."""
+    entries = [od.HEARTBEAT_CONSUMER.at(sub) for sub in range(1, (drive.known(od.HEARTBEAT_CONSUMERS) or 1) + 1)]
+    values = {entry: drive.known(entry) for entry in entries}
+    for wanted in (lambda v: v >> 16 & 0x7F == host_node, lambda v: not v & 0xFFFF):
+        for entry, value in values.items():
+            if value is not None and wanted(value):
+                return entry
+    return entries[0]
+
+
+def frame_format_writes(drive: Drive, switch: od.Object | None, *, fd: bool) -> list[Write]:
     """Classical or CAN FD frames for the PDOs, where the robot file or a known drive has an object that decides it.
 
     Raises:
-        HardwareError: refused or not confirmed, or CAN FD is wanted of a drive that lacks the object.
+        HardwareError: CAN FD is wanted of a drive that lacks the object.
     """
     if switch is None:
-        return  # the vendor's tool has set it; what comes in other frames is told while cycling
+        return []  # the vendor's tool has set it; what comes in other frames is told while cycling
     if drive.has(switch):
-        drive.write(switch, int(fd))
-    elif fd:
+        return [Write(switch, int(fd))]
+    if fd:
         raise HardwareError(
             f"the drive has no {switch.address}: it cannot be told to send its PDOs as CAN FD frames",
             where=drive.where(switch.address),
             cause="the drive or its firmware speaks classical CAN only",
             next_step="leave `fd` out of the robot file's options, or correct this joint's `fd_object`",
         )
+    return []
 
 
-def release_watchdog(drive: Drive) -> None:
-    """End the drive's watch over us (1016 = 0), so that it does not fault when we leave."""
-    if drive.has(od.HEARTBEAT_CONSUMER):
-        drive.write(od.HEARTBEAT_CONSUMER, 0)
-
-
-def configure_windows(drive: Drive, settings: JointSettings, position_rad_per_unit: float, *, active: bool) -> None:
-    """Following-error window, tight where the joint stands locked: 6065, 6066.
-
-    Raises:
-        HardwareError: refused or not confirmed.
-    """
+def window_writes(drive: Drive, settings: JointSettings, position_rad_per_unit: float, *, active: bool) -> list[Write]:
+    """Following-error window, tight where the joint stands locked: 6065, 6066."""
     window_rad = settings.following_window_rad if active else settings.locked_window_rad
+    writes = []
     if drive.has(od.FOLLOWING_WINDOW):
-        drive.write(od.FOLLOWING_WINDOW, max(1, round(window_rad / abs(position_rad_per_unit))))
+        units = max(1, round(window_rad / abs(position_rad_per_unit)))
+        writes.append(Write(od.FOLLOWING_WINDOW, units, "only the host watches the following error"))
     if drive.has(od.FOLLOWING_TIMEOUT_MS):
-        drive.write(od.FOLLOWING_TIMEOUT_MS, settings.following_timeout_ms)
+        said = "the drive's own time for a following error stays"
+        writes.append(Write(od.FOLLOWING_TIMEOUT_MS, settings.following_timeout_ms, said, (0,)))
+    return writes
 
 
-def configure_limits(
-    drive: Drive, scale: Scale, torque_nm: float, position_min_rad: float, position_max_rad: float
-) -> None:
+def limit_writes(
+    drive: Drive,
+    settings: JointSettings,
+    scale: Scale,
+    torque_nm: float,
+    position_min_rad: float,
+    position_max_rad: float,
+) -> tuple[list[Write], list[str]]:
     """The drive's own limits: 6072 in per mille, 607D in position units (which of them is lower depends on direction).
 
-    Raises:
-        HardwareError: refused or not confirmed.
-    """
-    if drive.has(od.MAX_TORQUE):
-        drive.write(od.MAX_TORQUE, math.floor(torque_nm / abs(scale.torque_nm)))
-    if not drive.has(od.POSITION_LIMIT_MIN):
-        return
-    low, high = sorted(round(limit_rad / scale.position_rad) for limit_rad in (position_min_rad, position_max_rad))
-    found_high = drive.read(od.POSITION_LIMIT_MAX)
-    # At no moment may the lower limit be above the upper one.
-    order = [(od.POSITION_LIMIT_MIN, low), (od.POSITION_LIMIT_MAX, high)]
-    for item, value in reversed(order) if low > found_high else order:
-        drive.write(item, value)
-
-
-def configure_set_points(drive: Drive, mode: int) -> None:
-    """A start from which nothing can jump: mode, target position where the joint stands, all other targets zero.
-
-    Raises:
-        HardwareError: refused or not confirmed.
-    """
-    drive.write(od.MODE, mode)
-    drive.write_blind(od.TARGET_POSITION, drive.read(od.POSITION_ACTUAL))
-    for target in (od.TARGET_TORQUE, od.TORQUE_OFFSET, od.TARGET_VELOCITY):
-        if drive.has(target):
-            drive.write(target, 0)
-
-
-def configure_pdos(drive: Drive, layout: Layout, joint: str) -> dict[tuple[bool, int], Frame]:
-    """Mapping and transmission of every PDO.
+    A limit that is tighter in the drive than asked for stays, unless the robot file says that it may be loosened.
 
     Returns:
-        The frames as read back from the drive, by (transmit, number).
+        The writes, and what stays tighter, in words.
 
     Raises:
-        HardwareError: refused or not confirmed.
+        HardwareError: the limits are no span of whole units.
     """
+    writes, tighter = [], []
+    torque = drive.known(od.MAX_TORQUE)
+    wanted = min(od.MAX_TORQUE.type.high, math.floor(torque_nm / abs(scale.torque_nm)))
+    if torque is not None and (settings.raise_torque_limit or torque >= wanted):
+        writes.append(Write(od.MAX_TORQUE, wanted))
+    elif torque is not None:
+        tighter.append(
+            f"the drive's torque limit is {format_torque(torque * abs(scale.torque_nm))} (6072), "
+            f"the robot file's {format_torque(torque_nm)}; the drive's stays "
+            "(`raise_torque_limit: true` in the joint's options raises it)"
+        )
+    if not drive.has(od.POSITION_LIMIT_MIN) or not drive.has(od.POSITION_LIMIT_MAX):
+        return writes, tighter
+    low, high = sorted(round(limit_rad / scale.position_rad) for limit_rad in (position_min_rad, position_max_rad))
+    kind = od.POSITION_LIMIT_MIN.type
+    if not kind.low <= low < high <= kind.high:
+        raise HardwareError(
+            f"the limits {format_angle(position_min_rad)}..{format_angle(position_max_rad)} are {low}..{high} in the "
+            "drive's units (607D)",
+            where=drive.where(od.POSITION_LIMIT_MIN.address),
+            cause="the position unit is not what the drive's objects say",
+            next_step="give `position_units_per_revolution` (of the joint) in the joint's options",
+        )
+    found_low, found_high = drive.known(od.POSITION_LIMIT_MIN) or 0, drive.known(od.POSITION_LIMIT_MAX) or 0
+    if found_low < found_high and not settings.widen_position_limits:
+        if found_low > low or found_high < high:
+            ends = sorted((found_low * scale.position_rad, found_high * scale.position_rad))
+            tighter.append(
+                f"the drive's position limits are {format_angle(ends[0])}..{format_angle(ends[1])} (607D), narrower "
+                f"than the robot file's {format_angle(position_min_rad)}..{format_angle(position_max_rad)}; the "
+                "drive's stay (`widen_position_limits: true` in the joint's options widens them)"
+            )
+        low, high = max(low, found_low), min(high, found_high)
+    # At no moment may the lower limit be above the upper one.
+    order = [Write(od.POSITION_LIMIT_MIN, low), Write(od.POSITION_LIMIT_MAX, high)]
+    return writes + (order[::-1] if low > found_high else order), tighter
+
+
+def set_point_writes(drive: Drive, mode: int) -> list[Write]:
+    """A start from which nothing can jump: mode, and all targets but the position zero."""
+    targets = (od.TARGET_TORQUE, drive.quirks.typed(od.TORQUE_OFFSET), od.TARGET_VELOCITY)
+    return [Write(od.MODE, mode), *(Write(target, 0) for target in targets if drive.has(target))]
+
+
+def pdo_writes(drive: Drive, layout: Layout, joint: str) -> list[Write]:
+    """Mapping and transmission of every PDO; those that are not used are made invalid first."""
     used = {(pdo.transmit, pdo.number) for pdo in layout.pdos[joint]}
+    writes = []
     for transmit, number in _ALL:
-        if (transmit, number) not in used:
-            _switch_off(drive, transmit, number)
-    return {(pdo.transmit, pdo.number): _configure_pdo(drive, pdo) for pdo in layout.pdos[joint]}
+        cob_id = od.pdo_cob_id(transmit, number)
+        present = drive.known(cob_id) if (transmit, number) not in used else None
+        if present is not None and not present & _NOT_VALID:
+            writes.append(Write(cob_id, present | _NOT_VALID, mask=_COB_ID_MASK))
+    for pdo in layout.pdos[joint]:
+        writes += _one_pdo(drive, pdo)
+    return writes
 
 
-def _switch_off(drive: Drive, transmit: bool, number: int) -> None:
-    cob_id = od.pdo_cob_id(transmit, number)
-    present = drive.confirmed(cob_id)
-    if present is None:
-        present = drive.find(cob_id)
-    if present is not None and not present & _NOT_VALID:
-        drive.write(cob_id, present | _NOT_VALID, _COB_ID_MASK)
-
-
-def _configure_pdo(drive: Drive, pdo: Pdo) -> Frame:
+def _one_pdo(drive: Drive, pdo: Pdo) -> list[Write]:
     cob_id = od.pdo_cob_id(pdo.transmit, pdo.number)
     valid = pdo.cob_id | (_NO_REMOTE if pdo.transmit else 0)
-    wanted = {od.pdo_type(pdo.transmit, pdo.number): pdo.every}
+    settings = [Write(od.pdo_type(pdo.transmit, pdo.number), pdo.every)]
     if pdo.transmit and drive.has(od.pdo_sync_start(pdo.number)):
-        wanted[od.pdo_sync_start(pdo.number)] = pdo.start
-    entries = {entry.index << 16 | entry.sub << 8 | entry.type.bits: entry for entry in pdo.entries}
-    mapped = _confirmed_mapping(drive, pdo) == list(entries)
-    if not mapped or drive.confirmed(cob_id) != valid or any(drive.confirmed(o) != v for o, v in wanted.items()):
-        drive.write(cob_id, valid | _NOT_VALID, _COB_ID_MASK)
-        for item, value in wanted.items():
-            drive.write(item, value)
-        if not mapped:
-            count = od.pdo_entry_count(pdo.transmit, pdo.number)
-            drive.write(count, 0)
-            for sub, word in enumerate(entries, start=1):
-                drive.write(od.pdo_entry(pdo.transmit, pdo.number, sub), word)
-            drive.write(count, len(entries))
-        drive.write(cob_id, valid, _COB_ID_MASK)
-    return Frame(pdo.cob_id, tuple(entries[word] for word in _confirmed_mapping(drive, pdo)))
+        settings.append(Write(od.pdo_sync_start(pdo.number), pdo.start))
+    items = [od.Object(entry.index, entry.sub, entry.type, entry.meaning) for entry in pdo.entries]
+    mapped = mapping(drive, pdo) == [item.mapping for item in items]
+    if mapped and drive.known(cob_id) == valid and all(drive.known(write.item) == write.value for write in settings):
+        return []
+    writes = [Write(cob_id, valid | _NOT_VALID, mask=_COB_ID_MASK), *settings]
+    if not mapped:
+        count = od.pdo_entry_count(pdo.transmit, pdo.number)
+        writes.append(Write(count, 0))
+        for sub, item in enumerate(items, start=1):
+            writes.append(Write(od.pdo_entry(pdo.transmit, pdo.number, sub), item.mapping, maps=item))
+        writes.append(Write(count, len(items)))
+    return [*writes, Write(cob_id, valid, mask=_COB_ID_MASK)]
 
 
-def _confirmed_mapping(drive: Drive, pdo: Pdo) -> list[int]:
-    """The mapping words that were read back from the drive, in order; empty before the first configuration."""
-    count = drive.confirmed(od.pdo_entry_count(pdo.transmit, pdo.number)) or 0
-    words = [drive.confirmed(od.pdo_entry(pdo.transmit, pdo.number, sub)) for sub in range(1, count + 1)]
+def mapping(drive: Drive, pdo: Pdo) -> list[int]:
+    """The mapping words of a PDO as the drive has them, in order."""
+    count = drive.known(od.pdo_entry_count(pdo.transmit, pdo.number)) or 0
+    words = [drive.known(od.pdo_entry(pdo.transmit, pdo.number, sub)) for sub in range(1, count + 1)]
     return [word for word in words if word is not None]
+
+
+def frame_of(drive: Drive, pdo: Pdo) -> Frame:
+    """The frame as read back from the drive."""
+    entries = {entry.index << 16 | entry.sub << 8 | entry.type.bits: entry for entry in pdo.entries}
+    return Frame(pdo.cob_id, tuple(entries[word] for word in mapping(drive, pdo)))
+
+
+def joint_writes(
+    drive: Drive,
+    joint: JointSetup,
+    scale: Scale,
+    facts: Facts,
+    settings: JointSettings,
+    bus: BusSettings,
+    layout: Layout,
+) -> list[Write]:
+    """Everything but the limits and the velocity unit, in order.
+
+    Raises:
+        HardwareError: the drive cannot be used so.
+    """
+    return [
+        *timing_writes(drive, layout.cycle_hz, layout.sync_overflow),
+        *safety_writes(drive, bus),
+        *frame_format_writes(drive, settings.fd_object, fd=layout.fd),
+        *window_writes(drive, settings, scale.position_rad, active=joint.name in layout.active),
+        *set_point_writes(drive, facts.position_mode),
+        *pdo_writes(drive, layout, joint.name),
+    ]
+
+
+def lesson(drive: Drive, refused: RefusedByDrive) -> bool:
+    """Learn from this drive's refusal of a nice-to-have: True where the layout can be planned again without it.
+
+    An object that cannot be mapped is left out where it can be; a drive that takes few transmission types reports on
+    every SYNC.
+    """
+    item, quirks = refused.item, drive.quirks
+    if item is None or refused.where != drive.where(item.address):
+        return False
+    if 0x1800 <= item.index < 0x1A00 and item.sub == 2 and quirks.sends_on(10):
+        drive.quirks = replace(quirks, transmission_types=(1, 253, 255))
+        return True
+    mapped = (refused.value >> 16, refused.value >> 8 & 0xFF)
+    if (
+        item.sub
+        and item.index & 0xFA00 in (0x1600, 0x1A00)
+        and mapped in _OPTIONAL
+        and mapped not in quirks.not_mappable
+    ):
+        drive.quirks = replace(quirks, not_mappable=quirks.not_mappable | {mapped})
+        return True
+    return False
+
+
+_OPTIONAL = {(item.index, item.sub) for item in (od.ERROR_CODE, od.TORQUE_OFFSET, od.TARGET_TORQUE, od.TARGET_VELOCITY)}

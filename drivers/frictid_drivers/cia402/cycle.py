@@ -71,7 +71,7 @@ class CycleTiming:
 class _Outgoing:
     """One command frame, sent when due; remembers what the drive has been told."""
 
-    __slots__ = ("cob_id", "command", "data", "message", "told")
+    __slots__ = ("cob_id", "command", "data", "message", "told", "told_cycle")
 
     def __init__(self, command: Command, *, fd: bool) -> None:
         self.command = command
@@ -80,6 +80,7 @@ class _Outgoing:
         # The message holds the command's own buffer: packing the command is all it takes to update it.
         self.message = _message(command.cob_id, command.data, fd=fd)
         self.told = b""
+        self.told_cycle = 0
 
 
 def _message(cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> can.Message:
@@ -126,6 +127,7 @@ class Cycle:
         self._timing = CycleTiming.of(layout, settings)
         self._active = [axis.joint in layout.active for axis in axes]
         self._fd = layout.fd
+        self._resend = [layout.resend_cycles.get(axis.joint, 0) for axis in axes]
         self._primary = [_Outgoing(axis.primary, fd=layout.fd) for axis in axes]
         self._secondary = [_Outgoing(axis.secondary, fd=layout.fd) for axis in axes]
         self._sync = _message(SYNC_COB_ID, bytearray(1 if layout.sync_overflow else 0))
@@ -263,6 +265,11 @@ class Cycle:
                 except SafetyAbort:
                     self.quick_stop()
                     raise
+            if self._resend[at]:
+                # A drive that supervises its RPDOs hears them again before it misses them.
+                for outgoing in (primary, secondary):
+                    if decoder.cycle - outgoing.told_cycle >= self._resend[at]:
+                        outgoing.told = b""
             if self._active[at]:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
                 self._send_command(regular, axis)
@@ -286,6 +293,7 @@ class Cycle:
     def _send_command(self, outgoing: _Outgoing, axis: Axis) -> None:
         self._send(outgoing.message, self._clock.now_ns())
         outgoing.told = bytes(outgoing.data)
+        outgoing.told_cycle = self._decoder.cycle
         if outgoing.command is axis.primary:
             axis.sent()
 

@@ -26,7 +26,7 @@ from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, open_bus
 from frictid_drivers.cia402.settings import read_settings
 from frictid_drivers.cia402.state import DriveState, drive_state
-from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
@@ -39,6 +39,7 @@ from frictid_hil.protocol.driver import (
     FrameSink,
     JointIdentity,
     SetPoint,
+    Severity,
     WallClock,
 )
 
@@ -145,16 +146,18 @@ class Cia402Driver:
         """Everything that can be said without moving or writing."""
         fleet = self._reached()
         cycle_hz = plan.cycle_hz if plan is not None else self.setup.cycle_hz
-        active = [self.setup.joints[0].name]
+        stretches = [[self.setup.joints[0].name]]
         if plan is not None and plan.joints:
-            active = [entry.joint for entry in (plan.joints if plan.together else plan.joints[:1])]
-        findings = [inspection.bus_finding(fleet.load(active, cycle_hz), fleet.highest_rate_hz(active))]
+            stretches = [[entry.joint for entry in stretch] for stretch in plan.stretches]
+        # The fullest of all stretches: joints differ in what they report.
+        active = max(stretches, key=lambda names: fleet.load(names, cycle_hz).average_percent)
+        layout = fleet.layout(active, cycle_hz)
+        findings = [inspection.bus_finding(layout.load(), fleet.highest_rate_hz(active))]
         if not fleet.sync_counter:
             findings.append(inspection.no_sync_counter(fleet.facts))
         for joint in self.setup.joints:
-            findings += inspection.joint_findings(
-                joint, fleet.drives[joint.name], fleet.facts[joint.name], self._settings
-            )
+            entry = next((one for one in plan.joints if one.joint == joint.name), None) if plan else None
+            findings += inspection.joint_findings(joint, fleet, layout, self._settings, entry)
         return findings
 
     # -- configuring --------------------------------------------------------------------------------------------
@@ -171,17 +174,7 @@ class Cia402Driver:
             raise HardwareError("configure while cycling", next_step="call stop_cycling first")
         for name in active:
             self.setup.joint(name)
-        load = fleet.load(active, cycle_hz)
-        if not load.fits:
-            raise PlanRefused(
-                f"{len(active)} of {len(self.setup.joints)} joints reporting on every cycle load the bus with {load}",
-                where="bus load",
-                cause="more than 80 % on average or 100 % in one cycle; frames would come late or not at all",
-                next_step=f"use a rate of at most {fleet.highest_rate_hz(active):g} Hz (`calibrate --rate`, or "
-                "`cycle_hz` in the robot file), or fewer joints at once",
-            )
-        layout = fleet.layout(active, cycle_hz)
-        self._frame_map = fleet.configure(layout)
+        layout, self._frame_map = fleet.configure(active, cycle_hz)
         self._layout = layout
         self._decoder = Decoder(self._frame_map, layout.active)
         self._axes = {
@@ -195,16 +188,29 @@ class Cia402Driver:
             self._heartbeat = HeartbeatTimer(fleet.send_heartbeat, self._settings.host_heartbeat_s)
         self._resume_heartbeat()
 
+    def remarks(self) -> list[Finding]:
+        """What drives did not take while being configured, and the run goes on without (``driver.Remarking``)."""
+        notes = self._reached().notes
+        return [Finding(Severity.WARNING, f"joint {joint}", said) for joint, all_ in notes.items() for said in all_]
+
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Torque and position limits in the drive, read back (6072, 607D), and the torque limit in the host.
+
+        A limit that is tighter in the drive stays, unless the joint's options say otherwise.
 
         Raises:
             HardwareError: refused or not confirmed.
         """
         fleet, name = self._reached(), self.setup.joint(joint).name
-        configure.configure_limits(
-            fleet.drives[name], fleet.scale_of(name), torque_nm, position_min_rad, position_max_rad
+        writes, _ = configure.limit_writes(
+            fleet.drives[name],
+            self._joint_settings[name],
+            fleet.scale_of(name),
+            torque_nm,
+            position_min_rad,
+            position_max_rad,
         )
+        fleet.drives[name].apply(writes)
         self._torque_limits_nm[name] = torque_nm
         self._axis_of(name).limit_torque(torque_nm)
 
@@ -271,9 +277,11 @@ class Cia402Driver:
         where = f"joint {joint} (node {self.setup.joint(joint).address})"
         if mode not in _MODES or not facts.supports(mode):
             raise HardwareError(f"the drive does not support mode {mode.name} (6502)", where=where)
-        if mode is Mode.TORQUE and not facts.heartbeat_consumers and not self._settings.allow_torque_without_watchdog:
+        watched = self._reached().watches(joint) or self._settings.allow_torque_without_watchdog
+        if mode is Mode.TORQUE and not watched:
             raise HardwareError(
-                "torque mode refused: the drive cannot watch over the host (no 1016)",
+                "torque mode refused: the drive cannot watch over the host "
+                + ("(no 1016)" if not facts.heartbeat_consumers else "and stop by itself (no 6007)"),
                 where=where,
                 cause="if this program died, the drive would keep the last torque",
                 next_step="use position mode; or set `allow_torque_without_watchdog: true` in options and keep the "
@@ -346,10 +354,10 @@ class Cia402Driver:
             with contextlib.suppress(*_WIRE_ERRORS):
                 self.stop_cycling()
         if self._heartbeat is not None and self._fleet is not None:
-            for name, drive in self._fleet.drives.items():
-                if name not in self.may_be_powered:
-                    with contextlib.suppress(*_WIRE_ERRORS):
-                        configure.release_watchdog(drive)
+            with contextlib.suppress(*_WIRE_ERRORS):
+                self._fleet.restore(
+                    self.may_be_powered
+                )  # the drives' watch over us too: they do not miss us when we leave
             self._heartbeat.stop()
         if self._bus is not None:
             with contextlib.suppress(*_WIRE_ERRORS):
@@ -396,6 +404,8 @@ class Cia402Driver:
             max_torque_nm=self._torque_limits_nm[joint.name],
             standstill_rad_s=self._joint_settings[joint.name].standstill_rad_s,
             reset_cycles=max(3, math.ceil(_RESET_S * cycle_hz)),
+            position_mode=fleet.facts[joint.name].position_mode,
+            mode_when_enabled=fleet.drives[joint.name].quirks.mode_when_enabled,
         )
 
     def _resume_heartbeat(self) -> None:

@@ -6,24 +6,22 @@ direction, rated torque where 6076 has no default) come from the robot file.
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
-import canopen
 from canopen.objectdictionary import ODVariable
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.facts import raise_on_error, read_facts, scale_of
+from frictid_drivers.cia402.facts import read_facts
 from frictid_drivers.cia402.frame_map import Entry, Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.objects import IntegerType, Object
+from frictid_drivers.cia402.quirks import Catalogue, dictionary_of, integer_type
+from frictid_drivers.cia402.scale import raise_on_error, scale_of
 from frictid_drivers.cia402.settings import read_settings
 from frictid_hil.errors import HardwareError, InputFileError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 _NOT_VALID = 1 << 31
 _PDOS = range(1, 9)
-_SIGNED = {0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15}
-"""CiA 301 data types INTEGER8, 16, 32, 24, 40, 48, 56, 64."""
 
 
 class _File:
@@ -31,12 +29,7 @@ class _File:
 
     def __init__(self, path: Path, joint: JointSetup) -> None:
         self._path = path
-        try:
-            self._dictionary = canopen.import_od(_text_of(path), joint.address)
-        except OSError as error:
-            raise InputFileError(f"cannot be read: {error}", where=str(path)) from error
-        except Exception as error:  # the parser raises whatever configparser and int() do
-            raise InputFileError(f"is no EDS or DCF file: {error}", where=str(path)) from error
+        self._dictionary = dictionary_of(path, joint.address)
 
     def variable(self, index: int, sub: int) -> ODVariable | None:
         found = self._dictionary.get_variable(index, sub)
@@ -61,17 +54,6 @@ class _File:
         return value if isinstance(value, str) else ""
 
 
-def _text_of(path: Path) -> io.StringIO:
-    """A file of vendors' tools: UTF-8, or what Windows writes in Western Europe."""
-    data = path.read_bytes()
-    try:
-        text = io.StringIO(data.decode("utf-8-sig"))
-    except UnicodeDecodeError:
-        text = io.StringIO(data.decode("cp1252", "replace"))
-    text.name = path.name  # by its ending the parser knows the format
-    return text
-
-
 def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
     """The frames of a robot whose drives all have the mapping of one EDS or DCF file.
 
@@ -89,7 +71,7 @@ def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
         file = _File(path, joint)
         if file.variable(od.POSITION_ACTUAL.index, 0) is None:
             raise InputFileError("describes no drive: it has no 6064", where=str(path))
-        facts = read_facts(file)
+        facts = read_facts(file, Catalogue(setup.folder).of)
         scale, findings = scale_of(facts, joint, facts.velocity_unit)
         raise_on_error(findings)
         meanings = {
@@ -141,5 +123,5 @@ def _entry(file: _File, word: int, meanings: dict[tuple[int, int], Entry]) -> En
     if known is not None:
         return known
     variable = file.variable(index, sub)
-    signed = variable is not None and variable.data_type in _SIGNED
-    return Entry.of(Object(index, sub, IntegerType(signed, bits), ""))
+    kind = None if variable is None else integer_type(variable)
+    return Entry.of(Object(index, sub, IntegerType(kind is not None and kind.signed, bits), ""))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Collection, Mapping, Sequence
 
 import can
 import canopen
@@ -11,16 +12,18 @@ from frictid_drivers.cia402 import configure
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BusLoad, highest_rate_hz
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE
-from frictid_drivers.cia402.facts import Facts, Scale, raise_on_error, read_facts, scale_of
+from frictid_drivers.cia402.facts import Facts, read_facts
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
 from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
 from frictid_drivers.cia402.network import Node, Wire
-from frictid_drivers.cia402.sdo import Drive
+from frictid_drivers.cia402.quirks import Catalogue, merged, quirks_of_eds
+from frictid_drivers.cia402.scale import Scale, raise_on_error, scale_of
+from frictid_drivers.cia402.sdo import Drive, RefusedByDrive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
-from frictid_hil.errors import HardwareError
+from frictid_hil.errors import HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import FrameSink
+from frictid_hil.protocol.driver import Finding, FrameSink
 
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 PRE_OPERATIONAL_STATE = b"\x7f"
@@ -44,6 +47,7 @@ class Fleet:
         drives: SDO access by joint name.
         facts: what each drive said of itself.
         scales: joint-side factors, by joint name, once configured.
+        notes: what drives did not take and the run goes on without, by joint name, once configured.
 
     Raises:
         HardwareError: a drive does not answer, or is no CANopen device.
@@ -71,7 +75,14 @@ class Fleet:
             self.wire.add_node(node)
             self.drives[joint.name] = Drive(node, joint.name, settings.sdo_timeout_s)
             self.wire.subscribe(HEARTBEAT_BASE + joint.address, self._on_heartbeat)
-        self.facts: dict[str, Facts] = {name: read_facts(drive) for name, drive in self.drives.items()}
+        catalogue = Catalogue(setup.folder)
+        self.facts: dict[str, Facts] = {}
+        self.notes: dict[str, list[str]] = {}
+        for joint in setup.joints:
+            drive = self.drives[joint.name]
+            facts = self.facts[joint.name] = read_facts(drive, catalogue.of)
+            eds = joint_settings[joint.name].eds
+            drive.learn(merged(quirks_of_eds(eds, joint.address), facts.quirks) if eds else facts.quirks)
 
     @property
     def sync_counter(self) -> bool:
@@ -81,7 +92,12 @@ class Fleet:
     @property
     def watchdog(self) -> bool:
         """Every drive notices when the host dies."""
-        return all(facts.heartbeat_consumers for facts in self.facts.values())
+        return all(self.watches(joint) for joint in self.facts)
+
+    def watches(self, joint: str) -> bool:
+        """This drive stops by itself when the host dies, and was seen to take our watch where it is configured."""
+        lost = ("watch over the host", "when the host is lost")
+        return self.facts[joint].watchdog and not any(one in note for note in self.notes.get(joint, ()) for one in lost)
 
     def nmt(self, command: int) -> None:
         """An NMT command to each of our drives; other devices on the bus are none of our business."""
@@ -117,37 +133,108 @@ class Fleet:
 
     def _wish(self, joint: JointSetup) -> NodeWish:
         facts, settings = self.facts[joint.name], self._joint_settings[joint.name]
+        drive = self.drives[joint.name]
+        quirks, offset = drive.quirks, drive.quirks.typed(od.TORQUE_OFFSET)
         return NodeWish(
             joint=joint.name,
             node=joint.address,
-            torque_offset=facts.torque_offset,
-            torque_target=facts.target_torque,
-            velocity_target=facts.supports(Mode.VELOCITY),
+            torque_offset=facts.torque_offset and quirks.maps(offset),
+            torque_target=facts.target_torque and quirks.maps(od.TARGET_TORQUE),
+            velocity_target=facts.supports(Mode.VELOCITY)
+            and drive.has(od.TARGET_VELOCITY)
+            and quirks.maps(od.TARGET_VELOCITY),
+            error_code=facts.error_code and quirks.maps(od.ERROR_CODE),
+            interpolated=facts.position_mode == od.INTERPOLATED,
+            offset=offset,
+            decimates=quirks.sends_on(10),
+            supervised_s=self._rpdo_timeout_s(drive),
             external_torque=settings.external_torque,
             temperature=settings.temperature,
             digital_inputs=settings.digital_inputs,
         )
 
+    @staticmethod
+    def _rpdo_timeout_s(drive: Drive) -> float:
+        """How long the drive waits for an RPDO (1400:05, 1401:05); 0 where it does not watch them."""
+        timeouts = [drive.known(od.rpdo_timeout_ms(number)) or 0 for number in (1, 2)]
+        return min((ms for ms in timeouts if ms), default=0) * 1e-3
+
     # -- writing ------------------------------------------------------------------------------------------------
 
-    def configure(self, layout: Layout) -> FrameMap:
+    def configure(self, active: Sequence[str], cycle_hz: float) -> tuple[Layout, FrameMap]:
         """Write a layout and everything that makes it safe to all drives.
 
+        A drive that does not take what is nice to have is asked again without it.
+
         Returns:
-            The frames as read back.
+            The layout, and its frames as read back.
 
         Raises:
+            PlanRefused: the layout does not fit the bus.
             HardwareError: a power stage is on, a setting is refused or not confirmed, or a drive is not what the robot
                 file says.
         """
+        self._refuse_overload(self.load(active, cycle_hz), active)
         for drive in self.drives.values():
+            configure.refuse_if_lacking(drive)
             configure.refuse_if_powered(drive)
         for drive in self.drives.values():
             configure.end_quick_stop(drive)
         self.nmt(NMT_PRE_OPERATIONAL)
-        frames = tuple(self._configure_joint(joint, layout) for joint in self._setup.joints)
-        window_ns = round(self._settings.reply_window * 1e9 / layout.cycle_hz)
-        return FrameMap(frames, SYNC_COB_ID, window_ns, self._settings.host_node)
+        while True:
+            layout = self.layout(active, cycle_hz)
+            self._refuse_overload(layout.load(), active)
+            try:
+                frames = tuple(self._configure_joint(joint, layout) for joint in self._setup.joints)
+            except RefusedByDrive as refused:
+                if not any(configure.lesson(drive, refused) for drive in self.drives.values()):
+                    raise
+                continue
+            window_ns = round(self._settings.reply_window * 1e9 / cycle_hz)
+            return layout, FrameMap(frames, SYNC_COB_ID, window_ns, self._settings.host_node)
+
+    def foreseen(self, joint: JointSetup, layout: Layout) -> tuple[list[Finding], list[str], list[str]]:
+        """What configuring this joint will meet, by reading alone.
+
+        Returns:
+            Findings of its scale; what will end the run; what it will go on without.
+        """
+        drive, facts, settings = self.drives[joint.name], self.facts[joint.name], self._joint_settings[joint.name]
+        units = configure.velocity_unit_writes(drive)
+        unit = facts.velocity_unit
+        if units and not drive.quirks.refusal(od.VELOCITY_UNIT, od.MILLI_RPM):
+            unit = od.MILLI_RPM
+        scale, findings = scale_of(facts, joint, unit)
+        limits = (joint.max_torque_nm, joint.position_min_rad, joint.position_max_rad)
+        try:
+            writes, tighter = configure.limit_writes(drive, settings, scale, *limits)
+            writes += configure.joint_writes(drive, joint, scale, facts, settings, self._settings, layout)
+            fatal, lost = drive.foresee([*units, *writes])
+            configure.refuse_other_period(drive, layout.cycle_hz, lost)
+        except HardwareError as error:
+            return findings, [error.what], []
+        return findings, fatal, [*tighter, *lost]
+
+    def travel_rad(self, joint: JointSetup) -> tuple[float, float] | None:
+        """Between which positions the drive lets this joint move once configured; None where it sets no limits."""
+        drive, settings = self.drives[joint.name], self._joint_settings[joint.name]
+        low, high = drive.known(od.POSITION_LIMIT_MIN), drive.known(od.POSITION_LIMIT_MAX)
+        if low is None or high is None or low >= high or settings.widen_position_limits:
+            return None
+        scale, _ = scale_of(self.facts[joint.name], joint, None)
+        first, last = sorted((low * scale.position_rad, high * scale.position_rad))
+        return first, last
+
+    def restore(self, but_not: Collection[str]) -> None:
+        """Put back what this run changed, drive by drive; one that no longer answers is left alone.
+
+        Args:
+            but_not: joints that may still have power: their drives go on watching over us.
+        """
+        for name, drive in self.drives.items():
+            if name not in but_not:
+                with contextlib.suppress(HardwareError):
+                    drive.restore()
 
     def scale_of(self, joint: str) -> Scale:
         """Joint-side factors.
@@ -167,18 +254,21 @@ class Fleet:
     def _configure_joint(self, joint: JointSetup, layout: Layout) -> JointFrames:
         drive, facts = self.drives[joint.name], self.facts[joint.name]
         settings = self._joint_settings[joint.name]
+        notes = []
         if joint.name not in self.scales:
-            unit = configure.configure_velocity_unit(drive, facts.velocity_unit)
-            scale, findings = scale_of(facts, joint, unit)
+            dependent = configure.velocity_dependent(drive)
+            notes += drive.apply(configure.velocity_unit_writes(drive))
+            notes += drive.apply(configure.dependent_writes(drive, facts.velocity_unit, dependent))
+            scale, findings = scale_of(facts, joint, drive.known(od.VELOCITY_UNIT))
             raise_on_error(findings)
             self.scales[joint.name] = scale
         scale = self.scales[joint.name]
-        configure.configure_timing(drive, layout.cycle_hz, layout.sync_overflow)
-        configure.configure_safety(drive, self._settings)
-        configure.configure_frame_format(drive, settings.fd_object, fd=layout.fd)
-        configure.configure_windows(drive, settings, scale.position_rad, active=joint.name in layout.active)
-        configure.configure_set_points(drive, Mode.POSITION)
-        frames = configure.configure_pdos(drive, layout, joint.name)
+        notes += drive.apply(configure.joint_writes(drive, joint, scale, facts, settings, self._settings, layout))
+        configure.refuse_other_period(drive, layout.cycle_hz, notes)
+        target = od.INTERPOLATED_TARGET if facts.position_mode == od.INTERPOLATED else od.TARGET_POSITION
+        drive.write_blind(target, drive.read(od.POSITION_ACTUAL))
+        self.notes[joint.name] = notes
+        frames = {(pdo.transmit, pdo.number): configure.frame_of(drive, pdo) for pdo in layout.pdos[joint.name]}
         return JointFrames(
             name=joint.name,
             node=joint.address,
@@ -197,3 +287,13 @@ class Fleet:
             for joint in self._setup.joints:
                 if HEARTBEAT_BASE + joint.address == can_id:
                     self.drives[joint.name].forget()
+
+    def _refuse_overload(self, load: BusLoad, active: Sequence[str]) -> None:
+        if not load.fits:
+            raise PlanRefused(
+                f"{len(active)} of {len(self.drives)} joints reporting on every cycle load the bus with {load}",
+                where="bus load",
+                cause="more than 80 % on average or 100 % in one cycle; frames would come late or not at all",
+                next_step=f"use a rate of at most {self.highest_rate_hz(active):g} Hz (`calibrate --rate`, or "
+                "`cycle_hz` in the robot file), or fewer joints at once",
+            )

@@ -59,6 +59,7 @@ _MEANINGS = {
     od.CONTROLWORD.index: "controlword",
     od.MODE.index: "target_mode",
     od.TARGET_POSITION.index: "target_position",
+    od.INTERPOLATED_TARGET.index: "target_position",
     od.TARGET_VELOCITY.index: "target_velocity",
     od.TARGET_TORQUE.index: "target_torque",
     od.TORQUE_OFFSET.index: "torque_offset",

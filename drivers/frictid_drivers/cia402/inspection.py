@@ -7,20 +7,26 @@ from collections.abc import Callable, Mapping
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BusLoad
-from frictid_drivers.cia402.facts import Facts, Scale, scale_of, velocity_unit_rad_s
+from frictid_drivers.cia402.configure import NEEDED
+from frictid_drivers.cia402.facts import Facts
+from frictid_drivers.cia402.fleet import Fleet
 from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_of
+from frictid_drivers.cia402.layout import Layout
+from frictid_drivers.cia402.scale import Scale, scale_of, velocity_unit_rad_s
 from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DriveState, drive_state
 from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.plan import JointPlan
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Finding, JointIdentity, Severity, Timing
-from frictid_hil.units import format_angle, format_torque
+from frictid_hil.protocol.error_words import told_error
+from frictid_hil.units import format_angle
 
 Said = Callable[..., Finding]
 """Makes a finding of the joint at hand: severity, message, next step."""
 
-_LIMIT_SLACK = 0.01
+_SLACK_RAD = math.radians(0.1)
 _HOST_LOST = 0x8130
 _SLOW_STOP_S = 1.0
 
@@ -40,6 +46,8 @@ def identity(joint: JointSetup, drive: Drive, facts: Facts, settings: JointSetti
     known = read_settings(drive, facts.vendor, facts.product)
     values: dict[str, str | float | int | bool] = {setting.object.name: value for setting, value in known.items()}
     values["motor rated torque (6076), mN m"] = facts.rated_torque_mnm or 0
+    if drive.quirks.names:
+        values["quirks"] = ", ".join(drive.quirks.names)
     for name, ratio in (("encoder (608F)", facts.encoder), ("gear (6091)", facts.gear), ("feed (6092)", facts.feed)):
         if ratio is not None:
             values[name] = f"{ratio[0]}:{ratio[1]}"
@@ -84,11 +92,14 @@ def no_sync_counter(facts: Mapping[str, Facts]) -> Finding:
     )
 
 
-def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, settings: BusSettings) -> list[Finding]:
-    """Everything worth saying of one drive."""
+def joint_findings(
+    joint: JointSetup, fleet: Fleet, layout: Layout, settings: BusSettings, planned: JointPlan | None
+) -> list[Finding]:
+    """Everything worth saying of one drive: what it is, and what ``configure`` will meet."""
     subject = f"joint {joint.name}"
-    # As ``configure`` will ask for.
-    scale, doubts = scale_of(facts, joint, None if facts.velocity_unit is None else od.MILLI_RPM)
+    drive, facts = fleet.drives[joint.name], fleet.facts[joint.name]
+    doubts, fatal, lost = fleet.foreseen(joint, layout)
+    scale, _ = scale_of(facts, joint, None if facts.velocity_unit is None else od.MILLI_RPM)
 
     def said(severity: Severity, message: str, next_step: str = "") -> Finding:
         return Finding(severity, subject, message, next_step)
@@ -102,12 +113,27 @@ def joint_findings(joint: JointSetup, drive: Drive, facts: Facts, settings: BusS
             f"{abs(scale.position_rad):.3g} rad per count",
         ),
     ]
-    if facts.device_type & 0xFFFF != 402:
-        findings.append(said(Severity.ERROR, f"device type {facts.device_type:#010x} (1000) is no CiA-402 drive"))
+    if drive.quirks.names:
+        findings.append(said(Severity.OK, f"known of this drive: {', '.join(drive.quirks.names)}"))
+    if facts.device_type & 0xFFFF != 402 and not facts.quirks.any_device_type:
+        findings.append(
+            said(
+                Severity.WARNING,
+                f"device type {facts.device_type:#010x} (1000) does not say that it is a CiA-402 drive",
+            )
+        )
+    manual = "see the drive's manual on this object"
+    findings += [said(Severity.ERROR, message, manual) for message in fatal]
+    findings += [said(Severity.WARNING, message) for message in lost]
+    findings += [
+        said(Severity.ERROR, f"the drive has no {item}: {why}", "use another firmware or drive")
+        for item, why in NEEDED.items()
+        if not drive.has(item)
+    ]
     findings += _state(drive, said)
     findings += _modes(facts, settings, said)
     findings += _missing(drive, said)
-    findings += _limits(joint, drive, scale, said)
+    findings += _limits(joint, drive, scale, fleet.travel_rad(joint), planned, said)
     findings += _quick_stop(joint, drive, facts, scale, said)
     for setting, value in read_settings(drive, facts.vendor, facts.product).items():
         if setting.effect is Effect.FRICTION_COMPENSATION and value:
@@ -142,12 +168,19 @@ def _state(drive: Drive, said: Said) -> list[Finding]:
                 "make sure that nothing holds the arm; the drive is switched off before anything else",
             )
         )
-    elif state in (DriveState.FAULT, DriveState.FAULT_REACTION) or error:
+    elif state in (DriveState.FAULT, DriveState.FAULT_REACTION):
         findings.append(
             said(
                 Severity.ERROR,
-                f"error {error:#06x} is pending (statusword {status:#06x})",
-                "look the code up in the drive's manual, clear its cause, and reset the fault",
+                f"error {told_error(error)} is pending (statusword {status:#06x})",
+                "clear its cause (the code is in the drive's manual), then `frictid-hil reset`",
+            )
+        )
+    elif error:
+        findings.append(
+            said(
+                Severity.WARNING,
+                f"the last error was {told_error(error)}; the drive is healthy (statusword {status:#06x})",
             )
         )
     register = drive.find(od.ERROR_REGISTER) or 0
@@ -164,12 +197,13 @@ def _modes(facts: Facts, settings: BusSettings, said: Said) -> list[Finding]:
         findings.append(said(Severity.WARNING, "no cyclic synchronous torque mode; compensation only by torque offset"))
     if not facts.torque_offset:
         findings.append(said(Severity.WARNING, "no torque offset (60B2); compensation only in torque mode"))
-    if not facts.heartbeat_consumers:
+    if not facts.watchdog:
         allowed = settings.allow_torque_without_watchdog
         findings.append(
             said(
                 Severity.WARNING,
-                "no heartbeat consumer (1016): the drive does not notice when this program dies; torque mode is "
+                f"no {'abort connection option (6007)' if facts.heartbeat_consumers else 'heartbeat consumer (1016)'}: "
+                "the drive does not stop by itself when this program dies; torque mode is "
                 + ("allowed by the robot file all the same" if allowed else "refused"),
                 "keep the emergency stop in your hand",
             )
@@ -183,6 +217,7 @@ def _missing(drive: Drive, said: Said) -> list[Finding]:
         od.ABORT_CONNECTION: "what it does when the host is lost cannot be set",
         od.QUICK_STOP_OPTION: "how it stops quickly cannot be set",
         od.FOLLOWING_WINDOW: "it does not watch the following error",
+        od.ERROR_CODE: "what a fault was is told by EMCY alone",
         od.MAX_TORQUE: "only the host limits the torque",
         od.POSITION_LIMIT_MIN: "only the host limits the position",
     }
@@ -191,40 +226,27 @@ def _missing(drive: Drive, said: Said) -> list[Finding]:
         for item, consequence in consequences.items()
         if not drive.has(item)
     ]
-    if not drive.has(od.HEARTBEAT_PRODUCER_MS):
-        findings.append(
-            said(
-                Severity.ERROR,
-                f"the drive has no {od.HEARTBEAT_PRODUCER_MS}: nobody would notice when it is gone",
-                "use another firmware or drive",
-            )
-        )
     return findings
 
 
-def _limits(joint: JointSetup, drive: Drive, scale: Scale, said: Said) -> list[Finding]:
+def _limits(
+    joint: JointSetup,
+    drive: Drive,
+    scale: Scale,
+    travel_rad: tuple[float, float] | None,
+    planned: JointPlan | None,
+    said: Said,
+) -> list[Finding]:
     findings = []
-    torque = drive.find(od.MAX_TORQUE)
-    if torque is not None and torque * abs(scale.torque_nm) < joint.max_torque_nm * (1 - _LIMIT_SLACK):
-        findings.append(
-            said(
-                Severity.WARNING,
-                f"the drive's torque limit is {format_torque(torque * abs(scale.torque_nm))} (6072), "
-                f"the robot file's {format_torque(joint.max_torque_nm)}; the robot file's will be set",
-            )
-        )
-    low, high = drive.find(od.POSITION_LIMIT_MIN), drive.find(od.POSITION_LIMIT_MAX)
-    if low is not None and high is not None and low < high:
-        ends = sorted((low * scale.position_rad, high * scale.position_rad))
-        slack = math.radians(0.1)
-        if ends[0] > joint.position_min_rad + slack or ends[1] < joint.position_max_rad - slack:
+    if planned is not None and travel_rad is not None:
+        low, high = planned.travel_rad
+        if low < travel_rad[0] - _SLACK_RAD or high > travel_rad[1] + _SLACK_RAD:
             findings.append(
                 said(
-                    Severity.WARNING,
-                    f"the drive's position limits are {format_angle(ends[0])}..{format_angle(ends[1])} (607D), "
-                    f"narrower than the robot file's {format_angle(joint.position_min_rad)}.."
-                    f"{format_angle(joint.position_max_rad)}; the robot file's will be set",
-                    "make sure that the robot file's are right",
+                    Severity.ERROR,
+                    f"the plan moves from {format_angle(low)} to {format_angle(high)}, the drive allows "
+                    f"{format_angle(travel_rad[0])}..{format_angle(travel_rad[1])} (607D)",
+                    "plan a shorter travel, or set `widen_position_limits: true` in the joint's options",
                 )
             )
     position = drive.find(od.POSITION_ACTUAL)

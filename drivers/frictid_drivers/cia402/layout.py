@@ -24,8 +24,8 @@ same SYNC. Where a drive has no SYNC counter they do, and the load is computed s
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BitRates, BusLoad, SyncFrame, bus_load
@@ -77,6 +77,11 @@ class NodeWish:
         external_torque: vendor object of a force sensor, None for none.
         temperature: vendor object of a temperature, None for none.
         digital_inputs: 60FD is to be reported.
+        error_code: 603F exists and can be mapped.
+        interpolated: targets go to 60C1, for interpolated position mode.
+        offset: 60B2 as this drive has it.
+        decimates: its PDOs take any number of SYNCs as transmission type.
+        supervised_s: how long the drive waits for an RPDO before it stops (1400:05); 0 where it does not.
     """
 
     joint: str
@@ -87,6 +92,11 @@ class NodeWish:
     external_torque: Entry | None = None
     temperature: Entry | None = None
     digital_inputs: bool = False
+    error_code: bool = True
+    interpolated: bool = False
+    offset: od.Object = od.TORQUE_OFFSET
+    decimates: bool = True
+    supervised_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +112,7 @@ class Layout:
         host_heartbeat_s: period of our own heartbeat.
         drive_heartbeat_s: period of every drive's heartbeat.
         rates: of the bus; PDOs are CAN FD frames where it has a data rate.
+        resend_cycles: by joint, after how many cycles a command goes out again though nothing changed.
     """
 
     cycle_hz: float
@@ -112,6 +123,7 @@ class Layout:
     host_heartbeat_s: float
     drive_heartbeat_s: float
     rates: BitRates
+    resend_cycles: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def fd(self) -> bool:
@@ -130,6 +142,8 @@ class Layout:
                 frames.append(SyncFrame(max(commands), fd=fd))
             frames += [SyncFrame(pdo.frame.size, pdo.every, pdo.start, fd) for pdo in pdos if pdo.transmit]
         timed = [(1, self.host_heartbeat_s)] + [(1, self.drive_heartbeat_s)] * len(self.pdos)
+        for joint, cycles in self.resend_cycles.items():
+            timed += [(min(8, pdo.frame.size), cycles / self.cycle_hz) for pdo in self.pdos[joint] if not pdo.transmit]
         # Besides the active joints' commands at most one more goes out per cycle, to whichever joint needs one.
         return bus_load(frames, self.cycle_hz, self.rates, occasional=[SyncFrame(largest_command, fd=fd)], timed=timed)
 
@@ -165,7 +179,9 @@ def plan_layout(
     pdos: dict[str, tuple[Pdo, ...]] = {}
     for wish in wishes:
         fast_start, slow_start = starts[wish.joint]
-        if wish.joint in active:
+        if not wish.decimates:
+            pdos[wish.joint] = _pdos(wish, pdo_bytes, 1, 0, slow_every=1, slow_start=0)
+        elif wish.joint in active:
             # The same SYNCs as when it is locked, more often: no other joint's start value has to change.
             slow_start = (slow_start - 1) % interval + 1 if interval > 1 and slow_start else 0
             pdos[wish.joint] = _pdos(wish, pdo_bytes, 1, 0, slow_every=interval, slow_start=slow_start)
@@ -180,6 +196,9 @@ def plan_layout(
         host_heartbeat_s=host_heartbeat_s,
         drive_heartbeat_s=drive_heartbeat_s,
         rates=rates,
+        resend_cycles={
+            wish.joint: max(1, math.floor(wish.supervised_s * cycle_hz / 3)) for wish in wishes if wish.supervised_s
+        },
     )
 
 
@@ -218,17 +237,21 @@ class _Slots:
 def _pdos(
     wish: NodeWish, pdo_bytes: int, every: int, start: int, *, slow_every: int, slow_start: int
 ) -> tuple[Pdo, ...]:
-    command = [Entry.of(od.CONTROLWORD), Entry.of(od.TARGET_POSITION)]
-    if wish.torque_offset:
-        command.append(Entry.of(od.TORQUE_OFFSET))
+    target = od.INTERPOLATED_TARGET if wish.interpolated else od.TARGET_POSITION
+    command = [Entry.of(od.CONTROLWORD), Entry.of(target)]
     other = [Entry.of(od.MODE)]
+    if wish.torque_offset:
+        # Beside the position where it fits a frame, else with the mode, which goes out whenever it changes.
+        offset = Entry.of(wish.offset)
+        (command if wish.offset.type.bits == 16 else other).append(offset)
     if wish.torque_target:
         other.append(Entry.of(od.TARGET_TORQUE))
-    if wish.velocity_target:
+    if wish.velocity_target and wish.offset.type.bits == 16:  # 6060, 6071, 60FF and 60B2 of 32 bits are too much
         other.append(Entry.of(od.TARGET_VELOCITY))
     fast = [Entry.of(od.STATUSWORD), Entry.of(od.POSITION_ACTUAL), Entry.of(od.TORQUE_ACTUAL)]
     velocity = [Entry.of(od.VELOCITY_ACTUAL)] + ([wish.external_torque] if wish.external_torque else [])
-    display = [Entry.of(od.MODE_DISPLAY), Entry.of(od.ERROR_CODE)] + ([wish.temperature] if wish.temperature else [])
+    display = [Entry.of(od.MODE_DISPLAY)]
+    display += ([Entry.of(od.ERROR_CODE)] if wish.error_code else []) + ([wish.temperature] if wish.temperature else [])
     node = wish.node
     pdos: tuple[Pdo, ...] = (
         Pdo(False, 1, 0x200 + node, tuple(command)),

@@ -134,22 +134,34 @@ POSITION_LIMIT_MIN = _object(0x607D, 1, "i32", "software position limit, min")
 POSITION_LIMIT_MAX = _object(0x607D, 2, "i32", "software position limit, max")
 PROFILE_DECELERATION = _object(0x6084, 0, "u32", "profile deceleration")
 QUICK_STOP_DECELERATION = _object(0x6085, 0, "u32", "quick stop deceleration")
+HOME_OFFSET = _object(0x607C, 0, "i32", "home offset")
+POLARITY = _object(0x607E, 0, "u8", "polarity")
+MAX_PROFILE_VELOCITY = _object(0x607F, 0, "u32", "max profile velocity")
+PROFILE_VELOCITY = _object(0x6081, 0, "u32", "profile velocity")
+PROFILE_ACCELERATION = _object(0x6083, 0, "u32", "profile acceleration")
 ENCODER_INCREMENTS = _object(0x608F, 1, "u32", "encoder increments")
 ENCODER_REVOLUTIONS = _object(0x608F, 2, "u32", "motor revolutions")
 GEAR_MOTOR = _object(0x6091, 1, "u32", "gear ratio, motor revolutions")
 GEAR_SHAFT = _object(0x6091, 2, "u32", "gear ratio, shaft revolutions")
 FEED = _object(0x6092, 1, "u32", "feed constant, feed")
 FEED_SHAFT = _object(0x6092, 2, "u32", "feed constant, shaft revolutions")
+POSITION_UNIT = _object(0x60A8, 0, "u32", "SI unit position")
 VELOCITY_UNIT = _object(0x60A9, 0, "u32", "SI unit velocity")
 ACCELERATION_UNIT = _object(0x60AA, 0, "u32", "SI unit acceleration")
 TORQUE_OFFSET = _object(0x60B2, 0, "i16", "torque offset")
+INTERPOLATED_TARGET = _object(0x60C1, 1, "i32", "interpolation data record")
 INTERPOLATION_VALUE = _object(0x60C2, 1, "u8", "interpolation time period, value")
 INTERPOLATION_INDEX = _object(0x60C2, 2, "i8", "interpolation time period, index")
+MAX_ACCELERATION = _object(0x60C5, 0, "u32", "max acceleration")
+MAX_DECELERATION = _object(0x60C6, 0, "u32", "max deceleration")
 DIGITAL_INPUTS = _object(0x60FD, 0, "u32", "digital inputs")
 TARGET_VELOCITY = _object(0x60FF, 0, "i32", "target velocity")
 SUPPORTED_MODES = _object(0x6502, 0, "u32", "supported drive modes")
 
-MODE_BITS = {8: 1 << 7, 9: 1 << 8, 10: 1 << 9}
+INTERPOLATED = 7
+"""Interpolated position mode: takes the place of cyclic synchronous position (8) where a drive lacks that."""
+
+MODE_BITS = {7: 1 << 6, 8: 1 << 7, 9: 1 << 8, 10: 1 << 9}
 """Bit of 6502 for each mode of 6060."""
 
 MILLI_RPM = 0xFDB44700
@@ -164,6 +176,11 @@ def pdo_cob_id(transmit: bool, number: int) -> Object:
 def pdo_type(transmit: bool, number: int) -> Object:
     """1400/1800 sub 2."""
     return _object((0x1800 if transmit else 0x1400) + number - 1, 2, "u8", "PDO transmission type")
+
+
+def rpdo_timeout_ms(number: int) -> Object:
+    """1400 sub 5: the RPDO's deadline monitoring."""
+    return _object(0x1400 + number - 1, 5, "u16", "RPDO event timer, ms")
 
 
 def pdo_sync_start(number: int) -> Object:

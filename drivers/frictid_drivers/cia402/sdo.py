@@ -5,17 +5,60 @@ What was written and read back is remembered, so that configuring the next joint
 
 from __future__ import annotations
 
+import contextlib
 import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import can
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from frictid_drivers.cia402.network import Node
 from frictid_drivers.cia402.objects import Object
+from frictid_drivers.cia402.quirks import NO_QUIRKS, Quirks
 from frictid_hil.errors import HardwareError
 
-_ABSENT = {0x06020000, 0x06090011, 0x08000024, 0x06010001}
-"""Abort codes that say "there is no such object", "no such sub-index", "no data", "write only"."""
+_ABSENT = {0x06020000, 0x06090011, 0x08000024, 0x06010000, 0x06010001, 0x08000000}
+"""Abort codes that say "there is no such object", "no such sub-index", "no data", "unsupported access", "write only" -
+and "general error", by which some drives say any of these."""
+
+
+_COMMANDS = {0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
+"""What a run commands, and nobody wants back."""
+
+
+class RefusedByDrive(HardwareError):
+    """A drive does not take a setting: ``value`` for ``item`` (which do not cross a process border)."""
+
+    def __init__(self, what: str, item: Object | None = None, value: int = 0, **details: str) -> None:
+        super().__init__(what, **details)
+        self.item, self.value = item, value
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """One setting as it shall be: what `check` foresees and what ``configure`` does.
+
+    Attributes:
+        item: object.
+        value: wanted.
+        otherwise: what it means where the drive does not take it, the run goes on; "" where the run ends.
+        instead: values that would do as well, in this order.
+        mask: bits that must read back as written; drives keep some bits of a COB-ID to themselves.
+        maps: what it maps, where it is an entry of a PDO.
+    """
+
+    item: Object
+    value: int
+    otherwise: str = ""
+    instead: tuple[int, ...] = ()
+    mask: int = -1
+    maps: Object | None = None
+
+    @property
+    def values(self) -> tuple[int, ...]:
+        """All that will do, best first."""
+        return (self.value, *self.instead)
 
 
 class Drive:
@@ -33,8 +76,15 @@ class Drive:
         self._sdo = node.sdo
         self._sdo.RESPONSE_TIMEOUT = timeout_s
         self._timeout_s = timeout_s
-        self._confirmed: dict[tuple[int, int], int] = {}
-        self._present: dict[tuple[int, int], bool] = {}
+        self._confirmed: dict[tuple[int, int], int | None] = {}
+        self._before: list[tuple[Object, int]] = []
+        self.quirks = NO_QUIRKS
+
+    def learn(self, quirks: Quirks) -> None:
+        """Take over what is known of this drive; it may need more time for its answers."""
+        self.quirks = quirks
+        if quirks.sdo_timeout_s is not None:
+            self._timeout_s = self._sdo.RESPONSE_TIMEOUT = max(self._timeout_s, quirks.sdo_timeout_s)
 
     def where(self, address: str) -> str:
         """How errors name an object of this drive."""
@@ -93,14 +143,80 @@ class Drive:
 
     def has(self, item: Object) -> bool:
         """The drive has this object; asked once."""
-        key = (item.index, item.sub)
-        if key not in self._present:
-            self._present[key] = self.find(item) is not None
-        return self._present[key]
+        return self.known(item) is not None
 
-    def confirmed(self, item: Object) -> int | None:
-        """What was last written and read back; None when that is not known."""
-        return self._confirmed.get((item.index, item.sub))
+    def known(self, item: Object) -> int | None:
+        """What was last written and read back, or read; asked once, None where the drive does not have it."""
+        key = (item.index, item.sub)
+        if key not in self._confirmed:
+            self._confirmed[key] = self.find(item)
+        return self._confirmed[key]
+
+    def apply(self, writes: Iterable[Write]) -> list[str]:
+        """Bring every setting about that is not yet so, in order.
+
+        Returns:
+            What drives did not take and the run goes on without, in words.
+
+        Raises:
+            RefusedByDrive: a drive does not take what the run cannot go on without.
+        """
+        said = []
+        for write in writes:
+            refused: RefusedByDrive | None = None
+            for value in write.values:
+                if self.known(write.item) == value:
+                    break
+                if self.quirks.refusal(write.item, value):
+                    continue
+                try:
+                    self.write(write.item, value, write.mask)
+                    break
+                except RefusedByDrive as error:
+                    refused = refused or error
+                    self._confirmed.pop((write.item.index, write.item.sub), None)
+            else:
+                why = refused.what if refused else self._why_not(write)
+                if not write.otherwise:
+                    raise refused or RefusedByDrive(why, write.item, write.value, where=self.where(write.item.address))
+                said.append(f"{write.otherwise} ({why})")
+        return said
+
+    def foresee(self, writes: Iterable[Write]) -> tuple[list[str], list[str]]:
+        """What ``apply`` would say of the same settings, by reading alone: what it would raise, what it would return.
+
+        What a drive will refuse shows in no object; it is foreseen where a quirk or an EDS file tells.
+        """
+        fatal: list[str] = []
+        lost: list[str] = []
+        for write in writes:
+            found = self.known(write.item)
+            refused = all(self.quirks.refusal(write.item, value) for value in write.values)
+            cannot_map = write.maps is not None and not self.quirks.maps(write.maps)
+            if found is not None and (found in write.values or not (refused or cannot_map)):
+                continue
+            why = self._why_not(write)
+            (lost if write.otherwise else fatal).append(f"{write.otherwise} ({why})" if write.otherwise else why)
+        return fatal, lost
+
+    def _why_not(self, write: Write) -> str:
+        if self.known(write.item) is None:
+            return f"the drive has no {write.item}"
+        if write.maps is not None:
+            return f"{write.maps} cannot be mapped into a PDO"
+        refusal = self.quirks.refusal(write.item, write.value)
+        return f"the drive does not take {write.item} = {_shown(write.item, write.value)}: {refusal}"
+
+    def restore(self) -> None:
+        """Undo every write of this run, the last one first; what a drive does not take back stays.
+
+        Raises:
+            HardwareError: the drive no longer answers.
+        """
+        before, self._before = self._before, []
+        for item, value in reversed(before):
+            with contextlib.suppress(RefusedByDrive):
+                self.write_blind(item, value)
 
     def write(self, item: Object, value: int, mask: int = -1) -> None:
         """Write and read back, unless this very value was confirmed before.
@@ -113,13 +229,20 @@ class Drive:
         Raises:
             HardwareError: refused, or another value is read back.
         """
-        if self._confirmed.get((item.index, item.sub)) == value:
+        before = self.known(item)
+        if before == value:
             return
         self.write_blind(item, value)
+        if before is not None and item.index not in _COMMANDS:
+            # Our own watch, left over from a run that was cut off, is not brought back.
+            ours = item.index == 0x1016 and before >> 16 == value >> 16
+            self._before.append((item, 0 if ours else before))
         found = self.read(item)
         if (found ^ value) & mask:
-            raise HardwareError(
+            raise RefusedByDrive(
                 f"{item.name}: wrote {_shown(item, value)}, read back {_shown(item, found)}",
+                item,
+                value,
                 where=self.where(item.address),
                 cause="the drive limits, rounds or locks this setting",
                 next_step="see the drive's manual on this object; nothing has moved",
@@ -134,16 +257,20 @@ class Drive:
         """
         self._confirmed.pop((item.index, item.sub), None)
         if not item.type.low <= value <= item.type.high:
-            raise HardwareError(
+            raise RefusedByDrive(
                 f"{item.name}: {value} does not fit a {item.type} ({item.type.low}..{item.type.high})",
+                item,
+                value,
                 where=self.where(item.address),
                 cause="a setting of the robot file is beyond what the drive can hold",
             )
         try:
             self._sdo.download(item.index, item.sub, item.type.pack(value))
         except SdoAbortedError as error:
-            raise HardwareError(
+            raise RefusedByDrive(
                 f"the drive refuses {item.name} = {_shown(item, value)}: {error}",
+                item,
+                value,
                 where=self.where(item.address),
                 cause="an object the drive lacks, a value it does not support, or a state in which it cannot be set",
                 next_step="see the drive's manual on this object; nothing has moved",
@@ -155,6 +282,7 @@ class Drive:
         """These were changed by other means than SDO; with none given, all may have been (the drive was reset)."""
         if not items:
             self._confirmed.clear()
+            self._before.clear()
         for item in items:
             self._confirmed.pop((item.index, item.sub), None)
 

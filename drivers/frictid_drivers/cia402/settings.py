@@ -12,7 +12,7 @@ watchdog_ms                             150       the drive stops when our heart
 drive_heartbeat_ms                      100       heartbeat period of the drives (1017); 2.5 of it missing is a stop
 host_node                               127       our own node id
 reply_window                            0.7       share of the cycle in which reports must have come
-allow_torque_without_watchdog           false     torque modes on drives without 1016
+allow_torque_without_watchdog           false     torque modes on drives without 1016 and 6007
 quick_stop_option                       6         605A: 5, 6 or 7 (stop and hold)
 abort_option                            3         6007: 2 (disable voltage) or 3 (quick stop)
 tty_baudrate, port, host, tcp_tune, ... -         handed to the python-can interface as they are (``network.FORWARDED``)
@@ -36,6 +36,9 @@ rated_torque_side                       motor     6076 is ``motor`` or ``joint``
 torque_source                           -         what the reported torque is, for the profile
 timing                                  -         position_delay_s, velocity_delay_s, torque_delay_s, uncertainty_s;
                                                   torque_lag_s: what of torque_delay_s is a low-pass
+eds                                     -         the maker's EDS file: what can be written and mapped (check)
+raise_torque_limit                      false     6072 may be raised to the robot file's ``max_torque_nm``
+widen_position_limits                   false     607D may be widened to the robot file's limits
 fd_object                               -         e.g. ``"2023:00 u8"``: 1 makes the drive's PDOs CAN FD frames, 0 not
 ======================================  ========  =====================================================================
 """
@@ -45,6 +48,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from frictid_drivers.cia402.bus_load import BitRates
@@ -89,6 +93,9 @@ JOINT_OPTIONS = frozenset(
         "torque_source",
         "timing",
         "fd_object",
+        "eds",
+        "raise_torque_limit",
+        "widen_position_limits",
     }
 )
 
@@ -141,6 +148,9 @@ class JointSettings:
     torque_source: str
     timing: Timing | None
     fd_object: Object | None
+    eds: Path | None = None
+    raise_torque_limit: bool = False
+    widen_position_limits: bool = False
 
 
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
@@ -149,7 +159,7 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
     Raises:
         InvalidFields: every option or node id that is wrong.
     """
-    reader = _Reader()
+    reader = _Reader(setup.folder)
     bus = reader.bus(setup.options)
     joints = {joint.name: reader.joint(joint) for joint in setup.joints}
     reader.nodes(setup, bus.host_node)
@@ -159,8 +169,9 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
 
 
 class _Reader:
-    def __init__(self) -> None:
+    def __init__(self, folder: Path | None) -> None:
         self.problems: list[FieldProblem] = []
+        self._folder = folder
 
     def bus(self, options: Mapping[str, Any]) -> BusSettings:
         at: tuple[str, ...] = ("options",)
@@ -216,6 +227,9 @@ class _Reader:
             torque_source=str(options.get("torque_source", "6077 actual torque")),
             timing=self._timing(at, options),
             fd_object=self._fd_object(at, options),
+            eds=self._file(at, options, "eds"),
+            raise_torque_limit=self._flag(at, options, "raise_torque_limit"),
+            widen_position_limits=self._flag(at, options, "widen_position_limits"),
         )
 
     def nodes(self, setup: RobotSetup, host_node: int) -> None:
@@ -295,6 +309,16 @@ class _Reader:
             self._problem((*at, key), f"expected a whole number {low}..{high}, found {value!r}")
             return default
         return value
+
+    def _file(self, at: tuple[str, ...], options: Mapping[str, Any], key: str) -> Path | None:
+        text = options.get(key)
+        if text is None:
+            return None
+        path = (self._folder or Path()) / str(text)
+        if not path.is_file():
+            self._problem((*at, key), f"no such file: {path}")
+            return None
+        return path
 
     def _flag(self, at: tuple[str, ...], options: Mapping[str, Any], key: str) -> bool:
         value = options.get(key, False)

@@ -163,6 +163,10 @@ class VirtualDriver:
         """As ``Driver.configure``."""
         self._host.configure(cycle_hz, active)
 
+    def remarks(self) -> list[Finding]:
+        """As ``driver.Remarking``."""
+        return self._host.remarks()
+
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """As ``Driver.set_limits``."""
         self._host.set_limits(
