@@ -22,6 +22,9 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 }
 """Dimension of each column of ``Samples``, on a rotary joint and on a linear axis."""
 
+JOINT = "{joint}"
+"""Stands in a column map for the name of any joint."""
+
 TIME_UNITS_NS: dict[str, float] = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 
@@ -52,11 +55,13 @@ class JointColumns:
         sources: by the names of ``Samples`` (``position_rad``, ...).
         prismatic: the values are m, m/s, N.
         meta: what else is known (torque_source, ...); travels with the samples.
+        command_shift_s: the command is brought this much later, where the log stamps it too early.
     """
 
     sources: Mapping[str, Source]
     prismatic: bool = False
     meta: Mapping[str, str | float] = field(default_factory=dict)
+    command_shift_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +70,15 @@ class ColumnMap:
 
     Attributes:
         name: of the map.
-        time: source of the time; its scale is to nanoseconds.
-        joints: by name, in order.
+        time: source of the time; its scale is to nanoseconds. Without a column rows are equally spaced by the scale.
+        joints: by name, in order; ``{joint}`` in a name and its columns stands for every joint that the file has.
+        topic: of a ROS bag that has several.
     """
 
     name: str
     time: Source
     joints: Mapping[str, JointColumns]
+    topic: str | None = None
 
 
 def si_factor(unit: str, column: str, *, prismatic: bool) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from frictid_hil import __version__
-from frictid_hil.cli import calibrate, compensate, emulate, gap, jobs, new, profiles, replay, reports
+from frictid_hil.cli import calibrate, columns, compensate, emulate, gap, jobs, new, profiles, replay, reports
 from frictid_hil.cli.output import Output
 from frictid_hil.errors import UsageError
 
@@ -25,6 +25,7 @@ compensate.register(app)
 reports.register(app)
 replay.register(app)
 jobs.register(app)
+columns.register(app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 app.add_typer(emulate.app, name="emulate")

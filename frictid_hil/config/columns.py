@@ -12,6 +12,10 @@
         position: {column: qm, unit: m}
         position_command: {column: qg, unit: m}
         torque: {product: [gtau, vir], unit: N}
+
+A joint named ``{joint}`` stands for all of a file whose columns follow one form: ``{column: "q_{joint}", unit: rad}``.
+A torque of ``unit: A`` is a motor current: ``torque_constant_nm_per_a`` (times ``gear_ratio``) makes it a torque, and
+``torque_constant_sigma`` says how sure that is, relative.
 """
 
 from __future__ import annotations
@@ -27,15 +31,30 @@ from frictid_hil.config.search import find
 from frictid_hil.config.yaml import read
 from frictid_hil.errors import FieldProblem, UsageError
 
+CURRENTS_A = {"A": 1.0, "mA": 1e-3}
 KIND = "frictid.columns"
 NEWEST = 1
 
 
 class TimeFile(Strict):
-    """The column of time."""
+    """The column of time, or the rate at which rows were taken where there is none."""
 
-    column: str
-    unit: Literal["s", "ms", "us", "ns"]
+    column: str | None = None
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    rate_hz: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> TimeFile:
+        if (self.column is None) == (self.rate_hz is None):
+            raise ValueError("give either `column` with its `unit`, or `rate_hz`")
+        return self
+
+    @property
+    def source(self) -> Source:
+        """As a value."""
+        if self.column is None:
+            return Source((), 1e9 / (self.rate_hz or 1.0))
+        return Source((self.column,), TIME_UNITS_NS[self.unit])
 
 
 class SourceFile(Strict):
@@ -48,7 +67,11 @@ class SourceFile(Strict):
         scale: further factor; -1 turns the sign.
         offset: added last, in the SI unit.
         index: for cells that hold a list, which of its values, from 0.
-        file: name of the file beside the first that has this column.
+        file: name of the file beside the first that has this column; at other times, its last value before each counts.
+        shift_s: of a command that is stamped too early, how much later it was.
+        torque_constant_nm_per_a: of the motor, for a torque in A.
+        torque_constant_sigma: one standard deviation of it, relative.
+        gear_ratio: between that motor and the joint.
     """
 
     column: str | None = None
@@ -58,6 +81,10 @@ class SourceFile(Strict):
     offset: float = 0.0
     index: int | None = Field(default=None, ge=0)
     file: str | None = Field(default=None, pattern=r"^[^/\\]+$")
+    shift_s: float = 0.0
+    torque_constant_nm_per_a: float | None = Field(default=None, gt=0)
+    torque_constant_sigma: float | None = Field(default=None, gt=0, lt=1)
+    gear_ratio: float = Field(default=1.0, gt=0)
 
     @model_validator(mode="after")
     def _one_way(self) -> SourceFile:
@@ -65,6 +92,8 @@ class SourceFile(Strict):
             raise ValueError("give either `column` or `product`")
         if self.index is not None and self.product is not None:
             raise ValueError("`index` is for a single `column`")
+        if (self.unit in CURRENTS_A) != (self.torque_constant_nm_per_a is not None):
+            raise ValueError("a torque in A (mA) needs `torque_constant_nm_per_a`, and nothing else does")
         if self.scale == 0:
             raise ValueError("`scale: 0` leaves nothing of the column")
         return self
@@ -95,6 +124,7 @@ class ColumnsFile(Strict):
 
     schema_: str = Field(alias="schema")
     name: str
+    topic: str | None = None
     time: TimeFile
     joints: dict[str, JointFile] = Field(min_length=1)
 
@@ -134,16 +164,24 @@ def load_columns(name: str | Path) -> ColumnMap:
                 sources[quantity] = _source(source, quantity, prismatic=columns.prismatic)
             except UsageError as error:
                 problems.append(FieldProblem(("joints", joint, name_here, "unit"), error.what))
-        joints[joint] = JointColumns(sources, columns.prismatic, columns.meta)
+        command, torque = columns.position_command, columns.torque
+        meta = dict(columns.meta)
+        if torque is not None and torque.torque_constant_sigma is not None:
+            meta["torque_constant_sigma"] = torque.torque_constant_sigma
+        joints[joint] = JointColumns(sources, columns.prismatic, meta, command.shift_s if command else 0.0)
     if problems:
         raise document.error(problems)
-    return ColumnMap(file.name, Source((file.time.column,), TIME_UNITS_NS[file.time.unit]), joints)
+    return ColumnMap(file.name, file.time.source, joints, file.topic)
 
 
 def _source(source: SourceFile, quantity: str, *, prismatic: bool) -> Source:
+    if source.torque_constant_nm_per_a is not None and quantity == "torque_nm":
+        unit = CURRENTS_A[source.unit] * source.torque_constant_nm_per_a * source.gear_ratio
+    else:
+        unit = si_factor(source.unit, quantity, prismatic=prismatic)
     return Source(
         columns=source.product or (str(source.column),),
-        scale=si_factor(source.unit, quantity, prismatic=prismatic) * source.scale,
+        scale=unit * source.scale,
         offset=source.offset,
         index=source.index,
         file=source.file,

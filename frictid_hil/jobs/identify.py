@@ -22,11 +22,11 @@ from frictid_hil.jobs.plans import given_procedure
 from frictid_hil.jobs.replaying.bus_logs import is_log, logs_of
 from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.recording.read import read
+from frictid_hil.recording.parquet import is_lerobot
+from frictid_hil.recording.read import READABLE, read
+from frictid_hil.recording.ros import is_bag
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runs.folder import load_manifest
-
-_READABLE = (".mcap", ".csv", ".csv.gz", ".mat")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,12 +129,12 @@ def recordings(named: Sequence[Path]) -> list[Path]:
 
 def _in_folder(folder: Path) -> list[Path]:
     """The folder itself where it is a run; else every run and every readable file below it."""
-    if any(folder.glob("samples*.mcap")):
+    if any(folder.glob("samples*.mcap")) or is_lerobot(folder) or is_bag(folder):
         return [folder]
-    inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name.endswith(_READABLE)]
+    inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name.lower().endswith(READABLE)]
     if not inside:
         raise UsageError(
-            f"holds no recording ({', '.join(_READABLE)})",
+            f"holds no recording ({', '.join(READABLE)})",
             where=str(folder),
             next_step="name a run folder, or a file",
         )
@@ -174,11 +174,13 @@ def _identified(task: _Task) -> _Identified:
 
 
 def _with_damage(error: FrictidError, samples: Samples) -> FrictidError:
-    """The error, and that the file is damaged, where that is a likelier cause than any that was looked for."""
-    damage = samples.meta.get("damage")
-    if not damage:
+    """The error, and that the file is damaged or odd, where that is a likelier cause than any that was looked for."""
+    damage, doubts = samples.meta.get("damage"), samples.meta.get("doubts", ())
+    if not damage and not doubts:
         return error
-    return type(error)(error.what, where=error.where, cause=f"the file is damaged: {damage}", next_step=error.next_step)
+    cause = f"the file is damaged: {damage}" if damage else "; ".join(doubts)
+    next_step = error.next_step if damage else "say the units in a column map; `frictid-hil columns` drafts one"
+    return type(error)(error.what, where=error.where, cause=cause, next_step=next_step)
 
 
 def _decoded(task: _Task) -> list[Samples]:

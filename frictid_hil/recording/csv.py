@@ -2,7 +2,8 @@
 
 Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
 command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
-guessed: a header in other words needs a column map. A file may have up to 10,000,000 rows.
+guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar) and decimal commas are
+found out and told. A file may have up to 10,000,000 rows and 2 GB.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import csv
 import difflib
 import gzip
 import io
+import re
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -25,10 +28,10 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.files import write_whole
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.linear_axis import linear_name
+from frictid_hil.recording.bounds import MAX_BYTES, MAX_ROWS, check_expansion, check_rows
 from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped, samples_of
 
-MAX_ROWS = 10_000_000
 _MAX_HEADER = 65_536
 
 _ORDER = (
@@ -55,7 +58,7 @@ def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = N
         InputFileError: unreadable, or a value that cannot be used, with line and column.
     """
     if columns is not None:
-        return mapped(CsvTable, path, columns, joint)
+        return mapped(CsvTable, CsvTable(path), columns, joint)
     table = CsvTable(path)
     prismatic = "position_m" in table.names
     names = {(linear_name(name) if prismatic else name): name for name in _ORDER}
@@ -66,7 +69,8 @@ def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = N
     for optional in ("external_torque_nm", "temperature_c"):
         if optional in quantities and np.isnan(quantities[optional]).all():
             del quantities[optional]
-    return [samples_of(table, joint or "0", time_s, quantities, unit_ns=1e9, prismatic=prismatic, meta={})]
+    meta = {"told": table.told} if table.told else {}
+    return [samples_of(table, joint or "0", time_s, quantities, unit_ns=1e9, prismatic=prismatic, meta=meta)]
 
 
 def write_csv(path: Path, samples: Samples) -> None:
@@ -86,6 +90,43 @@ def write_csv(path: Path, samples: Samples) -> None:
     write_whole(path, gzip.compress(raw, mtime=0) if path.suffix == ".gz" else raw)
 
 
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How a file is written.
+
+    Attributes:
+        separator: between cells.
+        decimal_comma: 1,5 is one and a half.
+    """
+
+    separator: str = ","
+    decimal_comma: bool = False
+
+    @staticmethod
+    def of(header: str, first: str) -> Dialect:
+        """What fits header and first row: the separator that is in both equally often, more often than any other."""
+        counts = {mark: (len(_cells(header, mark)), len(_cells(first, mark))) for mark in ",;\t|"}
+        fitting = [mark for mark, (a, b) in counts.items() if a > 1 and (a == b or not first)]
+        if not fitting:  # a comma within the cells of the first row may be a decimal one, or a mistake
+            fitting = [mark for mark in ";\t|," if counts[mark][0] > 1] or [","]
+        separator = max(fitting, key=lambda mark: counts[mark][0])
+        cells = [cell.strip() for cell in _cells(first, separator)]
+        return Dialect(separator, separator != "," and any(_DECIMAL_COMMA.fullmatch(cell) for cell in cells))
+
+    def told(self) -> tuple[str, ...]:
+        """What is unusual about it."""
+        name = {";": "semicolons", "\t": "tabs", "|": "bars"}.get(self.separator)
+        said = [f"cells are separated by {name}"] if name else []
+        return (*said, "numbers have decimal commas") if self.decimal_comma else tuple(said)
+
+
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return next(csv.reader([line], delimiter=separator), [])
+
+
 class CsvTable:
     """A CSV file with a header; a ``Table``. Blank lines and lines that begin with ``#`` are passed over.
 
@@ -95,6 +136,9 @@ class CsvTable:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.standard: ColumnMap | None = None
+        self.sparse = False
+        self._read: dict[str, Array] = {}
         self._header_lines = 0
         with _reading(path), _open(path) as file:
             header = ""
@@ -103,10 +147,11 @@ class CsvTable:
                 self._header_lines += 1
                 if not header:
                     raise InputFileError("the file is empty", where=str(path))
-        self.names = [name.strip() for name in next(csv.reader([header]))]
+            first = next((line for line in iter(lambda: file.readline(_MAX_HEADER), "") if not _is_remark(line)), "")
+            self.dialect = Dialect.of(header, first)
+        self.told = self.dialect.told()
+        self.names = [name.strip() for name in _cells(header, self.dialect.separator)]
         where = f"{path}, line {self._header_lines}"
-        if len(self.names) == 1 and (";" in header or "\t" in header):
-            raise InputFileError("columns are not separated by commas", where=where, next_step="export it with commas")
         if all(_is_number(name) for name in self.names):
             raise InputFileError("no header: the first line holds numbers", where=where)
         twice = [name for name in self.names if self.names.count(name) > 1]
@@ -114,15 +159,21 @@ class CsvTable:
             raise InputFileError(f"column {twice[0]!r} appears twice in the header", where=where)
 
     def numbers(self, names: Sequence[str]) -> list[Array]:
-        """Columns as float64, shape (n,) each."""
+        """Columns as float64, shape (n,) each; what is asked for together is read in one go."""
+        new = [name for name in dict.fromkeys(names) if name not in self._read]
+        if new:
+            self._read.update(zip(new, self._parsed(new), strict=True))
+        return [self._read[name] for name in names]
+
+    def _parsed(self, names: Sequence[str]) -> list[Array]:
         at = [self._index(name) for name in names]
         with _reading(self.path), warnings.catch_warnings():
             self._check_row_lengths()
             warnings.simplefilter("ignore", UserWarning)  # "no data": said better by whoever needs rows
             try:
                 values = np.loadtxt(
-                    self.path,
-                    delimiter=",",
+                    self._lines_with_points() if self.dialect.decimal_comma else self.path,
+                    delimiter=self.dialect.separator,
                     skiprows=self._header_lines,
                     usecols=at,
                     quotechar='"',
@@ -134,8 +185,7 @@ class CsvTable:
                 raise
             except ValueError as error:
                 raise self._explained(at, error) from None
-        if len(values) > MAX_ROWS:
-            raise InputFileError(f"more than {MAX_ROWS:,} rows", where=str(self.path), next_step="split the recording")
+        check_rows(len(values), str(self.path))
         return list(np.ascontiguousarray(values.T)) if values.size else [np.empty(0) for _ in names]
 
     def elements(self, name: str, index: int) -> Array:
@@ -165,13 +215,17 @@ class CsvTable:
     def _check_row_lengths(self) -> None:
         """A row with a comma too many would be read as something else."""
         expected = len(self.names)
-        rows = commas = 0
-        last = b"\n"
+        rows = commas = unpacked = 0
+        last, size, separator = b"\n", self.path.stat().st_size, self.dialect.separator.encode()
         with _open_bytes(self.path) as file:
             while block := file.read(1 << 20):
                 rows += block.count(b"\n")
-                commas += block.count(b",")
+                commas += block.count(separator)
                 last = block
+                unpacked += len(block)
+                if unpacked > size or size > MAX_BYTES:
+                    check_expansion(size, unpacked, str(self.path))
+        check_rows(rows - self._header_lines, str(self.path))
         rows += not last.endswith(b"\n")
         if commas == rows * (expected - 1):
             return  # the plain case, told by counting alone
@@ -180,7 +234,7 @@ class CsvTable:
                 raise InputFileError(
                     f"line {line} has {len(row)} values where the header has {expected}",
                     where=str(self.path),
-                    cause="the file ends in the middle of a line, or a comma is missing or too many",
+                    cause="the file ends in the middle of a line, or a separator is missing or too many",
                 )
 
     def _index(self, name: str) -> int:
@@ -194,10 +248,18 @@ class CsvTable:
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and cells of each row of data."""
         with _open(self.path) as file:
-            reader = csv.reader(file)
+            reader = csv.reader(file, delimiter=self.dialect.separator)
             for row in reader:
                 if reader.line_num > self._header_lines and row and not row[0].lstrip().startswith("#"):
                     yield reader.line_num, row
+
+    def _lines_with_points(self) -> Iterator[str]:
+        with _open(self.path) as file:
+            for line in file:
+                yield line.replace(",", ".")
+
+    def _is_number(self, cell: str) -> bool:
+        return _is_number(cell.replace(",", ".") if self.dialect.decimal_comma else cell)
 
     def _explained(self, at: Sequence[int], error: ValueError) -> InputFileError:
         """What is wrong with the file that could not be read as numbers: the first bad cell."""
@@ -206,7 +268,7 @@ class CsvTable:
             for k in at:
                 if not row[k].strip():
                     return InputFileError(f"line {line}, column {self.names[k]}: blank", where=where)
-                if not _is_number(row[k]):
+                if not self._is_number(row[k]):
                     return InputFileError(
                         f"line {line}, column {self.names[k]}: {row[k][:40]!r} is not a number", where=where
                     )
@@ -230,11 +292,15 @@ def _check_header(table: CsvTable, names: dict[str, str], present: list[str], pa
         raise InputFileError(
             f"no column {' and '.join(missing)}; the file has {', '.join(table.names)[:300]}",
             where=where,
-            next_step="say by --columns MAP which column is which",
+            next_step="`frictid-hil columns` looks at the file and drafts the map for --columns",
         )
     torque, command = [name for name, ours in names.items() if ours in ("torque_nm", "position_command_rad")]
     if torque not in present and command not in present:
         raise InputFileError(f"neither {torque} nor {command}", where=where)
+
+
+def _is_remark(line: str) -> bool:
+    return not line.strip() or line.lstrip().startswith("#")
 
 
 def _is_number(text: str) -> bool:

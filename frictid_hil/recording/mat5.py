@@ -15,11 +15,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.recording.bounds import allowed_bytes
 
 HEADER_SIZE = 128
-MAX_UNPACKED = 2_000_000_000
-"""Bytes; a compressed variable that unpacks to more is refused."""
-
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _MATRIX, _COMPRESSED = 14, 15
 _STRUCT, _FIRST_NUMERIC, _LAST_NUMERIC = 2, 6, 15
@@ -31,7 +29,7 @@ class SpoiltMatFile(ValueError):
 
 
 def read_numbers(data: bytes) -> dict[str, Array]:
-    """All real numeric variables of a file, as float64.
+    """All real numeric variables of a file, of the type in which they stand there.
 
     Args:
         data: the whole file.
@@ -46,9 +44,12 @@ def read_numbers(data: bytes) -> dict[str, Array]:
         raise SpoiltMatFile("no MATLAB 5 header")
     order = "<" if data[126:128] == b"IM" else ">"
     values: dict[str, Array] = {}
+    left = allowed_bytes(len(data))
     for kind, content in _elements(memoryview(data)[HEADER_SIZE:], order):
         if kind == _COMPRESSED:
-            ((kind, content),) = list(_elements(_unpacked(content), order))[:1] or [(0, memoryview(b""))]
+            unpacked = _unpacked(content, left)
+            left -= len(unpacked)
+            ((kind, content),) = list(_elements(unpacked, order))[:1] or [(0, memoryview(b""))]
         if kind == _MATRIX:
             values.update(_matrix(content, order))
     return values
@@ -77,14 +78,16 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
         at = end if kind == _COMPRESSED else end + -size % 8
 
 
-def _unpacked(packed: memoryview) -> memoryview:
+def _unpacked(packed: memoryview, most: int) -> memoryview:
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(packed, MAX_UNPACKED)
+        content = unpacker.decompress(packed, max(most, 1))
     except zlib.error as error:
         raise SpoiltMatFile(f"a compressed variable: {error}") from None
+    if not unpacker.eof and len(content) >= most:
+        raise SpoiltMatFile(f"it unpacks to more than {most:,} bytes, 100 times its size or 2 GB")
     if not unpacker.eof:
-        raise SpoiltMatFile("a compressed variable is cut off, or too large")
+        raise SpoiltMatFile("a compressed variable is cut off")
     return memoryview(content)
 
 
@@ -104,7 +107,7 @@ def _matrix(content: memoryview, order: str, name: str = "", *, inside: bool = F
     values = _numbers(*parts[3], order)
     if len(shape) < 2 or min(shape) < 0 or math.prod(shape) != values.size:
         raise SpoiltMatFile(f"variable {name}: {values.size} values for the shape {shape}")
-    return {name: values.astype(np.float64).reshape(shape, order="F")}
+    return {name: values.reshape(shape, order="F")}
 
 
 def _fields(parts: list[tuple[int, memoryview]], order: str, name: str) -> dict[str, Array]:

@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 
 from frictid_hil.errors import InputFileError
 from frictid_hil.recording import mcap_layout as layout
+from frictid_hil.recording.bounds import allowed_bytes
 from frictid_hil.recording.samples import Mark, Samples, checked
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
 _METADATA, _DATA_END = 0x0C, 0x0F
 _RECORD = struct.Struct("<BQ")
+NO_SAMPLES = "holds no samples of a joint"
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
-_MAX_CHUNK = 1 << 30
 
 Rows = NDArray[np.void]
 
@@ -58,6 +59,19 @@ def read_mcap(path: Path, joint: str | None = None) -> list[Samples]:
     ]
 
 
+def is_ours(path: Path) -> bool | None:
+    """Whether this reader wrote the file (or it is no MCAP file, which is told here); None where nothing tells."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(1 << 12)
+    except OSError:
+        return True
+    if not begin.startswith(MAGIC) or b"frictid" in begin:
+        return True
+    profile = begin[len(MAGIC) + _RECORD.size :][4:8]
+    return False if profile.startswith(b"ros") else None
+
+
 def read_rows(path: Path) -> dict[str, Rows]:
     """Every field of every sample, by joint: arrays of ``mcap_layout.RECORD`` (``log_time`` is the run time in ns).
 
@@ -75,6 +89,8 @@ class _Contents:
     others: list[tuple[int, bytes]] = field(default_factory=list)
     metadata: dict[str, dict[str, Any]] = field(default_factory=dict)
     damage: str = ""
+    size: int = 0
+    unpacked: int = 0
 
     @staticmethod
     def of(path: Path) -> _Contents:
@@ -86,7 +102,7 @@ class _Contents:
             raise InputFileError(
                 "not an MCAP file" if data else "the file is empty", where=f"{path}, byte 0", cause="another format?"
             )
-        contents = _Contents()
+        contents = _Contents(size=len(data))
         contents._walk(memoryview(data), len(MAGIC), path)
         return contents
 
@@ -131,8 +147,9 @@ class _Contents:
 
     def _chunk(self, body: memoryview) -> None:
         _, _, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
-        if size > _MAX_CHUNK:
-            raise _Damaged(f"a chunk of {size} bytes")
+        self.unpacked += size
+        if name_length and self.unpacked > allowed_bytes(self.size):
+            raise _Damaged(f"its chunks unpack to {self.unpacked} bytes; {allowed_bytes(self.size)} are read")
         # A copy of an uncompressed chunk would cost more than reading it.
         content = _unpacked(Chunk.read(_stream(body))) if name_length else body[_CHUNK_HEAD.size + 8 :]
         if len(content) != size or (crc and zlib.crc32(content) != crc):
@@ -190,7 +207,7 @@ class _Contents:
         if not self.rows:
             topics = ", ".join(sorted(channel.topic for channel in self.channels.values()))
             raise InputFileError(
-                "holds no samples of a joint",
+                NO_SAMPLES,
                 where=str(path),
                 cause=self.damage or f"topics in the file: {topics or 'none'}",
             )

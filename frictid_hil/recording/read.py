@@ -1,51 +1,96 @@
-"""Whatever a person hands us: the right reader for a file or a run folder."""
+"""Whatever a person hands us: the right reader for a file, a data set or a run folder."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from frictid_hil.columns import ColumnMap
 from frictid_hil.errors import InputFileError
 from frictid_hil.recording.bus_log import LOG_SUFFIXES
-from frictid_hil.recording.csv import read_csv
-from frictid_hil.recording.mat import read_mat
-from frictid_hil.recording.mcap_reader import read_mcap
+from frictid_hil.recording.csv import CsvTable, read_csv
+from frictid_hil.recording.mat import open_mat
+from frictid_hil.recording.mcap_reader import NO_SAMPLES, is_ours, read_mcap
+from frictid_hil.recording.numpy_files import open_hdf5, open_npz
+from frictid_hil.recording.parquet import is_lerobot, open_lerobot, open_parquet
+from frictid_hil.recording.ros import is_bag, open_bag
 from frictid_hil.recording.samples import Samples
+from frictid_hil.recording.servo_logs import open_bam, open_pace
+from frictid_hil.recording.table import Table, mapped, own_names
+
+_TABLES: dict[tuple[str, ...], Callable[[Path], Table]] = {
+    (".csv", ".csv.gz", ".txt", ".txt.gz", ".tsv", ".tsv.gz"): CsvTable,
+    (".mat",): open_mat,
+    (".npz",): open_npz,
+    (".h5", ".hdf5"): open_hdf5,
+    (".parquet",): open_parquet,
+    (".json",): open_bam,
+    (".pt",): open_pace,
+    (".mcap", ".bag", ".db3"): open_bag,
+}
+READABLE = tuple(suffix for suffixes in _TABLES for suffix in suffixes)
+"""How the names of recordings end."""
 
 
 def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:
     """The samples in a recording, one entry per joint.
 
     Args:
-        path: run folder, ``.mcap``, ``.csv``, ``.csv.gz`` or ``.mat``.
-        columns: which column is which, for CSV and .mat of other tools.
+        path: run folder, MCAP, CSV, .mat, npz, HDF5, parquet, ROS bag, LeRobot dataset, recording of BAM or PACE.
+        columns: which column is which, for files of other tools.
         joint: the only one wanted; the name of the joint where the file does not tell.
 
     Raises:
         InputFileError: unreadable, unusable, of an unknown kind, or without that joint.
     """
     path = Path(path)
-    if path.is_dir():
+    if path.is_dir() and not is_lerobot(path) and not is_bag(path):
         return _run_folder(path, joint)
+    if path.name.lower().endswith(".mcap") and columns is None:
+        ours = is_ours(path)
+        try:
+            if ours is not False:
+                return read_mcap(path, joint)
+        except InputFileError as error:
+            if ours or not error.what.startswith(NO_SAMPLES):
+                raise
+    if columns is None and path.name.lower().endswith(next(iter(_TABLES))):
+        return read_csv(path, None, joint)
+    table = open_table(path, None if columns is None else columns.topic)
+    known = columns or table.standard
+    if known is None:
+        return mapped(open_table, table, own_names(table, joint or "0"))
+    return mapped(open_table, table, known, joint)
+
+
+def open_table(path: Path, topic: str | None = None) -> Table:
+    """The named columns of a file or data set of other tools.
+
+    Args:
+        path: of the file or folder.
+        topic: of a ROS bag that has several.
+
+    Raises:
+        InputFileError: unreadable, or of an unknown kind.
+    """
     name = path.name.lower()
-    if name.endswith((".csv", ".csv.gz", ".txt", ".txt.gz")):
-        return read_csv(path, columns, joint)
-    if name.endswith(".mat"):
-        return read_mat(path, columns, joint)
-    if columns is not None:
-        raise InputFileError("a column map is for CSV and .mat files", where=str(path))
-    if name.endswith(".mcap"):
-        return read_mcap(path, joint)
+    if not path.exists() and not name.endswith(LOG_SUFFIXES):
+        raise InputFileError("cannot be read: no such file", where=str(path))
+    if is_lerobot(path):
+        return open_lerobot(path)
+    if is_bag(path) or name.endswith((".mcap", ".db3")):
+        return open_bag(path, topic)
+    for suffixes, opener in _TABLES.items():
+        if name.endswith(suffixes):
+            return opener(path)
     if name.endswith(LOG_SUFFIXES):
         raise InputFileError(
             "a bus log holds frames, not samples",
             where=str(path),
             next_step="give the robot whose drives sent them with --robot, so that they can be decoded",
         )
-    if not path.exists():
-        raise InputFileError("no such file", where=str(path))
     raise InputFileError(
-        "not a recording of a known kind", where=str(path), cause="read are .mcap, .csv, .csv.gz, .mat and bus logs"
+        "not a recording of a known kind", where=str(path), cause=f"read are {', '.join(READABLE)} and bus logs"
     )
 
 

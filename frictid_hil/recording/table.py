@@ -5,16 +5,19 @@ Tables are read by name and by need; a value that cannot be used is told with it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from frictid_hil.columns import ColumnMap, JointColumns, Source
+from frictid_hil.columns import JOINT, ColumnMap, JointColumns, Source
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.linear_axis import linear_name
+from frictid_hil.recording.proofs import doubts_of
 from frictid_hil.recording.samples import Nanoseconds, Samples, checked
 
 _EPOCH_NS = 1e17
@@ -24,9 +27,39 @@ _MAY_BE_MISSING = ("external_torque_nm", "temperature_c")
 
 
 class Table(Protocol):
-    """Named columns of equal length; a constant is a column of one value."""
+    """Named columns of equal length; a constant is a column of one value.
 
-    path: Path
+    Attributes:
+        names: of the columns.
+        standard: what they mean, where the format itself says so.
+        sparse: a row in which a column holds NaN says nothing of it (several publishers, several joints).
+        told: what was found out about the file, in sentences.
+    """
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the columns."""
+        ...
+
+    @property
+    def standard(self) -> ColumnMap | None:
+        """What the columns mean, where the format says so."""
+        ...
+
+    @property
+    def sparse(self) -> bool:
+        """Rows may say nothing of a column."""
+        ...
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What was found out about the file."""
+        ...
 
     def numbers(self, names: Sequence[str]) -> list[Array]:
         """Columns as float64, shape (n,) each (or (1,) for a constant); ``InputFileError`` for a name it has not."""
@@ -41,40 +74,95 @@ class Table(Protocol):
         ...
 
 
-def mapped(open_table: Callable[[Path], Table], path: Path, columns: ColumnMap, joint: str | None) -> list[Samples]:
+def mapped(
+    open_table: Callable[[Path], Table], table: Table, columns: ColumnMap, joint: str | None = None
+) -> list[Samples]:
     """The joints of a foreign file.
 
     Args:
-        open_table: opens a file of this kind.
-        path: of the file.
+        open_table: opens a companion file.
+        table: of the file.
         columns: which column is which.
         joint: name of the only one wanted.
 
     Raises:
         InputFileError: a column is missing or cannot be used; a companion file does not fit; no such joint.
     """
-    if joint is not None and joint not in columns.joints:
+    path = table.path
+    joints = expanded(columns, table)
+    if joint is not None and joint not in joints:
         raise InputFileError(
-            f"column map {columns.name} knows no joint {joint!r}; it has {', '.join(columns.joints)}", where=str(path)
+            f"column map {columns.name} knows no joint {joint!r}; it has {', '.join(joints)}", where=str(path)
         )
-    table = open_table(path)
-    (time,) = table.numbers(columns.time.columns)
-    companions: dict[str, Table] = {}
+    wanted = [source for known in _chosen(joints, joint).values() for source in known.sources.values()]
+    here = [name for source in wanted if source.file is None and source.index is None for name in source.columns]
+    table.numbers([*columns.time.columns, *here])  # all at once; tables keep what they have read
+    time = _time(table, columns)
+    companions: dict[str, Callable[[Array], Array]] = {}
 
-    def table_of(source: Source) -> Table:
+    def values_of(source: Source) -> Array:
         if source.file is None:
-            return table
+            return _values(table, source)
+        companion = open_table(_beside(path, source.file))
+        values = _values(companion, source)
         if source.file not in companions:
-            companion = open_table(_beside(path, source.file))
-            _check_belongs(companion, columns.time, time, path)
-            companions[source.file] = companion
-        return companions[source.file]
+            companions[source.file] = _onto(companion, columns, time, path)
+        return companions[source.file](values)
 
     return [
-        _joint_samples(name, known, time, columns.time.scale, table, table_of)
-        for name, known in columns.joints.items()
-        if joint in (None, name)
+        _joint_samples(name, known, time, columns.time.scale, table, values_of)
+        for name, known in _chosen(joints, joint).items()
     ]
+
+
+def _chosen(joints: Mapping[str, JointColumns], joint: str | None) -> dict[str, JointColumns]:
+    return {name: known for name, known in joints.items() if joint in (None, name)}
+
+
+def expanded(columns: ColumnMap, table: Table) -> dict[str, JointColumns]:
+    """The joints of a map; an entry ``{joint}`` stands for every joint whose position the file has.
+
+    Raises:
+        InputFileError: no column is of the form that the map says.
+    """
+    found = {name: known for name, known in columns.joints.items() if JOINT not in name}
+    for pattern, known in columns.joints.items():
+        if JOINT not in pattern:
+            continue
+        position = known.sources["position_rad"].columns[0]
+        form = re.compile(re.escape(position).replace(re.escape(JOINT), "(.+?)"))
+        names = [match[1] for match in map(form.fullmatch, table.names) if match]
+        if not names:
+            raise InputFileError(
+                f"no column {position!r}; the file has {', '.join(table.names)[:300]}", where=str(table.path)
+            )
+        for name in names:
+            sources = {quantity: _of_joint(source, name) for quantity, source in known.sources.items()}
+            present = {q: s for q, s in sources.items() if s.file or set(s.columns) <= set(table.names)}
+            found[pattern.replace(JOINT, name)] = replace(known, sources=present)
+    return found
+
+
+def _of_joint(source: Source, joint: str) -> Source:
+    return replace(source, columns=tuple(column.replace(JOINT, joint) for column in source.columns))
+
+
+def own_names(table: Table, joint: str) -> ColumnMap:
+    """The map of a table that uses our own names: ``time_s``, ``position_rad``, ... or ``position_m``, ....
+
+    Raises:
+        InputFileError: it does not.
+    """
+    prismatic = "position_m" in table.names
+    names = {name: linear_name(name) if prismatic else name for name in Samples.COLUMNS}
+    sources = {ours: Source((theirs,)) for ours, theirs in names.items() if theirs in table.names}
+    if "time_s" not in table.names or "position_rad" not in sources:
+        raise InputFileError(
+            f"no columns time_s and position_rad; the file has {', '.join(table.names)[:300] or 'none'}",
+            where=str(table.path),
+            next_step="`frictid-hil columns` looks at the file and drafts the map for --columns",
+        )
+    return ColumnMap("standard names", Source(("time_s",), 1e9), {joint: JointColumns(sources, prismatic)})
 
 
 def samples_of(
@@ -85,7 +173,7 @@ def samples_of(
     *,
     unit_ns: float,
     prismatic: bool,
-    meta: dict[str, object],
+    meta: Mapping[str, object],
 ) -> Samples:
     """Samples from columns in SI units, after every check a reader owes its user.
 
@@ -118,24 +206,73 @@ def samples_of(
             where=str(table.path),
             cause="rows reordered, two recordings joined, or time written with too few digits",
         )
-    return checked(
+    samples = checked(
         Samples(joint=joint, time_ns=time_ns, prismatic=prismatic, meta=meta, **columns),  # type: ignore[arg-type]
         where=str(table.path),
     )
+    doubts = doubts_of(samples, where=f"{table.path}, joint {joint}")
+    return replace(samples, meta={**samples.meta, "doubts": doubts}) if doubts else samples
 
 
 def _joint_samples(
-    name: str, known: JointColumns, time: Array, unit_ns: float, table: Table, table_of: Callable[[Source], Table]
+    name: str,
+    known: JointColumns,
+    time: Array,
+    unit_ns: float,
+    table: Table,
+    values_of: Callable[[Source], Array],
 ) -> Samples:
-    columns = {}
+    columns: dict[str, Array] = {}
     for quantity, source in known.sources.items():
-        column = _values(table_of(source), source)
+        column = values_of(source)
         columns[quantity] = np.full(time.size, column[0]) if column.size == 1 else column
         if columns[quantity].size != time.size:
             raise InputFileError(
                 f"{' * '.join(source.columns)} has {column.size} values for {time.size} times", where=str(table.path)
             )
-    return samples_of(table, name, time, columns, unit_ns=unit_ns, prismatic=known.prismatic, meta=dict(known.meta))
+    told = list(table.told)
+    if table.sparse:
+        said = np.isfinite(columns["position_rad"])
+        said[1:] &= np.diff(time) > 0.0
+        time = time[said]
+        columns = {q: kept for q, column in columns.items() if not np.isnan(kept := column[said]).all()}
+    for quantity in ("position_rad", "position_command_rad"):
+        if quantity in columns and not known.prismatic:
+            columns[quantity], turns = unwrapped(columns[quantity])
+            if turns:
+                told.append(f"{quantity} jumped by whole turns {turns} times and was unwrapped")
+    if (shift := known.command_shift_s) and "position_command_rad" in columns:
+        moved = time * unit_ns * 1e-9
+        columns["position_command_rad"] = np.interp(moved - shift, moved, columns["position_command_rad"])
+        told.append(f"the command was shifted by {1e3 * shift:g} ms, as the column map says")
+    meta = {**known.meta, **({"told": tuple(told)} if told else {})}
+    return samples_of(table, name, time, columns, unit_ns=unit_ns, prismatic=known.prismatic, meta=meta)
+
+
+def unwrapped(angle_rad: Array) -> tuple[Array, int]:
+    """An angle without jumps of a turn, and how many there were.
+
+    A jump is a step of more than 0.9 of a turn where the steps around it are less than a tenth of one, so that neither
+    a fast joint nor an angle in degrees is taken for one that wraps.
+    """
+    steps = np.diff(angle_rad)
+    turn = 2 * np.pi
+    jumps = (np.abs(np.abs(steps) - turn) < 0.1 * turn) & np.isfinite(steps)
+    if not jumps.any() or float(np.ptp(angle_rad)) > 1.05 * turn:
+        return angle_rad, 0
+    if float(np.nanquantile(np.abs(steps[~jumps]), 0.99)) > 0.1 * turn:
+        return angle_rad, 0
+    turns = np.concatenate([[0.0], np.cumsum(np.where(jumps, -np.sign(steps), 0.0))])
+    return angle_rad + turn * turns, int(np.count_nonzero(jumps))
+
+
+def _time(table: Table, columns: ColumnMap) -> Array:
+    """In the map's unit; made from the rate where the file has no column of time."""
+    if columns.time.columns:
+        (time,) = table.numbers(columns.time.columns)
+        return time
+    first = next(iter(expanded(columns, table).values()))
+    return np.arange(_values(table, first.sources["position_rad"]).size, dtype=np.float64)
 
 
 def _values(table: Table, source: Source) -> Array:
@@ -172,11 +309,22 @@ def _beside(path: Path, name: str) -> Path:
     raise InputFileError(f"its companion {name} is not beside it", where=str(path))
 
 
-def _check_belongs(companion: Table, time: Source, expected: Array, path: Path) -> None:
-    (found,) = companion.numbers(time.columns)
-    if found.shape != expected.shape or not np.array_equal(found, expected):
+def _onto(companion: Table, columns: ColumnMap, time: Array, path: Path) -> Callable[[Array], Array]:
+    """What brings a companion's values to the times of the first file: the last value before each, on one clock.
+
+    Raises:
+        InputFileError: the companion's times do not cover those of the file.
+    """
+    (found,) = companion.numbers(columns.time.columns)
+    if found.shape == time.shape and np.array_equal(found, time):
+        return lambda values: values
+    slack = 0.05 * (time[-1] - time[0]) if time.size else 0.0
+    covers = found.size >= max(10, time.size // 50) and found[0] <= time[0] + slack and found[-1] >= time[-1] - slack
+    if not covers or (np.diff(found) < 0).any():
         raise InputFileError(
-            f"its rows ({found.size}) are not at the times of {path.name} ({expected.size} rows)",
+            f"its rows ({found.size}) are not at the times of {path.name} ({time.size} rows), nor do they cover them",
             where=str(companion.path),
-            cause="two recordings, or two loggers that do not write at the same instants",
+            cause="files of two recordings, or of two clocks",
         )
+    at = np.clip(np.searchsorted(found, time, side="right") - 1, 0, None)
+    return lambda values: values[at]

@@ -220,7 +220,8 @@ def _from_plateaus(samples: Samples) -> JointProfile:
 
 def _damage(samples: Samples) -> list[str]:
     damage = samples.meta.get("damage")
-    return [f"the recording is damaged, what is left of it was used: {damage}"] if damage else []
+    said = [f"the recording is damaged, what is left of it was used: {damage}"] if damage else []
+    return [*said, *samples.meta.get("told", ()), *samples.meta.get("doubts", ())]
 
 
 def _interval(torque_nm: tuple[float, ...], half_width_nm: Array) -> tuple[tuple[float, float], ...]:
