@@ -17,15 +17,17 @@ from frictid_hil.protocol.frames import LoggedFrame
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A frame that commands a joint.
+    """A frame that commands a joint, or all of them.
 
     Attributes:
         joint: index.
         position_rad: target that it sets; NaN for none.
+        others: the same of further joints, where one frame commands several.
     """
 
     joint: int
     position_rad: float
+    others: tuple[tuple[int, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +83,9 @@ class RowDecoder:
             if seen.joint == 0:
                 for report in self.feedback:
                     report.age_cycles += 1
-            self._asked_ns[seen.joint] = t_ns
-            self.feedback[seen.joint].position_command_rad = seen.position_rad
+            for joint, position_rad in ((seen.joint, seen.position_rad), *seen.others):
+                self._asked_ns[joint] = t_ns
+                self.feedback[joint].position_command_rad = position_rad
         elif isinstance(seen, Report):
             report = self.feedback[seen.joint]
             report.age_cycles, report.valid, report.t_ns = 0, True, self._asked_ns[seen.joint]

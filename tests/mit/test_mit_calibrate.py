@@ -33,7 +33,7 @@ def unit(folder: Path, family: str, *, noise_per_mille: float, scale: float) -> 
 
 
 def calibrated(path: Path, out: Path, seed: int) -> None:
-    result = calibrate(CalibrateOptions(str(path), out=out, seed=seed, cycles=5), Silent())
+    result = calibrate(CalibrateOptions(str(path), out=out, seed=seed, cycles=5), Silent()).to_json()
     assert result["outcome"] == "ok", result
     joint = load_profile(out / "profile.yaml").joint("0")
     setup = load_robot(path).to_setup()
@@ -65,6 +65,6 @@ def test_compensation_follows_better_than_none(tmp_path: Path, family: str) -> N
     result = compensate(
         CompensateOptions(str(path), tmp_path / "run" / "profile.yaml", "0", wanted, out=tmp_path / "compensated"),
         Silent(),
-    )
+    ).to_json()
     assert result["outcome"] == "ok", result
     assert result["modes"]["mop"]["reduction_percent"] >= 50.0

@@ -133,7 +133,7 @@ class Rack:
             seed = zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode())
             actuator = Actuator(joint, seed, mine.motor.ranges, joint.address)
             self.actuators[joint.name] = actuator
-            self._wires.append((actuator, _wire_of(mine, seed)))
+            self._wires.append((actuator, _wire_of(mine, zlib.crc32(f"{setup.name}/{joint.name}".encode()))))
 
     def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
         """A frame of the host; the answer of the motor that it is meant for."""
@@ -150,10 +150,10 @@ class Rack:
             actuator.advance(to_ns)
 
 
-def _wire_of(settings: JointSettings, seed: int) -> Wire:
+def _wire_of(settings: JointSettings, serial: int) -> Wire:
     name, reply_id = settings.family.name, settings.motor.reply_id
     if name == "damiao":
-        return _DamiaoWire(settings.motor.ranges, reply_id, seed)
+        return _DamiaoWire(settings.motor.ranges, reply_id, serial)
     if name in ("robstride", "cybergear"):
         return _RobStrideWire(reply_id, 0x200C if name == "cybergear" else 0x7028)
     return _PlainWire(reply_id, 8 if name == "robstride-mit" else 6, deci=name == "robstride-mit")
@@ -197,10 +197,10 @@ def _mit_report(motor: Actuator, first: int) -> bytes:
 class _DamiaoWire:
     """Register numbers and status nibble as in the J4310 manual."""
 
-    def __init__(self, ranges: Ranges, reply_id: int, seed: int) -> None:
+    def __init__(self, ranges: Ranges, reply_id: int, serial: int) -> None:
         self._reply_id = reply_id
         self._floats = {21: ranges.position_rad, 22: ranges.velocity_rad_s, 23: ranges.torque_nm}
-        self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: seed}
+        self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: serial}
 
     def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
         if can_id == 0x7FF and len(data) == 8 and data[0] | data[1] << 8 == motor.id:

@@ -1,0 +1,143 @@
+"""The serial line: a port held exclusively, packets out and in, each told to the bus log."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+import serial
+
+from frictid_drivers.servos.logs import RECEIVED_ID, SENT_ID
+from frictid_drivers.servos.packets import Packet, Wire
+from frictid_hil.errors import HardwareBusy, HardwareError
+from frictid_hil.protocol.driver import Clock, FrameSink
+
+LOGGED_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Lengths that a row of a bus log can have; a packet is padded to the next with zeros, which no parser minds."""
+
+
+class BytePort(Protocol):
+    """Bytes out and in."""
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        ...
+
+    def read(self, timeout_s: float) -> bytes:
+        """What is there; waits so long for the first byte."""
+        ...
+
+    def close(self) -> None:
+        """Release."""
+        ...
+
+
+PortFactory = Callable[[], BytePort]
+
+
+class SerialPort:
+    """A real one.
+
+    Args:
+        path: of the device.
+        baud: bit/s.
+
+    Raises:
+        HardwareBusy: held by another process.
+        HardwareError: no such port, or no permission.
+    """
+
+    def __init__(self, path: str, baud: int) -> None:
+        try:
+            self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
+        except (serial.SerialException, OSError, ValueError) as error:
+            busy = "exclusively lock" in str(error)
+            raise (HardwareBusy if busy else HardwareError)(
+                f"cannot open the port: {error}",
+                where=path,
+                cause="another program holds it" if busy else "the adapter is absent, or you may not use it",
+                next_step="see `ls -l /dev/serial/by-id`; add your user to the group that owns it",
+            ) from error
+
+    def write(self, data: bytes) -> None:
+        """Send; also empties what was left of earlier answers."""
+        self._serial.write(data)
+
+    def read(self, timeout_s: float) -> bytes:
+        """What is there; waits so long for the first byte."""
+        self._serial.timeout = max(0.0, timeout_s)
+        first: bytes = self._serial.read(1)
+        return first + self._serial.read(self._serial.in_waiting) if first else b""
+
+    def close(self) -> None:
+        """Release."""
+        self._serial.close()
+
+
+class Line:
+    """Packets of one maker on one port.
+
+    Args:
+        port: opened.
+        wire: of the maker.
+        sink: told of every packet.
+        clock: run time.
+        heard: told of every packet, with its run time and identifier in the log.
+    """
+
+    def __init__(self, port: BytePort, wire: Wire, sink: FrameSink | None, clock: Clock) -> None:
+        self._port = port
+        self._wire = wire
+        self._sink = sink
+        self._clock = clock
+        self._buffer = bytearray()
+        self.heard: Callable[[int, int, bytes], None] | None = None
+
+    def send(self, packet: bytes) -> None:
+        """One packet.
+
+        Raises:
+            HardwareError: the port is gone.
+        """
+        try:
+            self._port.write(packet)
+        except (serial.SerialException, OSError) as error:
+            raise _gone(error) from error
+        self._tell(SENT_ID, packet, True)
+
+    def received(self, until_ns: int) -> Iterator[Packet]:
+        """Packets as they come until then; at once those that are here."""
+        while True:
+            left_s = (until_ns - self._clock.now_ns()) * 1e-9
+            try:
+                data = self._port.read(0.0 if self._clock.lock_step else max(0.0, left_s))
+            except (serial.SerialException, OSError) as error:
+                raise _gone(error) from error
+            self._buffer += data
+            for packet in self._wire.parse(self._buffer, answers=True):
+                self._tell(RECEIVED_ID, packet.raw, False)
+                yield packet
+            if not data and (self._clock.lock_step or left_s <= 0):
+                return
+
+    def close(self) -> None:
+        """Release the port."""
+        with contextlib.suppress(serial.SerialException, OSError):
+            self._port.close()
+
+    def _tell(self, can_id: int, packet: bytes, sent: bool) -> None:
+        t_ns = self._clock.now_ns()
+        size = next((size for size in LOGGED_LENGTHS if size >= len(packet)), len(packet))
+        if self._sink is not None:
+            self._sink(t_ns, can_id, packet.ljust(size, b"\0"), sent)
+        if self.heard is not None:
+            self.heard(t_ns, can_id, packet)
+
+
+def _gone(error: Exception) -> HardwareError:
+    return HardwareError(
+        f"the port is gone: {error}",
+        cause="the adapter was unplugged",
+        next_step="servos keep their last goal: switch their supply off before you touch the cable",
+    )

@@ -1,0 +1,188 @@
+"""Packets to figures, live and in replay (``protocol.frames``).
+
+A packet is one row of the bus log, under an identifier that no CAN device uses. A cycle is a sync write of goals, and
+half a cycle later the sync read that begins the row: a servo holds its goal until the next one comes, so its current
+swings around its mean from write to write, and passes it in the middle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from frictid_drivers.servos.models import VELOCITY_RAD_S, Model, Registers
+from frictid_drivers.servos.packets import WIRES, Packet
+from frictid_drivers.servos.settings import JointSettings
+from frictid_hil.errors import FieldProblem, InputFileError, InvalidFields
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Feedback, JointState
+from frictid_hil.protocol.rows import Command, Report, RowDecoder, RowLog, Service
+
+schema = "frictid.servo-packets/1"
+SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11
+"""Identifiers of packets in a bus log."""
+
+_SYNC_READ, _SYNC_WRITE = 0x82, 0x83
+SPEED_CYCLES = 8
+"""Position is differenced over so many cycles where the unit of the reported speed is not certain."""
+
+
+class Reader:
+    """Packets of one line to figures of its joints.
+
+    Args:
+        joints: in order.
+        period_s: of the cycle.
+    """
+
+    def __init__(self, joints: Sequence[JointSettings], period_s: float) -> None:
+        self._joints = list(joints)
+        self._period_s = period_s
+        self._wire = WIRES[joints[0].model.wire]
+        self._registers = joints[0].model.registers
+        self._at = {joint.id: at for at, joint in enumerate(joints)}
+        self._goals_rad = [math.nan] * len(joints)
+        self._powered = [False] * len(joints)
+        self._cycle = 0
+        self._track: list[deque[tuple[int, float]]] = [deque(maxlen=SPEED_CYCLES + 1) for _ in joints]
+        self.counts: list[int | None] = [None] * len(joints)
+        self.feedback = [Feedback() for _ in joints]
+
+    def rows(self) -> RowDecoder:
+        """A decoder of the log's rows."""
+        return RowDecoder(self.feedback, self._decode)
+
+    def _decode(self, can_id: int, data: bytes) -> Command | Report | Service | None:
+        if can_id not in (SENT_ID, RECEIVED_ID):
+            return None
+        for packet in self._wire.parse(bytearray(data), answers=can_id == RECEIVED_ID):
+            return self._told(packet) if can_id == SENT_ID else self._answered(packet)
+        return None
+
+    def _told(self, packet: Packet) -> Command | Service:
+        registers = self._registers
+        size = 1 if self._wire.name == "feetech" else 2
+        address = int.from_bytes(packet.data[:size], "little")
+        if packet.instruction == _SYNC_READ and address == registers.block:
+            self._cycle += 1
+            others = tuple((at, goal) for at, goal in enumerate(self._goals_rad) if at)
+            return Command(0, self._goals_rad[0], others)
+        if packet.instruction == _SYNC_WRITE and address in (registers.goal, registers.torque):
+            each = int.from_bytes(packet.data[size : 2 * size], "little") + 1
+            told = packet.data[2 * size :]
+            for k in range(0, len(told) - each + 1, each):
+                self._take(told[k], told[k + 1 : k + each], power=address == registers.torque)
+        return Service("packet")
+
+    def _take(self, servo: int, data: bytes, *, power: bool) -> None:
+        at = self._at.get(servo)
+        if at is None:
+            return
+        if power:
+            self._powered[at] = data[0] == 1
+            self._goals_rad[at] = self._goals_rad[at] if self._powered[at] else math.nan
+        else:
+            joint = self._joints[at]
+            self._goals_rad[at] = joint.position_rad(number(data, joint.model, 15))
+
+    def _answered(self, packet: Packet) -> Report | Service:
+        at, registers = self._at.get(packet.id), self._registers
+        if at is None or len(packet.data) != registers.block_bytes:
+            return Service("answer")
+        joint, report = self._joints[at], self.feedback[at]
+        model, block = joint.model, packet.data
+
+        def field(offset: int, size: int, sign_bit: int) -> int:
+            return number(block[offset : offset + size], model, sign_bit)
+
+        counts = field(*registers.position, 15)
+        self.counts[at] = counts
+        report.position_rad = joint.position_rad(counts)
+        track = self._track[at]
+        track.append((self._cycle, report.position_rad))
+        if registers.velocity[1]:
+            report.velocity_rad_s = joint.direction * field(*registers.velocity, 15) * VELOCITY_RAD_S
+        else:
+            cycles = track[-1][0] - track[0][0]
+            report.velocity_rad_s = (track[-1][1] - track[0][1]) / (cycles * self._period_s) if cycles else 0.0
+        report.torque_nm = joint.direction * joint.torque_nm_per_unit * _effort(model, field)
+        if registers.temperature >= 0:
+            report.temperature_c = float(block[registers.temperature])
+        # A Dynamixel's error is its alert bit; the others only tell that an instruction was wrong.
+        report.error_code = packet.error & (0xFF if self._wire.name == "feetech" else 0x80)
+        report.status_raw = packet.error
+        report.state = (
+            JointState.FAULT if report.error_code else JointState.ENABLED if self._powered[at] else JointState.DISABLED
+        )
+        report.mode = Mode.POSITION if report.state is JointState.ENABLED else Mode.NONE
+        return Report(at)
+
+
+def _effort(model: Model, field: Any) -> int:
+    """Signed steps of current, or of load where there is no current.
+
+    A Feetech's current has no documented sign; its load has.
+    """
+    registers = model.registers
+    if not model.current_a:
+        return int(field(registers.load, 2, 10))
+    current = int(field(registers.current, 2, 15))
+    return current if registers.load < 0 else abs(current) * (-1 if field(registers.load, 2, 10) < 0 else 1)
+
+
+def number(data: bytes, model: Model, sign_bit: int) -> int:
+    """A register's number; sign-magnitude or two's complement as the model has it."""
+    value = int.from_bytes(data, "big" if model.big_endian else "little", signed=not model.sign_magnitude)
+    if model.sign_magnitude and value >> sign_bit & 1:
+        return -(value & (1 << sign_bit) - 1)
+    return value
+
+
+def to_bytes(value: int, size: int, model: Model) -> bytes:
+    """The reverse, with the sign in bit 15."""
+    if model.sign_magnitude:
+        value = abs(value) | (0x8000 if value < 0 else 0)
+    return value.to_bytes(size, "big" if model.big_endian else "little", signed=not model.sign_magnitude)
+
+
+def frame_map_values(setup: RobotSetup, joints: Sequence[JointSettings], period_s: float) -> dict[str, Any]:
+    """What a replay must know."""
+    return {
+        "schema": schema,
+        "period_s": period_s,
+        "joints": {joint.name: asdict(mine) for joint, mine in zip(setup.joints, joints, strict=True)},
+    }
+
+
+def decoder(frame_map: Mapping[str, Any]) -> RowLog:
+    """A decoder for logs with this frame map.
+
+    Raises:
+        InvalidFields: the map is not what ``frame_map_values`` writes.
+    """
+    try:
+        joints = []
+        for values in frame_map["joints"].values():
+            model = dict(values["model"])
+            registers: Any = {
+                name: tuple(v) if isinstance(v, list) else v for name, v in model.pop("registers").items()
+            }
+            joint = JointSettings(**{**values, "model": Model(**model, registers=Registers(**registers))})
+            joints.append(replace(joint, id=int(joint.id)))
+        return RowLog(Reader(joints, float(frame_map["period_s"])).rows())
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InvalidFields([FieldProblem(("joints",), f"not a frame map of serial servos: {error!r}")]) from None
+
+
+def map_from_eds(path: Path, setup: RobotSetup) -> Mapping[str, Any]:
+    """Servos have no EDS files.
+
+    Raises:
+        InputFileError: always.
+    """
+    raise InputFileError("serial servos have no EDS file", where=str(path))

@@ -1,0 +1,125 @@
+"""What the registers of each servo are worth.
+
+A servo's torque is never measured. Where it reports a current, torque is that times a constant; where it reports only
+its PWM duty ("load"), torque is that times the stall torque, which also holds back-EMF and the supply voltage. The
+constants here come from stall figures of data sheets, so they bear the stated uncertainty: a scale error common to all
+torques of a joint, which no interval of a profile contains.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Registers:
+    """Addresses of one maker's control table; a size in bytes where it differs.
+
+    Attributes:
+        torque: power.
+        goal: position.
+        goal_bytes: of it.
+        block: first byte of what is read every cycle.
+        block_bytes: of it.
+        position: offset in the block, and bytes.
+        load: offset of duty; -1 where there is none.
+        current: offset; -1 where there is none.
+        velocity: offset and bytes; (-1, 0) where its unit is not certain, and position is differenced.
+        temperature: offset; -1 outside the block.
+        watchdog: bus watchdog; 0 where there is none.
+        model: number and firmware are read from here.
+        mode: operating mode.
+        position_mode: its value for position.
+        return_delay: of answers, in steps of 2 us.
+    """
+
+    torque: int
+    goal: int
+    goal_bytes: int
+    block: int
+    block_bytes: int
+    position: tuple[int, int]
+    load: int
+    current: int
+    velocity: tuple[int, int]
+    temperature: int
+    watchdog: int
+    model: int
+    mode: int
+    position_mode: int
+    return_delay: int
+
+
+FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, (-1, 0), 7, 0, 3, 33, 0, 7)
+DYNAMIXEL = Registers(64, 116, 4, 124, 12, (8, 4), -1, 2, (4, 4), -1, 98, 0, 11, 3, 9)
+DYNAMIXEL_LOAD = Registers(64, 116, 4, 124, 12, (8, 4), 2, -1, (4, 4), -1, 98, 0, 11, 3, 9)
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """One servo of a catalogue.
+
+    Attributes:
+        wire: ``feetech`` or ``dynamixel``.
+        registers: its table.
+        counts_per_turn: of position.
+        turn_rad: what these counts span.
+        current_a: one step of current; 0 where only load is told.
+        torque_constant_nm_per_a: joint torque per ampere.
+        stall_nm: torque at full duty, for servos that tell load only.
+        uncertainty_percent: of the torque scale.
+        sign_magnitude: negative numbers have a sign bit instead of two's complement.
+        big_endian: high byte first.
+    """
+
+    wire: str
+    registers: Registers
+    counts_per_turn: int = 4096
+    turn_rad: float = 2 * math.pi
+    current_a: float = 0.0
+    torque_constant_nm_per_a: float = 0.0
+    stall_nm: float = 0.0
+    uncertainty_percent: float = 30.0
+    sign_magnitude: bool = False
+    big_endian: bool = False
+
+    @property
+    def count_rad(self) -> float:
+        """One step of position."""
+        return self.turn_rad / self.counts_per_turn
+
+
+def _sts(constant: float) -> Model:
+    return Model("feetech", FEETECH, current_a=0.0065, torque_constant_nm_per_a=constant, sign_magnitude=True)
+
+
+def _x(current_a: float, constant: float) -> Model:
+    return Model(
+        "dynamixel", DYNAMIXEL, current_a=current_a, torque_constant_nm_per_a=constant, uncertainty_percent=20.0
+    )
+
+
+MODELS = {
+    "STS3215": _sts(0.79),  # 7.4 V: 1.9 N m at 2.4 A
+    "STS3215-12V": _sts(1.09),  # 2.94 N m at 2.7 A
+    "STS3250": _sts(1.2),
+    "SCS15": Model(  # 1024 steps over 220 deg (one source), high byte first, no current
+        "feetech",
+        FEETECH,
+        counts_per_turn=1024,
+        turn_rad=math.radians(220.0),
+        stall_nm=1.5,
+        uncertainty_percent=50.0,
+        sign_magnitude=True,
+        big_endian=True,
+    ),
+    "XL330-M288": _x(0.001, 0.35),  # 0.52 N m at 1.47 A
+    "XC330-M288": _x(0.001, 0.52),
+    "XM430-W350": _x(0.00269, 1.78),  # 4.1 N m at 2.3 A
+    "XM540-W270": _x(0.00269, 2.4),
+    "XL430-W250": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.4, uncertainty_percent=50.0),
+    "XC430-W150": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.6, uncertainty_percent=50.0),
+}
+VELOCITY_RAD_S = 0.229 * 2 * math.pi / 60.0
+"""One step of a Dynamixel's velocity."""

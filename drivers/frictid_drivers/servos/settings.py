@@ -1,0 +1,148 @@
+"""Options of the robot file for servos on a serial line.
+
+::
+
+    driver: servos
+    bus: serial:/dev/ttyACM0
+    options: {baud: 1000000}
+    joints:
+      shoulder_pan:
+        id: 1
+        options: {model: STS3215, zero_counts: 2048, torque_constant_nm_per_a: 0.8}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from frictid_drivers.servos.models import MODELS, Model
+from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.driver import unknown_options
+
+BUS_OPTIONS = frozenset({"baud", "watchdog_ms", "answer_ms"})
+JOINT_OPTIONS = frozenset(
+    {"model", "zero_counts", "torque_constant_nm_per_a", "stall_nm", "torque_uncertainty_percent"}
+)
+MOST_SERVOS = 10
+"""On one line; one packet must fit a row of the bus log."""
+
+
+@dataclass(frozen=True, slots=True)
+class LineSettings:
+    """Of the whole line.
+
+    Attributes:
+        baud: bit/s.
+        watchdog_s: bus watchdog of servos that have one.
+        answer_s: how long an answer may take outside the cycle.
+    """
+
+    baud: int
+    watchdog_s: float
+    answer_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class JointSettings:
+    """Of one joint.
+
+    Attributes:
+        name: of the model.
+        model: with the torque constants of the robot file.
+        id: of the servo.
+        zero_counts: position 0 of the joint.
+        direction: +1 or -1.
+    """
+
+    name: str
+    model: Model
+    id: int
+    zero_counts: int
+    direction: int
+
+    @property
+    def torque_nm_per_unit(self) -> float:
+        """One step of current, or of load where there is no current (0.1 % of the duty at stall)."""
+        model = self.model
+        return model.current_a * model.torque_constant_nm_per_a if model.current_a else model.stall_nm / 1000.0
+
+    def position_rad(self, counts: float) -> float:
+        """Of the joint."""
+        return self.direction * (counts - self.zero_counts) * self.model.count_rad
+
+    def counts(self, position_rad: float) -> int:
+        """The nearest."""
+        return round(self.direction * position_rad / self.model.count_rad) + self.zero_counts
+
+
+def read_settings(setup: RobotSetup) -> tuple[LineSettings, list[JointSettings]]:
+    """All options, checked.
+
+    Raises:
+        InvalidFields: every option that is unknown or impossible; two makers on one line; too many servos.
+    """
+    problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "servos")
+    line = LineSettings(
+        baud=int(_number(setup.options, "baud", 1_000_000, 9600, 4_500_000, ("options",), problems)),
+        watchdog_s=_number(setup.options, "watchdog_ms", 200, 20, 2540, ("options",), problems) / 1000.0,
+        answer_s=_number(setup.options, "answer_ms", 20, 1, 1000, ("options",), problems) / 1000.0,
+    )
+    joints = [settings for joint in setup.joints if (settings := _joint(joint, problems)) is not None]
+    if len({settings.model.wire for settings in joints}) > 1:
+        problems.append(FieldProblem(("joints",), "servos of two makers do not share a line"))
+    if len(joints) > MOST_SERVOS:
+        problems.append(FieldProblem(("joints",), f"at most {MOST_SERVOS} servos on one line"))
+    if problems:
+        raise InvalidFields(problems)
+    return line, joints
+
+
+def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | None:
+    at, options = ("joints", joint.name, "options"), joint.options
+    problems += unknown_options(options, JOINT_OPTIONS, at, "servos")
+    model = MODELS.get(str(options.get("model")))
+    if model is None:
+        problems.append(FieldProblem((*at, "model"), f"expected one of {', '.join(MODELS)}"))
+        return None
+    most = model.counts_per_turn - 1
+    settings = JointSettings(
+        name=str(options["model"]),
+        model=replace(
+            model,
+            torque_constant_nm_per_a=_number(
+                options, "torque_constant_nm_per_a", model.torque_constant_nm_per_a, 0, 100, at, problems
+            ),
+            stall_nm=_number(options, "stall_nm", model.stall_nm, 0, 100, at, problems),
+            uncertainty_percent=_number(
+                options, "torque_uncertainty_percent", model.uncertainty_percent, 0, 100, at, problems
+            ),
+        ),
+        id=joint.address,
+        zero_counts=int(_number(options, "zero_counts", model.counts_per_turn // 2, 0, most, at, problems)),
+        direction=joint.direction,
+    )
+    for name in ("position_min_rad", "position_max_rad"):
+        limit = getattr(joint, name)
+        if not 0 <= settings.counts(limit) <= most:
+            where = ("joints", joint.name, name)
+            problems.append(FieldProblem(where, f"{limit:g} rad is step {settings.counts(limit)}; there are 0..{most}"))
+    return settings
+
+
+def _number(
+    options: Mapping[str, Any],
+    name: str,
+    usual: float,
+    low: float,
+    high: float,
+    at: tuple[str, ...],
+    problems: list[FieldProblem],
+) -> float:
+    value = options.get(name, usual)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        problems.append(FieldProblem((*at, name), f"expected a number from {low:g} to {high:g}, found {value!r}"))
+        return usual
+    return float(value)

@@ -1,0 +1,307 @@
+"""Servos on a serial line: packets, and the driver against simulated servos byte by byte."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from frictid_drivers.servos.driver import ServoDriver
+from frictid_drivers.servos.logs import decoder, number, to_bytes
+from frictid_drivers.servos.models import MODELS
+from frictid_drivers.servos.packets import WIRES, Feetech
+from frictid_drivers.servos.simulated import Chain, VirtualServoDriver
+from frictid_hil.config.profile import load_profile
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.search import find
+from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused, SafetyAbort
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint, Severity
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.steady import true_curve_nm
+from frictid_hil.testing.wire import ManualClock
+
+KINDS = ("STS3215", "SCS15", "XL330-M288", "XL430-W250")
+
+
+# -- packets -----------------------------------------------------------------------------------------------------------
+
+
+def test_packets_of_the_manuals() -> None:
+    feetech, dynamixel = WIRES["feetech"], WIRES["dynamixel"]
+    assert feetech.read(1, 56, 8) == bytes.fromhex("FFFF0104023808B8")
+    assert dynamixel.read(1, 132, 4) == bytes.fromhex("FFFFFD00010700028400 04001D15".replace(" ", ""))
+
+
+def test_a_peer_agrees_byte_by_byte() -> None:
+    sdk = pytest.importorskip("dynamixel_sdk")
+
+    class Port:
+        is_using = False
+        written = b""
+
+        def clearPort(self) -> None: ...
+
+        def writePort(self, data: list[int]) -> int:
+            self.written = bytes(data)
+            return len(data)
+
+    port = Port()
+    params = [0xFF, 0x0F, 0xFD, 0x01]
+    packet = [0, 0, 0, 0, 1, 2 + 1 + 2 + 4, 0, 3, 116, 0, *params, 0, 0]
+    sdk.PacketHandler(2.0).txPacket(port, packet)
+    assert port.written == WIRES["dynamixel"].write(1, 116, bytes(params))
+
+
+@pytest.mark.parametrize("name", sorted(WIRES))
+@given(st.lists(st.tuples(st.integers(0, 252), st.binary(max_size=40)), max_size=5), st.binary(max_size=20))
+def test_answers_come_through_garbage_and_in_pieces(name: str, told: list[tuple[int, bytes]], noise: bytes) -> None:
+    wire = WIRES[name]
+    noise = noise.replace(b"\xff", b"\xfe")
+    stream = noise + b"".join(wire.answer(servo, 0, data) for servo, data in told)
+    buffer, found = bytearray(), []
+    for k in range(0, len(stream), 7):
+        buffer += stream[k : k + 7]
+        found += [(packet.id, packet.data) for packet in wire.parse(buffer, answers=True)]
+    assert found == told
+
+
+@pytest.mark.parametrize("name", sorted(WIRES))
+@given(st.binary(max_size=200))
+def test_no_bytes_whatever_raise(name: str, data: bytes) -> None:
+    for answers in (True, False):
+        list(WIRES[name].parse(bytearray(data), answers=answers))
+
+
+@given(st.sampled_from(sorted(MODELS)), st.integers(-32767, 32767))
+def test_numbers_of_every_model_both_ways(name: str, value: int) -> None:
+    assert number(to_bytes(value, 2, MODELS[name]), MODELS[name], 15) == value
+
+
+def test_load_has_its_sign_in_bit_ten() -> None:
+    assert number((0x0400 | 250).to_bytes(2, "little"), MODELS["STS3215"], 10) == -250
+
+
+# -- the driver --------------------------------------------------------------------------------------------------------
+
+
+def setup_of(model: str, joints: int = 2) -> RobotSetup:
+    setup = load_robot("so101.yaml").to_setup()
+    options = {"model": model, "zero_counts": MODELS[model].counts_per_turn // 2}
+    return replace(
+        setup,
+        joints=tuple(
+            replace(joint, options=options, position_min_rad=-1.5, position_max_rad=1.5)
+            for joint in setup.joints[:joints]
+        ),
+    )
+
+
+class Bench:
+    def __init__(self, setup: RobotSetup) -> None:
+        self.setup = setup
+        self.chain = Chain(setup)
+        self.clock = ManualClock(self.chain.advance)
+        self.chain.clock = self.clock
+        self.frames: list[tuple[int, int, bytes]] = []
+        self.driver = ServoDriver(setup, port_factory=lambda: self.chain, clock=self.clock)
+        self.set_points = [SetPoint() for _ in setup.joints]
+
+    def begin(self, cycle_hz: float = 200.0) -> None:
+        self.driver.open(lambda t_ns, can_id, data, sent: self.frames.append((t_ns, can_id, data)))
+        self.driver.configure(cycle_hz, [joint.name for joint in self.setup.joints])
+        self.period_ns = round(1e9 / cycle_hz)
+        self.driver.start_cycling()
+        self.next_ns = self.clock.now_ns()
+
+    def cycles(self, count: int) -> list[Feedback]:
+        for _ in range(count):
+            self.next_ns += self.period_ns
+            self.clock.wait_until(self.next_ns)
+            reports = self.driver.exchange(self.set_points)
+        return list(reports)
+
+    def enabled(self) -> None:
+        for joint in self.setup.joints:
+            self.driver.enable(joint.name, Mode.POSITION)
+        assert all(report.state is JointState.ENABLED for report in self.cycles(4))
+
+    def servo(self, at: int) -> Any:
+        return list(self.chain.servos.values())[at]
+
+
+@pytest.fixture(params=KINDS)
+def bench(request: pytest.FixtureRequest) -> Bench:
+    return Bench(setup_of(request.param))
+
+
+def test_a_joint_follows_and_reports_in_its_own_units(bench: Bench) -> None:
+    bench.begin()
+    bench.enabled()
+    for k in range(200):
+        bench.set_points[0].position_rad = 0.5 * (1 - math.cos(math.pi * k / 200))
+        (report, other) = bench.cycles(1)
+        if k == 100:
+            assert report.velocity_rad_s == pytest.approx(bench.servo(0).plant.velocity_rad_s, abs=0.35)
+            assert report.torque_nm > 0.1
+    (report, other) = bench.cycles(60)
+    assert report.position_rad == pytest.approx(1.0, abs=0.05)
+    assert report.position_rad == pytest.approx(bench.servo(0).plant.position_rad, abs=0.005)
+    assert abs(other.position_rad) < 0.05
+    bench.driver.close()
+    assert not bench.servo(0).on
+
+
+def test_what_torque_means_is_said_with_its_uncertainty(bench: Bench) -> None:
+    bench.driver.open()
+    findings = bench.driver.check(None)
+    assert any("scale error of up to" in f.message and f.severity is Severity.WARNING for f in findings)
+    identity = next(iter(bench.driver.identify().values()))
+    assert "N m/A" in identity.torque_source or "PWM duty" in identity.torque_source
+    assert identity.torque_resolution_nm > 0 and bench.driver.capabilities().modes == {Mode.POSITION}
+    bench.driver.configure(100.0, [])
+    with pytest.raises(HardwareError, match="TORQUE refused"):
+        bench.driver.enable("shoulder_pan", Mode.TORQUE)
+
+
+def test_a_rate_that_the_line_cannot_carry_is_refused(bench: Bench) -> None:
+    bench.driver.open()
+    most_hz = bench.driver.capabilities().max_cycle_hz
+    with pytest.raises(PlanRefused, match=f"at most {most_hz:g} Hz"):
+        bench.driver.configure(1000.0 + most_hz, [])
+    bench.driver.configure(most_hz, [])
+
+
+def test_a_log_decodes_to_what_was_live(bench: Bench) -> None:
+    bench.begin()
+    bench.enabled()
+    live = []
+    for _ in range(40):
+        bench.set_points[0].position_rad += 0.004
+        live.append([str(report) for report in bench.cycles(1)])
+    rows = decoder(bench.driver.frame_map_values()).rows(bench.frames)
+    decoded = [[str(report) for report in row.feedback] for row in rows]
+    assert decoded[-40:] == live
+
+
+def test_every_goal_is_logged_before_the_reading_that_sees_it() -> None:
+    bench = Bench(setup_of("STS3215", 1))
+    bench.begin()
+    bench.enabled()
+    bench.set_points[0].position_rad = 0.3
+    (report,) = bench.cycles(1)
+    assert report.position_command_rad == pytest.approx(0.3, abs=0.001)
+
+
+def test_silence_counts_and_closing_lets_go(bench: Bench) -> None:
+    bench.begin()
+    bench.enabled()
+    bench.chain.fault = lambda data, to_host: b"" if to_host else data
+    assert [report.age_cycles for report in bench.cycles(5)] == [5, 5]
+    bench.driver.close()
+    assert not bench.servo(0).on and not bench.servo(1).on
+
+
+def test_damaged_bytes_cost_a_cycle_and_change_nothing(bench: Bench) -> None:
+    bench.begin()
+    bench.enabled()
+    before = [report.position_rad for report in bench.cycles(1)]
+    bench.chain.fault = lambda data, to_host: bytes([*data[:-1], data[-1] ^ 0x55]) if to_host else data
+    after = bench.cycles(1)
+    assert [report.age_cycles for report in after] == [1, 1] and [r.position_rad for r in after] == before
+    bench.chain.fault = None
+    assert [report.age_cycles for report in bench.cycles(2)] == [0, 0]
+
+
+def test_an_unplugged_adapter_is_told() -> None:
+    bench = Bench(setup_of("STS3215"))
+    bench.begin()
+    bench.enabled()
+
+    def gone(data: bytes, to_host: bool) -> bytes:
+        raise OSError("Input/output error")
+
+    bench.chain.fault = gone
+    with pytest.raises(HardwareError, match="the port is gone"):
+        bench.cycles(1)
+    bench.driver.quick_stop()
+    bench.driver.close()
+
+
+def test_a_bus_watchdog_where_there_is_one() -> None:
+    bench = Bench(setup_of("XL330-M288"))
+    bench.begin()
+    bench.enabled()
+    assert bench.driver.capabilities().drive_watchdog
+    bench.clock.wait_until(bench.clock.now_ns() + 300_000_000)
+    assert not bench.servo(0).on
+    assert not Bench(setup_of("STS3215")).servo(0).mine.model.registers.watchdog
+
+
+def test_status_errors_are_faults() -> None:
+    bench = Bench(setup_of("STS3215"))
+    bench.begin()
+    bench.enabled()
+    bench.servo(1).error = 0x20
+    first, second = bench.cycles(1)
+    assert first.state is JointState.ENABLED
+    assert (second.state, second.error_code) == (JointState.FAULT, 0x20)
+
+
+def test_a_set_point_that_is_no_number_holds_every_joint(bench: Bench) -> None:
+    bench.begin()
+    bench.enabled()
+    bench.set_points[0].position_rad = math.nan
+    with pytest.raises(SafetyAbort, match="no number"):
+        bench.cycles(1)
+    bench.set_points[0].position_rad = 1.0
+    reports = bench.cycles(40)
+    assert all(abs(report.position_rad) < 0.05 for report in reports)
+
+
+@pytest.mark.parametrize(
+    "options", [{"model": "STS"}, {"model": "STS3215", "zero_counts": 4096}, {"model": "STS3215", "kt": 1}]
+)
+def test_impossible_options_are_refused_by_name(options: dict[str, object]) -> None:
+    setup = setup_of("STS3215")
+    with pytest.raises(InvalidFields, match="options"):
+        VirtualServoDriver(replace(setup, joints=(replace(setup.joints[0], options=options),)))
+
+
+def test_a_checksum_that_is_wrong_is_no_packet() -> None:
+    assert not list(Feetech().parse(bytearray.fromhex("FFFF010400380800"), answers=True))
+
+
+# -- identification from command, position and current ----------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["STS3215", "XL330-M288"])
+@pytest.mark.parametrize(("seed", "noise_per_mille"), [(1, 4.0), (2, 8.0), (3, 15.0)])
+def test_three_units(tmp_path: Path, model: str, seed: int, noise_per_mille: float) -> None:
+    values: dict[str, Any] = yaml.safe_load(find("so101.yaml").read_text())
+    joint = values["joints"]["shoulder_pan"]
+    joint["options"] = {"model": model}
+    joint["simulated"]["drive"]["torque_noise_per_mille"] = noise_per_mille
+    values["joints"], values["bus"] = {"pan": joint}, f"virtual:{model}{seed}"
+    path = tmp_path / "one.yaml"
+    path.write_text(yaml.safe_dump(values))
+    out = tmp_path / "run"
+    result = calibrate(CalibrateOptions(str(path), out=out, seed=seed), Silent()).to_json()
+    assert result["outcome"] == "ok", result
+    profile = load_profile(out / "profile.yaml").joint("pan")
+    model_of = JointModel.of(load_robot(path).to_setup().joint("pan"), "pan")
+    assert profile.coulomb_nm.value == pytest.approx(model_of.friction.coulomb_nm, rel=0.05)
+    assert profile.coulomb_nm.low < model_of.friction.coulomb_nm < profile.coulomb_nm.high
+    truth_nm = true_curve_nm(model_of, np.array(profile.velocity_rad_s))
+    assert np.allclose(profile.torque_nm, truth_nm, rtol=0.06)
