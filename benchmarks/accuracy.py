@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.friction import trajectory
@@ -29,6 +28,7 @@ from frictid_hil.friction.recording import CycleRecording, Skew
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import true_curve
+from frictid_hil.jobs.report import whole_profile
 from frictid_hil.jobs.watch import Silent
 
 DEG = math.pi / 180
@@ -82,7 +82,7 @@ def errors_of(robot: Mapping[str, Any], amplitude_deg: float, folder: Path) -> d
     bus = f"virtual:{robot['name']}-{amplitude_deg:g}"
     options = CalibrateOptions(str(path), bus=bus, amplitude_rad=amplitude_deg * DEG, out=out)
     result = calibrate(options, Silent()).to_json()
-    loaded, profile = load_robot(path), load_profile(result["profile"])
+    loaded, profile = load_robot(path), whole_profile(Path(result["run"]))
     found = {}
     for name, joint in profile.joints.items():
         assert joint.procedure is not None and joint.published is not None

@@ -20,11 +20,12 @@ import numpy as np
 from on_the_bus import V_RAD_S, Variant, calibrated, shipped, variant
 from svg import PALETTE, Chart, Line, svg
 
-from frictid_hil.config.profile import JointProfile, load_profile
+from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance, curve_mean
+from frictid_hil.jobs.report import whole_profile
 from frictid_hil.recording.read import read
 
 AMPLITUDES = (5, 10, 20, 30, 40, 50)
@@ -77,7 +78,7 @@ def measured(robot: Variant, joint: str, amplitude_deg: float, folder: Path) -> 
             )
         except PlanRefused as refusal:
             return Run(folder, None, refusal.what)
-    return Run(folder, load_profile(folder / "profile.yaml").joints[joint])
+    return Run(folder, whole_profile(folder).joints[joint])
 
 
 def posture(name: str, *, load_share: float = 0.0) -> dict[str, Any]:

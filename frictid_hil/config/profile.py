@@ -1,6 +1,7 @@
 """The friction profile: what was identified, how well, by what and where it holds. ``schema: frictid.profile/1``.
 
-A person can read the file; a program reads back the very same floats, so that the curve is the same to the last bit.
+Every figure has six significant digits, fewer where its interval is wide, from the moment it is identified: what is
+written, kept and used is the same to the last bit. What all joints share is written once, under ``all_joints``.
 The same content gives the same bytes but for the ``provenance`` block.
 """
 
@@ -8,23 +9,57 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from frictid_hil.config.provenance import Provenance
-from frictid_hil.config.schema import Names, Numbers, Pair, Pairs, Strict, as_tuple, schema_version, validated
-from frictid_hil.config.write import dump, plain, write_whole
-from frictid_hil.config.yaml import Document, KeyPath, Node, read
+from frictid_hil.config.schema import Names, Strict, as_tuple, schema_version, validated
+from frictid_hil.config.write import Row, dump, plain
+from frictid_hil.config.yaml import Document, KeyPath, Node, merge, read
 from frictid_hil.errors import ConfigError, ProfileMismatch
+from frictid_hil.files import write_whole
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan.linear_axis import linear_name, linear_names, rotary_name
 
 KIND = "frictid.profile"
 NEWEST = 1
+
+_DIGITS = 6
+_SECONDARY = 4
+"""Digits of what is not the curve itself: half widths, both directions, figures of quality."""
+_SAME_SPEED = 1e-3
+_DERIVED = 1e-3
+"""How well the slopes in a file must follow from its pairs, as a share of the torque."""
+
+
+def rounded(value: Any, digits: int = _DIGITS) -> Any:
+    """Every float in it, at any depth, with so many significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}")
+    if isinstance(value, Mapping):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(rounded(item, digits) for item in value)
+    return value
+
+
+Number = Annotated[float, AfterValidator(rounded)]
+Pair = Annotated[tuple[Number, Number], BeforeValidator(as_tuple)]
+Numbers = Annotated[tuple[Number, ...], BeforeValidator(as_tuple)]
+Shortened = Annotated[
+    tuple[float, ...], BeforeValidator(as_tuple), AfterValidator(lambda given: rounded(given, _SECONDARY))
+]
+Pairs = Annotated[tuple[Pair, ...], BeforeValidator(as_tuple)]
+Figures = Annotated[dict[str, Any], AfterValidator(lambda given: rounded(given, _SECONDARY))]
 
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 """From a major version to the next, as pure functions of the values; the tests hold one golden file per version."""
@@ -40,10 +75,26 @@ class Estimate(Strict):
         reason: why ``value`` is None, or why the interval is.
     """
 
-    value: float | None
-    low: float | None = None
-    high: float | None = None
+    value: Number | None
+    low: Number | None = None
+    high: Number | None = None
     reason: str = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_finer_than_wide(cls, given: Any) -> Any:
+        """The interval's ends to a hundredth of its width; rounding again changes nothing.
+
+        The value keeps its digits: gravity and bias are known far better together than each of them alone.
+        """
+        ends: list[Any] = [given.get("low"), given.get("high")] if isinstance(given, dict) else []
+        before: list[Any] = []
+        while (
+            ends != before and all(isinstance(end, float) and abs(end) < math.inf for end in ends) and ends[0] < ends[1]
+        ):
+            places = 2 - math.ceil(math.log10(ends[1] - ends[0]))
+            before, ends = ends, [round(end, places) for end in rounded(ends)]
+        return given | {"low": ends[0], "high": ends[1]} if before else given
 
     @model_validator(mode="after")
     def _sound(self) -> Estimate:
@@ -87,11 +138,48 @@ class Ripple(Strict):
 
     Attributes:
         period_rad: joint travel after which it repeats.
-        torque_nm: at equal steps over one period, the first at position 0, shape (k,).
+        orders: waves per period, shape (k,).
+        cos_nm: amplitude of each wave's cosine of the position, shape (k,).
+        sin_nm: of its sine.
+        torque_nm: instead of waves, at equal steps over one period, the first at position 0.
     """
 
-    period_rad: float = Field(gt=0)
-    torque_nm: Numbers = Field(min_length=2)
+    period_rad: Number = Field(gt=0)
+    orders: Annotated[tuple[int, ...], BeforeValidator(as_tuple)] = ()
+    cos_nm: Shortened = ()
+    sin_nm: Shortened = ()
+    torque_nm: Numbers = ()
+
+    @model_validator(mode="after")
+    def _sound(self) -> Ripple:
+        if len(self.torque_nm) < 2 and not self.orders:
+            raise ValueError("a ripple needs `orders`, `cos_nm` and `sin_nm`, or two values of `torque_nm`")
+        if not len(self.orders) == len(self.cos_nm) == len(self.sin_nm):
+            raise ValueError("`orders`, `cos_nm` and `sin_nm` belong together and must be equally long")
+        return self
+
+    @staticmethod
+    def of_table(period_rad: float, torque_nm: ArrayLike) -> Ripple:
+        """The waves of a ripple known at equal steps; those below 2 % of the largest are left out."""
+        table = np.asarray(torque_nm, dtype=np.float64)
+        waves = 2.0 * np.fft.rfft(table)[1 : (table.size + 1) // 2] / table.size
+        orders = np.flatnonzero(np.abs(waves) > 0.02 * np.abs(waves).max(initial=0.0))
+        if not orders.size:
+            return Ripple(period_rad=period_rad, torque_nm=tuple(table.tolist()))
+        kept = waves[orders]
+        return Ripple(
+            period_rad=period_rad,
+            orders=tuple((orders + 1).tolist()),
+            cos_nm=tuple(kept.real.tolist()),
+            sin_nm=tuple((-kept.imag).tolist()),
+        )
+
+    def table_nm(self, points: int = 64) -> tuple[float, ...]:
+        """At equal steps over one period, the first at position 0."""
+        if self.torque_nm:
+            return self.torque_nm
+        phase = np.outer(np.arange(points) / points * 2 * np.pi, self.orders)
+        return tuple((np.cos(phase) @ self.cos_nm + np.sin(phase) @ self.sin_nm).tolist())
 
 
 class ProcedureUsed(Strict):
@@ -101,10 +189,10 @@ class ProcedureUsed(Strict):
     itself among them; None where all others were locked.
     """
 
-    amplitude_rad: float = Field(gt=0)
-    velocity_rad_s: float = Field(gt=0)
+    amplitude_rad: Number = Field(gt=0)
+    velocity_rad_s: Number = Field(gt=0)
     cycles: int = Field(ge=1)
-    ratio: float = Field(ge=0, lt=1)
+    ratio: Number = Field(ge=0, lt=1)
     shares: Numbers | None = None
     together: Names | None = None
 
@@ -121,12 +209,12 @@ class TimeSkew(Strict):
         used_deviation_s: of it.
     """
 
-    declared_s: float
-    declared_deviation_s: float = Field(ge=0)
-    measured_s: float
-    measured_deviation_s: float = Field(ge=0)
-    used_s: float
-    used_deviation_s: float = Field(ge=0)
+    declared_s: Number
+    declared_deviation_s: Number = Field(ge=0)
+    measured_s: Number
+    measured_deviation_s: Number = Field(ge=0)
+    used_s: Number
+    used_deviation_s: Number = Field(ge=0)
 
 
 class DriveIdentity(Strict):
@@ -144,9 +232,9 @@ class DriveIdentity(Strict):
     serial: str = ""
     firmware: str = ""
     product: str = ""
-    rated_torque_nm: float | None = None
-    gear_ratio: float | None = None
-    settings: dict[str, Any] = Field(default_factory=dict)
+    rated_torque_nm: Number | None = None
+    gear_ratio: Number | None = None
+    settings: Figures = Field(default_factory=dict)
 
 
 class Gate(Strict):
@@ -157,6 +245,39 @@ class Gate(Strict):
     message: str
 
 
+def _gates(value: Any) -> Any:
+    """From the file's ``name: passed`` or ``name: why not``."""
+    if not isinstance(value, Mapping):
+        return as_tuple(value)
+    told = {name: str(answer) for name, answer in value.items()}
+    return tuple(
+        {"name": name, "passed": answer == _PASSED, "message": f"{name}: {answer}" if answer == _PASSED else answer}
+        for name, answer in told.items()
+    )
+
+
+_PASSED = "passed"
+
+
+def _at_speeds(given: Any, velocity_rad_s: tuple[float, ...]) -> dict[str, Any]:
+    values = given.model_dump() if isinstance(given, PairList) else dict(given)
+    own = values.get("velocity_rad_s", velocity_rad_s)
+    if len(own) == len(velocity_rad_s) and all(
+        abs(one - v) <= _SAME_SPEED * abs(v) for one, v in zip(own, velocity_rad_s, strict=True)
+    ):
+        values["velocity_rad_s"] = velocity_rad_s
+    values["torque_nm"] = tuple(rounded(float(torque), _SECONDARY) for torque in values["torque_nm"])
+    return values
+
+
+def _half_widths(torque_nm: tuple[float, ...], intervals_nm: Any) -> tuple[float, ...] | None:
+    """None where an interval is not symmetric about its F_n."""
+    intervals = np.array(intervals_nm, dtype=np.float64)
+    half = (intervals[:, 1] - intervals[:, 0]) / 2
+    even = np.abs(intervals.mean(axis=1) - torque_nm) <= 0.01 * half + 1e-6 * np.abs(torque_nm)
+    return tuple(half.tolist()) if np.all(even) else None
+
+
 class JointProfile(Strict):
     """One joint; on a linear axis the file says m, m/s, N (see ``linear_axis``) and these names hold them.
 
@@ -165,7 +286,9 @@ class JointProfile(Strict):
         prismatic: a linear axis.
         velocity_rad_s: V_1..V_N, positive, increasing, shape (N,).
         torque_nm: F_1..F_N, shape (N,).
-        torque_interval_nm: 95 % interval of each F_n, shape (N, 2), or None.
+        torque_plus_minus_nm: half the width of each F_n's 95 % interval, shape (N,); None without intervals, or where
+            they are not symmetric.
+        torque_interval_nm: 95 % interval of each F_n, shape (N, 2), or None; not in the file where the former is.
         coulomb_nm: F_0.
         presliding_stiffness_nm_per_rad: from a slow small reversal.
         presliding_level_nm: friction of creeping motion, from the same: where presliding yields.
@@ -174,9 +297,11 @@ class JointProfile(Strict):
         gravity_cos_nm: of ``gravity_cos * cos(q) + gravity_sin * sin(q)``.
         gravity_sin_nm: see there.
         bias_nm: constant torque.
-        forward: pairs of positive motion as averaged, gravity and bias included.
+        forward: pairs of positive motion as averaged, gravity and bias included; mean speeds within 0.1 % of V_n are
+            taken as V_n.
         backward: of negative motion.
-        published: what Function A gives untouched, beside the chosen method.
+        published: what Function A gives untouched, beside the chosen method; not in the file (``identify --method
+            function-a`` gives it again).
         ripple: by position, where identified.
         torque_source: what the torque is (``6077 actual torque``).
         time_skew_s: by which torque was taken to lag position.
@@ -192,6 +317,7 @@ class JointProfile(Strict):
     prismatic: bool = False
     velocity_rad_s: Numbers = Field(min_length=2)
     torque_nm: Numbers = Field(min_length=2)
+    torque_plus_minus_nm: Numbers | None = None
     torque_interval_nm: Pairs | None = None
     measured_range_rad_s: Pair | None = None
     slopes_nm_s_per_rad: Numbers | None = None
@@ -208,13 +334,33 @@ class JointProfile(Strict):
     published: PairList | None = None
     ripple: Ripple | None = None
     torque_source: str = ""
-    time_skew_s: float = 0.0
+    time_skew_s: Number = 0.0
     time_skew: TimeSkew | None = None
-    temperature_c: float | None = None
+    temperature_c: Number | None = None
     procedure: ProcedureUsed | None = None
     drive: DriveIdentity = DriveIdentity()
-    quality: dict[str, Any] = Field(default_factory=dict)
-    gates: Annotated[tuple[Gate, ...], BeforeValidator(as_tuple)] = ()
+    quality: Figures = Field(default_factory=dict)
+    gates: Annotated[tuple[Gate, ...], BeforeValidator(_gates)] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _completed(cls, given: Any) -> Any:
+        """What the file leaves out because it follows: speeds of both directions, intervals. Nonsense stays."""
+        if not isinstance(given, Mapping):
+            return given
+        completed = dict(given)
+        with suppress(TypeError, ValueError, KeyError):
+            velocity, torque = (tuple(map(rounded, as_tuple(given[name]))) for name in ("velocity_rad_s", "torque_nm"))
+            for name, sign in (("forward", 1.0), ("backward", -1.0)):
+                if completed.get(name) is not None:
+                    completed[name] = _at_speeds(completed[name], tuple(sign * v for v in velocity))
+            half = completed.get("torque_plus_minus_nm")
+            if half is None and completed.get("torque_interval_nm") is not None:
+                half = _half_widths(torque, completed["torque_interval_nm"])
+            if half is not None:
+                half = completed["torque_plus_minus_nm"] = tuple(rounded(float(h), _SECONDARY) for h in as_tuple(half))
+                completed["torque_interval_nm"] = [(f - h, f + h) for f, h in zip(torque, half, strict=True)]
+        return completed
 
     @field_validator("velocity_rad_s")
     @classmethod
@@ -229,9 +375,8 @@ class JointProfile(Strict):
         _same_length(self.velocity_rad_s, self.torque_nm)
         if self.torque_interval_nm is not None:
             _same_length(self.velocity_rad_s, self.torque_interval_nm)
-        for name, stated in (("measured range", self.measured_range_rad_s), ("slopes", self.slopes_nm_s_per_rad)):
-            derived = self.curve().measured_range_rad_s if name == "measured range" else self._slopes()
-            if stated is not None and not _close(stated, derived):
+        for name, follows in (("measured range", self._range_follows()), ("slopes", self._slopes_follow())):
+            if not follows:
                 raise ValueError(f"the {name} do not follow from the pairs; delete them, or undo the edit of the pairs")
         return self
 
@@ -239,40 +384,47 @@ class JointProfile(Strict):
         """phi of (8) through the pairs."""
         return FrictionCurve(self.velocity_rad_s, self.torque_nm)
 
-    def _slopes(self) -> tuple[float, ...]:
-        return tuple(map(float, self.curve().slopes_nm_s_per_rad))
+    def _range_follows(self) -> bool:
+        stated = self.measured_range_rad_s
+        return stated is None or stated == self.curve().measured_range_rad_s
+
+    def _slopes_follow(self) -> bool:
+        """Of each section to a small part of the torque: older files have more digits."""
+        if self.slopes_nm_s_per_rad is None:
+            return True
+        width = np.diff(self.velocity_rad_s)
+        derived, stated = self.curve().slopes_nm_s_per_rad, np.array(self.slopes_nm_s_per_rad)
+        if stated.shape != derived.shape:
+            return False
+        off_nm = np.abs(stated - derived) * np.concatenate([width[:1], width, width[-1:]])
+        return bool(np.all(off_nm <= _DERIVED * np.abs(self.torque_nm).max()))
 
     def values(self) -> dict[str, Any]:
-        """As the file holds it: plain, derived figures filled in, empty things left out."""
-        filled = self.model_copy(
-            update={"measured_range_rad_s": self.curve().measured_range_rad_s, "slopes_nm_s_per_rad": self._slopes()}
-        )
-        values: dict[str, Any] = plain(filled.model_dump())
-        for name in _LEFT_OUT:
-            if values[name] is None:
-                del values[name]
-        if self.procedure is not None:
-            for name in ("shares", "together"):
-                if values["procedure"][name] is None:
-                    del values["procedure"][name]
-        if self.presliding_level_nm.value is None:
-            del values["presliding_level_nm"]  # the stiffness beside it says why
-        if self.presliding_yields == "at once":
-            del values["presliding_yields"]
-        for value in values.values():
-            if isinstance(value, dict) and "value" in value:
-                _drop_nothings(value)
-        if not self.prismatic:
-            del values["prismatic"]
-            return values
-        renamed: dict[str, Any] = linear_names(values)
-        return renamed
+        """As the file holds it: derived figures filled in, empty things and messages of passed gates left out."""
+        derived = {
+            "measured_range_rad_s": self.curve().measured_range_rad_s,
+            "slopes_nm_s_per_rad": tuple(rounded(self.curve().slopes_nm_s_per_rad.tolist(), _SECONDARY)),
+        }
+        values: dict[str, Any] = plain(self.model_copy(update=derived).model_dump(exclude_defaults=True))
+        values["gates"] = {gate.name: _PASSED if gate.passed else gate.message for gate in self.gates}
+        values.pop("published", None)
+        values.pop("torque_interval_nm" if self.torque_plus_minus_nm else "torque_plus_minus_nm", None)
+        for name, sign in (("forward", 1.0), ("backward", -1.0)):
+            if name in values and values[name]["velocity_rad_s"] == [sign * v for v in self.velocity_rad_s]:
+                del values[name]["velocity_rad_s"]
+        if self.presliding_stiffness_nm_per_rad.value is None and self.presliding_level_nm.value is None:
+            values.pop("presliding_level_nm", None)  # the stiffness says why
+        quality = values.get("quality", {})
+        values["quality"] = {key: value for key, value in quality.items() if value not in (None, [])}
+        for name, value in values.items():
+            if name in _IN_A_ROW or (isinstance(value, dict) and "value" in value):
+                values[name] = Row(value)
+        ordered = {name: values[name] for name in type(self).model_fields if values.get(name) not in (None, {}, "")}
+        return linear_names(ordered) if self.prismatic else ordered
 
 
-_LEFT_OUT = (
-    "torque_interval_nm", "forward", "backward", "published", "ripple", "time_skew", "procedure", "temperature_c",
-)  # fmt: skip
-"""Not written where there is nothing of it."""
+_IN_A_ROW = ("procedure", "time_skew", "ripple", "forward", "backward", "drive", "quality", "gates")
+"""Mappings that a person reads as one line."""
 
 
 class FrictionProfile(Strict):
@@ -303,11 +455,16 @@ class FrictionProfile(Strict):
 
     def values(self) -> dict[str, Any]:
         """As the file holds it, in its order."""
+        joints = {name: joint.values() for name, joint in self.joints.items()}
+        shared = {key: value for key, value in _shared(list(joints.values())).items() if key in _SHARED}
+        if len(joints) > 1 and shared:
+            joints = {name: _without(values, shared) for name, values in joints.items()}
         return {
             "schema": f"{KIND}/{NEWEST}",
             "robot": self.robot,
-            "joints": {name: joint.values() for name, joint in self.joints.items()},
-            "provenance": plain(self.provenance.model_dump()),
+            **({"all_joints": shared} if len(joints) > 1 and shared else {}),
+            "joints": joints,
+            "provenance": plain(self.provenance.model_dump(exclude_defaults=True)),
         }
 
     @property
@@ -329,6 +486,33 @@ class FrictionProfile(Strict):
         write_whole(path, self.to_yaml())
 
 
+_SHARED = ("method", "torque_source", "time_skew_s", "procedure", "drive", "gates")
+"""What a file says once where it is the same for all joints."""
+
+
+def _shared(several: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The entries that all of them have alike, at any depth."""
+    first, *others = several
+    same: dict[str, Any] = {}
+    for key, value in first.items():
+        if all(key in other and other[key] == value for other in others):
+            same[key] = value
+        elif isinstance(value, dict) and all(isinstance(other.get(key), dict) for other in others):
+            part = _shared([value, *(other[key] for other in others)])
+            same |= {key: part} if part else {}
+    return same
+
+
+def _without(values: dict[str, Any], shared: Mapping[str, Any]) -> dict[str, Any]:
+    left = type(values)()
+    for key, value in values.items():
+        if key not in shared:
+            left[key] = value
+        elif value != shared[key]:
+            left[key] = _without(value, shared[key])
+    return left
+
+
 def profile_file(given: Path) -> Path:
     """The profile itself, or that of a run folder."""
     return given / "profile.yaml" if given.is_dir() else given
@@ -346,7 +530,7 @@ def load_profile(path: str | Path) -> FrictionProfile:
 def profile_from(document: Document) -> FrictionProfile:
     """A profile from a document already read; raises as ``load_profile``."""
     version = schema_version(document, KIND, NEWEST)
-    document = with_rotary_names(document)
+    document = _with_rotary_names(_with_shared(document))
     values = document.data
     for major in range(version, NEWEST):
         values = MIGRATIONS[major](values)
@@ -354,7 +538,17 @@ def profile_from(document: Document) -> FrictionProfile:
     return validated(document, FrictionProfile, values)
 
 
-def with_rotary_names(document: Document) -> Document:
+def _with_shared(document: Document) -> Document:
+    """The same document with ``all_joints`` in every joint."""
+    content = dict(document.root.content)
+    shared, joints = content.pop("all_joints", None), content.get("joints")
+    if shared is None or joints is None or not joints.is_mapping:
+        return document
+    content["joints"] = joints._replace(content={name: merge(shared, one) for name, one in joints.content.items()})
+    return replace(document, root=document.root._replace(content=content))
+
+
+def _with_rotary_names(document: Document) -> Document:
     """The same document with the joints of linear axes under rotary names, every value keeping its place."""
     joints = document.root.content.get("joints")
     if joints is None or not joints.is_mapping:
@@ -389,16 +583,3 @@ def _renamed(node: Node) -> Node:
 def _same_length(first: tuple[Any, ...], second: tuple[Any, ...]) -> None:
     if len(first) != len(second):
         raise ValueError(f"lists of {len(first)} and {len(second)} values belong together and must be equally long")
-
-
-def _close(stated: tuple[float, ...], derived: tuple[float, ...]) -> bool:
-    scale = max(map(abs, derived))
-    return len(stated) == len(derived) and all(abs(s - d) <= 1e-9 * scale for s, d in zip(stated, derived, strict=True))
-
-
-def _drop_nothings(estimate: dict[str, Any]) -> None:
-    for name in ("low", "high"):
-        if estimate[name] is None:
-            del estimate[name]
-    if not estimate["reason"]:
-        del estimate["reason"]

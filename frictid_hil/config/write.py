@@ -1,6 +1,6 @@
 """YAML out, for people and for bytes that repeat: block style, keys in the order given, shortest exact floats.
 
-A list of plain values stays on one line, so that a curve reads as a row; so does ``{value: .., low: .., high: ..}``.
+A list of plain values stays on one line, so that a curve reads as a row; so does a ``Row``.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 import yaml
 import yamlcore
 
-from frictid_hil.files import write_whole
 
-__all__ = ["dump", "plain", "write_whole"]
+class Row(dict[str, Any]):
+    """A mapping that is written on one line: ``{value: .., low: .., high: ..}``."""
 
 
 class _Writer(yamlcore.CCoreDumper):  # type: ignore[misc]  # yamlcore is untyped
@@ -32,12 +32,13 @@ def _represent_list(writer: Any, value: list[Any]) -> Any:
 
 
 def _represent_dict(writer: Any, value: dict[str, Any]) -> Any:
-    on_one_line = not value or (next(iter(value)) == "value" and _on_one_line(value.values()))
+    on_one_line = not value or isinstance(value, Row)
     return writer.represent_mapping("tag:yaml.org,2002:map", value.items(), flow_style=on_one_line)
 
 
 _Writer.add_representer(list, _represent_list)
 _Writer.add_representer(dict, _represent_dict)
+_Writer.add_representer(Row, _represent_dict)
 
 
 def dump(values: Mapping[str, Any]) -> str:
@@ -47,7 +48,7 @@ def dump(values: Mapping[str, Any]) -> str:
         ValueError: a number that is not finite, or a value that is no mapping, list, text, number, truth or None.
     """
     text: str = yaml.dump(
-        plain(values), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=100, default_flow_style=False
+        plain(values), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120, default_flow_style=False
     )
     return text
 
@@ -61,7 +62,7 @@ def plain(value: Any) -> Any:
     if value is None or isinstance(value, str | bool):
         return value
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return (Row if isinstance(value, Row) else dict)((str(key), plain(item)) for key, item in value.items())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if hasattr(value, "tolist"):  # numpy scalars and arrays

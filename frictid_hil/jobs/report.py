@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import FrictionProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.jobs.history import write_index_page
@@ -45,7 +46,7 @@ def report(
     assert run is not None  # by the check above
     manifest = load_manifest(run)
     if (run / "profile.yaml").exists():
-        page = write_run_page(run, load_profile(run / "profile.yaml"), manifest)
+        page = write_run_page(run, whole_profile(run), manifest)
     elif not (page := run / "report.html").exists():
         raise UsageError(
             "nothing was identified in this run",
@@ -56,6 +57,19 @@ def report(
     if (run / "recalibration.html").exists():
         result["recalibration_report"] = str((run / "recalibration.html").resolve())
     return result
+
+
+def whole_profile(run: Path) -> FrictionProfile:
+    """The profile of a run with all that was kept of each joint: also what Function A gave, and why gates passed."""
+    profile = load_profile(run / "profile.yaml")
+    kept = {name: run / "joints" / f"{name}.json" for name in profile.joints}
+    joints = {
+        name: JointProfile.model_validate(json.loads(kept[name].read_text())["profile"])
+        if kept[name].exists()
+        else joint
+        for name, joint in profile.joints.items()
+    }
+    return profile.model_copy(update={"joints": joints})
 
 
 def _name_of(robot: str) -> str:

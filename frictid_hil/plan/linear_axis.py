@@ -13,6 +13,7 @@ _LINEAR = {
     "velocity_rad_s": "velocity_m_s",
     "torque_nm": "force_n",
     "torque_command_nm": "force_command_n",
+    "torque_plus_minus_nm": "force_plus_minus_n",
     "torque_interval_nm": "force_interval_n",
     "external_torque_nm": "external_force_n",
     "rigid_body_torque_nm": "rigid_body_force_n",
@@ -46,7 +47,7 @@ def rotary_name(name: str) -> str:
 def linear_names(values: Any) -> Any:
     """The same values with every key, at every depth, as on a linear axis."""
     if isinstance(values, dict):
-        return {linear_name(key): linear_names(value) for key, value in values.items()}
+        return type(values)((linear_name(key), linear_names(value)) for key, value in values.items())
     if isinstance(values, list):
         return [linear_names(value) for value in values]
     return values

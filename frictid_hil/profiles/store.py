@@ -24,14 +24,14 @@ from pathlib import Path
 
 import filelock
 
-from frictid_hil.config.profile import KIND, NEWEST, FrictionProfile, load_profile
+from frictid_hil.config.profile import FrictionProfile, load_profile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.search import user_data_dir
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
 from frictid_hil.profiles.journal import append_line, append_lines, journal_lines
 from frictid_hil.profiles.promotions import Promotion, active_stack, baseline_of, promotions_in
-from frictid_hil.profiles.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary, summary_of_file
+from frictid_hil.profiles.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary
 
 _LOCK_TIMEOUT_S = 30.0
 _ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}")
@@ -238,11 +238,7 @@ class ProfileStore:
         """Summaries from the profiles themselves, against the baseline of today, oldest first."""
         reference, found = self._reference(robot), []
         for identity in sorted(identities):
-            text = _unchanged_bytes(self.path(robot, identity)).decode()
-            if text.startswith(f"schema: {KIND}/{NEWEST}\n"):
-                found.append(summary_of_file(identity, robot, text, reference))
-            else:
-                found.append(summary(identity, self.load(robot, identity), reference))
+            found.append(summary(identity, self.load(robot, identity), reference))
             self._told(len(found), len(identities))
         return found
 

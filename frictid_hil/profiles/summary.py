@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import FrictionProfile, with_rotary_names
-from frictid_hil.config.yaml import parse
+from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.plan.linear_axis import rotary_name
 from frictid_hil.profiles.drift import distance_and_mean_nm
-
-_NEEDED = ("prismatic", "velocity_rad_s", "torque_nm", "coulomb_nm", "temperature_c", "gates")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,54 +95,12 @@ def summary(identity: str, profile: FrictionProfile, reference: Reference) -> St
     return Stored(identity, profile.robot, profile.provenance.created_utc, reference.id, joints)
 
 
-def summary_of_file(identity: str, robot: str, text: str, reference: Reference) -> Stored:
-    """The same from a file that is, byte for byte, what was stored: it was whole then, and is not judged again.
-
-    A third of the time of reading and judging all of it, which counts where an index of thousands was lost.
-    """
-    document = with_rotary_names(parse(_outline(text), Path(f"{identity}.yaml")))
-    values = document.data
-    joints = {}
-    for name, joint in values["joints"].items():
-        coulomb = joint["coulomb_nm"]
-        curve = FrictionCurve(tuple(map(float, joint["velocity_rad_s"])), tuple(map(float, joint["torque_nm"])))
-        joints[name] = JointSummary(
-            coulomb_nm=coulomb["value"],
-            coulomb_low_nm=coulomb.get("low"),
-            coulomb_high_nm=coulomb.get("high"),
-            temperature_c=joint.get("temperature_c"),
-            gates_failed=[gate["name"] for gate in joint.get("gates", ()) if not gate["passed"]],
-            distance_percent=_distance_percent(reference, name, curve),
-        )
-    return Stored(identity, robot, values["provenance"]["created_utc"], reference.id, joints)
-
-
 def _distance_percent(reference: Reference, name: str, curve: FrictionCurve) -> float | None:
     known = None if reference.profile is None else reference.profile.joints.get(name)
     if known is None:
         return None
     distance_nm, mean_nm = distance_and_mean_nm(known.curve(), curve)
     return 100.0 * distance_nm / mean_nm
-
-
-def _outline(text: str) -> str:
-    """The lines that a summary needs, of a profile as ``FrictionProfile.to_yaml`` writes it: in block style."""
-    kept, section, keep = [], "", False
-    for line in text.splitlines(keepends=True):
-        begins = line.lstrip(" ")
-        indent = len(line) - len(begins)
-        if begins.strip() and not begins.startswith("- "):  # else it goes on with what was begun
-            key = begins.partition(":")[0]
-            if indent == 0:
-                section = key
-                keep = section in ("joints", "provenance")
-            elif indent == 2:
-                keep = section == "joints" or (section == "provenance" and key == "created_utc")
-            elif indent == 4 and section == "joints":
-                keep = rotary_name(key) in _NEEDED
-        if keep:
-            kept.append(line)
-    return "".join(kept)
 
 
 def line_of(stored: Stored) -> dict[str, Any]:

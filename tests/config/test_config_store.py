@@ -10,7 +10,6 @@ from pathlib import Path
 
 import filelock
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.config.profile import DriveIdentity, Estimate, FrictionProfile, Gate, JointProfile
@@ -19,7 +18,6 @@ from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.profiles import store as store_module
 from frictid_hil.profiles.drift import drift
 from frictid_hil.profiles.store import ProfileStore
-from frictid_hil.profiles.summary import Reference, summary, summary_of_file
 
 V = (0.2, 0.4, 0.6, 1.9)
 
@@ -349,14 +347,6 @@ def stored_joints(draw: st.DrawFn) -> JointProfile:
         drive=DriveIdentity(settings={"a": {"joints": 1}, "gates": [{"name": draw(words)}]}),
         gates=tuple(Gate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
     )
-
-
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
-@given(joints=st.dictionaries(st.sampled_from(["0", "joints", "a: b", "- x", "é"]), stored_joints(), min_size=1))
-def test_a_summary_from_the_lines_it_needs_is_that_of_the_whole_profile(joints: dict[str, JointProfile]) -> None:
-    whole = FrictionProfile(robot="hp3j", joints=joints, provenance=Provenance(created_utc="2026-01-01T02:00:00Z"))
-    for reference in (Reference(None, None), Reference("first", profile(1.1, joints="0"))):
-        assert summary_of_file("id", "hp3j", whole.to_yaml(), reference) == summary("id", whole, reference)
 
 
 def test_reading_many_profiles_anew_is_told(store: ProfileStore) -> None:

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frictid_hil.config.write import dump, write_whole
+from frictid_hil.config.write import dump
 from frictid_hil.config.yaml import Place, merge, parse, read
 from frictid_hil.errors import ConfigError, FieldProblem, FrictidError, InvalidFields
+from frictid_hil.files import write_whole
 
 HERE = Path("hp3j.yaml")
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import true_curve
+from frictid_hil.jobs.report import whole_profile
 from frictid_hil.jobs.watch import Silent
 
 
@@ -25,7 +25,7 @@ def test_torque_four_milliseconds_late_changes_nothing_where_the_drive_declares_
     options = CalibrateOptions(
         str(robot), bus="virtual:late", joints=("4",), amplitude_rad=0.1745, out=tmp_path / "run"
     )
-    profile = load_profile(calibrate(options, Silent()).to_json()["profile"]).joint("4")
+    profile = whole_profile(Path(calibrate(options, Silent()).to_json()["run"])).joint("4")
     assert profile.time_skew_s == pytest.approx(0.0045)
     assert profile.procedure is not None and profile.published is not None
     velocity = profile.procedure.velocity_rad_s

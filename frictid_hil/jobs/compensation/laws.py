@@ -58,7 +58,7 @@ def law_of(entry: JointProfile, joint: JointSetup, mode: str, wanted: Wanted, wa
     if mode != "nc":
         friction = friction_settings(entry, mode, wanted, where, warnings)
         if wanted.setting == "ours" and mode.startswith("mop") and entry.ripple is not None:
-            ripple = RippleTorque(entry.ripple.period_rad, entry.ripple.torque_nm)
+            ripple = RippleTorque(entry.ripple.period_rad, entry.ripple.table_nm())
     return ControlLaw(
         mode=mode,
         gravity=gravity,

@@ -157,9 +157,7 @@ def _from_cycles(
         forward=_pair_list(result.pairs.velocity_plus_rad_s, result.pairs.torque_plus_nm),
         backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
         published=_published(result.published),
-        ripple=Ripple(period_rad=result.ripple.period_rad, torque_nm=result.ripple.torque_nm)
-        if result.ripple
-        else None,
+        ripple=Ripple.of_table(result.ripple.period_rad, result.ripple.torque_nm) if result.ripple else None,
         torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s
         if result.time_skew is None
