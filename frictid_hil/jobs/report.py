@@ -62,13 +62,10 @@ def report(
 def whole_profile(run: Path) -> FrictionProfile:
     """The profile of a run with all that was kept of each joint: also what Function A gave, and why gates passed."""
     profile = load_profile(run / "profile.yaml")
-    kept = {name: run / "joints" / f"{name}.json" for name in profile.joints}
-    joints = {
-        name: JointProfile.model_validate(json.loads(kept[name].read_text())["profile"])
-        if kept[name].exists()
-        else joint
-        for name, joint in profile.joints.items()
-    }
+    joints = dict(profile.joints)
+    for name in joints:
+        if (path := run / "joints" / f"{name}.json").exists():
+            joints[name] = JointProfile.model_validate(json.loads(path.read_text())["profile"])
     return profile.model_copy(update={"joints": joints})
 
 

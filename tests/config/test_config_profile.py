@@ -211,7 +211,7 @@ def test_six_joints_are_twelve_kilobytes_that_a_person_reads(tmp_path: Path) -> 
             method="aligned",
             velocity_rad_s=v,
             torque_nm=f,
-            torque_interval_nm=np.column_stack([f - half, f + half]),
+            torque_interval_nm=tuple(zip(f - half, f + half, strict=True)),
             **around,  # type: ignore[arg-type]
             forward=PairList(velocity_rad_s=v, torque_nm=f + 0.2),
             backward=PairList(velocity_rad_s=-v * 1.0001, torque_nm=0.2 - f),
