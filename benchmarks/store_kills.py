@@ -13,12 +13,12 @@ start to its end.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import random
 import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -32,7 +32,6 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.profiles.attempts import attempts
 from frictid_hil.profiles.store import ProfileStore
 
 SPEEDS = tuple(0.2 * k for k in range(1, 11))
@@ -132,7 +131,7 @@ def killed_nights(place: Path, kills: int) -> None:
             assert active.id in {before.id} | (has - had)
             for identity in has - had | {active.id}:
                 store.load(ROBOT, identity)
-            attempts(store.root, ROBOT)
+            store.attempts(ROBOT)
             stored += len(has - had)
             promoted += active.id != before.id
         except Exception as error:  # whatever it is, it is what this benchmark looks for
@@ -165,20 +164,21 @@ def many(root: Path, count: int) -> None:
     store.promote("arm", first)
     folder, stamp = root / "arm", profile(0).provenance.created_utc
     template = store.path("arm", first).read_text()
-    line = (folder / "index.jsonl").read_text().splitlines()[-1]
-    assert json.loads(line)["baseline"] == first
-    with (folder / "index.jsonl").open("a") as index:
+    assert store.history("arm")[0].baseline == first
+    with sqlite3.connect(folder / "index.sqlite") as index:
+        ((value,),) = index.execute("SELECT value FROM kept WHERE kind = 'profiles'")
         for number in range(1, count):
             later = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(1.7e9 + 3600 * number))
             text = template.replace(stamp, later).encode()
             identity = f"{later.replace('-', '').replace(':', '')}-{hashlib.sha256(text).hexdigest()[:12]}"
             (folder / "profiles" / f"{identity}.yaml").write_bytes(text)
-            index.write(line.replace(f'"id": "{first}"', f'"id": "{identity}"').replace(stamp, later) + "\n")
+            row = value.replace(f'"id": "{first}"', f'"id": "{identity}"').replace(stamp, later)
+            index.execute("INSERT INTO kept VALUES ('profiles', ?, ?)", (identity, row))
     history = [sys.executable, "-m", "frictid_hil.cli.app", "profile", "history", "arm", "--store", str(root)]
     page = [sys.executable, "-m", "frictid_hil.cli.app", "report", "--robot", "arm", "--store", str(root)]
     for name, command in (("history", history), ("history --json", [*history, "--json"]), ("index page", page)):
         timed(f"{count} profiles, {name}", command)
-    (folder / "index.jsonl").unlink()
+    (folder / "index.sqlite").unlink()
     timed(f"{count} profiles, history after the index was lost", history)
     timed(f"{count} profiles, history after that", history)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
-from frictid_hil.profiles.attempts import attempts
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import write_page
@@ -27,17 +26,17 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
         UsageError: nothing is known of such a robot.
     """
     with _nothing_to_collect():
-        profiles, promotions, nights = store.history(robot), store.promotions(robot), attempts(store.root, robot)
+        profiles, promotions = store.history(robot, last), store.promotions(robot, last)
+        nights = store.attempts(robot, last)
     if not profiles and not nights:
         raise _unknown(store, robot)
     active, baseline = store.active(robot), store.baseline(robot)
-    kept = slice(-last if last else None, None)
     return {
         "outcome": "ok",
         "robot": robot,
         "active": active.id if active else None,
         "baseline": baseline,
-        "profiles_kept": len(profiles),
+        "profiles_kept": store.count(robot),
         "profiles": [
             {
                 "id": stored.id,
@@ -53,15 +52,15 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
                     for name, joint in stored.joints.items()
                 },
             }
-            for stored in profiles[kept]
+            for stored in profiles
         ],
         "promotions": [
-            {"action": p.action, "id": p.id, "utc": p.utc, "by": p.by, "reason": p.reason} for p in promotions[kept]
+            {"action": p.action, "id": p.id, "utc": p.utc, "by": p.by, "reason": p.reason} for p in promotions
         ],
         "recalibrations": [
             {"utc": one.utc, "outcome": one.outcome, "promoted": one.promoted, "drifted": list(one.drifted)}
             | {"reason": one.reason, "next_step": one.next_step, "run": one.run}
-            for one in nights[kept]
+            for one in nights
         ],
     }
 
@@ -73,7 +72,7 @@ def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) 
         UsageError: nothing is known of such a robot.
     """
     with _nothing_to_collect():
-        trends, nights = store.trends(robot), attempts(store.root, robot)
+        trends, nights = store.trends(robot), store.attempts(robot)
     if not trends and not nights:
         raise _unknown(store, robot)
     page = index_page(robot, trends, store.promotions(robot), nights, store.active(robot), store.baseline(robot))

@@ -31,8 +31,8 @@ from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, I
 from frictid_hil.jobs.calibrate import Calibrated, CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.profiles.attempts import Attempt, note_attempt
 from frictid_hil.profiles.judgement import Verdict, judge
+from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.recalibration import recalibration_page
@@ -90,7 +90,7 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
     except Exception as error:
         _note_failure(store, robot, began_utc, Defect.of(error))
         raise
-    note_attempt(store.root, robot.name, _attempt(began_utc, result))
+    store.note_attempt(robot.name, _attempt(began_utc, result))
     # The history is on the disk; a page that cannot be written must not turn a good night into a bad one.
     with contextlib.suppress(FrictidError):
         result["history"] = str(write_index_page(store, robot.name).resolve())
@@ -291,4 +291,4 @@ def _note_failure(store: ProfileStore, robot: Robot, began_utc: str, error: Fric
     attempt = Attempt(began_utc, error.outcome, error.exit_code, reason=str(error), next_step=error.next_step)
     # The error itself is what must be told; a disk that is full cannot hold the line as well.
     with contextlib.suppress(FrictidError):
-        note_attempt(store.root, robot.name, attempt)
+        store.note_attempt(robot.name, attempt)

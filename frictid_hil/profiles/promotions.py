@@ -1,17 +1,14 @@
-"""The journal of promotions: which profile became active when, by whom and why; the last whole line rules."""
+"""Promotions: which profile became active when, by whom and why; and recalibrations, however they ended."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-
-from frictid_hil.profiles.journal import journal_lines
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
 class Promotion:
-    """A line of the journal.
+    """A file of ``promotions/``; they count in the order of their numbers.
 
     Attributes:
         action: ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from).
@@ -30,27 +27,47 @@ class Promotion:
     reason: str = ""
 
 
-def promotions_in(path: Path) -> list[Promotion]:
-    """The lines of a journal, oldest first; nothing where there is none yet.
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A file of ``recalibrations/``: how one of them ended.
 
-    Raises:
-        FrictidError: it cannot be read.
+    Attributes:
+        utc: when it began.
+        outcome: word of its JSON.
+        exit_code: of the process.
+        promoted: its profile became the active one.
+        profile: id in the store; "" where nothing was identified.
+        drift_percent: distance (15) from the reference by joint; None where there was none.
+        drifted: joints beyond the policy's limit.
+        reason: why it was promoted or not, in a sentence.
+        next_step: for the person who reads it.
+        run: folder; "" where none was kept.
     """
-    return [Promotion(**line) for line in journal_lines(path) if line.keys() == Promotion.__dataclass_fields__.keys()]
+
+    utc: str
+    outcome: str
+    exit_code: int
+    promoted: bool = False
+    profile: str = ""
+    drift_percent: Mapping[str, float | None] = field(default_factory=dict)
+    drifted: Sequence[str] = ()
+    reason: str = ""
+    next_step: str = ""
+    run: str = ""
 
 
-def active_stack(journal: Sequence[Promotion]) -> list[Promotion]:
+def active_stack(promotions: Sequence[Promotion]) -> list[Promotion]:
     """Those active one after the other, as far as they were not rolled back; the last is active."""
     stack: list[Promotion] = []
-    for line in journal:
-        if line.action == "promote":
-            stack.append(line)
-        elif line.action == "rollback" and stack:
+    for one in promotions:
+        if one.action == "promote":
+            stack.append(one)
+        elif one.action == "rollback" and stack:
             stack.pop()
     return stack
 
 
-def baseline_of(journal: Sequence[Promotion]) -> str | None:
+def baseline_of(promotions: Sequence[Promotion]) -> str | None:
     """Id of the profile that drift is measured from: the pinned one, else the first ever promoted."""
-    pinned = [line.id for line in journal if line.action == "baseline"]
-    return pinned[-1] if pinned else journal[0].id if journal else None
+    pinned = [one.id for one in promotions if one.action == "baseline"]
+    return pinned[-1] if pinned else promotions[0].id if promotions else None

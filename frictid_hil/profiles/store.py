@@ -3,38 +3,49 @@
 ::
 
     <root>/<robot>/
-        profiles/<UTC>-<hash>.yaml   named by content, written once, never changed
-        index.jsonl                  a summary line per profile; can be rebuilt from the profiles
-        promotions.jsonl             a line per promotion, rollback and pinned baseline; the last whole line rules
+        profiles/<UTC>-<hash>.yaml         named by content
+        promotions/000001.yaml             a promotion, rollback or pinned baseline each; the last one rules
+        recalibrations/<UTC>-<hash>.yaml   how a night ended
+        index.sqlite                       what was read of all these; made anew where it is lost
 
-A profile is on the disk before a line names it, and a line counts once its last byte is there. A process killed at any
-moment therefore leaves the old active profile or the new one, whole; what it left unfinished is passed over by readers
-and tidied by the next writer. Writers exclude each other by a lock that dies with its process; readers need none.
+Each file is written once, whole or not at all, and never changed. A process killed at any moment therefore leaves the
+old active profile or the new one; what it left unfinished is passed over by readers and tidied by the next writer.
+Writers exclude each other by a lock that dies with its process; readers need none.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, TypeVar
 
 import filelock
 
 from frictid_hil.config.profile import FrictionProfile, load_profile
 from frictid_hil.config.provenance import utc_now
+from frictid_hil.config.schema import schema_version
 from frictid_hil.config.search import user_data_dir
+from frictid_hil.config.write import dump
+from frictid_hil.config.yaml import read
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
-from frictid_hil.profiles.journal import append_line, append_lines, journal_lines
-from frictid_hil.profiles.promotions import Promotion, active_stack, baseline_of, promotions_in
-from frictid_hil.profiles.summary import Reference, Stored, TrendPoint, line_of, stored_of, summary
+from frictid_hil.profiles.index import Index
+from frictid_hil.profiles.promotions import Attempt, Promotion, active_stack, baseline_of
+from frictid_hil.profiles.summary import Reference, Stored, TrendPoint, stored_of, summary
 
 _LOCK_TIMEOUT_S = 30.0
-_ID = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}")
+_NAMES = {
+    "profiles": re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}"),
+    "promotions": re.compile(r"\d{6}"),
+    "recalibrations": re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{12}"),
+}
+_NOTE = "frictid.store-note"
+
+Note = TypeVar("Note", Promotion, Attempt)
 
 
 class ProfileStore:
@@ -62,20 +73,8 @@ class ProfileStore:
         Raises:
             FrictidError: disk full, no permission, or another process holds the store for too long.
         """
-        text = profile.to_yaml().encode()
-        sha256 = hashlib.sha256(text).hexdigest()
-        utc = re.sub(r"[-:]", "", profile.provenance.created_utc)
-        identity = f"{utc}-{sha256[:12]}"
         with self._locked(profile.robot) as folder:
-            _tidy(folder)
-            path = _profile_path(folder, identity)
-            if path.exists():
-                return identity
-            write_whole(path, text)
-            path.chmod(0o444)
-            # A crash just here costs nothing: `history` finds the profile and writes its line.
-            append_line(folder / "index.jsonl", line_of(summary(identity, profile, self._reference(profile.robot))))
-        return identity
+            return _written(folder / "profiles", profile.provenance.created_utc, profile.to_yaml())
 
     def path(self, robot: str, identity: str) -> Path:
         """The file of a profile.
@@ -88,9 +87,9 @@ class ProfileStore:
             UsageError: there is none, or more than one.
         """
         folder = self._folder(robot)
-        if _ID.fullmatch(identity) and (whole := _profile_path(folder, identity)).exists():
+        if _NAMES["profiles"].fullmatch(identity) and (whole := folder / "profiles" / f"{identity}.yaml").exists():
             return whole  # a store may hold ten thousand: look at the folder only for a beginning of an id
-        found = [name for name in _profile_ids(folder) if name.startswith(identity)]
+        found = [name for name in _names(folder, "profiles") if name.startswith(identity)]
         if len(found) != 1 or not identity:
             count = "no profile" if not found else f"{len(found)} profiles"
             raise UsageError(
@@ -98,7 +97,7 @@ class ProfileStore:
                 where=str(folder),
                 next_step=f"see `frictid-hil profile history {robot}`",
             )
-        return _profile_path(folder, found[0])
+        return folder / "profiles" / f"{found[0]}.yaml"
 
     def load(self, robot: str, identity: str) -> FrictionProfile:
         """A profile by its id (or the beginning of it).
@@ -108,7 +107,12 @@ class ProfileStore:
             ConfigError: its file is not what was added.
         """
         path = self.path(robot, identity)
-        _unchanged_bytes(path)
+        if not path.stem.endswith(hashlib.sha256(path.read_bytes()).hexdigest()[:12]):
+            raise ConfigError(
+                "the file was changed after it was stored",
+                where=str(path),
+                next_step="restore it from a backup, or roll back to another profile",
+            )
         return load_profile(path)
 
     def active(self, robot: str) -> Promotion | None:
@@ -132,11 +136,12 @@ class ProfileStore:
             UsageError: there is none of that id.
             FrictidError: as ``add``.
         """
-        first = self.active(robot) is None
-        promotion = self._write_promotion("promote", robot, identity, by, reason)
-        if first:
-            self.rebuild_index(robot)
-        return promotion
+        with self._locked(robot) as folder:
+            path = self.path(robot, identity)
+            active = self.active(robot)
+            if active is not None and active.id == path.stem:
+                return active
+            return self._noted(folder, "promote", path, by, reason)
 
     def pin_baseline(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
         """Measure drift from this profile from now on; what is active stays.
@@ -144,11 +149,10 @@ class ProfileStore:
         Raises:
             UsageError: there is none of that id, or nothing was promoted yet.
         """
-        if self.active(robot) is None:
-            raise UsageError(f"no profile of {robot} was promoted yet", where=str(self._folder(robot)))
-        pinned = self._write_promotion("baseline", robot, identity, by, reason)
-        self.rebuild_index(robot)
-        return pinned
+        with self._locked(robot) as folder:
+            if self.active(robot) is None:
+                raise UsageError(f"no profile of {robot} was promoted yet", where=str(folder))
+            return self._noted(folder, "baseline", self.path(robot, identity), by, reason)
 
     def rollback(self, robot: str, *, by: str = "", reason: str = "") -> Promotion:
         """Make the profile active again that was so before the present one; again for the one before that.
@@ -164,51 +168,57 @@ class ProfileStore:
                     where=str(folder),
                     next_step=f"see `frictid-hil profile history {robot}` and promote one by its id",
                 )
-            line = Promotion("rollback", stack[-2].id, stack[-2].sha256, utc_now(), by, reason)
-            self.load(robot, line.id)
-            append_line(folder / "promotions.jsonl", asdict(line))
-        return line
+            return self._noted(folder, "rollback", self.path(robot, stack[-2].id), by, reason)
 
-    def promotions(self, robot: str) -> list[Promotion]:
-        """The journal, oldest first."""
-        return promotions_in(self._folder(robot) / "promotions.jsonl")
+    def promotions(self, robot: str, last: int | None = None) -> list[Promotion]:
+        """All of them, or the last few, oldest first."""
+        return self._notes(Promotion, robot, "promotions", last)
 
-    def history(self, robot: str) -> list[Stored]:
-        """Every profile of a robot, oldest first; those that the index lost are read anew, and noted for next time.
+    def note_attempt(self, robot: str, attempt: Attempt) -> None:
+        """Keep how a recalibration ended.
 
         Raises:
-            ConfigError: the file of one that the index lost was changed.
-        """
-        folder = self._folder(robot)
-        present = _profile_ids(folder)
-        index = _index(folder, robot, present)
-        if len(index) < len(present):
-            found = self._measured(robot, present - index.keys())
-            index |= {stored.id: stored for stored in found}
-            self._note(robot, found)
-        return [index[identity] for identity in sorted(index)]
-
-    def rebuild_index(self, robot: str) -> None:
-        """Write the index anew from the profiles; needed where it was lost, and when the baseline changes.
-
-        Raises:
-            ConfigError: a profile's file was changed.
+            FrictidError: as ``add``.
         """
         with self._locked(robot) as folder:
-            every = self._measured(robot, _profile_ids(folder))
-            write_whole(folder / "index.jsonl", "".join(json.dumps(line_of(stored)) + "\n" for stored in every))
+            _written(folder / "recalibrations", attempt.utc, _note_text(attempt))
+
+    def attempts(self, robot: str, last: int | None = None) -> list[Attempt]:
+        """Recalibrations, all or the last few, oldest first."""
+        return self._notes(Attempt, robot, "recalibrations", last)
+
+    def count(self, robot: str) -> int:
+        """How many profiles there are."""
+        return len(_names(self._folder(robot), "profiles"))
+
+    def history(self, robot: str, last: int | None = None) -> list[Stored]:
+        """Profiles of a robot, all or the last few, oldest first; distances are from the baseline of today.
+
+        Raises:
+            ConfigError: a file that the index does not know yet was changed.
+        """
+        folder = self._folder(robot)
+        names = _names(folder, "profiles")[-last if last else None :]
+        baseline = self.baseline(robot)
+        reference = Reference(baseline, None if baseline is None else self.load(robot, baseline))
+        index = Index(folder / "index.sqlite", self._told)
+
+        def measured() -> list[Stored]:
+            found = index.values(
+                "profiles", names, lambda name: asdict(summary(name, self.load(robot, name), reference))
+            )
+            return [stored_of(value) for value in found.values()]
+
+        stored = measured()
+        if stale := [one.id for one in stored if one.baseline != baseline]:
+            index.forget("profiles", stale)
+            stored = measured()
+        return stored
 
     def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
-        baseline = self.baseline(robot)
-        history = {stored.id: stored for stored in self.history(robot)}
-        stale = {stored.id for stored in history.values() if stored.baseline != baseline}
-        if stale:
-            measured_anew = self._measured(robot, stale)
-            history |= {stored.id: stored for stored in measured_anew}
-            self._note(robot, measured_anew)
         trends: dict[str, list[TrendPoint]] = {}
-        for stored in history.values():
+        for stored in self.history(robot):
             for name, joint in stored.joints.items():
                 trends.setdefault(name, []).append(TrendPoint(stored.id, stored.created_utc, joint))
         return trends
@@ -218,42 +228,32 @@ class ProfileStore:
             raise UsageError(f"{robot!r} is no name of a robot")
         return self.root / robot
 
-    def _write_promotion(self, action: str, robot: str, identity: str, by: str, reason: str) -> Promotion:
-        with self._locked(robot) as folder:
-            path = self.path(robot, identity)
-            active = self.active(robot)
-            if action == "promote" and active is not None and active.id == path.stem:
-                return active
-            self.load(robot, path.stem)  # what is promoted must be readable
-            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-            line = Promotion(action, path.stem, sha256, utc_now(), by, reason)
-            append_line(folder / "promotions.jsonl", asdict(line))
-        return line
+    def _noted(self, folder: Path, action: str, profile: Path, by: str, reason: str) -> Promotion:
+        """Write a promotion; only under the lock."""
+        self.load(folder.name, profile.stem)  # what is promoted must be readable
+        sha256 = hashlib.sha256(profile.read_bytes()).hexdigest()
+        note = Promotion(action, profile.stem, sha256, utc_now(), by, reason)
+        number = int(max(_names(folder, "promotions"), default="0")) + 1
+        _write_once(folder / "promotions" / f"{number:06d}.yaml", _note_text(note))
+        return note
 
-    def _reference(self, robot: str) -> Reference:
-        baseline = self.baseline(robot)
-        return Reference(baseline, None if baseline is None else self.load(robot, baseline))
-
-    def _measured(self, robot: str, identities: Collection[str]) -> list[Stored]:
-        """Summaries from the profiles themselves, against the baseline of today, oldest first."""
-        reference, found = self._reference(robot), []
-        for identity in sorted(identities):
-            found.append(summary(identity, self.load(robot, identity), reference))
-            self._told(len(found), len(identities))
-        return found
-
-    def _note(self, robot: str, found: Sequence[Stored]) -> None:
-        """Add lines to the index; it only saves time, so a store that may not be written stays as it is."""
-        with suppress(FrictidError), self._locked(robot) as folder:
-            append_lines(folder / "index.jsonl", [line_of(stored) for stored in found])
+    def _notes(self, kind: type[Note], robot: str, where: str, last: int | None) -> list[Note]:
+        folder = self._folder(robot)
+        names = _names(folder, where)[-last if last else None :]
+        index = Index(folder / "index.sqlite", self._told)
+        return [
+            kind(**values) for values in index.values(where, names, lambda n: _note(folder / where, n, kind)).values()
+        ]
 
     @contextmanager
     def _locked(self, robot: str) -> Iterator[Path]:
         folder = self._folder(robot)
         try:
-            (folder / "profiles").mkdir(parents=True, exist_ok=True)
-            lock = filelock.FileLock(folder / ".lock", timeout=_LOCK_TIMEOUT_S)
-            with lock:
+            for name in _NAMES:
+                (folder / name).mkdir(parents=True, exist_ok=True)
+            with filelock.FileLock(folder / ".lock", timeout=_LOCK_TIMEOUT_S):
+                for staged in folder.glob("*/.*.part"):  # left by killed writers
+                    staged.unlink(missing_ok=True)
                 yield folder
         except filelock.Timeout:
             raise FrictidError(
@@ -265,44 +265,42 @@ class ProfileStore:
             raise could_not_write(folder, error) from error
 
 
-def _index(folder: Path, robot: str, present: Set[str]) -> dict[str, Stored]:
-    """The summaries whose profiles are there, by id."""
-    index = {}
-    for line in journal_lines(folder / "index.jsonl"):
-        stored = stored_of(line, robot)
-        if stored is not None and stored.id in present:
-            index[stored.id] = stored
-    return index
-
-
-def _unchanged_bytes(path: Path) -> bytes:
-    """The bytes of a stored profile, seen to be those that were stored."""
-    raw = path.read_bytes()
-    if not path.stem.endswith(hashlib.sha256(raw).hexdigest()[:12]):
-        raise ConfigError(
-            "the file was changed after it was stored",
-            where=str(path),
-            next_step="restore it from a backup, or roll back to another profile",
-        )
-    return raw
-
-
-def _profile_path(folder: Path, identity: str) -> Path:
-    return folder / "profiles" / f"{identity}.yaml"
-
-
-def _profile_ids(folder: Path) -> set[str]:
-    """Ids of the profiles on disk."""
+def _names(folder: Path, kind: str) -> list[str]:
+    """Names of the files of a kind, sorted: by time, or by number."""
     try:
-        names = [path.name for path in (folder / "profiles").iterdir()]
+        names = [path.name for path in (folder / kind).iterdir()]
     except FileNotFoundError:
-        return set()
+        return []
     except OSError as error:
         raise FrictidError(f"cannot be read: {error.strerror}", where=str(folder)) from error
-    return {name[:-5] for name in names if name.endswith(".yaml") and _ID.fullmatch(name[:-5])}
+    return sorted(name[:-5] for name in names if name.endswith(".yaml") and _NAMES[kind].fullmatch(name[:-5]))
 
 
-def _tidy(folder: Path) -> None:
-    """Remove what killed writers had staged; only under the lock."""
-    for staged in [*folder.glob(".*.part"), *(folder / "profiles").glob(".*.part")]:
-        staged.unlink(missing_ok=True)
+def _written(folder: Path, utc: str, text: str) -> str:
+    """Write a file named by its time and content, unless it is there; its name."""
+    name = f"{re.sub(r'[-:]', '', utc)}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    path = folder / f"{name}.yaml"
+    if not path.exists():
+        _write_once(path, text)
+    return name
+
+
+def _write_once(path: Path, text: str) -> None:
+    write_whole(path, text)
+    path.chmod(0o444)
+
+
+def _note_text(note: Promotion | Attempt) -> str:
+    return dump({"schema": f"{_NOTE}/1", **asdict(note)})
+
+
+def _note(folder: Path, name: str, kind: type[Note]) -> dict[str, Any]:
+    document = read(folder / f"{name}.yaml")
+    schema_version(document, _NOTE, 1)
+    values = document.data
+    del values["schema"]
+    try:
+        kind(**values)
+    except TypeError as error:
+        raise ConfigError(f"not what the store wrote: {error}", where=str(document.path)) from None
+    return values

@@ -1,4 +1,4 @@
-"""What history shows of a stored profile: a few figures per joint, and the line of the index that holds them."""
+"""What history shows of a stored profile: a few figures per joint, as the index holds them."""
 
 from __future__ import annotations
 
@@ -103,20 +103,7 @@ def _distance_percent(reference: Reference, name: str, curve: FrictionCurve) -> 
     return 100.0 * distance_nm / mean_nm
 
 
-def line_of(stored: Stored) -> dict[str, Any]:
-    """A line of the index; a joint is a list of its figures, because a store may have 60,000 of them."""
-    joints = {
-        name: [getattr(joint, field) for field in JointSummary.__slots__] for name, joint in stored.joints.items()
-    }
-    return {"index": 1, "id": stored.id, "utc": stored.created_utc, "baseline": stored.baseline, "joints": joints}
-
-
-def stored_of(line: Mapping[str, Any], robot: str) -> Stored | None:
-    """What a line of the index says; None where it is not one that this version writes."""
-    try:
-        if line["index"] != 1:
-            return None  # written by another version: the profile itself is read instead
-        joints = {name: JointSummary(*figures) for name, figures in line["joints"].items()}
-        return Stored(line["id"], robot, line["utc"], line["baseline"], joints)
-    except (KeyError, TypeError, AttributeError):
-        return None
+def stored_of(values: Mapping[str, Any]) -> Stored:
+    """From the values of ``dataclasses.asdict``."""
+    joints = {name: JointSummary(**figures) for name, figures in values["joints"].items()}
+    return Stored(**{**values, "joints": joints})

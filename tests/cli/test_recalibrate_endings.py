@@ -22,7 +22,6 @@ from frictid_drivers.virtual.channel import runtime_folder
 from frictid_hil.cli.app import app
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
-from frictid_hil.profiles.attempts import attempts
 from frictid_hil.profiles.store import ProfileStore
 
 ROBOT = "endings"
@@ -151,7 +150,7 @@ def test_every_ending(name: str, first_night: Path, tmp_path: Path) -> None:
     assert (result["schema"], result["outcome"]) == ("frictid.recalibrate/1", wanted.outcome)
     told = result["error"] if "error" in result else {"what": result["reason"], "next_step": result["next_step"]}
     assert wanted.says in told["what"] and told["next_step"] and wanted.next_step in told["next_step"], told
-    last = attempts(store.root, ROBOT)[-1]
+    last = store.attempts(ROBOT)[-1]
     assert (last.exit_code, last.outcome, last.next_step) == (wanted.code, wanted.outcome, told["next_step"])
     assert last.promoted is (name == "within the policy")
     assert store.active_profile(ROBOT) is not None
@@ -183,7 +182,7 @@ def test_a_defect_of_the_program_is_an_ending_too(
     result = json.loads(line)
     assert result["outcome"] == "aborted" and "ZeroDivisionError" in result["error"]["what"]
     assert "report" in result["error"]["next_step"] and "Traceback" in ended.stderr
-    last = attempts(tmp_path / "store", ROBOT)[-1]
+    last = ProfileStore(tmp_path / "store").attempts(ROBOT)[-1]
     assert (last.exit_code, last.promoted) == (1, False) and "ZeroDivisionError" in last.reason and last.next_step
 
 
@@ -210,5 +209,5 @@ def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Pat
     (line,) = said.splitlines()
     result = json.loads(line)
     assert (result["outcome"], result["promoted"]) == ("interrupted", False) and result["next_step"]
-    last = attempts(tmp_path / "store", ROBOT)[-1]
+    last = ProfileStore(tmp_path / "store").attempts(ROBOT)[-1]
     assert (last.exit_code, last.outcome) == (130, "interrupted")

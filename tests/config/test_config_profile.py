@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.config import profile as profile_module
@@ -102,6 +102,47 @@ def test_any_curve_survives_the_file_bit_for_bit(
     path = tmp_path_factory.mktemp("bits") / "p.yaml"
     profile(a=one).save(path)
     assert load_profile(path).joint("a").curve() == one.curve()
+
+
+words = st.text(min_size=1, alphabet="abc :#'\"\n-{}[]é", max_size=200)
+figures = st.floats(1.0, 9.0)
+
+
+@st.composite
+def stored_joints(draw: st.DrawFn) -> JointProfile:
+    count = draw(st.integers(2, 12))
+    torque = sorted(draw(st.lists(figures, min_size=count, max_size=count, unique=True)))
+    missing = draw(st.booleans())
+    return JointProfile(
+        method=draw(words),
+        prismatic=draw(st.booleans()),
+        velocity_rad_s=tuple(0.2 * (n + 1) for n in range(count)),
+        torque_nm=tuple(torque),
+        torque_interval_nm=draw(st.sampled_from([None, tuple((t - 0.1, t + 0.1) for t in torque)])),
+        coulomb_nm=Estimate.none("why: - not") if missing else Estimate(value=draw(figures)),
+        temperature_c=draw(st.one_of(st.none(), figures)),
+        torque_source=draw(words),
+        drive=DriveIdentity(settings={"a": {"joints": 1}, "gates": [{"name": draw(words)}]}),
+        gates=tuple(Gate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
+    )
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(joints=st.dictionaries(st.sampled_from(["0", "all_joints", "a: b", "- x", "é"]), stored_joints(), min_size=1))
+def test_any_profile_survives_the_file(
+    tmp_path_factory: pytest.TempPathFactory, joints: dict[str, JointProfile]
+) -> None:
+    whole = profile(**joints)
+    path = tmp_path_factory.mktemp("any") / "p.yaml"
+    whole.save(path)
+    loaded = load_profile(path)
+    assert loaded.to_yaml() == whole.to_yaml()
+    for name, one in joints.items():
+        kept = loaded.joints[name]
+        assert (kept.curve(), kept.coulomb_nm, kept.temperature_c) == (one.curve(), one.coulomb_nm, one.temperature_c)
+        assert (kept.method, kept.torque_source, kept.drive) == (one.method, one.torque_source, one.drive)
+        assert [(g.name, g.passed) for g in kept.gates] == [(g.name, g.passed) for g in one.gates]
+        assert [g.message for g in kept.gates if not g.passed] == [g.message for g in one.gates if not g.passed]
 
 
 def test_arrays_of_the_mathematics_are_taken_as_they_are() -> None:

@@ -4,19 +4,22 @@ import json
 import os
 import random
 import signal
+import sqlite3
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 
 import filelock
 import pytest
-from hypothesis import strategies as st
 
-from frictid_hil.config.profile import DriveIdentity, Estimate, FrictionProfile, Gate, JointProfile
+from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
+from frictid_hil.profiles import index as index_module
 from frictid_hil.profiles import store as store_module
 from frictid_hil.profiles.drift import drift
+from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 
 V = (0.2, 0.4, 0.6, 1.9)
@@ -165,24 +168,31 @@ def test_differences_between_two_profiles() -> None:
 
 def test_a_lost_or_spoilt_index_costs_nothing_but_time(store: ProfileStore, tmp_path: Path) -> None:
     for night in range(5):
-        store.add(profile(night=night))
-    before = store.history("hp3j")
-    index = tmp_path / "store" / "hp3j" / "index.jsonl"
+        store.promote("hp3j", store.add(profile(night=night)))
+    before = store.history("hp3j"), store.promotions("hp3j")
+    index = tmp_path / "store" / "hp3j" / "index.sqlite"
     whole = index.read_bytes()
-    for spoilt in (
-        b"",
-        whole[: len(whole) // 2],
-        whole.replace(b'"index": 1', b'"index": 2'),
-        b"\xff\xfe garbage\n" + whole,
-    ):
+    dice = random.Random(1)
+    for spoilt in (b"", whole[:5000], b"\xff\xfe garbage\n" * 500, whole[:100] + dice.randbytes(len(whole) - 100)):
         index.write_bytes(spoilt)
-        assert store.history("hp3j") == before
-    index.write_bytes(whole[: len(whole) // 2])
-    store.add(profile(night=7))
-    assert len(store.history("hp3j")) == 6
+        assert (store.history("hp3j"), store.promotions("hp3j")) == before
+    with sqlite3.connect(index) as database:
+        database.execute("PRAGMA user_version = 99")
+        database.execute("DROP TABLE kept")
+    assert store.history("hp3j") == before[0], "another version's index is made anew"
+    with sqlite3.connect(index) as database:
+        database.execute("UPDATE kept SET value = '{half'")
+    assert (store.history("hp3j"), store.promotions("hp3j")) == before
     index.unlink()
-    store.rebuild_index("hp3j")
-    assert len(index.read_bytes().splitlines()) == 6
+    index.mkdir()
+    assert (store.history("hp3j"), store.promotions("hp3j")) == before, "where none can be kept, files are read"
+
+
+def test_a_person_may_take_a_profile_out(store: ProfileStore) -> None:
+    first, second = (store.add(profile(night=night)) for night in (1, 2))
+    assert len(store.history("hp3j")) == 2
+    store.path("hp3j", first).unlink()
+    assert [stored.id for stored in store.history("hp3j")] == [second]
 
 
 def test_what_the_index_lost_is_read_once(store: ProfileStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +200,7 @@ def test_what_the_index_lost_is_read_once(store: ProfileStore, monkeypatch: pyte
         store.add(profile(night=night))
     store.promote("hp3j", store.add(profile(night=5)))
     before = store.trends("hp3j")
-    (store.root / "hp3j" / "index.jsonl").unlink()
+    (store.root / "hp3j" / "index.sqlite").unlink()
     assert store.trends("hp3j") == before
     baseline = store.baseline("hp3j")
     read = []
@@ -200,31 +210,45 @@ def test_what_the_index_lost_is_read_once(store: ProfileStore, monkeypatch: pyte
     assert set(read) <= {baseline}, "all others are told by the index"
 
 
-def test_a_store_that_may_not_be_written_is_told_all_the_same(
-    store: ProfileStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_may_not_be_written_is_told_all_the_same(store: ProfileStore) -> None:
     store.promote("hp3j", store.add(profile()))
-    (store.root / "hp3j" / "index.jsonl").unlink()
+    before = store.history("hp3j")
+    index = store.root / "hp3j" / "index.sqlite"
+    with closing(sqlite3.connect(index)) as database:
+        database.execute("DELETE FROM kept")
+        database.commit()
+        database.execute("BEGIN EXCLUSIVE")  # as another process, or a file system without locks, would have it
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(index_module, "_BUSY_S", 0.01)
+            assert store.history("hp3j") == before
 
-    def denied(_path: Path, _values: object) -> None:
-        raise FrictidError("no permission to write")
 
-    monkeypatch.setattr(store_module, "append_lines", denied)
-    assert len(store.history("hp3j")) == 1
-
-
-def test_a_line_that_a_crash_cut_off_is_no_promotion(store: ProfileStore, tmp_path: Path) -> None:
+def test_a_file_that_a_crash_left_half_written_is_no_promotion(store: ProfileStore, tmp_path: Path) -> None:
     first, second = store.add(profile()), store.add(profile(1.1))
     store.promote("hp3j", first)
     store.promote("hp3j", second)
-    journal = tmp_path / "store" / "hp3j" / "promotions.jsonl"
-    whole = journal.read_bytes()
-    for cut in range(whole.index(b"\n") + 1, len(whole)):
-        journal.write_bytes(whole[:cut])
-        active = store.active("hp3j")
-        assert active is not None and active.id == first
+    newest = tmp_path / "store" / "hp3j" / "promotions" / "000002.yaml"
+    newest.rename(newest.with_name(".000002.yaml.x.part"))
+    active = store.active("hp3j")
+    assert active is not None and active.id == first
     store.promote("hp3j", second)
-    assert [line.id for line in store.promotions("hp3j")] == [first, second]
+    assert [one.id for one in store.promotions("hp3j")] == [first, second]
+    assert not list(newest.parent.glob(".*"))
+
+
+def test_a_promotion_that_is_none_is_told_with_its_place(store: ProfileStore, tmp_path: Path) -> None:
+    store.promote("hp3j", store.add(profile()))
+    (tmp_path / "store" / "hp3j" / "promotions" / "000002.yaml").write_text("schema: frictid.store-note/1\nwho: me\n")
+    with pytest.raises(ConfigError, match=r"000002.yaml: not what the store wrote"):
+        store.active("hp3j")
+
+
+def test_recalibrations_are_kept_in_order(store: ProfileStore) -> None:
+    nights = [Attempt(f"2026-11-{day:02d}T02:00:00Z", "ok", 0, drift_percent={"0": 1.0 * day}) for day in range(1, 5)]
+    for night in [*nights, nights[0]]:
+        store.note_attempt("hp3j", night)
+    assert [night.utc for night in store.attempts("hp3j")] == [night.utc for night in nights]
+    assert store.attempts("hp3j", 2)[0].drift_percent == {"0": 3.0}
 
 
 def test_a_full_disk_leaves_the_store_as_it_was(store: ProfileStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,7 +287,6 @@ def test_writers_exclude_each_other(store: ProfileStore, tmp_path: Path, monkeyp
     for thread in threads:
         thread.join()
     assert len(store.history("hp3j")) == 9
-    assert len((tmp_path / "store" / "hp3j" / "index.jsonl").read_bytes().splitlines()) == 9
 
 
 def kill_while_writing(root: Path, kills: int) -> None:
@@ -297,9 +320,7 @@ def kill_while_writing(root: Path, kills: int) -> None:
                 path.stem for path in (root / "hp3j" / "profiles").glob("*.yaml")
             )
     store.add(profile(1.5))
-    assert not list((root / "hp3j" / "profiles").glob(".*")), "what the killed had staged is tidied away"
-    for line in (root / "hp3j" / "promotions.jsonl").read_text().splitlines()[-1:]:
-        json.loads(line)
+    assert not list((root / "hp3j").glob("*/.*")), "what the killed had staged is tidied away"
 
 
 def test_fifty_kills_never_spoil_the_store(tmp_path: Path) -> None:
@@ -316,43 +337,21 @@ def test_a_long_history_opens_no_profile(tmp_path: Path) -> None:
     folder = tmp_path / "hp3j"
     first = store.add(profile(joints="012345"))
     store.promote("hp3j", first)
-    line = json.loads((folder / "index.jsonl").read_text())
-    assert line["baseline"] == first
-    with (folder / "index.jsonl").open("a") as index:
+    assert len(store.history("hp3j")) == 1
+    with sqlite3.connect(folder / "index.sqlite") as database:
+        ((value,),) = database.execute("SELECT value FROM kept WHERE kind = 'profiles'")
+        assert json.loads(value)["baseline"] == first
         for k in range(200):
             identity = f"20260101T{k:06d}Z-{k:012x}"
             (folder / "profiles" / f"{identity}.yaml").write_text("read, I am no profile")
-            index.write(json.dumps({**line, "id": identity}) + "\n")
+            database.execute("INSERT INTO kept VALUES ('profiles', ?, ?)", (identity, value))
     assert len(store.history("hp3j")) == len(store.trends("hp3j")["5"]) == 201
-
-
-words = st.text("abc :#'\"\n-{}[]é", max_size=200)
-figures = st.floats(1.0, 9.0)
-
-
-@st.composite
-def stored_joints(draw: st.DrawFn) -> JointProfile:
-    count = draw(st.integers(2, 12))
-    torque = sorted(draw(st.lists(figures, min_size=count, max_size=count, unique=True)))
-    missing = draw(st.booleans())
-    return JointProfile(
-        method=draw(words),
-        prismatic=draw(st.booleans()),
-        velocity_rad_s=tuple(0.2 * (n + 1) for n in range(count)),
-        torque_nm=tuple(torque),
-        torque_interval_nm=draw(st.sampled_from([None, tuple((t - 0.1, t + 0.1) for t in torque)])),
-        coulomb_nm=Estimate.none("why: - not") if missing else Estimate(value=draw(figures)),
-        temperature_c=draw(st.one_of(st.none(), figures)),
-        torque_source=draw(words),
-        drive=DriveIdentity(settings={"a": {"joints": 1}, "gates": [{"name": draw(words)}]}),
-        gates=tuple(Gate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
-    )
+    assert len(store.history("hp3j", 3)) == 3
 
 
 def test_reading_many_profiles_anew_is_told(store: ProfileStore) -> None:
     for night in range(3):
         store.add(profile(night=night))
-    (store.root / "hp3j" / "index.jsonl").unlink()
     told: list[tuple[int, int]] = []
     ProfileStore(store.root, lambda done, of: told.append((done, of))).history("hp3j")
     assert told == [(1, 3), (2, 3), (3, 3)]

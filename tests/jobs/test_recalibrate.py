@@ -22,7 +22,6 @@ from frictid_hil.errors import HardwareBusy, UsageError
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import WarmUp
-from frictid_hil.profiles.attempts import attempts
 from frictid_hil.profiles.judgement import judge
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.protocol.driver import Feedback, SetPoint
@@ -65,7 +64,7 @@ def test_nights_are_promoted_until_one_is_broken(tmp_path: Path) -> None:
     assert (broken["outcome"], broken["exit_code"], broken["promoted"]) == ("gate_failed", 5, False)
     assert broken["active"] == second["active"] and broken["drift"]["5"]["broken"]
     load_profile(Path(broken["active"]))
-    kept = attempts(tmp_path / "store", "night")
+    kept = ProfileStore(tmp_path / "store").attempts("night")
     assert [one.outcome for one in kept] == ["ok", "ok", "gate_failed"]
     assert all(one.next_step for one in kept)
     for key in ("recalibration_report", "history", "report"):
@@ -76,7 +75,7 @@ def test_a_real_robot_needs_permission(tmp_path: Path) -> None:
     options = RecalibrateOptions(robot_file(tmp_path), bus="socketcan:nowhere0", store=tmp_path / "store")
     with pytest.raises(UsageError, match="unattended"):
         recalibrate(options, Silent())
-    (kept,) = attempts(tmp_path / "store", "night")
+    (kept,) = ProfileStore(tmp_path / "store").attempts("night")
     assert (kept.exit_code, kept.promoted) == (2, False) and "unattended" in kept.next_step
 
 

@@ -15,7 +15,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.report import report
-from frictid_hil.profiles.attempts import Attempt, note_attempt
+from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 
 
@@ -38,7 +38,7 @@ def store(tmp_path: Path) -> ProfileStore:
     for day, factor in ((1, 1.0), (2, 1.1)):
         store.promote("arm", store.add(profile(factor, day)), by="somebody", reason=f"night {day}")
     missed = Attempt("2026-03-03T02:00:00Z", "aborted", 3, reason="robot is off", next_step="switch it on")
-    note_attempt(store.root, "arm", missed)
+    store.note_attempt("arm", missed)
     return store
 
 
