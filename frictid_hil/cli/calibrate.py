@@ -32,6 +32,7 @@ from frictid_hil.cli.options import (
     robot_files,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees, format_duration
 
 
@@ -229,7 +230,7 @@ def compare(
 
     def show(result: Result) -> None:
         table = Table("joint", "E [N m]", "percent of mean, [0, V]", "percent, measured range")
-        for name, figures in result["joints"].items():
+        for name, figures in rotary_names(result["joints"]).items():
             table.add_row(
                 name,
                 f"{figures['e_nm']:.4f}",
@@ -237,6 +238,8 @@ def compare(
                 f"{figures['e_percent_measured_range']:.2f}",
             )
         output.out.print(table)
+        for warning in result["warnings"]:
+            output.out.print(f"note: {warning}", soft_wrap=True, markup=False)
 
     output.run("compare", lambda: job(profile, other, truth), show)
 
@@ -256,6 +259,7 @@ def print_joints(output: Output, result: Result) -> None:
 
 
 def _row(joint: dict[str, Any]) -> tuple[str, ...]:
+    joint = rotary_names(joint)
     outcome = joint["outcome"]
     shown = "[green]ok[/]" if outcome == "ok" else f"[red]{outcome}[/]"
     prismatic = bool(joint.get("prismatic"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -20,6 +19,7 @@ from frictid_hil.cli.options import (
     RealtimeOption,
     RobotOption,
     SeedOption,
+    StoreOption,
     YesOption,
     one_of,
     quantity,
@@ -43,9 +43,6 @@ def _duration(text: str) -> float:
 
 def compensate(
     robot: RobotOption,
-    profile: Annotated[
-        Path, typer.Option("--profile", "-p", metavar="PROFILE", help="Profile, or a run folder that holds one.")
-    ],
     joint: OneJointOption,
     task: Annotated[
         str,
@@ -56,6 +53,15 @@ def compensate(
             help="hand (a person guides the joint), track (a triangle under a weak PD).",
         ),
     ],
+    profile: Annotated[
+        str,
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="PROFILE",
+            help="Profile, run folder, or id of the store. Default: the robot's active profile.",
+        ),
+    ] = "active",
     mode: Annotated[
         str | None,
         typer.Option(
@@ -116,6 +122,7 @@ def compensate(
     live: LiveOption = False,
     live_at: LiveAtOption = None,
     out: OutOption = None,
+    store: StoreOption = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -145,7 +152,7 @@ def compensate(
             drive_mode=_DRIVE_MODES[drive_mode],
             force=force,
         )
-        return CompensateOptions(robot, profile, joint, wanted, bus, realtime, seed, out)
+        return CompensateOptions(robot, profile, joint, wanted, bus, realtime, seed, out, store)
 
     if dry_run:
 

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from frictid_hil.cli.options import JsonOption, ProfileArgument, QuietOption, StoreOption
 from frictid_hil.cli.output import READING, Output, Result
+from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
 RobotName = Annotated[
@@ -34,7 +35,7 @@ def show(
     output = Output(as_json, quiet)
 
     def print_profile(result: Result) -> None:
-        for name, joint in result["joints"].items():
+        for name, joint in rotary_names(result["joints"]).items():
             linear = bool(joint.get("prismatic"))
             force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
             table = Table(title=f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
@@ -99,6 +100,8 @@ def diff(
                 "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
             )
         output.out.print(table)
+        for warning in result["warnings"]:
+            output.out.print(f"[yellow]note:[/] {escape(warning)}", soft_wrap=True)
 
     output.run("profile_diff", lambda: job(older, newer, robot=robot, store=store), show)
 
@@ -116,15 +119,23 @@ def promote(
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Make a profile the active one of its robot; nothing is overwritten, and one command goes back."""
+    """Make a profile the active one of its robot; joints that it lacks stay, and one command goes back."""
     from frictid_hil.jobs.profiles import promote as job
 
     output = Output(as_json, quiet)
     told = output.counting(READING)
+
+    def show(result: Result) -> None:
+        output.out.print(f"active: {result['active']}", soft_wrap=True)
+        if kept := result["joints_kept"]:
+            output.out.print(
+                f"joints {', '.join(kept)} are not in this profile, and stay as {result['before']} has them"
+            )
+
     output.run(
         "profile_promote",
         lambda: job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force, told=told),
-        lambda result: output.out.print(f"active: {result['active']}", soft_wrap=True),
+        show,
     )
 
 
@@ -191,6 +202,7 @@ def history(
 
 def _cell(joint: Result | None) -> str:
     """F_0 above the other two: six joints then fit side by side."""
+    joint = rotary_names(joint)
     if joint is None or joint["coulomb_nm"] is None:
         return ""
     distance, temperature = joint["distance_percent"], joint["temperature_c"]

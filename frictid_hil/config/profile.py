@@ -234,7 +234,7 @@ class DriveIdentity(Strict):
     product: str = ""
     rated_torque_nm: Number | None = None
     gear_ratio: Number | None = None
-    settings: Figures = Field(default_factory=dict)
+    settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class Gate(Strict):
@@ -311,6 +311,7 @@ class JointProfile(Strict):
         drive: that measured.
         quality: figures of quality by name.
         gates: questions and answers.
+        identified_utc: when, where that is not when the profile was made: joints taken over from an older profile.
     """
 
     method: str
@@ -341,6 +342,7 @@ class JointProfile(Strict):
     drive: DriveIdentity = DriveIdentity()
     quality: Figures = Field(default_factory=dict)
     gates: Annotated[tuple[Gate, ...], BeforeValidator(_gates)] = ()
+    identified_utc: str = ""
 
     @model_validator(mode="before")
     @classmethod
@@ -452,6 +454,25 @@ class FrictionProfile(Strict):
                 next_step=f"calibrate it: `frictid-hil calibrate --joint {name}`",
             )
         return self.joints[name]
+
+    def identified_utc(self, name: str) -> str:
+        """When a joint was identified."""
+        return self.joint(name).identified_utc or self.provenance.created_utc
+
+    def completed_by(self, older: FrictionProfile) -> FrictionProfile:
+        """With the joints of an older profile of the same robot that this one lacks; itself where it lacks none."""
+        taken = {
+            name: joint.model_copy(update={"identified_utc": older.identified_utc(name)})
+            for name, joint in older.joints.items()
+            if name not in self.joints
+        }
+        if older.robot != self.robot or not taken:
+            return self
+        order = [*older.joints, *(name for name in self.joints if name not in older.joints)]
+        joints = {name: taken[name] if name in taken else self.joints[name] for name in order}
+        note = f"joints {', '.join(taken)} as in the profile of {older.provenance.created_utc}"
+        provenance = self.provenance.model_copy(update={"notes": [*self.provenance.notes, note]})
+        return FrictionProfile(robot=self.robot, joints=joints, provenance=provenance)
 
     def values(self) -> dict[str, Any]:
         """As the file holds it, in its order."""

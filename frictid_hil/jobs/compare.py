@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance
+from frictid_hil.plan.linear_axis import linear_names
+from frictid_hil.profiles.drift import differences
 from frictid_hil.simulation.steady import true_curve_nm
 
 _TRUTH_POINTS = 4000
@@ -37,13 +40,17 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
         )
     profile = load_profile(profile_file(profile_path))
     if truth is not None:
-        references = _true_curves(load_robot(truth), profile)
+        robot = load_robot(truth)
+        references = _true_curves(robot, profile)
         named = f"truth of {truth}"
+        other_robot = robot.name != profile.robot
+        warnings = [f"they are of different robots: {profile.robot} and {robot.name}"] if other_robot else []
     else:
         assert other_path is not None  # by the check above
         other = load_profile(profile_file(other_path))
         references = {name: joint.curve() for name, joint in other.joints.items()}
         named = str(profile_file(other_path).resolve())
+        warnings = differences(other, profile)
     common = [name for name in profile.joints if name in references]
     if not common:
         raise ProfileMismatch(
@@ -54,16 +61,13 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
     for name in common:
         velocity = _upper_velocity(profile.joints[name])
         distance = curve_distance(profile.joints[name].curve(), references[name], velocity)
-        joints[name] = {
-            "e_nm": distance.e_nm,
-            "e_percent": distance.e_percent,
-            "e_percent_measured_range": distance.e_percent_measured_range,
-            "velocity_rad_s": velocity,
-        }
+        figures = asdict(distance) | {"velocity_rad_s": velocity}
+        joints[name] = linear_names(figures) if profile.joints[name].prismatic else figures
     return {
         "outcome": "ok",
         "profile": str(profile_file(profile_path).resolve()),
         "reference": named,
+        "warnings": warnings,
         "joints": joints,
         "not_compared": [name for name in profile.joints if name not in common],
     }

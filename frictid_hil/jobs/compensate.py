@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from frictid_hil.config.profile import load_profile, profile_file
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
@@ -20,6 +19,7 @@ from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of
 from frictid_hil.jobs.compensation.result import Asked, CompensationResult, Progress, result_of
 from frictid_hil.jobs.compensation.wanted import MODES, Wanted
 from frictid_hil.jobs.plans import expected_of
+from frictid_hil.jobs.profiles import named_profile
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.limits import refuse_beyond_limits
@@ -39,7 +39,8 @@ class CompensateOptions:
 
     Attributes:
         robot: robot file, by path or name.
-        profile: file, or a run folder that holds one.
+        profile: file, a run folder that holds one, or an id of the store; ``active`` is the one in force there.
+        store: folder of the profile store; None for the user's own.
         joint: name.
         wanted: task, modes, setting and the rest of what is to be run.
         bus: ``interface:channel``.
@@ -49,13 +50,14 @@ class CompensateOptions:
     """
 
     robot: str
-    profile: Path
+    profile: Path | str
     joint: str
     wanted: Wanted
     bus: str | None = None
     realtime: bool = False
     seed: int = 0
     out: Path | None = None
+    store: Path | None = None
 
 
 def plan_compensation(options: CompensateOptions) -> Asked:
@@ -69,8 +71,7 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     simulated = robot.kind(options.bus).simulated
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     joint = setup.joint(options.joint)
-    profile_path = profile_file(options.profile)
-    profile = load_profile(profile_path)
+    profile, profile_path = named_profile(str(options.profile), robot.name, options.store)
     wanted = options.wanted.completed(simulated=simulated)
     doubts = doubts_of_file(profile, joint, robot.name, robot.policy)
     if not wanted.force:

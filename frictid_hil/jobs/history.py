@@ -44,7 +44,7 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
                 "active": active is not None and stored.id == active.id,
                 "joints": {
                     name: {
-                        "coulomb_nm": joint.coulomb_nm,
+                        "coulomb_n" if joint.prismatic else "coulomb_nm": joint.coulomb_nm,
                         "temperature_c": joint.temperature_c,
                         "distance_percent": joint.distance_percent,
                         "gates_failed": list(joint.gates_failed),

@@ -8,9 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import FrictionProfile, load_profile, profile_file
-from frictid_hil.errors import GateFailed, ProfileMismatch
-from frictid_hil.profiles.drift import drift
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile, profile_file
+from frictid_hil.errors import GateFailed, ProfileMismatch, UsageError
+from frictid_hil.plan.linear_axis import linear_names
+from frictid_hil.profiles.drift import differences, drift
 from frictid_hil.profiles.store import ProfileStore
 
 
@@ -22,9 +23,14 @@ def show(path: Path) -> dict[str, Any]:
         "outcome": "ok",
         "profile": str(place.resolve()),
         "robot": profile.robot,
-        "joints": {name: joint.model_dump(mode="json") for name, joint in profile.joints.items()},
+        "joints": {name: _by_axis(joint, joint.model_dump(mode="json")) for name, joint in profile.joints.items()},
         "provenance": profile.provenance.model_dump(mode="json"),
     }
+
+
+def _by_axis(joint: JointProfile, values: dict[str, Any]) -> dict[str, Any]:
+    """Values under the names of their kind of axis."""
+    return linear_names(values) if joint.prismatic else values
 
 
 def diff(older: str, newer: str, *, robot: str | None = None, store: Path | None = None) -> dict[str, Any]:
@@ -39,17 +45,21 @@ def diff(older: str, newer: str, *, robot: str | None = None, store: Path | None
     Raises:
         ProfileMismatch: no joint in common.
         UsageError: no such profile.
+
+    Returns:
+        ``warnings``: why they may not be comparable (other robots, other procedures).
     """
-    (before, before_name), (after, after_name) = (_named(text, robot, store) for text in (older, newer))
-    joints = {name: asdict(one) for name, one in drift(before, after).items()}
+    (before, before_name), (after, after_name) = (named_profile(text, robot, store) for text in (older, newer))
+    joints = {name: _by_axis(after.joints[name], asdict(one)) for name, one in drift(before, after).items()}
     if not joints:
         raise ProfileMismatch(
-            f"no joint in common: {', '.join(before.joints)} and {', '.join(after.joints)}", where=after_name
+            f"no joint in common: {', '.join(before.joints)} and {', '.join(after.joints)}", where=str(after_name)
         )
     return {
         "outcome": "ok",
-        "older": before_name,
-        "newer": after_name,
+        "older": str(before_name),
+        "newer": str(after_name),
+        "warnings": differences(before, after),
         "joints": joints,
         "only_in_older": [name for name in before.joints if name not in after.joints],
         "only_in_newer": [name for name in after.joints if name not in before.joints],
@@ -66,7 +76,7 @@ def promote(
     force: bool = False,
     told: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Make a profile the active one.
+    """Make a profile the active one; joints that it lacks stay as the active profile has them.
 
     Args:
         named: a file or run folder, which is added to the store; or (with ``robot``) an id of the store.
@@ -81,7 +91,7 @@ def promote(
         GateFailed: a quality gate failed.
         UsageError: no such profile.
     """
-    profile, name = _named(named, robot, store)
+    profile, place = named_profile(named, robot, store)
     bad = {
         joint: [gate.name for gate in one.gates if not gate.passed]
         for joint, one in profile.joints.items()
@@ -91,12 +101,14 @@ def promote(
         failed = "; ".join(f"joint {joint}: {', '.join(gates)}" for joint, gates in bad.items())
         raise GateFailed(
             f"quality gates failed: {failed}",
-            where=name,
+            where=str(place),
             next_step="measure again; or promote with --force, knowing why",
         )
     kept = ProfileStore(store, told)
-    identity = kept.add(profile)
     before = kept.active(profile.robot)
+    active = kept.active_profile(profile.robot)
+    whole = profile if active is None else profile.completed_by(active)
+    identity = kept.add(whole)
     promotion = kept.promote(profile.robot, identity, by=_person(), reason=reason)
     if baseline:
         kept.pin_baseline(profile.robot, identity, by=_person(), reason=reason)
@@ -106,6 +118,7 @@ def promote(
         "active": str(kept.path(profile.robot, promotion.id).resolve()),
         "id": promotion.id,
         "before": before.id if before else None,
+        "joints_kept": [name for name in whole.joints if name not in profile.joints],
         "baseline": kept.baseline(profile.robot),
     }
 
@@ -128,17 +141,33 @@ def rollback(robot: str, *, store: Path | None = None, reason: str = "") -> dict
     }
 
 
-def _named(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, str]:
-    """The profile a person means, and where it is; a file goes before an id of the store."""
+def named_profile(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, Path]:
+    """The profile a person means, and where it is; a file goes before an id of the store.
+
+    Args:
+        text: a file, a run folder, or (with ``robot``) an id of the store, ``active`` or ``baseline``.
+        robot: name.
+        store: folder of the store; None for the user's own.
+
+    Raises:
+        UsageError: no such profile; nothing is active yet.
+    """
     path = Path(text)
-    if robot is None or path.exists():
+    if robot is None or path.exists() or path.suffix:
         place = profile_file(path)
-        return load_profile(place), str(place.resolve())
+        return load_profile(place), place.resolve()
     kept = ProfileStore(store)
-    active, baseline = kept.active(robot), kept.baseline(robot)
-    special = {"active": active.id if active else None, "baseline": baseline}
-    identity = special.get(text) or text
-    return kept.load(robot, identity), str(kept.path(robot, identity).resolve())
+    identity: str | None = text
+    if text in ("active", "baseline"):
+        active = kept.active(robot)
+        identity = kept.baseline(robot) if text == "baseline" else active.id if active else None
+    if identity is None:
+        raise UsageError(
+            f"no profile of {robot} is active yet",
+            where=str(kept.root),
+            next_step="`frictid-hil calibrate`, then `frictid-hil profile promote RUN`; or name a profile",
+        )
+    return kept.load(robot, identity), kept.path(robot, identity).resolve()
 
 
 def _person() -> str:

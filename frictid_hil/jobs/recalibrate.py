@@ -31,6 +31,7 @@ from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, I
 from frictid_hil.jobs.calibrate import Calibrated, CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
 from frictid_hil.jobs.watch import Watcher
+from frictid_hil.plan.linear_axis import rotary_name
 from frictid_hil.profiles.judgement import Verdict, judge
 from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
@@ -204,7 +205,7 @@ def _promote_by_hand(run: str, store: Path | None) -> str:
 def _short(joint: dict[str, Any]) -> dict[str, Any]:
     """What fits on a line of a journal."""
     kept = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
-    return {key: joint[key] for key in kept if key in joint}
+    return {key: value for key, value in joint.items() if rotary_name(key) in kept}
 
 
 def _write_page(

@@ -5,6 +5,7 @@ Inside the product both kinds use the rotary names (see ``recording.samples``); 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 _LINEAR = {
@@ -28,6 +29,9 @@ _LINEAR = {
     "gravity_cos_nm": "gravity_cos_n",
     "gravity_sin_nm": "gravity_sin_n",
     "bias_nm": "bias_n",
+    "distance_nm": "distance_n",
+    "e_nm": "e_n",
+    "e_measured_nm": "e_measured_n",
     "amplitude_rad": "amplitude_m",
     "period_rad": "period_m",
 }
@@ -46,8 +50,17 @@ def rotary_name(name: str) -> str:
 
 def linear_names(values: Any) -> Any:
     """The same values with every key, at every depth, as on a linear axis."""
+    return _renamed(values, linear_name)
+
+
+def rotary_names(values: Any) -> Any:
+    """The other way."""
+    return _renamed(values, rotary_name)
+
+
+def _renamed(values: Any, name: Callable[[str], str]) -> Any:
     if isinstance(values, dict):
-        return type(values)((linear_name(key), linear_names(value)) for key, value in values.items())
+        return type(values)((name(key), _renamed(value, name)) for key, value in values.items())
     if isinstance(values, list):
-        return [linear_names(value) for value in values]
+        return [_renamed(value, name) for value in values]
     return values

@@ -77,10 +77,30 @@ def _overlap_share(older: JointProfile, newer: JointProfile) -> float | None:
     return float(np.mean((low <= was_high) & (high >= was_low)))
 
 
+def differences(older: FrictionProfile, newer: FrictionProfile) -> list[str]:
+    """Why two profiles may not be comparable at all, in sentences."""
+    found = [f"they are of different robots: {older.robot} and {newer.robot}"] if older.robot != newer.robot else []
+    for name, joint in newer.joints.items():
+        was, now = (_procedure(older.joints[name]) if name in older.joints else "", _procedure(joint))
+        if was and now and was != now:
+            found.append(f"joint {name} was measured by different procedures: {was} and {now}")
+    return found
+
+
+def _procedure(joint: JointProfile) -> str:
+    used, unit = joint.procedure, "m" if joint.prismatic else "rad"
+    if used is None:
+        return ""
+    together = ", together with others" if used.together and len(used.together) > 1 else ""
+    travel = f"A = {used.amplitude_rad:g} {unit}, V = {used.velocity_rad_s:g} {unit}/s"
+    return f"{travel}, N = {used.cycles}, c = {used.ratio:g}{together}"
+
+
 def _circumstances(older: JointProfile, newer: JointProfile) -> dict[str, tuple[object, object]]:
     return {
         "method": (older.method, newer.method),
         "torque_source": (older.torque_source, newer.torque_source),
+        "procedure": (_procedure(older), _procedure(newer)),
         "drive serial": (older.drive.serial, newer.drive.serial),
         "drive firmware": (older.drive.firmware, newer.drive.firmware),
         "gear_ratio": (older.drive.gear_ratio, newer.drive.gear_ratio),

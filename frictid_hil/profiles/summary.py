@@ -22,6 +22,7 @@ class JointSummary:
         temperature_c: during the cycles, None where not measured.
         gates_failed: names of failed quality gates.
         distance_percent: (15) from the baseline's curve, in percent of its mean; None where it has none.
+        prismatic: a linear axis: N instead of N m.
     """
 
     coulomb_nm: float | None
@@ -30,6 +31,7 @@ class JointSummary:
     temperature_c: float | None
     gates_failed: Sequence[str]
     distance_percent: float | None
+    prismatic: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +91,7 @@ def summary(identity: str, profile: FrictionProfile, reference: Reference) -> St
             temperature_c=joint.temperature_c,
             gates_failed=[gate.name for gate in joint.gates if not gate.passed],
             distance_percent=_distance_percent(reference, name, joint.curve()),
+            prismatic=joint.prismatic,
         )
         for name, joint in profile.joints.items()
     }

@@ -30,10 +30,12 @@ def doubts_of_file(profile: FrictionProfile, joint: JointSetup, robot: str, poli
     doubts = []
     if profile.robot != robot:
         doubts.append(f"the profile is of robot {profile.robot!r}, this is {robot!r}")
-    created = datetime.strptime(profile.provenance.created_utc, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
+    created = datetime.strptime(profile.identified_utc(joint.name), "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)
     age_days = (datetime.now(UTC) - created).total_seconds() / 86400.0
     if age_days > policy.max_age_days:
-        doubts.append(f"the profile is {age_days:.0f} days old, policy.max_age_days is {policy.max_age_days:g}")
+        doubts.append(
+            f"the profile of this joint is {age_days:.0f} days old, policy.max_age_days is {policy.max_age_days:g}"
+        )
     if age_days < -1.0:
         doubts.append(f"the profile is dated {profile.provenance.created_utc}, in the future")
     failed = [gate.name for gate in entry.gates if not gate.passed]

@@ -28,6 +28,7 @@ from frictid_hil.jobs.identification.companions import with_companions
 from frictid_hil.jobs.identification.declared import declared_skew
 from frictid_hil.jobs.identification.path_time import gaps_ns, path_time
 from frictid_hil.jobs.identification.skew_stretch import wanted_note, with_shaking
+from frictid_hil.plan.linear_axis import linear_names
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.recording.samples import Mark, Samples
 
@@ -87,9 +88,9 @@ def procedure_of(mark: Mark) -> Procedure:
 
 
 def joint_result(profile: JointProfile) -> dict[str, Any]:
-    """A joint's entry in the JSON of ``calibrate`` and ``identify``."""
+    """A joint's entry in the JSON of ``calibrate`` and ``identify``, by the names of its kind of axis."""
     failed = [gate for gate in profile.gates if not gate.passed]
-    return {
+    result = {
         "outcome": "gate_failed" if failed else "ok",
         "method": profile.method,
         "velocity_rad_s": list(profile.velocity_rad_s),
@@ -104,6 +105,7 @@ def joint_result(profile: JointProfile) -> dict[str, Any]:
         "remarks": [gate.message for gate in failed],
         "notes": list(profile.quality.get("notes", ())),
     }
+    return linear_names(result) if profile.prismatic else result
 
 
 def _from_cycles(
