@@ -12,7 +12,6 @@ joints; what became of the broken night; and the CPU time of it all. Another see
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.profiles.store import ProfileStore
 
 DRIFTING, BROKEN, BROKEN_NIGHT = "2", "4", 40
 DRIFT, WANDER, THRESHOLD_PERCENT = 0.15, 0.01, 10.0
@@ -111,11 +111,9 @@ def robot_file(place: Path, factors: dict[str, float], seed: int) -> str:
 
 
 def active(place: Path) -> str | None:
-    journal = place / "store" / "nights" / "promotions.jsonl"
-    if not journal.exists():
-        return None
-    last = json.loads(journal.read_text().splitlines()[-1])["id"]
-    return str((place / "store" / "nights" / "profiles" / f"{last}.yaml").resolve())
+    store = ProfileStore(place / "store")
+    last = store.active("nights")
+    return None if last is None else str(store.path("nights", last.id).resolve())
 
 
 def dated(night: int) -> AbstractContextManager[object]:

@@ -10,6 +10,7 @@ UsageError          2     refused      arguments, configuration, or an unusable 
 HardwareError       3     aborted      hardware unreachable or held by another process
 SafetyAbort         4     aborted      motion was stopped because something unexpected happened
 GateFailed          5     gate_failed  measured, but not good enough to be promoted
+(recalibrate)       6     ok           done, but a joint has drifted; only where ``policy.on_drift`` is ``alarm``
 Interrupted         130   interrupted  a person or the system asked to stop
 ==================  ====  ===========  ==========================================================
 """

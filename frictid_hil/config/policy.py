@@ -68,6 +68,7 @@ class Policy(Strict):
         drift_percent: a joint further than this from the reference has drifted; reported, not refused.
         drift_reference: ``baseline`` (the first profile promoted, or the one pinned since) sees slow drift that
             night-by-night comparison with the ``active`` profile would not.
+        on_drift: ``report`` leaves a night on which a joint drifted at exit code 0; ``alarm`` ends it with 6.
         refuse_percent: a joint further than this from the active profile is taken as broken: nothing is promoted.
         promotion: ``automatic`` within these limits, or only ``by_person``.
         max_age_days: an older profile is not used for compensation unless forced.
@@ -78,6 +79,7 @@ class Policy(Strict):
 
     drift_percent: float = Field(default=10.0, gt=0)
     drift_reference: Literal["baseline", "active"] = "baseline"
+    on_drift: Literal["report", "alarm"] = "report"
     refuse_percent: float = Field(default=30.0, gt=0)
     promotion: Literal["automatic", "by_person"] = "automatic"
     max_age_days: float = Field(default=180.0, gt=0)

@@ -30,7 +30,7 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.protocol.driver import planned_quantum_s
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.events import JointRun
+from frictid_hil.runner.events import JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runs.folder import kept_joints, manifest_of
 from frictid_hil.runs.life import Ended, Order, Run
@@ -238,7 +238,9 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
         measured = _Measured(planned, run, watcher)
         error = None
         if planned.plan.joints:
-            error = run.move(planned.plan, each=measured.identify, care=Care(interlock=planned.options.interlock))
+            interlock = planned.options.interlock
+            asked = _refuse_without_watchdog if interlock else _nothing
+            error = run.move(planned.plan, each=measured.identify, asked=asked, care=Care(interlock=interlock))
         else:
             run.reopen()
         return measured.concluded(error)
@@ -310,7 +312,6 @@ class _Measured:
 
     def _provenance(self) -> Provenance:
         order, setup, folder = self._planned.order, self._planned.setup, self._run.folder
-        temperatures = {name: joint.temperature_c for name, joint in self._profiles.items()}
         return Provenance(
             created_utc=utc_now(),
             git_revision=git_revision(),
@@ -323,11 +324,28 @@ class _Measured:
             seed=setup.seed if order.simulated else None,
             run=str(folder.path.resolve()),
             log_sha256=folder.log_digests(),
-            temperatures_c={f"joint {name}": value for name, value in temperatures.items() if value is not None},
         )
 
 
 _NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
+
+
+def _nothing(_: Preflight) -> None:
+    pass
+
+
+def _refuse_without_watchdog(preflight: Preflight) -> None:
+    """With nobody there, a drive must stop by itself where this computer does not.
+
+    Raises:
+        UsageError: these drives do not.
+    """
+    if not preflight.capabilities.drive_watchdog:
+        raise UsageError(
+            "these drives have no watchdog of their own; they would go on if this computer died with nobody there",
+            cause="no heartbeat consumer (1016), or it is switched off",
+            next_step="use drives with a watchdog, or run `frictid-hil calibrate` with a person present",
+        )
 
 
 def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:

@@ -40,6 +40,9 @@ from frictid_hil.report.recalibration import recalibration_page
 from frictid_hil.runner.interlock import Interlock
 
 VERB = "recalibrate"
+DRIFTED = 6
+"""Exit code of a good night on which a joint drifted, where the policy wants an alarm for that."""
+
 _UNTOLD = "see the run folder and `frictid-hil check`, then start it again with a person present"
 """What to do next where nothing better is known: whoever reads it in the morning is never left without."""
 
@@ -175,6 +178,8 @@ def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, m
         if measured.ended.outcome in ("ok", "gate_failed"):
             result["stored"] = identity = store.add(newer)
             _apply(verdict, result, store, robot.name, identity, options.by)
+            if verdict.drifted and not result["exit_code"] and robot.policy.on_drift == "alarm":
+                result["exit_code"] = DRIFTED
         _write_page(result, robot, store, newer, active, baseline)
     current = store.active(robot.name)
     result["active"] = str(store.path(robot.name, current.id).resolve()) if current else None

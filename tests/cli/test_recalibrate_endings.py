@@ -18,6 +18,7 @@ import filelock
 import pytest
 from typer.testing import CliRunner
 
+from frictid_drivers.cia402.fleet import Fleet
 from frictid_drivers.virtual.channel import runtime_folder
 from frictid_hil.cli.app import app
 from frictid_hil.config.robot import load_robot
@@ -85,6 +86,13 @@ def another_drive_in_force(place: Path) -> Iterator[None]:
     yield
 
 
+@contextmanager
+def no_watchdog(_: Path) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Fleet, "watchdog", False)
+        yield
+
+
 def nothing_special(_: Path) -> AbstractContextManager[None]:
     return nullcontext()
 
@@ -118,9 +126,15 @@ def fault(kind: str, at_s: float) -> dict[str, Any]:
 
 ALLOWED = {"unattended": UNATTENDED}
 NO_CAN = ("--bus", "socketcan:no0")
+ALARM = {"friction": 1.15, "on_drift": "alarm"}
 ENDINGS = {
     "within the policy": Ending(0, "ok", "within every limit", "nothing to do"),
     "left to a person": Ending(0, "ok", "to a person", "profile promote", {"promotion": "by_person"}),
+    "drifted": Ending(0, "ok", "has drifted", "look at joint 5:", {"friction": 1.15}),
+    "drifted, with an alarm": Ending(
+        6, "ok", "has drifted", "look at joint 5:", {"friction": 1.15, "on_drift": "alarm"}
+    ),
+    "no watchdog": Ending(2, "refused", "no watchdog of their own", "person present", ALLOWED, meanwhile=no_watchdog),
     "no permission": Ending(2, "refused", "unattended", "add policy.unattended", more=NO_CAN),
     "not reachable": Ending(3, "aborted", "cannot open the bus", "ip link set no0 up", ALLOWED, NO_CAN),
     "bus held": Ending(3, "aborted", "in use", "wait for it", meanwhile=bus_held),
@@ -152,7 +166,7 @@ def test_every_ending(name: str, first_night: Path, tmp_path: Path) -> None:
     assert wanted.says in told["what"] and told["next_step"] and wanted.next_step in told["next_step"], told
     last = store.attempts(ROBOT)[-1]
     assert (last.exit_code, last.outcome, last.next_step) == (wanted.code, wanted.outcome, told["next_step"])
-    assert last.promoted is (name == "within the policy")
+    assert last.promoted is (name in ("within the policy", "drifted", "drifted, with an alarm"))
     assert store.active_profile(ROBOT) is not None
     assert (store.active(ROBOT) != before) is last.promoted
 

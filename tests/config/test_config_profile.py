@@ -141,8 +141,8 @@ def test_any_profile_survives_the_file(
         kept = loaded.joints[name]
         assert (kept.curve(), kept.coulomb_nm, kept.temperature_c) == (one.curve(), one.coulomb_nm, one.temperature_c)
         assert (kept.method, kept.torque_source, kept.drive) == (one.method, one.torque_source, one.drive)
-        assert [(g.name, g.passed) for g in kept.gates] == [(g.name, g.passed) for g in one.gates]
-        assert [g.message for g in kept.gates if not g.passed] == [g.message for g in one.gates if not g.passed]
+        assert {(g.name, g.passed) for g in kept.gates} == {(g.name, g.passed) for g in one.gates}
+        assert {g.message for g in kept.gates if not g.passed} == {g.message for g in one.gates if not g.passed}
 
 
 def test_arrays_of_the_mathematics_are_taken_as_they_are() -> None:
