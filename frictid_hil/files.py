@@ -41,6 +41,25 @@ def refuse_overwriting(paths: Iterable[Path], *, force: bool = False) -> None:
         )
 
 
+def made_folders(path: Path) -> list[Path]:
+    """Make a folder where there is none, see that it takes files, and tell which folders were made.
+
+    Raises:
+        FrictidError: no permission, no space, or a file is in the way; what was made is gone again.
+    """
+    made: list[Path] = []
+    try:
+        for folder in reversed([folder for folder in (path, *path.parents) if not folder.exists()]):
+            folder.mkdir(exist_ok=True)
+            made.append(folder)
+        with tempfile.TemporaryFile(dir=path):
+            return made
+    except OSError as error:
+        for folder in reversed(made):
+            folder.rmdir()
+        raise FrictidError(f"cannot be written to: {error.strerror}", where=str(path)) from error
+
+
 def write_whole(path: Path, text: str | bytes) -> None:
     """Write a file so that every reader, at any moment and after any crash, sees the old content or the new, whole.
 

@@ -13,6 +13,7 @@ from frictid_hil.cli.options import (
     BusOption,
     CyclesOption,
     DryRunOption,
+    ForceOption,
     JointOption,
     JsonOption,
     LiveAtOption,
@@ -24,6 +25,7 @@ from frictid_hil.cli.options import (
     QuietOption,
     RatioOption,
     RealtimeOption,
+    ResumeOption,
     RobotOption,
     SeedOption,
     VelocityOption,
@@ -69,7 +71,7 @@ def check(
 
 
 def calibrate(
-    robot: RobotOption,
+    robot: RobotOption = "",
     joint: JointOption = None,
     amplitude: AmplitudeOption = None,
     velocity: VelocityOption = None,
@@ -77,14 +79,14 @@ def calibrate(
     ratio: RatioOption = None,
     method: MethodOption = None,
     program: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--program",
             metavar="PROGRAM",
             autocompletion=one_of("thorough", "standard", "quick"),
-            help="thorough (N speeds, aligned), standard (3 speeds), quick (2): least squares.",
+            help="thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
         ),
-    ] = "thorough",
+    ] = None,
     together: Annotated[
         bool,
         typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
@@ -106,10 +108,7 @@ def calibrate(
     dry_run: DryRunOption = False,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
-    resume: Annotated[
-        Path | None,
-        typer.Option("--resume", metavar="RUN", help="Continue this run folder with the joints it still lacks."),
-    ] = None,
+    resume: ResumeOption = None,
     live: LiveOption = False,
     live_at: LiveAtOption = None,
     out: OutOption = None,
@@ -135,11 +134,11 @@ def calibrate(
         ratio=ratio,
         method=method,
         program=program,
-        together=together,
+        together=together or None,
         measure_skew=measure_skew,
         rate_hz=rate,
-        realtime=realtime,
-        seed=seed,
+        realtime=realtime or None,
+        seed=seed or None,
         resume=resume,
         out=out,
     )
@@ -184,6 +183,7 @@ def identify(
         typer.Option("--executor", metavar="WHERE", help="processes:N, or dask://host:port, for many recordings."),
     ] = None,
     out: OutOption = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -204,6 +204,7 @@ def identify(
         columns=columns,
         executor=executor,
         out=out,
+        force=force,
     )
     output.run("identify", lambda: job(options, note=output.err.print), lambda result: print_joints(output, result))
 

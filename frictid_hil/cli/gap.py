@@ -10,14 +10,17 @@ from rich.table import Table
 
 from frictid_hil.cli.options import (
     BusOption,
+    ForceOption,
     JsonOption,
     QuietOption,
     RealtimeOption,
+    ResumeOption,
     RobotOption,
     SeedOption,
     YesOption,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.errors import UsageError
 
 app = typer.Typer(
     help="Where the simulator differs from the machine, why, and how far it closes.", no_args_is_help=True
@@ -36,7 +39,6 @@ ColumnsOption = Annotated[
 JointNameOption = Annotated[
     str | None, typer.Option("--joint", "-j", metavar="JOINT", help="The joint, where logs or profile hold several.")
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
 
 
 @app.command("diagnose")
@@ -152,8 +154,8 @@ def check(
 
 @app.command("record")
 def record(
-    robot: RobotOption,
-    joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")],
+    robot: RobotOption = "",
+    joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")] = "",
     bus: BusOption = None,
     short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
     plan: Annotated[
@@ -172,6 +174,11 @@ def record(
     ] = None,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
+    resume: ResumeOption = None,
+    recorded: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="RUN", help="Make a set of what this run has recorded; nothing moves."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
     yes: YesOption = False,
     as_json: JsonOption = False,
@@ -195,11 +202,14 @@ def record(
         realtime=realtime,
         seed=seed,
         out=out,
+        resume=resume or recorded,
     )
 
     def run() -> Told:
+        if resume is not None and recorded is not None:
+            raise UsageError("--resume moves the joint and --from does not; give one")
         try:
-            return job(options, watcher)
+            return job(options, watcher, move=recorded is None)
         finally:
             watcher.close()
 

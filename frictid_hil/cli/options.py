@@ -45,6 +45,11 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, e
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
 OutOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to write to.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
+ResumeOption = Annotated[
+    Path | None,
+    typer.Option("--resume", metavar="RUN", help="Go on with this run: its robot and options, what it still lacks."),
+]
 NotifyOption = Annotated[
     str | None,
     typer.Option(

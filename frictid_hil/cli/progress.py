@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import signal
 import sys
+import termios
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 
 import typer
 from rich.console import Console
@@ -13,7 +16,7 @@ from rich.table import Table
 
 from frictid_hil.cli.joint_view import JointView
 from frictid_hil.cli.output import Output
-from frictid_hil.errors import UsageError
+from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.live import DEFAULT_ADDRESS
 from frictid_hil.jobs.live import live as live_watcher
 from frictid_hil.jobs.watch import Watcher
@@ -22,32 +25,73 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Severity
 from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import Rows
-from frictid_hil.units import degrees, format_angle, format_duration, format_torque, format_velocity
+from frictid_hil.units import degrees, format_duration
 
 
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
-    """Joint order, travel, peaks, locked joints and duration, as a technician reads them."""
+    """Whether it is real, joint order, travel, peaks, limits, locked joints, duration, as a technician reads them."""
     how = ", all joints together" if plan.together else ""
+    console.print(f"[bold]{_which(setup)}[/]", soft_wrap=True)
     table = Table(title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}")
-    for heading in ("joint", "travel", "peak speed", "predicted torque", "limit", "time", "others locked at"):
-        table.add_column(heading)
-    for joint in plan.joints:
-        low, high = joint.travel_rad
-        limit = setup.joint(joint.joint).max_torque_nm
-        predicted = format_torque(joint.predicted_torque_nm) if joint.predicted_torque_nm else "unknown"
-        locked = " ".join(f"{name}:{degrees(at):.0f}" for name, at in joint.locked.items())
+    table.add_column("joint")
+    for heading in (
+        "travel (limits), deg",
+        "speed of limit, deg/s",
+        "torque of limit, N m",
+        "time",
+        "others locked, deg",
+    ):
+        table.add_column(heading, overflow="fold")
+    for entry in plan.joints:
+        joint = setup.joint(entry.joint)
+        locked = " ".join(f"{name}:{degrees(at):.0f}" for name, at in entry.locked.items())
+        predicted = f"{entry.predicted_torque_nm:.1f}" if entry.predicted_torque_nm else "unknown"
+        limits = _range_deg(joint.position_min_rad, joint.position_max_rad)
         table.add_row(
-            joint.joint,
-            f"{degrees(low):.1f} .. {degrees(high):.1f} deg",
-            format_velocity(joint.peak_velocity_rad_s),
-            predicted,
-            format_torque(limit),
-            format_duration(joint.duration_s),
-            f"{locked} deg" if locked else "none: all move",
+            entry.joint,
+            f"{_range_deg(*entry.travel_rad)} ({limits})",
+            f"{degrees(entry.peak_velocity_rad_s):.1f} of {degrees(joint.max_velocity_rad_s):.0f}",
+            f"{predicted} of {joint.max_torque_nm:.1f}",
+            format_duration(entry.duration_s),
+            locked or "none: all move",
         )
     console.print(table)
     for note in plan.notes:
         console.print(f"note: {note}")
+
+
+def _which(setup: RobotSetup) -> str:
+    """In capitals, because a person must not miss it."""
+    if setup.simulated:
+        return f"SIMULATED: no real robot moves (bus {setup.bus})"
+    return f"REAL: the robot on {setup.bus} moves"
+
+
+def _range_deg(low_rad: float, high_rad: float) -> str:
+    return f"{degrees(low_rad):.4g} .. {degrees(high_rad):.4g}"
+
+
+def answer(question: str) -> bool:
+    """A person's yes or no, typed after the question was shown: what was typed before answers nothing.
+
+    Raises:
+        Interrupted: Ctrl-C, Ctrl-D or SIGTERM; while asking, these mean what they say to every other program.
+    """
+
+    def stop(_signal: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM) if ours}
+    try:
+        with contextlib.suppress(termios.error, OSError, ValueError):  # no terminal
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        return typer.confirm(question, err=True)
+    except (typer.Abort, KeyboardInterrupt):
+        raise Interrupted("interrupted at the question; nothing moves", next_step="start again") from None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class TerminalWatcher:
@@ -62,6 +106,7 @@ class TerminalWatcher:
         self._console = output.err
         self._silent = output.as_json or output.quiet
         self._yes = yes
+        self._which = ""
         self._view: JointView | None = None
         self._period_s = math.inf
         self._make_view: Callable[[], JointView] | None = None
@@ -78,6 +123,7 @@ class TerminalWatcher:
                 "motion needs a yes, and there is no terminal to ask on",
                 next_step="add --yes once the plan is right (see --dry-run)",
             )
+        self._which = _which(setup)
         self._period_s = 1.0 / plan.cycle_hz
         members = {stretch_name(stretch): [entry.joint for entry in stretch] for stretch in plan.stretches}
         planned = {stretch_name(stretch): max(entry.duration_s for entry in stretch) for stretch in plan.stretches}
@@ -96,14 +142,14 @@ class TerminalWatcher:
             return True
         joints = stretch_name(plan.joints)
         how = "ALL AT ONCE" if plan.together else "one at a time, all others locked"
-        return typer.confirm(f"{plan.robot}: joints {joints} will move, {how}. Is the cell clear?", err=True)
+        return answer(f"{self._which}. {plan.robot}: joints {joints} will move, {how}. Is the cell clear?")
 
     def ask(self, question: str) -> bool:
         """Ask; with ``--yes``, or without a terminal, nobody is there to have done anything."""
         if self._yes or not sys.stdin.isatty():
             return False
         self.close()
-        return typer.confirm(question, err=True)
+        return answer(question)
 
     def event(self, event: Event) -> None:
         """Follow the phases."""
@@ -180,7 +226,7 @@ class TerminalWatcher:
             self._view.done(event.joint, event.late_cycles + event.missed_cycles)
 
 
-@contextmanager
+@contextlib.contextmanager
 def watching(output: Output, *, yes: bool, live: bool, live_at: str | None) -> Iterator[Watcher]:
     """The terminal's watcher while a job lasts, which streams as well where ``--live`` or ``--live-at`` asks for it."""
     watcher = TerminalWatcher(output, yes=yes)
@@ -189,6 +235,3 @@ def watching(output: Output, *, yes: bool, live: bool, live_at: str | None) -> I
             yield streamed
     finally:
         watcher.close()
-
-
-__all__ = ["TerminalWatcher", "format_angle", "print_plan", "watching"]

@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from frictid_hil.config.schema import Pair, Strict, Triple, in_si, schema_versio
 from frictid_hil.config.search import find
 from frictid_hil.config.yaml import Document, KeyPath, merge, read
 from frictid_hil.errors import ConfigError, FieldProblem, UsageError
+from frictid_hil.files import PLAIN_NAME
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.kinematics import DhRow
 from frictid_hil.plan.setup import JointSetup, RobotSetup
@@ -345,6 +347,7 @@ class Robot:
             realtime=realtime,
             seed=seed,
             simulated_arm=self.file.simulated_arm,
+            simulated=self.kind(bus).simulated,
             workspace=_workspace(self.file),
             care=self.file.care.model_dump(exclude_none=True),
             folder=self.path.resolve().parent,
@@ -409,6 +412,8 @@ def _contradictions(file: RobotFile) -> list[FieldProblem]:
     taken: dict[tuple[str, int], str] = {}
     for name, joint in file.joints.items():
         at = ("joints", name)
+        if re.fullmatch(PLAIN_NAME, name) is None:
+            problems.append(FieldProblem(at, "a joint's name becomes a file's: letters, digits, '_', '-', '.', spaces"))
         low, high = joint.position_min_rad, joint.position_max_rad
         if low >= high:
             problems.append(FieldProblem((*at, "position_max_rad"), f"must be above position_min_rad = {low}"))

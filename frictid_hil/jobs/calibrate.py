@@ -20,7 +20,7 @@ from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
 from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.identification.programmes import Programme, programme
 from frictid_hil.jobs.identification.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
-from frictid_hil.jobs.plans import calibration_plan, expected_of, rehearsal_note
+from frictid_hil.jobs.plans import calibration_plan, expected_of, inherited_notes, rehearsal_note
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
@@ -192,7 +192,7 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     notes = [chosen.note(procedure) for procedure in first]
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in first]
-    notes += _notes(procedures, expected, rehearse)
+    notes += [*_notes(procedures, expected, rehearse), *inherited_notes(robot, list(procedures))]
     if together:
         notes += _together_notes(setup)
     if measure_skew:
@@ -320,8 +320,8 @@ class _Measured:
             driver=order.driver,
             bus=setup.bus,
             settings={"cycle_hz": setup.cycle_hz, "together": self._planned.plan.together, **dict(setup.options)},
-            realtime=setup.realtime or not order.simulated,
-            seed=setup.seed if order.simulated else None,
+            realtime=setup.realtime or not order.setup.simulated,
+            seed=setup.seed if order.setup.simulated else None,
             run=str(folder.path.resolve()),
             log_sha256=folder.log_digests(),
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
-from frictid_hil.files import write_whole
+from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -83,7 +83,7 @@ def draft(source: Source, out: Path, *, force: bool = False) -> dict[str, Any]:
     Returns:
         The JSON of the verb.
     """
-    _must_be_new(out, force)
+    refuse_overwriting([out], force=force)
     document = drafted(source.load())
     write_whole(out, dump(document))
     return {"outcome": "ok", "nominal": str(out.resolve()), **document}
@@ -116,8 +116,9 @@ def diagnose(
         The JSON of the verb. Any verdict is a result: where a model was asked for and none is written, ``model`` is
         null and ``model_refused`` says why and what to do.
     """
-    for path in (write_model, mujoco, None if out is None else out / "gap.html"):
-        _must_be_new(path, force)
+    callback = None if mujoco is None else mujoco.with_suffix(".py")
+    outputs = (write_model, mujoco, callback, None if out is None else out / "gap.html")
+    refuse_overwriting([path for path in outputs if path is not None], force=force)
     experiments = (Source((source,)) if isinstance(source, Path) else source).load()
     found = find_causes(experiments)
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
@@ -144,11 +145,6 @@ def diagnose(
         page = gap_page(found, _side_by_side(experiments, found), missing_torque(experiments))
         result["report"] = str(write_page(page, out / "gap.html").resolve())
     return result
-
-
-def _must_be_new(path: Path | None, force: bool) -> None:
-    if path is not None and path.exists() and not force:
-        raise UsageError("is there already", where=str(path), next_step="name another file, or add --force")
 
 
 def _side_by_side(experiments: ExperimentSet, found: Diagnosis) -> tuple[SideBySide, ...]:

@@ -394,15 +394,17 @@ class _Recording:
         if not plans:
             self._run.reopen()
         for plan in [_joined(plans)] if plans and self._in_lock_step() else plans:
-            if not self._ready_for(plan):
-                break
             try:
+                if not self._ready_for(plan):
+                    break
                 error = self._run.move(plan, each=self._keep, asked=self._mount, prepare=self._remember)
-            except PlanRefused as refused:
+            except FrictidError as refused:
                 if not self._session:
                     raise
-                self._unloaded = refused.what
-                break
+                if isinstance(refused, PlanRefused):
+                    self._unloaded = refused.what
+                    break
+                error = refused
             if error is not None:
                 self._keep_whole_experiments()
                 return error
@@ -463,7 +465,7 @@ class _Recording:
         Raises:
             UsageError: there are no others.
         """
-        if self._planned.order.simulated or not self._planned.loaded[self._session]:
+        if self._planned.order.setup.simulated or not self._planned.loaded[self._session]:
             return True
         for note in plan.notes:
             if not self._watcher.ask(f"{note[:1].upper()}{note[1:]}. Is it mounted?"):

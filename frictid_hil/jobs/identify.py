@@ -15,6 +15,7 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, InputFileError, UsageError
+from frictid_hil.files import made_folders, refuse_overwriting
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
@@ -45,6 +46,7 @@ class IdentifyOptions:
         columns: column map of foreign files.
         executor: ``processes:N`` or ``dask://host:port``; None chooses.
         out: folder for profiles.
+        force: write over profiles that are there.
     """
 
     logs: tuple[Path, ...]
@@ -58,6 +60,7 @@ class IdentifyOptions:
     columns: str | None = None
     executor: str | None = None
     out: Path | None = None
+    force: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +95,14 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
     """Identify every joint of every recording.
 
     Raises:
-        UsageError: nothing to read, or options that contradict each other.
+        UsageError: nothing to read, options that contradict each other, or a profile would be overwritten.
         InputFileError: the only recording is unreadable or unusable.
         IdentificationError: the only recording gives no curve.
     """
     logs = recordings(options.logs)
+    if options.out is not None:
+        refuse_overwriting([options.out / name for name in profile_names(logs)], force=options.force)
+        made_folders(options.out)
     tasks = [_task(log, options) for log in logs]
     results: list[_Identified] = []
     with executor(options.executor, len(tasks)) as pool:
@@ -283,7 +289,6 @@ def profile_names(logs: Sequence[Path]) -> list[str]:
 def _write(task: _Task, result: _Identified, path: Path) -> Path | None:
     if not result.joints:
         return None
-    path.parent.mkdir(parents=True, exist_ok=True)
     robot = task.setup.name if task.setup else task.log.stem
     FrictionProfile(
         robot=robot,

@@ -34,6 +34,7 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 APPROACH_RAD_S = math.radians(20.0)
 """Speed of moves between the locked position and the start, and of the rehearsal."""
 
+_LIMITS = ("position_min_rad", "position_max_rad", "max_velocity_rad_s", "max_torque_nm")
 _REVERSAL_TRAVEL_RAD = 6e-3
 _REVERSAL_SPEED_RAD_S = 4e-3
 
@@ -90,6 +91,20 @@ def calibration_motions(
 def rehearsal_note(joints: Sequence[str]) -> str:
     """For the plan of joints whose travel was never seen on this robot."""
     return f"first run of this travel on this robot: joints {', '.join(joints)} rehearse it slowly, torque watched"
+
+
+def inherited_notes(robot: Robot, joints: Sequence[str]) -> list[str]:
+    """Of a robot file that extends another: limits that it does not state itself, so that a person can doubt them."""
+    by_origin: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for name in joints:
+        for origin in {robot.document.place(("joints", name, key)).path for key in _LIMITS} - {robot.path}:
+            keys = tuple(key for key in _LIMITS if robot.document.place(("joints", name, key)).path == origin)
+            by_origin.setdefault((origin.name, keys), []).append(name)
+    return [
+        f"{', '.join(keys)} of joint {', '.join(names)} {'is' if len(keys) == 1 else 'are'} inherited from {origin}; "
+        f"{robot.path.name} does not state {'it' if len(keys) == 1 else 'them'}"
+        for (origin, keys), names in by_origin.items()
+    ]
 
 
 def slow_reversal(start_rad: float, *, repeats: int = 2) -> Corners:

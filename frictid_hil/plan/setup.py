@@ -61,6 +61,7 @@ class RobotSetup:
         realtime: run on the wall clock even where lock-step is possible.
         seed: seed of every simulated noise; ignored by real hardware.
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
+        simulated: nothing real moves; a setup that says nothing of it is taken for a real robot's.
         workspace: the box that the arm may not leave; None where the robot file names none.
         care: bounds of the supervisor that the robot file sets, by name; see ``runner.care.Care``.
         folder: of the robot file; file names in options count from there.
@@ -74,6 +75,7 @@ class RobotSetup:
     realtime: bool = False
     seed: int = 0
     simulated_arm: Mapping[str, Any] = field(default_factory=dict)
+    simulated: bool = False
     workspace: Workspace | None = None
     care: Mapping[str, float] = field(default_factory=dict)
     folder: Path | None = None

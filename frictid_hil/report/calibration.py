@@ -47,7 +47,8 @@ def calibration_page(
     """
     joints = profile.joints
     good = sum(all(gate.passed for gate in joint.gates) for joint in joints.values())
-    headline = f"{good} of {len(joints)} joints of {profile.robot} identified and passed every quality gate."
+    which = "" if not profile.provenance.driver else "SIMULATED: " if profile.provenance.seed is not None else "REAL: "
+    headline = f"{which}{good} of {len(joints)} joints of {profile.robot} identified and passed every quality gate."
     if outcome != "ok":
         headline += f" The run ended as {outcome.replace('_', ' ')}{': ' + error if error else ''}."
     done = (*_what_was_done(profile, samples), _compared_with(previous))

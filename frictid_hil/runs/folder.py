@@ -27,7 +27,6 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -37,8 +36,8 @@ from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.provenance import file_sha256, utc_now
 from frictid_hil.config.robot import Robot
 from frictid_hil.config.write import dump, plain
-from frictid_hil.errors import ConfigError, FrictidError, HardwareBusy, UsageError
-from frictid_hil.files import could_not_write, part_of_path, write_whole
+from frictid_hil.errors import ConfigError, HardwareBusy, UsageError
+from frictid_hil.files import could_not_write, made_folders, part_of_path, write_whole
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, Preflight, Warned
 from frictid_hil.runner.ring import Rows
@@ -144,7 +143,7 @@ class RunFolder:
         Raises:
             FrictidError: it cannot.
         """
-        self._make_folder(path)
+        self._made += made_folders(path)
 
     def begin(self) -> None:
         """From here on something may have moved: whatever happens, nothing is removed any more."""
@@ -216,7 +215,7 @@ class RunFolder:
 
     def _claim(self) -> None:
         """Make the folder, or take one that holds nothing of a run; alone in it from here on."""
-        self._make_folder(self.path)
+        self.claim_output(self.path)
         taken = sorted(path.name for path in self.path.iterdir() if _OURS.fullmatch(path.name))
         if "manifest.json" in taken:
             raise UsageError(
@@ -229,16 +228,6 @@ class RunFolder:
                 next_step="choose another --out",
             )
         self._hold()
-
-    def _make_folder(self, path: Path) -> None:
-        try:
-            for folder in reversed([folder for folder in (path, *path.parents) if not folder.exists()]):
-                folder.mkdir(exist_ok=True)
-                self._made.append(folder)
-            with TemporaryFile(dir=path):
-                pass
-        except OSError as error:
-            raise FrictidError(f"cannot be written to: {error.strerror}", where=str(path)) from error
 
     def _hold(self) -> None:
         self._lock = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)

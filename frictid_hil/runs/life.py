@@ -14,6 +14,7 @@ What a run will not do: choose what moves (the jobs plan), or move it (the runne
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -95,11 +96,6 @@ class Order:
     def driver(self) -> str:
         """Entry-point name of the driver."""
         return self.robot.driver(self.bus)
-
-    @property
-    def simulated(self) -> bool:
-        """Nothing real moves."""
-        return self.robot.kind(self.bus).simulated
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +331,7 @@ class Run:
         """An interrupted run is gone on with by a command that names it."""
         if isinstance(error, Interrupted):
             command = self._order.continued_by
-            error.next_step = f"continue with `{command} {self.folder.path}`" if command else ""
+            error.next_step = f"continue with `{command} {shlex.quote(str(self.folder.path))}`" if command else ""
         return error
 
 

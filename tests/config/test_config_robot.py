@@ -46,6 +46,19 @@ def test_a_robot_file_becomes_a_setup() -> None:
     assert robot.driver() == "virtual"
 
 
+@pytest.mark.parametrize("name", ["../../../evil/x", "left/elbow", ".hidden", "a\\b", "x" * 65, "nul\u0000"])
+def test_a_joint_is_not_named_like_a_path(tmp_path: Path, name: str) -> None:
+    import json
+
+    error = refused(written(tmp_path, ('"0":', f"{json.dumps(name)}:")))
+    assert error.where.startswith("two.yaml:1") and "letters, digits" in error.what
+
+
+@pytest.mark.parametrize("name", ["left_elbow", "J1", "shoulder pan", "wrist-3", "0.5"])
+def test_a_joint_has_a_plain_name(tmp_path: Path, name: str) -> None:
+    assert name in load_robot(written(tmp_path, ('"0":', f'"{name}":'))).joint_names
+
+
 def test_a_joint_may_have_its_own_travel_and_a_person_overrides_both() -> None:
     robot = load_robot(FIXTURE)
     assert robot.procedure("0").amplitude_rad == 0.3490658503988659

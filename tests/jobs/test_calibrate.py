@@ -71,6 +71,16 @@ def test_recorded_samples_identify_to_the_same_profile(joint_5: Path) -> None:
     assert first.content_sha256 == second.content_sha256
 
 
+def test_a_profile_is_written_over_only_where_that_is_asked_for(joint_5: Path, tmp_path: Path) -> None:
+    before = (joint_5 / "profile.yaml").read_bytes()
+    with pytest.raises(UsageError, match="exists already") as told:
+        identify(IdentifyOptions((joint_5,), robot="hp3j.yaml", out=joint_5))
+    assert (joint_5 / "profile.yaml").read_bytes() == before and "--force" in told.value.next_step
+    shutil.copytree(joint_5, tmp_path / "run")
+    identify(IdentifyOptions((joint_5,), robot="hp3j.yaml", out=tmp_path / "run", force=True))
+    assert (tmp_path / "run" / "profile.yaml").read_bytes() != before
+
+
 def test_the_same_seed_gives_the_same_bytes_but_for_provenance(joint_5: Path, tmp_path: Path) -> None:
     run(tmp_path / "second", joints=("5",))
     first = (joint_5 / "profile.yaml").read_text().split("provenance:")[0]
@@ -123,15 +133,18 @@ class StoppedAt(Silent):
 
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """A robot of two joints, and a run of it that was stopped during the second one."""
+    """A robot of three joints, and a run of two of them that was stopped during the second one."""
     place = tmp_path_factory.mktemp("interrupted")
     values = load_robot("hp3j").values()
-    values |= {"name": "two", "bus": "virtual:two", "joints": {name: values["joints"][name] for name in ("4", "5")}}
-    values["procedure"] |= {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3}
+    values |= {"name": "two", "bus": "virtual:two", "joints": {n: values["joints"][n] for n in ("3", "4", "5")}}
     robot = place / "two.yaml"
     robot.write_text(dump(values))
-    result = calibrate(CalibrateOptions(str(robot), out=place / "run"), StoppedAt("5")).to_json()
+    asked = CalibrateOptions(
+        str(robot), joints=("4", "5"), amplitude_rad=0.2, velocity_rad_s=1.5, cycles=3, seed=7, out=place / "run"
+    )
+    result = calibrate(asked, StoppedAt("5")).to_json()
     assert (result["outcome"], result["exit_code"]) == ("interrupted", 130)
+    assert result["error"]["next_step"] == f"continue with `frictid-hil calibrate --resume {place / 'run'}`"
     assert list(result["joints"]) == ["4"] and load_profile(result["profile"]).joints.keys() == {"4"}
     return str(robot), place / "run"
 
@@ -150,6 +163,67 @@ def test_a_run_is_continued_with_the_joints_it_lacks(interrupted: tuple[str, Pat
     profile = load_profile(whole / "profile.yaml")
     assert profile.joints["4"] == before and profile.joints.keys() == {"4", "5"}
     assert [session["joint"] for session in load_manifest(whole)["sessions"]] == ["4", "5"]
+
+
+def test_a_continued_run_needs_its_folder_alone_and_moves_as_it_began(
+    interrupted: tuple[str, Path], tmp_path: Path
+) -> None:
+    robot, run = interrupted
+    whole = tmp_path / "run"
+    shutil.copytree(run, whole)
+    planned = plan_calibration(CalibrateOptions(resume=whole))
+    assert [entry.joint for entry in planned.plan.joints] == ["5"] and planned.setup.seed == 7
+    result = calibrate(CalibrateOptions(resume=whole), Silent())
+    assert list(result.joints) == ["4", "5"] and result.profile is not None
+    used = [joint.procedure for joint in result.profile.joints.values() if joint.procedure is not None]
+    assert {(one.amplitude_rad, one.velocity_rad_s, one.cycles) for one in used} == {(0.2, 1.5, 3)}
+    first, second = (run / "samples.mcap").read_bytes(), (whole / "samples.mcap").read_bytes()
+    assert first == second and (whole / "samples-2.mcap").exists()
+    again = identify(IdentifyOptions((whole,), robot=robot, out=tmp_path / "again"))
+    assert again["joints"].keys() == {"4", "5"} and again["outcome"] == "ok"
+    # Nothing is missing any more: the result is formed anew, and no bus is opened.
+    assert calibrate(CalibrateOptions(resume=whole), Silent()).profile_file == whole / "profile.yaml"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"amplitude_rad": 0.3},
+        {"joints": ("3",)},
+        {"bus": "virtual:elsewhere"},
+        {"together": True},
+        {"program": "quick"},
+        {"seed": 8},
+    ],
+)
+def test_a_run_is_not_continued_otherwise_than_it_began(interrupted: tuple[str, Path], other: dict[str, Any]) -> None:
+    _, run = interrupted
+    (name,) = other
+    with pytest.raises(UsageError, match=f"began otherwise: {name} is .* now and was"):
+        plan_calibration(CalibrateOptions(resume=run, **other))
+
+
+def test_a_run_whose_robot_file_is_gone_is_continued_with_its_own_copy(
+    interrupted: tuple[str, Path], tmp_path: Path
+) -> None:
+    robot, run = interrupted
+    whole = tmp_path / "run"
+    shutil.copytree(run, whole)
+    manifest = load_manifest(whole)
+    (whole / "manifest.json").write_text(json.dumps({**manifest, "robot_file": str(tmp_path / "gone.yaml")}))
+    assert plan_calibration(CalibrateOptions(resume=whole)).robot.path == whole / "config.yaml"
+    (whole / "manifest.json").write_text(json.dumps({**manifest, "verb": "gap-record"}))
+    with pytest.raises(UsageError, match="a run of gap-record"):
+        plan_calibration(CalibrateOptions(robot, resume=whole))
+    for broken in ({"options": 3}, {"options": {"cycles": "many"}}):
+        (whole / "manifest.json").write_text(json.dumps({**manifest, **broken}))
+        with pytest.raises(UsageError, match="its options cannot be read"):
+            plan_calibration(CalibrateOptions(robot, resume=whole))
+
+
+def test_a_calibration_without_a_robot_is_refused() -> None:
+    with pytest.raises(UsageError, match="which robot"):
+        plan_calibration(CalibrateOptions())
 
 
 def test_a_run_of_another_drive_is_not_continued(interrupted: tuple[str, Path], tmp_path: Path) -> None:

@@ -12,14 +12,25 @@ import yaml
 from scipy import signal
 
 from frictid_drivers.virtual import VirtualDriver
+from frictid_hil.config.robot import load_robot
 from frictid_hil.config.search import find
-from frictid_hil.errors import UsageError
+from frictid_hil.errors import FrictidError, Interrupted, UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.gap.experiments import SCHEMA, Envelope, catalogue, chosen, full_set, names_of_plan, plan_document
+from frictid_hil.gap.experiments import (
+    SCHEMA,
+    Envelope,
+    Experiment,
+    catalogue,
+    chosen,
+    full_set,
+    names_of_plan,
+    plan_document,
+)
+from frictid_hil.jobs import gap_record
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
-from frictid_hil.runner.events import Preflight
+from frictid_hil.runner.events import Event, PhaseStarted, Preflight
 
 HP3J = find("hp3j.yaml").resolve()
 NOISE_NM = 0.005 * 11.4
@@ -189,6 +200,72 @@ def test_nothing_is_left_behind_when_the_person_says_no(robot: str, tmp_path: Pa
         record(GapRecordOptions(robot, "0", short=True, out=tmp_path / "set"), Refusing())
     assert not (tmp_path / "set").exists()
     assert not list((tmp_path / "runs").rglob("manifest.json"))
+
+
+class StoppedAt(Silent):
+    """A person who presses Ctrl-C when a phase begins."""
+
+    def __init__(self, phase: str) -> None:
+        self._phase = phase
+
+    def event(self, event: Event) -> None:
+        if isinstance(event, PhaseStarted) and event.phase == self._phase:
+            raise Interrupted("stopped on request")
+
+
+def test_an_interrupted_recording_gives_a_set_and_is_gone_on_with(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    last = "second_posture"
+    plan = plan_file(tmp_path, "breakaway", last)
+    options = GapRecordOptions(robot, "0", plan=plan, seed=3, out=out)
+    motion = catalogue_of(robot)[last].marked_motions[0].name
+    first = record(options, StoppedAt(motion))
+    assert first.ended.outcome == "interrupted" and first.experiments == ("breakaway",)
+    run = first.ended.run
+    assert first.ended.error is not None
+    assert first.ended.error.next_step == f"continue with `frictid-hil gap record --resume {run}`"
+    assert [e.name for e in ExperimentSet.load(out).experiments] == ["breakaway"]
+    before = {path: path.read_bytes() for path in [*out.glob("*.csv"), *run.glob("*1.mcap"), run / "samples.mcap"]}
+    plan.unlink()  # what was asked for stands in the run itself
+    # A set of what there is, elsewhere; nothing moves.
+    made = record(GapRecordOptions(resume=run, out=tmp_path / "made"), Refusing(), move=False)
+    assert made.experiments == ("breakaway",)
+    assert (tmp_path / "made" / "breakaway.csv").read_bytes() == before[out / "breakaway.csv"]
+    # What is missing, into the set that it began.
+    second = record(GapRecordOptions(resume=run), Silent())
+    assert second.ended.error is None and second.experiments == ("breakaway", last) and second.place == out
+    assert [e.name for e in ExperimentSet.load(out).experiments] == ["breakaway", last]
+    assert {path: path.read_bytes() for path in before} == before
+    with pytest.raises(UsageError, match="began otherwise: seed"):
+        record(GapRecordOptions(resume=run, seed=4), Silent())
+
+
+def catalogue_of(robot: str) -> dict[str, Experiment]:
+    loaded = load_robot(robot)
+    envelope = gap_record.envelope_of(loaded, loaded.to_setup().joint("0"), GapRecordOptions(robot, "0"))
+    return dict(catalogue(envelope))
+
+
+@pytest.mark.parametrize("place", ["/proc/nowhere", "file/set"])
+def test_a_set_that_cannot_be_written_is_refused_before_anything_moves(robot: str, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    moved = AssertionError("the person was asked")
+
+    class Asked(Silent):
+        def confirm(self, plan: Plan, preflight: Preflight) -> bool:
+            raise moved
+
+    with pytest.raises(FrictidError, match="cannot be written to"):
+        record(GapRecordOptions(robot, "0", short=True, out=tmp_path / place), Asked())
+    assert not list((tmp_path / "runs").rglob("*"))
+
+
+def test_a_log_that_no_list_names_is_not_written_over(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "breakaway"), out=out), Silent())
+    (out / "second_posture.csv").write_text("mine")
+    record(GapRecordOptions(robot, "0", plan=plan_file(tmp_path, "second_posture"), out=out), Silent())
+    assert (out / "second_posture.csv").read_text() == "mine" and (out / "second_posture_2.csv").exists()
 
 
 def test_travel_beyond_the_limits_is_refused_before_anything_opens(robot: str, tmp_path: Path) -> None:

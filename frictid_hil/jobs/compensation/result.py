@@ -126,7 +126,10 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
         wanted.task,
         progress.runs,
         told["modes"],
-        facts=_facts({**told, "run": str(ended.run.resolve())}),
+        facts={
+            "robot": "SIMULATED" if wanted.simulated else "REAL",
+            **_facts({**told, "run": str(ended.run.resolve())}),
+        },
         remarks=told["remarks"],
         outcome=ended.outcome,
         error=error.what if error else "",
