@@ -17,7 +17,7 @@ from frictid_hil.runner.motions import AT_RAD, stream
 from frictid_hil.runner.reference import verify_reference
 from frictid_hil.runner.supervisor import Supervisor
 
-_POWER_TIMEOUT_S = 3.0
+_POWER_TIMEOUT_S = 15.0
 _STANDSTILL_S = 0.2
 _STOPPING_S = 0.3
 _DISABLING_S = 0.1

@@ -19,7 +19,7 @@ apply the later and closer ones win, key by key::
       types: {"60B2:00": i32}            # where it differs from CiA 402
       position_unit_deg: 0.001           # of 6064, of the joint, where 60A8 does not tell
       velocity_unit: position            # of 606C where 60A9 does not tell: `position` (units per second), `tenth
-                                         # position`, `rpm`, or a number: rad/s of the driving shaft
+                                         # position`, `rpm`, or a number: rad/s, both of the motor
       torque_unit_mnm: 1.0               # of 6077 on the motor side, where it is not per mille of 6076
       mode_when_enabled: true            # 6061 shows the mode only once power is on
       sdo_timeout_s: 2.0                 # how long an answer may take

@@ -211,9 +211,9 @@ def _velocity_unit(
     elif told is not None:
         unit = told / shafts_per_joint
     elif isinstance(quirk, int | float):
-        unit = float(quirk) / shafts_per_joint
+        unit = float(quirk) / joint.gear_ratio
     elif quirk == "rpm":
-        unit = _RPM / shafts_per_joint
+        unit = _RPM / joint.gear_ratio
     elif quirk is not None:
         unit = position_rad * (0.1 if str(quirk).startswith("tenth") else 1.0)
     else:

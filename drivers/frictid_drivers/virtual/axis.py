@@ -14,8 +14,8 @@ from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary
 from frictid_drivers.virtual.objects import Key, key
 
-CSP, CSV, CST = 8, 9, 10
-MODES = (CSP, CSV, CST)
+IP, CSP, CSV, CST = 7, 8, 9, 10
+MODES = (IP, CSP, CSV, CST)
 SUPPORTED_MODES = 1 << CSP - 1 | 1 << CSV - 1 | 1 << CST - 1
 
 _NS = 1e-9
@@ -106,6 +106,8 @@ class Axis:
         increments_per_revolution: encoder increments per joint revolution, as built.
         direction: +1 or -1.
         torque_step: smallest step of the reported torque, per mille.
+        position_units_per_rad: at the joint; None where 608Fh, 6091h and 6092h say it.
+        velocity_unit_rad_s: at the joint; None where 60A9h says it.
 
     Attributes:
         now_ns: run time that the plant has reached.
@@ -129,7 +131,11 @@ class Axis:
         increments_per_revolution: float,
         direction: int,
         torque_step: int = 1,
+        position_units_per_rad: float | None = None,
+        velocity_unit_rad_s: float | None = None,
     ) -> None:
+        self._own_units_per_rad = position_units_per_rad
+        self._own_unit_rad_s = velocity_unit_rad_s
         self._values = cast("dict[Key, int]", dictionary.values)
         self._plant = plant
         self._gear_ratio = gear_ratio
@@ -161,6 +167,8 @@ class Axis:
         gear = number[key(0x6091, 1)] / number[key(0x6091, 2)]
         feed = number[key(0x6092, 1)] / number[key(0x6092, 2)]
         self._units_per_increment = feed / (encoder * gear)
+        if self._own_units_per_rad is not None:
+            self._units_per_increment = self._own_units_per_rad / self._increments_per_rad
         if abs(self._units_per_increment - 1.0) < 1e-12:
             self._units_per_increment = 1.0
         units_per_rad = self._increments_per_rad * self._units_per_increment * self._direction
@@ -168,7 +176,7 @@ class Axis:
         # Velocity is of the shaft behind the gear that the drive knows of; a further gear is the host's business.
         further_gear = self._gear_ratio / gear
         unit_rad_s = VELOCITY_UNITS[number[key(0x60A9)]]
-        self._rad_s_per_unit = unit_rad_s / further_gear * self._direction
+        self._rad_s_per_unit = (self._own_unit_rad_s or unit_rad_s / further_gear) * self._direction
         self._nm_per_mille = number[key(0x6076)] * 1e-6 * self._gear_ratio * self._direction
         self._speed_limit_rad_s = number[key(0x6080)] * _RPM / self._gear_ratio
         self.max_torque_per_mille = number[key(0x6072)]

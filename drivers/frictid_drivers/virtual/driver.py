@@ -219,12 +219,15 @@ def _told_to_host(setup: RobotSetup) -> RobotSetup:
         raise InvalidFields(problems)
     options = {name: value for name, value in setup.options.items() if name != "faults"}
     fd = bool(options.get("fd"))
-    joints = tuple(replace(joint, options={**_objects(joint, fd=fd), **joint.options}) for joint in setup.joints)
+    joints = tuple(
+        replace(joint, options=_objects(joint, fd=fd) | {k: v for k, v in joint.options.items() if k != "personality"})
+        for joint in setup.joints
+    )
     return replace(setup, options=options, joints=joints)
 
 
-def _objects(joint: JointSetup, *, fd: bool) -> dict[str, str | float]:
-    known: dict[str, str | float] = {"temperature_object": "2031:00 i16", "temperature_c_per_unit": 0.1}
+def _objects(joint: JointSetup, *, fd: bool) -> dict[str, Any]:
+    known: dict[str, Any] = {"temperature_object": "2031:00 i16", "temperature_c_per_unit": 0.1}
     if fd:
         known["fd_object"] = "2023:00 u8"
     if "hand" in joint.simulated:

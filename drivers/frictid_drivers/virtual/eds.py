@@ -8,9 +8,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from frictid_drivers.virtual.objects import COMMUNICATION, DRIVE, MANUFACTURER, OBJECTS, DataType, Entry, Record, Value
+from frictid_drivers.virtual.objects import OBJECTS, DataType, Entry, Key, Record, Value
 
 EDS_FILE = Path(__file__).with_name("frictid_servo.eds")
 
@@ -19,10 +21,21 @@ _MANDATORY = (0x1000, 0x1001, 0x1018)
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
-def eds_text() -> str:
-    """The whole file."""
-    optional = [record for record in COMMUNICATION + DRIVE if record.index not in _MANDATORY]
-    mandatory = [record for record in COMMUNICATION if record.index in _MANDATORY]
+def eds_text(records: Sequence[Record] = OBJECTS, absent: Collection[Key] = ()) -> str:
+    """The whole file.
+
+    Args:
+        records: of the drive.
+        absent: entries that it lacks.
+    """
+    records = [
+        replace(record, entries=entries)
+        for record in records
+        if (entries := tuple(entry for entry in record.entries if entry.key not in absent))
+    ]
+    manufacturer = [record for record in records if 0x2000 <= record.index < 0x6000]
+    mandatory = [record for record in records if record.index in _MANDATORY]
+    optional = [record for record in records if record not in mandatory and record not in manufacturer]
     lines = [
         "[FileInfo]",
         "FileName=frictid_servo.eds",
@@ -54,9 +67,9 @@ def eds_text() -> str:
         "",
         *_index_list("MandatoryObjects", mandatory),
         *_index_list("OptionalObjects", optional),
-        *_index_list("ManufacturerObjects", list(MANUFACTURER)),
+        *_index_list("ManufacturerObjects", manufacturer),
     ]
-    for record in OBJECTS:
+    for record in records:
         lines += _record(record)
     return "\n".join(lines)
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 
 from frictid_drivers.virtual.objects import Key, Value, key
+from frictid_drivers.virtual.personality import Personality, personality_of
 from frictid_drivers.virtual.servo import Send, Servo
 from frictid_hil.errors import ConfigError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
@@ -101,6 +102,7 @@ def servo_for(
         )
 
     overrides[key(0x2010, 1)] = sync_gap_tenths
+    family = personality_of(joint, robot.folder) or Personality()
     return Servo(
         joint.address,
         plant,
@@ -109,7 +111,9 @@ def servo_for(
         increments_per_revolution=float(per_joint_turn),
         direction=joint.direction,
         torque_step=max(1, round(model.drive.torque_quantum_per_mille)),
-        overrides=overrides,
+        overrides=family.overrides(overrides),
+        records=family.records,
         missing=missing,
+        manner=family.manner_for(joint, float(per_joint_turn)),
         hold_hand=hold_hand if model.hand is not None else None,
     )

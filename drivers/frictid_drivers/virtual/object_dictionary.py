@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
+from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.objects import (
     OBJECTS,
     SIGNED,
@@ -64,6 +65,7 @@ class ObjectDictionary:
         overrides: defaults of this very drive (rated torque, gear, serial number).
         missing: indices that this drive does not have (to play a poorer drive).
         records: the table.
+        manner: what sets the drive's family apart.
 
     Attributes:
         values: current values by key; numbers, or text for strings.
@@ -78,11 +80,15 @@ class ObjectDictionary:
         *,
         missing: Iterable[int] = (),
         records: Iterable[Record] = OBJECTS,
+        manner: Manner = STANDARD,
     ) -> None:
+        self.manner = manner
         absent = frozenset(missing)
         every = [entry for record in records for entry in record.entries]
         # Objects that are missing keep their values: the drive acts by its defaults, it only does not let anybody see.
-        self.entries: dict[Key, Entry] = {entry.key: entry for entry in every if entry.key >> 8 not in absent}
+        self.entries: dict[Key, Entry] = {
+            entry.key: entry for entry in every if entry.key >> 8 not in absent and entry.key not in manner.absent
+        }
         self.indices = frozenset(address >> 8 for address in self.entries)
         self.guards: dict[Key, Guard] = {}
         self.effects: dict[Key, Effect] = {}
@@ -120,7 +126,7 @@ class ObjectDictionary:
         """
         found = self.entries.get(address)
         if found is None:
-            raise SdoAbort(NO_SUBINDEX if address >> 8 in self.indices else NO_OBJECT)
+            raise SdoAbort(NO_SUBINDEX if address >> 8 in self.indices else self.manner.no_object)
         return found
 
     def upload(self, address: Key) -> bytes:

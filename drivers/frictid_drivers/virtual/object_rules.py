@@ -75,6 +75,10 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         if value not in VELOCITY_UNITS:
             raise SdoAbort(INVALID_VALUE)
 
+    def mode(value: int) -> None:
+        if value and (not 1 <= value <= 32 or not number(key(0x6502)) >> value - 1 & 1 or value not in MODES):
+            raise SdoAbort(INVALID_VALUE)
+
     def sync_cob_id(value: int) -> None:
         # Bit 30 would make this node the producer of SYNC.
         if not 0x80 <= value <= 0xFF:
@@ -107,7 +111,7 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         key(0x1016, 2): _consumer(dictionary, key(0x1016, 1)),
         key(0x1019): sync_counter,
         key(0x2023): while_off,
-        key(0x6060): _one_of(0, *MODES),
+        key(0x6060): mode,
         key(0x60A9): velocity_unit,
     }
     guards |= dict.fromkeys(_UNITS, while_off)

@@ -341,6 +341,7 @@ DRIVE: tuple[Record, ...] = (
     _variable(0x60B0, "Position offset", I32, "rw", 0, "R"),
     _variable(0x60B1, "Velocity offset", I32, "rw", 0, "R"),
     _variable(0x60B2, "Torque offset", I16, "rw", 0, "R"),
+    _group(0x60C1, "Interpolation data record", ("Set-point", I32, "rw", 0, "R")),
     _group(
         0x60C2,
         "Interpolation time period",

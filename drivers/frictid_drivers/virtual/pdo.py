@@ -342,7 +342,7 @@ class ProcessData:
                 raise SdoAbort(DEVICE_STATE)
 
         def transmission_type(value: int) -> None:
-            if _SYNC_MAX < value < 254:
+            if _SYNC_MAX < value < 254 or value not in (self._dictionary.manner.transmission_types or (value,)):
                 raise SdoAbort(INVALID_VALUE)
 
         def while_invalid(value: int) -> None:

@@ -9,15 +9,18 @@ from collections.abc import Callable
 from typing import cast
 
 from frictid_drivers.virtual import emergency
-from frictid_drivers.virtual.axis import CSP, MODES, Axis, Plant
+from frictid_drivers.virtual.axis import CSP, IP, MODES, Axis, Plant
 from frictid_drivers.virtual.emergency import Emergency
+from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary
 from frictid_drivers.virtual.objects import Key, key
 from frictid_drivers.virtual.power_state import FAULT_RESET, HALT, PowerState, next_state
 
 _K6040, _K6041, _K6060, _K6061 = key(0x6040), key(0x6041), key(0x6060), key(0x6061)
 _K6072, _K60FD, _K60FE, _K60FE_MASK = key(0x6072), key(0x60FD), key(0x60FE, 1), key(0x60FE, 2)
+_K6064, _K607A, _K60C1 = key(0x6064), key(0x607A), key(0x60C1, 1)
 _INTERLOCK_CLOSED = 1 << 3
+_INTERPOLATE = 1 << 4
 _BRAKE_ENGAGED = 1 << 16
 _OUTPUT_BRAKE = 1 << 0
 
@@ -33,6 +36,7 @@ class PowerStage:
         plant: the joint, for its brake.
         errors: of the node.
         host_missing: asked before power is given: a watched heartbeat is missing.
+        manner: what sets the drive's family apart.
 
     Attributes:
         state: of the state machine.
@@ -47,7 +51,11 @@ class PowerStage:
         plant: Plant,
         errors: Emergency,
         host_missing: Callable[[], bool],
+        manner: Manner = STANDARD,
     ) -> None:
+        self._manner = manner
+        self._mode_due_ns: int | None = None
+        self._enable_due_ns: int | None = None
         self._values = cast("dict[Key, int]", dictionary.values)
         self._axis = axis
         self._plant = plant
@@ -67,6 +75,7 @@ class PowerStage:
     def boot(self) -> None:
         """Transitions 0 and 1: power-on, without motor power; the objects have their defaults again."""
         self._power_off()
+        self._mode_due_ns = self._enable_due_ns = None
         self._controlword = 0
         self._outputs = 0
         self._axis.encoder_stuck = False
@@ -83,6 +92,10 @@ class PowerStage:
             self.fault(code)
         if axis.ramping and axis.ramp_done:
             self._ramp_ended()
+        if self._mode_due_ns is not None and axis.now_ns >= self._mode_due_ns:
+            self.follow_commands()
+        if self._enable_due_ns is not None and axis.now_ns >= self._enable_due_ns:
+            self._follow_controlword(self._values[_K6040])
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
@@ -108,10 +121,14 @@ class PowerStage:
         if controlword != self._controlword:
             self._follow_controlword(controlword)
         mode = values[_K6060]
-        if mode != values[_K6061] and (mode in MODES or mode == 0):
+        if mode != values[_K6061] and (mode in MODES or mode == 0) and self._mode_is_due():
             values[_K6061] = mode
             self.changed = True
-            self._axis.set_mode(mode)
+            self._axis.set_mode(CSP if mode == IP else mode)
+        if mode == IP:
+            # Interpolated position is cyclic position by another object, followed while bit 4 says so.
+            follow = controlword & _INTERPOLATE and self.state is PowerState.ENABLED
+            values[_K607A] = values[_K60C1] if follow else values[_K6064]
         if values[_K60FE] != self._outputs:
             self._outputs = values[_K60FE]
             self.apply_brake()
@@ -136,7 +153,26 @@ class PowerStage:
         if self.state is PowerState.ENABLED and self._after_ramp is None:
             self._follow_halt(bool(controlword & HALT))
 
+    def _mode_is_due(self) -> bool:
+        """The new mode shows, after as long as this family takes."""
+        if self._mode_due_ns is None:
+            self._mode_due_ns = self._axis.now_ns + round(self._manner.mode_change_s * 1e9)
+        if self._axis.now_ns < self._mode_due_ns:
+            return False
+        self._mode_due_ns = None
+        return True
+
+    def _power_is_due(self) -> bool:
+        if self._enable_due_ns is None:
+            self._enable_due_ns = self._axis.now_ns + round(self._manner.power_on_s * 1e9)
+        if self._axis.now_ns < self._enable_due_ns:
+            return False
+        self._enable_due_ns = None
+        return True
+
     def _may(self, transition: int) -> bool:
+        if transition == 4 and self._manner.power_on_s and not self._power_is_due():
+            return False
         if transition in (4, 16) and self._host_missing():
             return False  # no power while the host's heartbeat is missing
         return not (transition == 16 and self._values[key(0x605A)] not in (5, 6, 7))

@@ -16,9 +16,10 @@ from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.axis import Axis, Plant
 from frictid_drivers.virtual.emergency import Emergency
 from frictid_drivers.virtual.heartbeat import Consumer, HeartbeatWatch
+from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary, encode
 from frictid_drivers.virtual.object_rules import Reactions, install_rules
-from frictid_drivers.virtual.objects import Key, Value, key
+from frictid_drivers.virtual.objects import OBJECTS, Key, Record, Value, key
 from frictid_drivers.virtual.pdo import NEVER_NS, ProcessData, ReceivePdo
 from frictid_drivers.virtual.power_stage import PowerStage
 from frictid_drivers.virtual.power_state import PowerState
@@ -45,7 +46,9 @@ class Servo:
         direction: +1 or -1, sign of joint motion for positive motor motion.
         torque_step: smallest step of the reported torque, per mille.
         overrides: defaults of objects of this drive.
+        records: its objects.
         missing: indices of objects that it does not have.
+        manner: what sets its family apart.
         hold_hand: called as (held, centre_rad, amplitude_rad, frequency_hz) when the simulated hand (2040h) changes.
 
     Attributes:
@@ -65,11 +68,13 @@ class Servo:
         direction: int = 1,
         torque_step: int = 1,
         overrides: Mapping[Key, Value] | None = None,
+        records: Iterable[Record] = OBJECTS,
         missing: Iterable[int] = (),
+        manner: Manner = STANDARD,
         hold_hand: Callable[[bool, float, float, float], None] | None = None,
     ) -> None:
         self.node_id = node_id
-        self.dictionary = ObjectDictionary(node_id, overrides, missing=missing)
+        self.dictionary = ObjectDictionary(node_id, overrides, missing=missing, records=records, manner=manner)
         self._values = cast("dict[Key, int]", self.dictionary.values)
         self._plant = plant
         self._send = send
@@ -82,13 +87,15 @@ class Servo:
             increments_per_revolution=increments_per_revolution,
             direction=direction,
             torque_step=torque_step,
+            position_units_per_rad=manner.position_units_per_rad,
+            velocity_unit_rad_s=manner.velocity_unit_rad_s,
         )
         self.emergency = Emergency(self.dictionary, self._send_emergency)
         self._watch = HeartbeatWatch()
         self.process_data = ProcessData(self.dictionary, send, self._pdo_changed)
         self._sdo = SdoServer(self.dictionary)
         self.nmt_state = INITIALISING
-        self.power = PowerStage(self.dictionary, self.axis, plant, self.emergency, lambda: self._watch.any_lost)
+        self.power = PowerStage(self.dictionary, self.axis, plant, self.emergency, lambda: self._watch.any_lost, manner)
         self.next_event_ns = NEVER_NS
         self.wake: Callable[[int], None] = _ignore
         self.routes_changed: Callable[[], None] = _do_nothing

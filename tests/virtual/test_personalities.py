@@ -1,0 +1,160 @@
+"""Families of drives behind the simulated bus: `check` foresees what configuring meets, and F_0 comes out whole."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from frictid_drivers.virtual.driver import VirtualDriver
+from frictid_drivers.virtual.eds import eds_text
+from frictid_drivers.virtual.personality import from_data, known_personalities
+from frictid_hil.config.robot import load_robot
+from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.check import check
+from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Severity
+
+FAMILIES = sorted(known_personalities())
+COULOMB_NM = 5.0
+COUNTS = 131_072 * 100
+QUICK = ["elmo", "nanotec"]
+SLOW = sorted({*FAMILIES} - {*QUICK})
+NEEDS: dict[str, dict[str, Any]] = {
+    # What the drive cannot tell, a person must.
+    "epos4": {"position_units_per_revolution": COUNTS},
+    "nanotec": {"raise_torque_limit": True},
+}
+RATES = {"prbt": 125}
+
+
+def robot(family: str, folder: Path, **options: object) -> Path:
+    joint = {
+        "node": 3, "gear_ratio": 100, "max_velocity_rad_s": 3.0, "max_torque_nm": 60.0, "rated_torque_nm": 40.0,
+        "position_min_rad": -2.0, "position_max_rad": 2.0, "start_position_rad": -0.2, "locked_position_rad": 0.0,
+        "options": {"personality": family, **NEEDS.get(family, {}), **options},
+        "simulated": {"inertia_kg_m2": 0.3, "friction": {"coulomb_nm": COULOMB_NM, "viscous_nm_s_per_rad": 1.5}},
+    }  # fmt: skip
+    values = {
+        "schema": "frictid.robot/1", "name": family, "driver": "virtual", "bus": f"virtual:{family}{os.getpid()}",
+        "cycle_hz": RATES.get(family, 1000),
+        "procedure": {"amplitude_rad": 0.35, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8},
+        "joints": {"0": {key: value for key, value in joint.items()}},
+    }  # fmt: skip
+    path = folder / f"{family}.yaml"
+    path.write_text(yaml.safe_dump(values, sort_keys=False))
+    return path
+
+
+def told(findings, severity):
+    return {one.message for one in findings if one.severity is severity}
+
+
+def met(path: Path) -> tuple[set[str], set[str], set[str], str]:
+    """What check says (errors, warnings), what configuring remarks, and what it ends with."""
+    loaded = load_robot(path)
+    driver = VirtualDriver(loaded.to_setup())
+    driver.open()
+    findings = driver.check(None)
+    ended = ""
+    remarks: set[str] = set()
+    try:
+        driver.configure(loaded.file.cycle_hz, ["0"])
+        driver.set_limits("0", torque_nm=60.0, position_min_rad=-2.0, position_max_rad=2.0)
+        remarks = told(driver.remarks(), Severity.WARNING)
+    except (HardwareError, PlanRefused) as error:
+        ended = str(error)
+    finally:
+        driver.close()
+    return told(findings, Severity.ERROR), told(findings, Severity.WARNING), remarks, ended
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_check_foresees_what_configuring_meets(family, tmp_path):
+    errors, warnings, remarks, ended = met(robot(family, tmp_path))
+    assert not errors and not ended
+    assert remarks <= warnings
+
+
+@pytest.mark.parametrize("family", ["epos4", "nanotec"])
+def test_what_a_person_must_say_is_foreseen_too(family, tmp_path, monkeypatch):
+    monkeypatch.setitem(NEEDS, family, {})
+    errors, warnings, _, ended = met(robot(family, tmp_path))
+    if family == "epos4":
+        assert any("tells neither its position unit" in error for error in errors) and "tells neither" in ended
+    else:
+        assert any("the drive's torque limit is 4 N m (6072)" in warning for warning in warnings)
+
+
+STRICT = [
+    "1006:00", "1016:01", "1017:00", "1019:00", "1600:01", "1800:02", "1A00:00", "1A00:01", "6007:00", "605A:00",
+    "6060:00", "6065:00", "6066:00", "6072:00", "607D:01", "607D:02", "60A9:00", "60B2:00", "60C2:01", "60C2:02",
+]  # fmt: skip
+UNMAPPABLE = ["603F:00", "6041:00", "6064:00", "6071:00", "6077:00", "60B2:00", "60FF:00"]
+
+
+@pytest.mark.parametrize("family", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+def test_every_refusal_of_a_strict_drive_is_foreseen(family, tmp_path):
+    data = known_personalities()[family]
+    surprises = []
+    refused = 0
+    unmapped: dict[str, Any] = {"receive": False, "transmit": False}
+    fixed: dict[str, Any] = {"access": "ro"}
+    for at, change in [*((at, fixed) for at in STRICT), *((at, unmapped) for at in UNMAPPABLE)]:
+        given: dict[str, Any] = data.get("objects", {})
+        objects = {**given, at: given.get(at, {}) | change}
+        made = from_data({**data, "objects": objects})
+        file = tmp_path / "strict.eds"
+        file.write_text(eds_text(made.records, made.manner.absent))
+        path = robot(family, tmp_path, eds=file.name)
+        values = yaml.safe_load(path.read_text())
+        del values["joints"]["0"]["options"]["personality"]
+        path.write_text(yaml.safe_dump(values))
+        errors, warnings, remarks, ended = met(path)
+        refused += bool(ended)
+        if bool(errors) is not bool(ended) or not remarks <= warnings:
+            surprises.append((at, sorted(errors), ended, sorted(remarks - warnings)))
+    assert not surprises
+    assert refused >= 5
+
+
+def test_a_family_that_does_not_exist(tmp_path):
+    with pytest.raises(InvalidFields, match="known: copley"):
+        driver = VirtualDriver(load_robot(robot("acme", tmp_path)).to_setup())
+        driver.open()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_checked_and_calibrated(family, tmp_path):
+    path = robot(family, tmp_path)
+    assert check(str(path))["ok"]
+    result = calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent()).to_json()
+    assert result["outcome"] == "ok", result
+    assert result["joints"]["0"]["coulomb_nm"] == pytest.approx(COULOMB_NM, rel=0.01)
+    print("F_0", family, result["joints"]["0"]["coulomb_nm"], result["joints"]["0"]["duration_s"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", FAMILIES)
+def test_compensated(family, tmp_path):
+    # A drive without torque offset needs torque mode, and without a watch of its own a person's word for that.
+    path = robot(family, tmp_path)
+    if family == "eyou":
+        values = yaml.safe_load(path.read_text())
+        values["options"] = {"allow_torque_without_watchdog": True}
+        path.write_text(yaml.safe_dump(values))
+    calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent())
+    mode = Mode.TORQUE if family in ("eyou", "nanotec") else Mode.POSITION
+    wanted = Wanted(task="track", modes=("nc", "mo"), duration_s=4.0, drive_mode=mode)
+    options = CompensateOptions(str(path), tmp_path / "run", "0", wanted, out=tmp_path / "two")
+    result = compensate(options, Silent()).to_json()
+    assert result["outcome"] == "ok", result
+    assert result["modes"]["mo"]["reduction_percent"] > 20
