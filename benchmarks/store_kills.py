@@ -180,6 +180,7 @@ def many(root: Path, count: int) -> None:
         timed(f"{count} profiles, {name}", command)
     (folder / "index.sqlite").unlink()
     timed(f"{count} profiles, history after the index was lost", history)
+    timed(f"{count} profiles, history --json after the index was lost", [*history, "--json"])
     timed(f"{count} profiles, history after that", history)
 
 

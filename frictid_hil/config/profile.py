@@ -15,10 +15,10 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
 from frictid_hil.config.provenance import Provenance
@@ -382,9 +382,45 @@ class JointProfile(Strict):
                 raise ValueError(f"the {name} do not follow from the pairs; delete them, or undo the edit of the pairs")
         return self
 
-    def curve(self) -> FrictionCurve:
-        """phi of (8) through the pairs."""
-        return FrictionCurve(self.velocity_rad_s, self.torque_nm)
+    @overload
+    def curve(self) -> FrictionCurve: ...
+
+    @overload
+    def curve(self, velocity_rad_s: ArrayLike) -> NDArray[np.float64]: ...
+
+    def curve(self, velocity_rad_s: ArrayLike | None = None) -> FrictionCurve | NDArray[np.float64]:
+        """phi of (8) through the pairs: the curve itself, or its torque at velocities.
+
+        Args:
+            velocity_rad_s: any shape, both directions; beyond the measured range the curve goes on straight.
+
+        Returns:
+            N m, of the same shape (N, at m/s, on a linear axis).
+        """
+        curve = FrictionCurve(self.velocity_rad_s, self.torque_nm)
+        if velocity_rad_s is None:
+            return curve
+        return np.asarray(curve.torque(np.asarray(velocity_rad_s, dtype=np.float64)), dtype=np.float64)
+
+    def interval_nm(self, velocity_rad_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper end of the curve's 95 % interval at velocities, between the pairs by straight lines.
+
+        Args:
+            velocity_rad_s: any shape, both directions.
+
+        Returns:
+            N m, each of the same shape; NaN where no interval is known: outside of [V_1, V_N], or without intervals.
+        """
+        v = np.asarray(velocity_rad_s, dtype=np.float64)
+        ends = (
+            np.full((len(self.velocity_rad_s), 2), np.nan)
+            if self.torque_interval_nm is None
+            else self.torque_interval_nm
+        )
+        low, high = (
+            np.interp(np.abs(v), self.velocity_rad_s, end, left=np.nan, right=np.nan) for end in np.asarray(ends).T
+        )
+        return np.where(v < 0, -high, low), np.where(v < 0, -low, high)
 
     def _range_follows(self) -> bool:
         stated = self.measured_range_rad_s

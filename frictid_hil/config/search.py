@@ -11,6 +11,8 @@ import os
 from importlib.resources import files
 from pathlib import Path
 
+import platformdirs
+
 from frictid_hil.errors import ConfigError
 
 _SUFFIXES = ("", ".yaml", ".yml")
@@ -18,8 +20,7 @@ _SUFFIXES = ("", ".yaml", ".yml")
 
 def user_data_dir() -> Path:
     """The person's own folder: ``$XDG_DATA_HOME/frictid-hil``, else ``~/.local/share/frictid-hil``."""
-    base = os.environ.get("XDG_DATA_HOME", "")
-    return (Path(base) if base else Path.home() / ".local" / "share") / "frictid-hil"
+    return platformdirs.user_data_path("frictid-hil")
 
 
 def shipped_dir() -> Path:

@@ -189,7 +189,7 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         refuse_where_the_bus_is_too_slow(setup, quantum_s, together=together)
     rehearse = _unseen(Rehearsals(robot, options.bus), setup, procedures, together=together)
     first = list(procedures.values())[:1]
-    notes = [chosen.note(procedure) for procedure in first]
+    notes = [chosen.note(procedure, setup.cycle_hz, quantum_s) for procedure in first]
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in first]
     notes += [*_notes(procedures, expected, rehearse), *inherited_notes(robot, list(procedures))]

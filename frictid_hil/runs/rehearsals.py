@@ -8,12 +8,12 @@ What simulated drives rehearsed proves nothing of a machine, and is not kept.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from platformdirs import user_state_path
 
 from frictid_hil.config.robot import Robot
 from frictid_hil.errors import UsageError
@@ -139,8 +139,7 @@ class Rehearsals:
 
     @property
     def _path(self) -> Path:
-        state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-        return state / "frictid-hil" / "rehearsed" / f"{self._robot.name}.json"
+        return user_state_path("frictid-hil") / "rehearsed" / f"{self._robot.name}.json"
 
 
 def _rehearsed_travel_rad(entry: JointPlan) -> tuple[float, float]:

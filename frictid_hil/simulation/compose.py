@@ -12,7 +12,6 @@ import functools
 import hashlib
 import importlib.util
 import inspect
-import os
 import re
 import sys
 import tempfile
@@ -20,6 +19,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
+
+from platformdirs import user_cache_path
 
 from frictid_hil.simulation import plant
 from frictid_hil.simulation.effect import Effect
@@ -176,7 +177,7 @@ def _load(source: str) -> Any:
 
 def _cache_folder() -> Path:
     """``$XDG_CACHE_HOME/frictid-hil`` or its default; a private temporary folder where that cannot be written."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "frictid-hil"
+    folder = user_cache_path("frictid-hil")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -304,6 +304,17 @@ def test_rounding_an_estimate_again_changes_nothing(value: float, width: float) 
     assert abs(once.low - (value - width)) <= 0.1 * width + 1e-5 * (abs(value) + width)
 
 
+def test_a_joint_is_a_function_of_velocity(tmp_path: Path) -> None:
+    one = joint()
+    velocity = np.linspace(-2.0, 2.0, 9).reshape(3, 3)
+    assert np.array_equal(one.curve(velocity), one.curve().torque(velocity))
+    assert one.curve([0.374, -0.374]).tolist() == [9.25, -9.25]
+    low, high = one.interval_nm([0.187, -1.87, 0.0, 5.0])
+    assert np.allclose(low[:2], [8.4, -12.1]) and np.allclose(high[:2], [8.6, -11.9])
+    assert np.isnan(low[2:]).all() and np.isnan(high[2:]).all()
+    assert np.isnan(joint(torque_interval_nm=None).interval_nm(1.0)).all()
+
+
 def test_a_ripple_is_kept_as_its_waves() -> None:
     angle = np.arange(64) / 32 * np.pi
     table = 0.1187 * np.cos(2 * angle) - 0.049 * np.sin(5 * angle)

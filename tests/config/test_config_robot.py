@@ -105,7 +105,7 @@ def test_a_joint_may_have_its_own_travel_and_a_person_overrides_both() -> None:
         (("schema: frictid.robot/1", "schema: frictid.robot/2"), "two.yaml:1:9", "newer than this program"),
         (("schema: frictid.robot/1", "schema: frictid.profile/1"), "two.yaml:1:9", "this is a frictid.profile/1, not"),
         (("schema: frictid.robot/1\n", ""), "two.yaml:1:1", "does not say what it is"),
-        (("cycle_hz: 1000", "cycle_hz: 1000\npolicy: {drift: 3}"), "two.yaml:6:10", "did you mean drift_"),
+        (("cycle_hz: 1000", "cycle_hz: 1000\npolicy: {drif_percent: 3}"), "two.yaml:6:10", "did you mean drift_"),
     ],
 )
 def test_mistakes_are_told_with_their_place(tmp_path: Path, change: tuple[str, str], where: str, words: str) -> None:

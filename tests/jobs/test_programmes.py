@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import UsageError
+from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import compare
-from frictid_hil.jobs.identification.programmes import PROGRAMMES
+from frictid_hil.jobs.identification.programmes import PROGRAMMES, programme
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Cycles
@@ -63,3 +65,20 @@ def test_its_recording_identifies_to_the_same_profile(quick: Path) -> None:
 def test_what_makes_no_programme_is_refused(options: dict[str, object], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         plan_calibration(CalibrateOptions("hp3j.yaml", **options))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "rate_hz", "quantum_s", "said"),
+    [
+        ({}, 1000.0, 0.0, "by aligned; error at most 0.25 % over the measured speeds"),
+        ({"cycles": 5}, 1000.0, 0.0, "not measured for N = 5;"),
+        ({"amplitude_rad": 0.1, "velocity_rad_s": 1.0}, 1000.0, 0.0, "not measured for A = 5.73 deg, V = 57.3 deg/s;"),
+        ({}, 500.0, 0.0, "not measured for 500 Hz;"),
+        ({}, 1000.0, 0.02, "not measured for a controller that cycles by itself;"),
+    ],
+)
+def test_an_accuracy_is_promised_only_where_it_was_measured(
+    changes: dict[str, float], rate_hz: float, quantum_s: float, said: str
+) -> None:
+    usual: dict[str, Any] = {"amplitude_rad": 0.349066, "velocity_rad_s": 2.00713, "cycles": 10, "ratio": 0.8}
+    assert said in programme("thorough").note(Procedure(**usual | changes), rate_hz, quantum_s)

@@ -7,13 +7,17 @@ is the slowest speed, one cycle of which takes pi A / v.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.units import degrees, format_angle, format_velocity
 
 _TOP = 115.0
 """Peak speed of the paper, deg/s, for which the speeds of the short programmes were chosen; they scale with V."""
+_AMPLITUDE, _CYCLES, _RATE_HZ = 20.0, 10, 1000.0
+"""With which the errors below were measured; A in degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +37,30 @@ class Programme:
     method: str
     error_percent: float
 
-    def note(self, procedure: Procedure) -> str:
-        """What a person should expect of it, in a sentence."""
+    def note(self, procedure: Procedure, rate_hz: float, quantum_s: float = 0.0) -> str:
+        """What a person should expect of it, in a sentence; an accuracy is promised only where it was measured.
+
+        Args:
+            procedure: of one joint.
+            rate_hz: of set-points.
+            quantum_s: of the positions' time where a controller cycles by itself; 0 on a bus that we cycle.
+        """
+        cycles = len(self.shares) or _CYCLES
+        compared = (
+            (f"A = {format_angle(procedure.amplitude_rad)}", degrees(procedure.amplitude_rad), _AMPLITUDE),
+            (f"V = {format_velocity(procedure.velocity_rad_s)}", degrees(procedure.velocity_rad_s), _TOP),
+            (f"N = {procedure.cycles}", procedure.cycles, cycles),
+            (f"{rate_hz:g} Hz", rate_hz, _RATE_HZ),
+        )
+        other = [said for said, here, measured in compared if not math.isclose(here, measured, rel_tol=0.02)]
+        other += ["a controller that cycles by itself"] if quantum_s else []
+        conditions = f"simulated hp3j, A = {_AMPLITUDE:g} deg, V = {_TOP:g} deg/s, N = {cycles}, {_RATE_HZ:g} Hz"
+        promise = f"error at most {self.error_percent:g} % over the measured speeds ({conditions})"
+        if other:
+            promise = f"its error was not measured for {', '.join(other)}; where it was: {promise}"
         return (
             f"programme {self.name}: {procedure.cycles} speeds, {procedure.duration_s:.1f} s of cycles per joint, by "
-            f"{self.method}; measured error at most {self.error_percent:g} % over the measured speeds (simulated hp3j, "
-            "A = 20 deg, benchmarks/programmes.py)"
+            f"{self.method}; {promise}"
         )
 
 
