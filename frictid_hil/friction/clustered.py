@@ -74,7 +74,7 @@ def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior
     left = whole + 1e-11 * np.eye(scale.size)
     noise = float(np.mean((targets[:, 0] - x @ np.linalg.solve(left, right[:, 0])) ** 2))
     weights = np.array([noise * (p.rows_alike or x.shape[0] / len(gram)) / p.deviation**2 for p in priors])
-    wished = np.array([p.weights for p in priors]) / scale
+    wished = np.array([p.weights for p in priors]).reshape(-1, scale.size) / scale
     left = left + (wished.T * weights) @ wished
     alive = np.isfinite(scale)
     spectrum = np.linalg.eigvalsh(left[np.ix_(alive, alive)])

@@ -17,6 +17,7 @@ from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
 from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.free_motion import free_motion
 from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
@@ -77,7 +78,12 @@ def identify_joint(
         path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
         start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
         return _from_cycles(samples, procedure, start_s, joint, method, late_cycles)
-    return _from_plateaus(samples)
+    if method == "least-squares":
+        return _from_free_motion(samples, [])
+    try:
+        return _from_plateaus(samples)
+    except IdentificationError as error:
+        return _from_free_motion(samples, [f"{error.what}: least squares over the whole motion instead"])
 
 
 def procedure_of(mark: Mark) -> Procedure:
@@ -215,6 +221,46 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=skew.torque_delay_s - skew.position_delay_s,
         quality={"notes": notes},
+    )
+
+
+def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
+    assert samples.torque_nm is not None  # by the caller
+    skew = declared_skew(samples)
+    torque = samples.torque_nm
+    if samples.rigid_body_torque_nm is not None:
+        torque = torque - samples.rigid_body_torque_nm
+        notes = [*notes, "inertia and gravity are what the rigid-body column leaves"]
+    delay_s = skew.torque_delay_s - skew.position_delay_s
+    found = free_motion(
+        samples.time_s,
+        samples.position_rad,
+        torque,
+        torque_delay_s=delay_s,
+        prismatic=samples.prismatic,
+        where=f"joint {samples.joint}",
+    )
+    names = ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm", "bias_nm")
+    body = {name: _figure(getattr(found, name), found.untold.get(name, "a linear axis")) for name in names}
+    return JointProfile(
+        method="least-squares",
+        prismatic=samples.prismatic,
+        velocity_rad_s=found.curve.velocity_rad_s,
+        torque_nm=found.curve.torque_nm,
+        torque_interval_nm=_interval(found.curve.torque_nm, found.half_width_nm),
+        coulomb_nm=_figure(found.coulomb_nm),
+        torque_source=str(samples.meta.get("torque_source", "")),
+        time_skew_s=delay_s,
+        quality={
+            "residual_rms_nm": found.residual_rms_nm,
+            "torque_rms_nm": found.torque_rms_nm,
+            "notes": [*_damage(samples), *notes],
+        },
+        gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in found.gates),
+        inertia_kg_m2=body["inertia_kg_m2"],
+        gravity_cos_nm=body["gravity_cos_nm"],
+        gravity_sin_nm=body["gravity_sin_nm"],
+        bias_nm=body["bias_nm"],
     )
 
 
