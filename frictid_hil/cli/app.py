@@ -8,10 +8,10 @@ from typing import Any
 
 import typer
 
-from frictid_hil import __version__
 from frictid_hil.cli import calibrate, columns, compensate, emulate, gap, jobs, new, profiles, replay, reports
 from frictid_hil.cli.output import Output
 from frictid_hil.errors import UsageError
+from frictid_hil.version import __version__
 
 app = typer.Typer(
     name="frictid-hil",

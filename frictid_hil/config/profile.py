@@ -422,6 +422,10 @@ class JointProfile(Strict):
         )
         return np.where(v < 0, -high, low), np.where(v < 0, -low, high)
 
+    def __call__(self, velocity_rad_s: ArrayLike) -> NDArray[np.float64]:
+        """Friction torque [N m] at any velocity [rad/s], same shape: phi of (8), odd, 0 at rest."""
+        return np.asarray(self.curve().torque(np.asarray(velocity_rad_s, dtype=np.float64)))
+
     def _range_follows(self) -> bool:
         stated = self.measured_range_rad_s
         return stated is None or stated == self.curve().measured_range_rad_s

@@ -10,8 +10,8 @@ from typing import Any
 
 from pydantic import Field
 
-import frictid_hil
 from frictid_hil.config.schema import Strict
+from frictid_hil.version import __version__
 
 
 class Provenance(Strict):
@@ -36,7 +36,7 @@ class Provenance(Strict):
     """
 
     created_utc: str = Field(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")
-    tool_version: str = frictid_hil.__version__
+    tool_version: str = __version__
     git_revision: str = ""
     robot_file: str = ""
     config_sha256: str = ""
@@ -59,7 +59,7 @@ def utc_now() -> str:
 
 def git_revision() -> str:
     """Revision of the checkout this program runs from, with ``+`` where files differ from it; "" outside a checkout."""
-    checkout = Path(frictid_hil.__file__).parent.parent
+    checkout = Path(__file__).parents[2]
     if not (checkout / ".git").exists():
         return ""
     try:

@@ -116,6 +116,24 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
     return _result(tasks, results, options)
 
 
+def identified_profile(options: IdentifyOptions) -> FrictionProfile:
+    """The profile of one recording; nothing is written.
+
+    Raises:
+        UsageError: none or several recordings are meant.
+        InputFileError: it is unreadable or unusable.
+        IdentificationError: it gives no curve.
+    """
+    logs = recordings(options.logs)
+    if len(logs) != 1:
+        raise UsageError(f"one recording is expected, {len(logs)} are meant")
+    task = _task(logs[0], options)
+    result = _identified(task)
+    if result.error is not None:
+        raise result.error
+    return _profile(task, result)
+
+
 def recordings(named: Sequence[Path]) -> list[Path]:
     """Every recording that is meant by files, folders, run folders and globs, each once, in order.
 
@@ -289,9 +307,13 @@ def profile_names(logs: Sequence[Path]) -> list[str]:
 def _write(task: _Task, result: _Identified, path: Path) -> Path | None:
     if not result.joints:
         return None
-    robot = task.setup.name if task.setup else task.log.stem
-    FrictionProfile(
-        robot=robot,
+    _profile(task, result).save(path)
+    return path
+
+
+def _profile(task: _Task, result: _Identified) -> FrictionProfile:
+    return FrictionProfile(
+        robot=task.setup.name if task.setup else task.log.stem,
         joints=result.joints,
         provenance=Provenance(
             created_utc=utc_now(),
@@ -299,8 +321,7 @@ def _write(task: _Task, result: _Identified, path: Path) -> Path | None:
             run=str(task.log.resolve()),
             log_sha256={path.name: file_sha256(path) for path in _files(task.log)},
         ),
-    ).save(path)
-    return path
+    )
 
 
 def _files(log: Path) -> list[Path]:

@@ -32,10 +32,10 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-import frictid_hil
 from frictid_hil.recording import mcap_layout as layout
 from frictid_hil.recording.growing_file import GrowingFile
 from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.version import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_ROWS = 32_768
@@ -75,7 +75,7 @@ class SampleWriter:
         self._index: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
         self._head = [*_schemas(), *self._channel_records(prismatic)]
-        self._file.write(MAGIC + _bytes(Header("", f"frictid-hil {frictid_hil.__version__}"), *self._head))
+        self._file.write(MAGIC + _bytes(Header("", f"frictid-hil {__version__}"), *self._head))
         if meta:
             self.metadata("recording", meta)
 

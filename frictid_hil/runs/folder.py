@@ -31,7 +31,6 @@ from typing import Any
 
 import numpy as np
 
-import frictid_hil
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.provenance import file_sha256, utc_now
 from frictid_hil.config.robot import Robot
@@ -42,6 +41,7 @@ from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.runner.events import Configured, Event, JointRun, Marked, Preflight, Warned
 from frictid_hil.runner.ring import Rows
 from frictid_hil.runs.keeper import RowKeeper
+from frictid_hil.version import __version__
 
 SCHEMA = "frictid.run/1"
 _WHERE_RUNS_ARE = "every run tells its folder when it ends; unless --out was given it lies below runs/<robot>/"
@@ -80,7 +80,7 @@ class RunFolder:
             "robot": robot.name,
             "robot_file": str(robot.path.resolve()),
             "config_sha256": robot.digest,
-            "tool_version": frictid_hil.__version__,
+            "tool_version": __version__,
             "started_utc": utc_now(),
             "ended_utc": None,
             "state": "preflight",
