@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +35,7 @@ from frictid_hil.cli.options import (
     robot_files,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.errors import UsageError
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees, format_duration
 
@@ -41,6 +43,7 @@ from frictid_hil.units import degrees, format_duration
 def register(app: typer.Typer) -> None:
     """Add this group's verbs."""
     app.command("check")(check)
+    app.command("reset")(reset)
     app.command("calibrate")(calibrate)
     app.command("identify")(identify)
     app.command("compare")(compare)
@@ -68,6 +71,35 @@ def check(
         output.out.print("ready" if result["ok"] else "not ready: see the errors above")
 
     output.run("check", lambda: job(robot, bus=bus), show)
+
+
+def reset(
+    robot: RobotOption,
+    bus: BusOption = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before the reset.")] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Bring drives back that a fault or a cut-off run left standing: shows what it was, asks, resets. No power."""
+    from frictid_hil.cli.progress import answer
+    from frictid_hil.jobs.reset import reset as job
+    from frictid_hil.protocol.driver import Finding
+
+    output = Output(as_json, quiet)
+
+    def ask(faults: list[Finding]) -> bool:
+        for fault in faults:
+            output.err.print(f"{fault.subject}: {fault.message}")
+        if not yes and not sys.stdin.isatty():
+            raise UsageError("a reset needs a yes, and there is no terminal to ask on", next_step="add --yes")
+        return yes or answer("These will be reset; nothing moves. Is the cause cleared, the arm safe without power?")
+
+    def show(result: Result) -> None:
+        for one in result["reset"]:
+            output.out.print(f"{one['subject']}: {one['message']}: reset")
+        output.out.print("ready for `frictid-hil check`" if result["reset"] else "no drive is in fault")
+
+    output.run("reset", lambda: job(robot, bus=bus, ask=ask), show)
 
 
 def calibrate(

@@ -391,6 +391,19 @@ class Remarking(Protocol):
 
 
 @runtime_checkable
+class Resettable(Protocol):
+    """A driver that can bring drives back after a fault, or after a run that was cut off."""
+
+    def faults(self) -> list[Finding]:
+        """What keeps drives from running again; after ``open``, reads only."""
+        ...
+
+    def reset_faults(self) -> None:
+        """Bring those drives back; nothing gets power. ``HardwareError`` where one stays in fault."""
+        ...
+
+
+@runtime_checkable
 class Batched(Protocol):
     """A driver whose controller runs whole motions by itself and hands over what it recorded (``batch_only``).
 

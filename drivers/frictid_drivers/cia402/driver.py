@@ -11,11 +11,12 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import can
 
-from frictid_drivers.cia402 import configure, inspection
+from frictid_drivers.cia402 import configure, inspection, reentry
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import Decoder
@@ -159,6 +160,22 @@ class Cia402Driver:
             entry = next((one for one in plan.joints if one.joint == joint.name), None) if plan else None
             findings += inspection.joint_findings(joint, fleet, layout, self._settings, entry)
         return findings
+
+    def faults(self) -> list[Finding]:
+        """What keeps drives from running again (``driver.Resettable``)."""
+        drives = self._reached().drives
+        return [fault for name, drive in drives.items() if (fault := reentry.standing_fault(name, drive)) is not None]
+
+    def reset_faults(self) -> None:
+        """Bring them back, without power: reset of communication, then of the fault.
+
+        Raises:
+            HardwareError: a drive has power, does not come back, or stays in fault.
+        """
+        fleet = self._reached()
+        for name, drive in fleet.drives.items():
+            if reentry.standing_fault(name, drive) is not None:
+                reentry.bring_back(drive, partial(fleet.nmt_to, drive.node_id))
 
     # -- configuring --------------------------------------------------------------------------------------------
 

@@ -102,7 +102,11 @@ class Fleet:
     def nmt(self, command: int) -> None:
         """An NMT command to each of our drives; other devices on the bus are none of our business."""
         for drive in self.drives.values():
-            self.wire.send_message(0, bytes([command, drive.node_id]))
+            self.nmt_to(drive.node_id, command)
+
+    def nmt_to(self, node: int, command: int) -> None:
+        """An NMT command to one node."""
+        self.wire.send_message(0, bytes([command, node]))
 
     def send_heartbeat(self) -> None:
         """The host's own heartbeat while nobody cycles."""

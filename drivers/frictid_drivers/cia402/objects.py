@@ -100,6 +100,7 @@ def _object(index: int, sub: int, kind: str, name: str) -> Object:
 # CiA 301: communication
 DEVICE_TYPE = _object(0x1000, 0, "u32", "device type")
 ERROR_REGISTER = _object(0x1001, 0, "u8", "error register")
+ERROR_HISTORY = _object(0x1003, 1, "u32", "last error")
 SYNC_COB_ID = _object(0x1005, 0, "u32", "SYNC COB-ID")
 SYNC_PERIOD_US = _object(0x1006, 0, "u32", "SYNC period, us")
 HEARTBEAT_CONSUMERS = _object(0x1016, 0, "u8", "number of heartbeat consumers")

@@ -16,7 +16,7 @@ import can
 from frictid_drivers.virtual import channel, side_channel
 from frictid_drivers.virtual.arm import arm_of
 from frictid_drivers.virtual.faults import faults_of, missing_objects
-from frictid_drivers.virtual.faulty_rack import FaultyRack
+from frictid_drivers.virtual.faulty_rack import FaultyRack, leave_in_fault
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
@@ -91,6 +91,7 @@ class VirtualDriver:
             return SocketBus(self._channel)
         bus = LockStepBus(self._drives, self._channel)
         self._rack.power_on()
+        leave_in_fault(self._rack, self._faults)
         return bus
 
     def close(self) -> None:
@@ -158,6 +159,14 @@ class VirtualDriver:
     def check(self, plan: Plan | None) -> list[Finding]:
         """As ``Driver.check``."""
         return self._host.check(plan)
+
+    def faults(self) -> list[Finding]:
+        """As ``driver.Resettable``."""
+        return self._host.faults()
+
+    def reset_faults(self) -> None:
+        """As ``driver.Resettable``."""
+        self._host.reset_faults()
 
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """As ``Driver.configure``."""

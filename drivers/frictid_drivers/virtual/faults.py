@@ -24,6 +24,8 @@ stuck_encoder    the drive reports the same position for ever
 blocked          the brake stays closed                        for_s
 interlock_open   the interlock input opens (60FDh bit 3)       for_s
 missing          the drive has no such object, from the start  index
+left_in_fault    the drive is found in fault, as after a run   code
+                 that was cut off (8130h unless told)
 ===============  ============================================  ===========================================
 
 ``at_s`` counts from the first SYNC. ``frames`` is ``sync``, ``host_heartbeat``, ``sdo``, ``emcy``, ``heartbeat`` or
@@ -46,7 +48,17 @@ from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.simulation.fields import Fields
 
 FRAME_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")
-DRIVE_KINDS = ("mute", "emcy", "fault", "reset", "stuck_encoder", "blocked", "interlock_open", "missing")
+DRIVE_KINDS = (
+    "mute",
+    "emcy",
+    "fault",
+    "reset",
+    "stuck_encoder",
+    "blocked",
+    "interlock_open",
+    "missing",
+    "left_in_fault",
+)
 SERVICES: dict[str, tuple[int, ...]] = {
     "sync": (0x080,),
     "emcy": (0x080,),
@@ -144,7 +156,7 @@ def read_faults(rows: Any, setup: RobotSetup) -> tuple[Fault, ...]:
                 joints=joints,
                 cob_ids=_cob_ids(service, [setup.joint(name).address for name in joints]) if service else frozenset(),
                 delay_s=fields.number("delay_s", 0.0, low=0.0),
-                code=round(fields.number("code", 0x5000, low=1.0, high=0xFFFF)),
+                code=round(fields.number("code", 0x8130 if kind == "left_in_fault" else 0x5000, low=1.0, high=0xFFFF)),
                 index=round(fields.number("index", 0.0, low=0.0, high=0xFFFF)),
             )
         )

@@ -156,3 +156,11 @@ def _call(switch: Callable[[bool], None], on: bool) -> Callable[[], None]:
 
 def _discard(can_id: int, data: bytes) -> None:
     """No bus yet."""
+
+
+def leave_in_fault(rack: Rack, faults: Sequence[Fault]) -> None:
+    """Drives as an earlier run left them, right after power-on."""
+    for fault in faults:
+        if fault.kind == "left_in_fault":
+            for joint in fault.joints:
+                rack.servos[joint].fail(fault.code, rack.now_ns)

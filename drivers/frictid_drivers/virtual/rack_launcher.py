@@ -8,6 +8,7 @@ import json
 import select
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import HardwareError
@@ -80,11 +81,14 @@ def start_rack(setup: RobotSetup) -> RunningRack:
 
 def encode_setup(setup: RobotSetup) -> str:
     """The robot as one line of JSON."""
-    return json.dumps(dataclasses.asdict(setup), default=dict)
+    plain = dataclasses.asdict(setup)
+    plain["folder"] = None if setup.folder is None else str(setup.folder)
+    return json.dumps(plain, default=dict)
 
 
 def decode_setup(line: str) -> RobotSetup:
     """The robot of ``encode_setup``."""
     mapping: dict[str, Any] = json.loads(line)
     joints = tuple(JointSetup(**joint) for joint in mapping.pop("joints"))
-    return RobotSetup(joints=joints, **mapping)
+    folder = mapping.pop("folder")
+    return RobotSetup(joints=joints, folder=None if folder is None else Path(folder), **mapping)

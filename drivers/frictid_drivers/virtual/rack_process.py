@@ -23,7 +23,7 @@ from typing import Protocol
 
 from frictid_drivers.virtual import channel
 from frictid_drivers.virtual.faults import Fault, faults_of, missing_objects
-from frictid_drivers.virtual.faulty_rack import FaultyRack
+from frictid_drivers.virtual.faulty_rack import FaultyRack, leave_in_fault
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import DISMISSAL, READY, decode_setup
 from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE, Hub
@@ -108,6 +108,7 @@ class RackProcess:
 
     def __init__(self, rack: Rack, hub: Wire, faults: Sequence[Fault] = (), *, now_ns: int | None = None) -> None:
         self._rack = rack
+        self._faults = faults
         self._drives = FaultyRack(rack, faults) if faults else rack
         self._hub = hub
         self._origin_ns = (time.monotonic_ns() if now_ns is None else now_ns) - rack.now_ns
@@ -136,6 +137,7 @@ class RackProcess:
     def run(self, owner: Owner) -> None:
         """Serve until the owner says so, or is gone and the robot stands still."""
         self._drives.power_on()
+        leave_in_fault(self._rack, self._faults)
         farewell = _Farewell()
         while True:
             wait_s = (self._drives.next_event_ns - self._drives.now_ns) * 1e-9

@@ -1,0 +1,50 @@
+"""``frictid-hil reset``: drives that an earlier run left in fault or quick stop are brought back, without power."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from frictid_hil.config.robot import load_robot
+from frictid_hil.errors import PlanRefused, UsageError
+from frictid_hil.protocol.driver import Driver, Finding, Resettable, load_driver
+
+
+def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Finding]], bool]) -> dict[str, Any]:
+    """Show what the faults are, ask, and reset them.
+
+    Args:
+        robot_name: robot file.
+        bus: ``interface:channel`` instead of the file's own.
+        ask: shown the faults; False leaves everything as it is.
+
+    Raises:
+        UsageError: this robot's driver has no such thing.
+        PlanRefused: the person said no.
+        HardwareError: a drive does not answer, has power, or stays in fault.
+    """
+    robot = load_robot(robot_name)
+    setup = robot.to_setup(bus)
+    with robot.document.locating():
+        driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    if not isinstance(driver, Resettable):
+        raise UsageError(
+            f"the {robot.driver(bus)} driver cannot reset faults",
+            where=setup.bus,
+            next_step="reset them at the controller",
+        )
+    try:
+        driver.open()
+        faults = driver.faults()
+        if faults and not ask(faults):
+            raise PlanRefused("not confirmed; nothing was reset")
+        if faults:
+            driver.reset_faults()
+    finally:
+        driver.close()
+    return {
+        "outcome": "ok",
+        "robot": robot.name,
+        "bus": setup.bus,
+        "reset": [{"subject": fault.subject, "message": fault.message} for fault in faults],
+    }
