@@ -120,6 +120,9 @@ def draft(
 def check(
     cases: Annotated[int, typer.Option("--cases", metavar="N", min=1, help="Joints to draw.")] = 40,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the draw.")] = 1,
+    world: Annotated[
+        str, typer.Option("--world", metavar="NAMES", help="narrow, wide, zoo, or several with commas.")
+    ] = "narrow",
     processes: Annotated[int, typer.Option("--processes", metavar="N", min=1, help="Parallel processes.")] = 2,
     leave_one_out: Annotated[
         bool, typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn.")
@@ -136,17 +139,25 @@ def check(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        table = Table("figure", "value", "95 % interval", "of", title=f"Blind check: {cases} joints, seed {seed}")
-        for name, rate in result["rates"].items():
-            if rate.get("of"):
-                interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
-                table.add_row(name.replace("_", " "), f"{100 * rate['rate']:.1f} %", interval, str(rate["of"]))
-        output.out.print(table)
+        for name, one in (result.get("worlds") or {result["world"]: result}).items():
+            title = f"Blind check, {name} world: {cases} joints, seed {seed}"
+            table = Table("figure", "value", "95 % interval", "of", title=title)
+            for figure, rate in one["rates"].items():
+                if rate.get("of"):
+                    interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
+                    table.add_row(figure.replace("_", " "), f"{100 * rate['rate']:.1f} %", interval, str(rate["of"]))
+            output.out.print(table)
 
     output.run(
         "gap_check",
         lambda: run_gap_check(
-            cases, seed, out, processes=processes, leave_one_out=leave_one_out, progress=output.err.print
+            cases,
+            seed,
+            out,
+            worlds=[name.strip() for name in world.split(",") if name.strip()],
+            processes=processes,
+            leave_one_out=leave_one_out,
+            progress=output.err.print,
         ),
         show,
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
 from frictid_hil.gap.blind.check import run_check
-from frictid_hil.gap.blind.page import headline, page
+from frictid_hil.gap.blind.worlds import WORLDS
 
 
 def run_gap_check(
@@ -18,6 +18,7 @@ def run_gap_check(
     out: Path | None = None,
     processes: int | None = None,
     *,
+    worlds: Sequence[str] = ("narrow",),
     leave_one_out: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
@@ -27,44 +28,53 @@ def run_gap_check(
         cases: how many joints; twenty bring every kind, 200 every effect five times.
         seed: of everything drawn.
         out: folder that keeps commitment, cases, answers, truth, ``result.json`` and ``gap-check.md``.
+        worlds: names of the worlds to draw from, ``cases`` joints each.
         processes: at once; one per processor core unless given.
         leave_one_out: also take each joint's own effect out of the library and diagnose again.
         progress: given a line now and then.
 
     Returns:
-        What ``--json`` prints: ``outcome``, ``seed``, ``cases``, ``truth_sha256``, ``rates`` (each ``rate``, ``low``,
-        ``high``, ``right``, ``of``), ``scores`` (everything), ``leave_one_out`` (or None), ``out``.
+        What ``--json`` prints of a single world: ``outcome``, ``world``, ``seed``, ``cases``, ``truth_sha256``,
+        ``rates`` (each ``rate``, ``low``, ``high``, ``right``, ``of``), ``scores`` (everything), ``leave_one_out`` (or
+        None), ``out``. Of several: ``outcome``, ``seed``, ``cases``, ``worlds`` (the same by name), ``out``.
 
     Raises:
-        UsageError: no case asked for, or ``out`` holds the result of a finished check. An interrupted one goes on.
+        UsageError: no case asked for, no such world, or ``out`` holds the result of a finished check. An interrupted
+            one goes on.
     """
     if cases < 1:
         raise UsageError(f"{cases} cases cannot be scored", next_step="ask for at least 20: `gap check --cases 20`")
-    if out is not None and (out / "result.json").exists():
-        raise UsageError("this folder holds an earlier check", where=str(out), next_step="name a new folder")
-    result = run_check(
-        cases,
-        seed,
-        out=out,
-        processes=processes or os.cpu_count() or 1,
-        leave_one_out=leave_one_out,
-        progress=_told(progress) if progress else None,
-    )
-    if out is not None:
-        (out / "gap-check.md").write_text(page(result))
-    return {
-        "outcome": "ok",
-        **result,
-        "rates": headline(result["scores"]),
-        "out": str(out.resolve()) if out is not None else None,
-    }
+    strange = [name for name in worlds if name not in WORLDS]
+    if strange or not worlds:
+        raise UsageError(f"no world is called {', '.join(strange)!r}", next_step=f"name of: {', '.join(WORLDS)}")
+    results = {}
+    for name in worlds:
+        folder = out if out is None or len(worlds) == 1 else out / name
+        if folder is not None and (folder / "result.json").exists():
+            raise UsageError("this folder holds an earlier check", where=str(folder), next_step="name a new folder")
+        result = run_check(
+            cases,
+            seed,
+            out=folder,
+            processes=processes or os.cpu_count() or 1,
+            world=name,
+            leave_one_out=leave_one_out and name == "narrow",
+            progress=_told(name, progress) if progress else None,
+        )
+        if folder is not None:
+            (folder / "gap-check.md").write_text(WORLDS[name].page(result))
+        results[name] = {**result, "rates": WORLDS[name].headline(result["scores"])}
+    kept = {"out": str(out.resolve()) if out is not None else None}
+    if len(results) == 1:
+        return {"outcome": "ok", **next(iter(results.values())), **kept}
+    return {"outcome": "ok", "seed": seed, "cases": cases, "worlds": results, **kept}
 
 
-def _told(tell: Callable[[str], None]) -> Callable[[str, int, int], None]:
+def _told(world: str, tell: Callable[[str], None]) -> Callable[[str, int, int], None]:
     """A line at every tenth of a phase."""
 
     def progress(phase: str, done: int, of: int) -> None:
         if done == of or 10 * done // of > 10 * (done - 1) // of:
-            tell(f"{phase}: {done} of {of}")
+            tell(f"{world}, {phase}: {done} of {of}")
 
     return progress

@@ -22,8 +22,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.gap.blind.generator import Assignment, assignments, draw_case, truth_text, write_case
-from frictid_hil.gap.blind.score import Answer, score, score_left_out
+from frictid_hil.gap.blind.generator import truth_text
+from frictid_hil.gap.blind.score import Answer, score_left_out
+from frictid_hil.gap.blind.worlds import WORLDS
 
 SCHEMA = "frictid.gap_check/1"
 
@@ -56,6 +57,7 @@ def run_check(
     *,
     out: Path | None = None,
     processes: int = 1,
+    world: str = "narrow",
     leave_one_out: bool = False,
     progress: Progress | None = None,
     diagnoser: DiagnoserCommand = DIAGNOSER,
@@ -68,26 +70,27 @@ def run_check(
         out: folder to keep the commitment, the cases, the answers, the truth and the result in, and to go on in after
             an interruption; kept nowhere if None.
         processes: how many diagnose (and draw) at once.
+        world: name in ``WORLDS``.
         leave_one_out: also diagnose every visible joint with one effect by a library that lacks this effect.
         progress: see ``Progress``.
         diagnoser: command of a diagnosing process; see ``diagnoser.serve`` for what it is told and answers.
 
     Returns:
-        The scores, plain values, with ``schema``, ``seed``, ``cases``, ``truth_sha256``.
+        The scores, plain values, with ``schema``, ``world``, ``seed``, ``cases``, ``truth_sha256``.
     """
     report = progress or (lambda phase, done, of: None)
     with _folder(out) as folder:
-        sealed = draw_sealed(assignments(cases, seed), seed, folder / "cases", processes, report)
+        sealed = draw_sealed(world, cases, seed, folder / "cases", processes, report)
         # The commitment stands before the first answer is asked for.
         commitment = {"schema": SCHEMA, "cases": cases, "truth_sha256": sealed.digest, "code_sha256": code_digest()}
         kept = _Kept.in_folder(folder, commitment)
         requests = [{"case": name, "left_out": None} for name in sealed.truths]
         lines = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "diagnose", kept)
-        answers = {line["case"]: Answer.from_json(line) for line in lines}
         result: dict[str, Any] = {
             **commitment,
+            "world": world,
             "seed": seed,
-            "scores": score(sealed.truths, answers),
+            "scores": WORLDS[world].score(sealed.truths, {line["case"]: line for line in lines}),
             "leave_one_out": None,
         }
         left_out: list[dict[str, Any]] = []
@@ -95,7 +98,7 @@ def run_check(
             requests = [
                 {"case": name, "left_out": truth["effects"][0]["name"]}
                 for name, truth in sealed.truths.items()
-                if truth["kind"] == "single" and truth["visible"]
+                if truth["kind"] == "single" and truth.get("visible", True)
             ]
             left_out = _diagnosed(diagnoser, sealed.folder, requests, processes, report, "leave one out", kept)
             result["leave_one_out"] = score_left_out(
@@ -147,10 +150,12 @@ class _Kept:
         return found
 
 
-def draw_sealed(dealt: Sequence[Assignment], seed: int, folder: Path, processes: int, progress: Progress) -> Sealed:
+def draw_sealed(world: str, cases: int, seed: int, folder: Path, processes: int, progress: Progress) -> Sealed:
     """Draw all cases and write their sets below ``folder``; truth comes back to the caller's memory alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = [(index, seed, assignment, folder) for index, assignment in enumerate(dealt)]
+    tasks: list[_Task] = [
+        (world, index, seed, card, folder) for index, card in enumerate(WORLDS[world].cards(cases, seed))
+    ]
     truths: dict[str, dict[str, Any]] = {}
     for done, truth in enumerate(_mapped(tasks, processes), start=1):
         truths[truth["case"]] = truth
@@ -160,7 +165,10 @@ def draw_sealed(dealt: Sequence[Assignment], seed: int, folder: Path, processes:
     return Sealed(folder, truths, texts, digest)
 
 
-def _mapped(tasks: Sequence[tuple[int, int, Assignment, Path]], processes: int) -> Iterator[dict[str, Any]]:
+_Task = tuple[str, int, int, Any, Path]
+
+
+def _mapped(tasks: Sequence[_Task], processes: int) -> Iterator[dict[str, Any]]:
     if processes <= 1:
         yield from map(_draw_and_write, tasks)
         return
@@ -168,11 +176,9 @@ def _mapped(tasks: Sequence[tuple[int, int, Assignment, Path]], processes: int) 
         yield from pool.map(_draw_and_write, tasks, chunksize=4)
 
 
-def _draw_and_write(task: tuple[int, int, Assignment, Path]) -> dict[str, Any]:
-    index, seed, assignment, folder = task
-    case = draw_case(index, seed, assignment)
-    write_case(case, folder / case.name)
-    return case.truth
+def _draw_and_write(task: _Task) -> dict[str, Any]:
+    world, index, seed, card, folder = task
+    return WORLDS[world].draw(index, seed, card, folder)
 
 
 def _diagnosed(

@@ -135,7 +135,7 @@ def _inverse_residual(joint: Joint, log: Log) -> Array:
     centred = log.torque_nm.copy()
     centred[:-1] = 0.5 * (log.torque_nm[:-1] + log.torque_nm[1:])
     # The second difference is the acceleration averaged over a triangle of two ticks; friction must be averaged alike.
-    friction = p.coulomb * _slip(q, p.slip_length) + rate
+    friction = p.coulomb * slip_of_spring(q, p.slip_length) + rate
     friction[1:-1] = 0.25 * friction[:-2] + 0.5 * friction[1:-1] + 0.25 * friction[2:]
     rigid = (p.motor_inertia + p.link_inertia) * acceleration + p.gravity * np.cos(q)
     residual: Array = centred - rigid - friction
@@ -154,7 +154,8 @@ def _actuation_residual(control: Controller, log: Log) -> Array:
 
 
 @njit(cache=True)
-def _slip(position: Array, length: float) -> Array:
+def slip_of_spring(position: Array, length: float) -> Array:
+    """State of a spring that slips after ``length``, along a motion from rest."""
     slip = np.zeros(position.size)
     for k in range(1, position.size):
         slip[k] = min(max(slip[k - 1] + (position[k] - position[k - 1]) / length, -1.0), 1.0)

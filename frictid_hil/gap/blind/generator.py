@@ -125,7 +125,7 @@ def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[
             }
             for effect, one, ratio in zip(assignment.effects, alone, separately, strict=True)
         ]
-        return Case(name, _rounded(nominal_mapping(joint, name)), logs, _rounded(truth))
+        return Case(name, rounded(nominal_mapping(joint, name)), logs, rounded(truth))
     raise RuntimeError(f"no joint that its controller can hold came up for {assignment}")
 
 
@@ -255,12 +255,12 @@ def _size_class(ratio: float, effects: tuple[str, ...]) -> str:
     return "small" if ratio < SMALL else "medium" if ratio < MEDIUM else "large"
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Numbers to eight significant digits, everything plain."""
     if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
+        return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(item) for item in value]
+        return [rounded(item) for item in value]
     if isinstance(value, bool | int | str):
         return value
     return float(f"{float(value):.8g}")

@@ -1,9 +1,10 @@
 """A second, unrelated simulation of a geared joint, so that the diagnosis is not judged by its own formulas.
 
-It shares no code and no formula with ``frictid_hil.simulation``: presliding is a Maxwell-slip network, the rate curve a
-hyperbolic bend, stiction an ageing state with a logarithmic law, weakening a hyperbolic secant, and so on; the
-integrator is an explicit leapfrog at 20 kHz around a 500 Hz digital controller. One flat record, ``Physics``, holds
-every number; each effect is neutral at its default.
+It shares no code and no formula with ``frictid_hil.simulation``: presliding is a network of Maxwell slips (or of
+generalised ones, a LuGre bristle, a Bouc-Wen loop), the rate curve a hyperbolic bend (or a root, a cube, Eyring's
+inverse sine), stiction an ageing state with a logarithmic law, weakening a hyperbolic secant, saturation a tanh
+beyond a linear part, and so on; the integrator is an explicit leapfrog at 20 kHz around a digital controller. One flat
+record, ``Physics``, holds every number; each effect is neutral at its default.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ WEAKENING_SECH, WEAKENING_GAUSS, WEAKENING_RATIONAL = 0, 1, 2
 RATE_POWER, RATE_TANH, RATE_LOG = 0, 1, 2
 LOAD_ROUNDED, LOAD_POWER = 0, 1
 ESTIMATE_TWO_POLES, ESTIMATE_AVERAGE = 0, 1
+RATE_BEND, RATE_ROOT, RATE_EYRING, RATE_CUBE = 0, 1, 2, 3
+SLIP_NETWORK, SLIP_GENERALISED, SLIP_BRISTLE, SLIP_LOOP = 0, 1, 2, 3
 
 _NETWORK_REACH = np.array([0.95, 1.0, 1.05])
 _NETWORK_SHARE = np.array([0.3, 0.4, 0.3])
@@ -48,6 +51,9 @@ class Physics(NamedTuple):
     # How round the bend is and how gradual the first slip; 0 for a belief: two straight lines and one spring, no more
     # than a nominal file can tell.
     rounding: float = 1.0
+    # Families of base friction; a rate family other than the bend rises by ``viscous_low`` up to ``bend_velocity``.
+    rate_family: int = RATE_BEND
+    slip_family: int = SLIP_NETWORK
     # Friction.
     weakening: float = 0.0
     weakening_velocity: float = 0.05
@@ -61,6 +67,8 @@ class Physics(NamedTuple):
     load_share: float = 0.0
     load_scale: float = 1.0
     load_kind: int = LOAD_ROUNDED
+    driving_loss: float = 0.0
+    backdriving_loss: float = 0.0
     soft_share: float = 0.0
     soft_length: float = 0.01
     ageing: float = 0.0
@@ -74,6 +82,9 @@ class Physics(NamedTuple):
     ripple_harmonic: float = 2.0
     ripple_phase: float = 0.0
     ripple_sharpness: float = 0.5
+    kinematic: float = 0.0
+    kinematic_harmonic: float = 2.0
+    kinematic_phase: float = 0.0
     stiffness: float = 0.0
     hardening: float = 0.0
     coupling_damping: float = 0.0
@@ -119,23 +130,42 @@ class Physics(NamedTuple):
 
 
 class Controller(NamedTuple):
-    """The digital position controller: kp e + integral(ki e) + kd (d cmd/dt - filtered v), frozen while limited."""
+    """The digital position controller: kp (b cmd - q) + integral(ki e) + kd (c d cmd/dt - filtered v) + a d2 cmd/dt2.
+
+    Frozen while limited. ``backward``: it knows only the set-points that have come.
+    """
 
     kp: float
     ki: float
     kd: float
     velocity_filter: float
     torque_limit: float
+    tick: float = TICK_S
+    substeps: int = SUBSTEPS
+    command_weight: float = 1.0
+    rate_weight: float = 1.0
+    inertia_ahead: float = 0.0
+    backward: bool = False
 
 
 @njit(cache=True)
-def _rate_part(p: Physics, speed: float) -> float:
+def rate_part(p: Physics, speed: float) -> float:
     """Friction above Coulomb at a speed: a hyperbolic bend between two slopes, and what the nominal curve lacks."""
-    width = 0.08 * p.bend_velocity * p.rounding
-    reach = speed - p.bend_velocity
-    bent = 0.5 * (speed + p.bend_velocity - math.sqrt(reach * reach + width * width))
-    bent -= 0.5 * (p.bend_velocity - math.sqrt(p.bend_velocity * p.bend_velocity + width * width))
-    torque = p.viscous_high * speed + (p.viscous_low - p.viscous_high) * bent
+    if p.rate_family == RATE_BEND:
+        width = 0.08 * p.bend_velocity * p.rounding
+        reach = speed - p.bend_velocity
+        bent = 0.5 * (speed + p.bend_velocity - math.sqrt(reach * reach + width * width))
+        bent -= 0.5 * (p.bend_velocity - math.sqrt(p.bend_velocity * p.bend_velocity + width * width))
+        torque = p.viscous_high * speed + (p.viscous_low - p.viscous_high) * bent
+    else:
+        times = speed / p.bend_velocity
+        if p.rate_family == RATE_ROOT:
+            shape = math.sqrt(times)
+        elif p.rate_family == RATE_EYRING:
+            shape = math.asinh(12.0 * times) / math.asinh(12.0)
+        else:
+            shape = 0.6 * times + 0.4 * times * times * times
+        torque = p.viscous_low * p.bend_velocity * shape
     if p.rate_extra != 0.0:
         ratio = speed / p.rate_velocity
         if p.rate_kind == RATE_POWER:
@@ -170,6 +200,51 @@ def _load_part(p: Physics, load: float) -> float:
 
 
 @njit(cache=True)
+def _by_quadrant(p: Physics, load: float, slip: float) -> float:
+    """What the gear takes of the power that passes it: one efficiency forward, another one back."""
+    if load * slip >= 0.0:
+        return load * abs(slip) * (1.0 / (1.0 - p.driving_loss) - 1.0)
+    return -load * abs(slip) * p.backdriving_loss
+
+
+@njit(cache=True)
+def _kinematic(p: Physics, q: float, v: float, acceleration: float, load: float, link_inertia: float) -> float:
+    """Reaction of a link that stands at q + e(q): virtual work of load and inertia along e."""
+    if p.kinematic == 0.0:
+        return 0.0
+    pace = p.kinematic_harmonic * p.gear_ratio
+    phase = pace * q + p.kinematic_phase
+    ahead = p.kinematic * pace * math.cos(phase)
+    pushed = -p.kinematic * pace * pace * math.sin(phase) * v * v + ahead * acceleration
+    return ahead * load + (1.0 + ahead) * link_inertia * pushed
+
+
+@njit(cache=True)
+def _slipped(p: Physics, state: Array, dq: float, h: float) -> float:
+    """State of presliding friction, -1..1 at steady sliding, carried over one step of travel ``dq``."""
+    if p.slip_family == SLIP_BRISTLE:
+        state[0] += dq / p.slip_length - abs(dq) / p.slip_length * state[0]
+        state[0] = min(max(state[0], -1.0), 1.0)
+        return float(state[0])
+    if p.slip_family == SLIP_LOOP:
+        held = 0.5 * (1.0 + math.copysign(1.0, dq * state[0])) if state[0] != 0.0 else 0.0
+        state[0] += dq / p.slip_length * (1.0 - held * state[0] * state[0])
+        state[0] = min(max(state[0], -1.0), 1.0)
+        return float(state[0])
+    slip = 0.0
+    for i in range(state.size):
+        reach = p.slip_length * (1.0 + p.rounding * (_NETWORK_REACH[i] - 1.0))
+        if p.slip_family == SLIP_GENERALISED and abs(state[i] + dq) > 0.7 * reach:
+            # A slipping block creeps towards its limit as it travels instead of stopping there at once.
+            state[i] += dq * (1.0 - state[i] / math.copysign(reach, dq)) / 0.3
+            state[i] = min(max(state[i], -reach), reach)
+        else:
+            state[i] = min(max(state[i] + dq, -reach), reach)
+        slip += _NETWORK_SHARE[i] * state[i] / reach
+    return slip
+
+
+@njit(cache=True)
 def _ripple(p: Physics, position: float) -> float:
     """A bell-shaped wave over the motor angle, without its mean: a fundamental with a share of overtones."""
     sharp = p.ripple_sharpness
@@ -199,7 +274,11 @@ def _amplified(p: Physics, command: float) -> float:
     if p.dead_zone > 0.0:
         torque = math.copysign(max(abs(torque) - p.dead_zone, 0.0), torque)
     if p.ceiling > 0.0:
-        torque = torque / (1.0 + abs(torque / p.ceiling) ** p.ceiling_knee) ** (1.0 / p.ceiling_knee)
+        # Linear up to a share of the ceiling that grows with the knee's sharpness, then a tanh up to the ceiling.
+        start = p.ceiling * (1.0 - 2.0 / p.ceiling_knee)
+        if abs(torque) > start:
+            room = p.ceiling - start
+            torque = math.copysign(start + room * math.tanh((abs(torque) - start) / room), torque)
     return torque
 
 
@@ -233,7 +312,8 @@ def run(
         thermal state at the end.
     """
     n = command.size
-    h = TICK_S / SUBSTEPS
+    period = control.tick
+    h = period / control.substeps
     two_masses = p.stiffness > 0.0
     pendulum = p.pendulum_inertia > 0.0
     link_inertia = p.link_inertia - p.pendulum_inertia
@@ -262,14 +342,14 @@ def run(
     soft = np.zeros(_SOFT_REACH.size)
     drag = 0.0
     age = 1.0
-    integral = first
+    integral = first - control.kp * (control.command_weight - 1.0) * command[0]
     filtered = 0.0
-    blend = 1.0 - math.exp(-TICK_S / control.velocity_filter)
+    blend = 1.0 - math.exp(-period / control.velocity_filter)
     lag_blend = 1.0 - math.exp(-h / p.lag) if p.lag > 0.0 else 1.0
     second_blend = 1.0 - math.exp(-h / p.second_lag) if p.second_lag > 0.0 else 1.0
-    pole = math.exp(-2.0 * TICK_S / p.estimate_lag) if p.estimate_lag > 0.0 else 0.0
+    pole = math.exp(-2.0 * period / p.estimate_lag) if p.estimate_lag > 0.0 else 0.0
     stage1 = stage2 = 0.0
-    window = round(2.0 * p.estimate_lag / TICK_S) + 1
+    window = round(2.0 * p.estimate_lag / period) + 1
     half_step = 0.5 * p.encoder_step
     last = math.floor(q / p.encoder_step + 0.5) * p.encoder_step
     target = _amplified(p, first)
@@ -277,7 +357,7 @@ def run(
 
     for k in range(n):
         count = math.floor((q + half_step) / p.encoder_step) * p.encoder_step
-        raw = (count - last) / TICK_S
+        raw = (count - last) / period
         last = count
         position[k] = count
         estimate = raw
@@ -288,24 +368,28 @@ def run(
                 estimate = stage2
             else:
                 oldest = max(0, k - window)
-                estimate = (count - position[oldest]) / (TICK_S * window)
+                estimate = (count - position[oldest]) / (period * window)
         velocity[k] = estimate
         torque[k] = applied
 
         before, after = max(k - 1, 0), min(k + 1, n - 1)
-        rate = (command[after] - command[before]) / (2.0 * TICK_S)
+        rate = (command[after] - command[before]) / (2.0 * period)
+        if control.backward:
+            rate = (command[k] - command[before]) / period
+        bend = (command[after] - 2.0 * command[k] + command[before]) / (period * period)
         filtered += blend * (estimate - filtered)
         error = command[k] - count
-        demand = control.kp * error + integral + control.kd * (rate - filtered)
+        demand = control.kp * error + integral + control.kd * (control.rate_weight * rate - filtered)
+        demand += control.kp * (control.command_weight - 1.0) * command[k] + control.inertia_ahead * bend
         limited = min(max(demand, -control.torque_limit), control.torque_limit)
         if limited == demand:
-            integral += control.ki * error * TICK_S
+            integral += control.ki * error * period
         sent[k] = sent[k - 1] if k > 0 and chance[k] < p.missed else limited
 
-        for j in range(SUBSTEPS):
-            now = k * TICK_S + j * h
+        for j in range(control.substeps):
+            now = k * period + j * h
             # The newest command that has had time to arrive.
-            due = k if p.delay == 0.0 else math.floor((now - p.delay) / TICK_S + 1e-9)
+            due = k if p.delay == 0.0 else math.floor((now - p.delay) / period + 1e-9)
             if due != taken:
                 target = _amplified(p, sent[due] if due >= 0 else first)
                 taken = due
@@ -315,13 +399,7 @@ def run(
             # Leapfrog: positions by the velocity half a step on, then velocities by the torque at the new position.
             dq = h * v
             q += dq
-            for i in range(network.size):
-                reach = p.slip_length * (1.0 + p.rounding * (_NETWORK_REACH[i] - 1.0))
-                network[i] = min(max(network[i] + dq, -reach), reach)
-            slip = 0.0
-            for i in range(network.size):
-                reach = p.slip_length * (1.0 + p.rounding * (_NETWORK_REACH[i] - 1.0))
-                slip += _NETWORK_SHARE[i] * network[i] / reach
+            slip = _slipped(p, network, dq, h)
             level = p.coulomb * slip
             if p.soft_share != 0.0:
                 give = 0.0
@@ -336,7 +414,7 @@ def run(
                 remembered += h / p.memory * (v - remembered)
                 seen = remembered
             speed = abs(seen)
-            rate_torque = _rate_part(p, speed)
+            rate_torque = rate_part(p, speed)
             friction = math.copysign(rate_torque, seen) if speed > 0.0 else 0.0
             if p.memory > 0.0:
                 friction += 0.35 * p.coulomb * (math.tanh(seen / 0.08) - math.tanh(v / 0.08))
@@ -346,8 +424,10 @@ def run(
             if p.ageing != 0.0:
                 age = (age + h) / (1.0 + h * abs(v) / p.ageing_length)
                 friction += slip * p.ageing * math.log1p(age / p.ageing_time) / math.log1p(2.0 / p.ageing_time)
-            if p.load_share != 0.0:
-                friction += slip * _load_part(p, _static(p, ql) + link_inertia * acceleration)
+            if p.load_share != 0.0 or p.driving_loss != 0.0 or p.backdriving_loss != 0.0 or p.kinematic != 0.0:
+                load = _static(p, ql) + link_inertia * acceleration
+                friction += slip * _load_part(p, load) + _by_quadrant(p, load, slip)
+                friction += _kinematic(p, q, v, acceleration, load, link_inertia)
             if p.patch != 0.0:
                 aside = (q - p.patch_position) / p.patch_width
                 friction += slip * p.patch * math.exp(-aside * aside)

@@ -1,0 +1,177 @@
+"""Scores of the wide world and the zoo: what is named first, false all-clears, confidence against truth, intervals.
+
+A truth names the causes that are right first (``main``), those that are there (``present``), those that are neither
+right nor wrong (``neutral``), and for each contributor what can't be told from it. Every rate has its Wilson interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.gap.blind.score import CONFIDENT, Answer, Rate
+
+FALSE_CLEAR = 3.0
+"""Gap over floor from which ``none`` is a false all-clear."""
+BINS = 10
+"""Of confidence, for the calibration error."""
+LEVEL = "friction_level_error"
+
+
+def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Every figure, plain values.
+
+    Args:
+        truths: by case name.
+        documents: lines of the diagnosing process by case name; a case without one counts as an error.
+    """
+    absent = {"error": "no answer"}
+    cases = [(t, Answer.from_json(documents.get(n, absent)), documents.get(n, absent)) for n, t in truths.items()]
+    visible = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
+    named = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
+    sure = [_wrong(t, a) for t, a, _ in cases if a.confidence >= CONFIDENT]
+    off = [(t, a) for t, a in visible if LEVEL in t["main"]]
+
+    def first(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+        return Rate.over(_right(t, a) for t, a in chosen).to_json()
+
+    return {
+        "cases": len(cases),
+        "errors": [{"case": t["case"], "message": a.message} for t, a, _ in cases if a.verdict == "error"],
+        "first": first(visible),
+        "first_by_kind": {kind: first([(t, a) for t, a in visible if t["kind"] == kind]) for kind in _kinds(visible)},
+        "first_by_controller": {
+            told: first([(t, a) for t, a in visible if t["controller"] == told])
+            for told in sorted({str(t["controller"]) for t, _ in visible})
+        },
+        "first_or_tied": Rate.over(_right(t, a) or a.first in _tied(t) for t, a in visible).to_json(),
+        "none": Rate.over(a.verdict == "none" for t, a, _ in cases if t["kind"] == "none").to_json(),
+        "outside": Rate.over(a.verdict == "unknown" for t, a, _ in cases if t["kind"] == "outside").to_json(),
+        "false_none": Rate.over(
+            a.verdict == "none" for t, a, _ in cases if t["size_ratio"] >= FALSE_CLEAR
+        ).to_json(),
+        "sure_and_wrong": Rate(sum(sure), len(cases)).to_json(),
+        "friction_level_taken_for_another": Rate.over(
+            a.confidence >= 0.5 and a.first not in (*t["main"], *_tied(t)) for t, a in off
+        ).to_json(),
+        "parameters": Rate.over(held for t, _, d in cases for held in _held(t, d)).to_json(),
+        "brier": float(np.mean([(c - _there(t, e)) ** 2 for t, e, c in named])) if named else None,
+        "calibration_error": _calibration_error([(c, _there(t, e)) for t, e, c in named]),
+        "confusion": _confusion([(t, a) for t, a, _ in cases]),
+        "seconds": _quantiles([a.seconds for _, a, _ in cases if np.isfinite(a.seconds)]),
+        "misses": [
+            {"case": t["case"], "kind": t["kind"], "main": t["main"], "answer": a.first, "confidence": a.confidence,
+             "size": t["size_ratio"]}
+            for t, a, _ in cases if not _right(t, a)
+        ],
+    }  # fmt: skip
+
+
+def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The rates that a person asks for first, by name."""
+    told = {f"first_controller_{name}": rate for name, rate in scores["first_by_controller"].items()}
+    names = ("none", "outside", "false_none", "sure_and_wrong", "friction_level_taken_for_another", "parameters")
+    return {"first": scores["first"], **told, "first_or_tied": scores["first_or_tied"], **{n: scores[n] for n in names}}
+
+
+def page(result: Mapping[str, Any]) -> str:
+    """One run in Markdown, failures included."""
+    scores = result["scores"]
+    lines = [
+        f"### The {result['world']} world",
+        "",
+        f"{result['cases']} joints, seed {result['seed']}; SHA-256 of the truth, published before the first answer: "
+        f"`{result['truth_sha256']}`; of the code that answered: `{result['code_sha256']}`.",
+        "",
+        "| | share | 95 % interval | count |",
+        "|---|---|---|---|",
+    ]
+    for name, rate in headline(scores).items():
+        if rate["of"]:
+            interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
+            share = f"{100 * rate['rate']:.1f} %"
+            lines.append(f"| {name.replace('_', ' ')} | {share} | {interval} | {rate['right']} of {rate['of']} |")
+    lines += [
+        "",
+        f"Brier score of named causes {_told(scores['brier'])}, expected calibration error "
+        f"{_told(scores['calibration_error'])}; median of processor time {_told(scores['seconds']['median'])} s; "
+        f"errors {len(scores['errors'])}.",
+        "",
+        "| missed | truth | answer | confidence | floors |",
+        "|---|---|---|---|---|",
+    ]
+    for miss in scores["misses"]:
+        truth = ", ".join(miss["main"]) or "none"
+        lines.append(f"| {miss['case']} | {truth} | {miss['answer']} | {miss['confidence']:.2f} | {miss['size']:.3g} |")
+    return "\n".join(lines) + "\n"
+
+
+def _told(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _kinds(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[str]:
+    return sorted({str(t["kind"]) for t, _ in cases})
+
+
+def _right(truth: Mapping[str, Any], answer: Answer) -> bool:
+    if truth["kind"] == "none":
+        return answer.verdict == "none"
+    return answer.first in truth["main"]
+
+
+def _tied(truth: Mapping[str, Any]) -> set[str]:
+    """What can't be told from a right first answer."""
+    return {name for one in truth["contributors"] if one["name"] in truth["main"] for name in one["indistinguishable"]}
+
+
+def _there(truth: Mapping[str, Any], effect: str) -> bool:
+    return effect in (*truth["present"], *truth["main"]) or effect in _tied(truth)
+
+
+def _wrong(truth: Mapping[str, Any], answer: Answer) -> bool:
+    """The first cause is not there; one that is neither there nor not is no mistake."""
+    return not _there(truth, answer.first) and answer.first not in truth["neutral"]
+
+
+def _held(truth: Mapping[str, Any], document: Mapping[str, Any]) -> list[bool]:
+    """Whether the interval of each known parameter that the answer states holds the truth."""
+    diagnosis = document.get("diagnosis") or {}
+    stated = {
+        (cause["effect"], name): value["interval_95"]
+        for cause in diagnosis.get("causes", [])
+        for name, value in cause.get("parameters", {}).items()
+        if isinstance(value, Mapping) and value.get("interval_95")
+    }
+    return [
+        bool(interval[0] <= known["value"] <= interval[1])
+        for known in truth["true_parameters"]
+        if (interval := stated.get((known["effect"], known["parameter"]))) is not None
+    ]
+
+
+def _calibration_error(outcomes: Sequence[tuple[float, bool]]) -> float | None:
+    """Mean distance of confidence from share, over bins of confidence, weighted by count."""
+    if not outcomes:
+        return None
+    chance = np.array([c for c, _ in outcomes])
+    there = np.array([float(is_there) for _, is_there in outcomes])
+    bins = np.minimum((chance * BINS).astype(int), BINS - 1)
+    parts = [abs(float(np.sum(chance[bins == k] - there[bins == k]))) for k in range(BINS)]
+    return float(sum(parts) / chance.size)
+
+
+def _confusion(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, dict[str, int]]:
+    rows: dict[str, dict[str, int]] = {}
+    for truth, answer in cases:
+        row = rows.setdefault(truth["main"][0] if truth["main"] else "none", {})
+        row[answer.first] = row.get(answer.first, 0) + 1
+    return dict(sorted(rows.items()))
+
+
+def _quantiles(seconds: Sequence[float]) -> dict[str, float | None]:
+    if not seconds:
+        return {"median": None, "p90": None}
+    return {"median": float(np.median(seconds)), "p90": float(np.quantile(seconds, 0.9))}

@@ -1,0 +1,104 @@
+"""The worlds that a diagnosis is checked in: how each deals, draws and scores its joints.
+
+``narrow``: joints close to their beliefs, eight experiments (``generator``). ``wide``: joints as they come in practice.
+``zoo``: joints of MuJoCo, and real recordings with an effect added.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from frictid_hil.files import write_whole
+from frictid_hil.gap.blind import judged, score, spoilt, wide, zoo
+from frictid_hil.gap.blind import page as narrow_page
+from frictid_hil.gap.blind.generator import assignments, draw_case, rounded, write_case
+from frictid_hil.gap.blind.score import Answer
+
+Documents = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """One world.
+
+    Attributes:
+        cards: (cases, seed) -> what each case shall be; plain and small, they go to other processes.
+        draw: (index, seed, card, folder) -> truth; the set is written to ``folder``.
+        score: (truths, lines of the diagnosing process), both by case -> scores.
+        headline: scores -> rates by name.
+        page: result -> Markdown.
+    """
+
+    cards: Callable[[int, int], Sequence[Any]]
+    draw: Callable[[int, int, Any, Path], dict[str, Any]]
+    score: Callable[[Mapping[str, Mapping[str, Any]], Documents], dict[str, Any]]
+    headline: Callable[[Mapping[str, Any]], dict[str, Mapping[str, Any]]]
+    page: Callable[[Mapping[str, Any]], str]
+
+
+def write_rows(folder: Path, nominal: Mapping[str, Any], rows: Sequence[wide.Row]) -> None:
+    """A set: ``nominal.yaml`` and one gzipped CSV per recording."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / "nominal.yaml", yaml.safe_dump(rounded(dict(nominal)), sort_keys=False))
+    for row in rows:
+        table = np.column_stack(list(row.columns.values()))
+        header = ",".join(row.columns)
+        np.savetxt(folder / f"{row.name}.csv.gz", table, fmt="%.10g", delimiter=",", header=header, comments="")
+
+
+def _draw_narrow(index: int, seed: int, card: Any, folder: Path) -> dict[str, Any]:
+    case = draw_case(index, seed, card)
+    write_case(case, folder / case.name)
+    return case.truth
+
+
+def _draw_wide(index: int, seed: int, card: Any, folder: Path) -> dict[str, Any]:
+    return _written(wide.draw_wide(index, seed, card), folder)
+
+
+def _draw_zoo(index: int, seed: int, card: Any, folder: Path) -> dict[str, Any]:
+    drawn = spoilt.draw_spoilt(index, seed, card) if isinstance(card, Path) else zoo.draw_zoo(index, seed, card)
+    return _written(drawn, folder)
+
+
+def _written(drawn: tuple[dict[str, Any], tuple[wide.Row, ...], dict[str, Any]], folder: Path) -> dict[str, Any]:
+    nominal, rows, truth = drawn
+    write_rows(folder / truth["case"], nominal, rows)
+    plain: dict[str, Any] = rounded(truth)
+    return plain
+
+
+def _dealt(kinds: Sequence[str], cases: int, seed: int) -> list[str]:
+    rng = np.random.default_rng([seed, 707])
+    cards: list[str] = []
+    while len(cards) < cases:
+        cards += [str(kind) for kind in rng.permutation(list(kinds))]
+    return cards[:cases]
+
+
+def _zoo_cards(cases: int, seed: int) -> list[Any]:
+    """Every third case a real recording, where there are any."""
+    real = spoilt.recorded_sets()
+    cards: list[Any] = list(_dealt(zoo.KINDS, cases, seed))
+    for k in range(2, cases, 3):
+        if real:
+            cards[k] = real[(seed + k // 3) % len(real)]
+    return cards
+
+
+def _score_narrow(truths: Mapping[str, Mapping[str, Any]], documents: Documents) -> dict[str, Any]:
+    return score.score(truths, {name: Answer.from_json(line) for name, line in documents.items()})
+
+
+WORLDS: dict[str, World] = {
+    "narrow": World(assignments, _draw_narrow, _score_narrow, narrow_page.headline, narrow_page.page),
+    "wide": World(functools.partial(_dealt, wide.KINDS), _draw_wide, judged.judged, judged.headline, judged.page),
+    "zoo": World(_zoo_cards, _draw_zoo, judged.judged, judged.headline, judged.page),
+}

@@ -1,0 +1,186 @@
+"""The wide world and the zoo: what they draw is repeatable and legal, what truth says is so, and scores count right."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from frictid_hil.errors import UsageError
+from frictid_hil.gap.blind import judged, plant, spoilt, wide, zoo
+from frictid_hil.gap.blind.worlds import WORLDS, write_rows
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.sanity import checked
+from frictid_hil.jobs.gap_check import run_gap_check
+
+BARE = plant.Physics(0.1, 0.3, 4.0, 3.0, 0.5, 0.5, 1.0, 2e-4, 100.0, 1e-7, 50.0)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> tuple[dict[str, Any], tuple[wide.Row, ...], dict[str, Any]]:
+    return wide.draw_wide(1, 7, "single")
+
+
+@pytest.mark.slow
+def test_a_case_is_drawn_from_its_numbers_alone(drawn: tuple[Any, Any, dict[str, Any]]) -> None:
+    assert wide.draw_wide(1, 7, "single")[2] == drawn[2]
+
+
+def test_a_case_is_a_legal_set(drawn: tuple[Any, Any, dict[str, Any]], tmp_path: Path) -> None:
+    nominal, rows, _ = drawn
+    write_rows(tmp_path, nominal, rows)
+    read = ExperimentSet.load(tmp_path)
+    checked(read)
+    assert {e.validation for e in read.experiments} == {True, False}
+    assert read.nominal.tolerances.inertia_kg_m2.source == "stated"
+
+
+def test_what_is_withheld_is_there_and_the_largest(drawn: tuple[Any, Any, dict[str, Any]]) -> None:
+    truth = drawn[2]
+    sizes = {one["name"]: one["size_alone"] for one in truth["contributors"]}
+    (withheld,) = [one for one in truth["contributors"] if one["role"] == "withheld"]
+    assert withheld["name"] in truth["main"] and withheld["name"] in truth["present"]
+    assert withheld["size_alone"] >= wide.WITHHELD and withheld["size_alone"] == max(sizes.values())
+    for name in truth["neutral"]:
+        assert name in wide.FORMS or wide.NOTHING <= sizes[name] < wide.PRESENT
+
+
+@pytest.mark.parametrize("family", range(4))
+def test_every_presliding_family_is_a_loop_that_saturates(family: int) -> None:
+    p = BARE._replace(slip_family=family)
+    state = np.zeros(3)
+    forth = [plant._slipped(p, state, 2e-6, 5e-5) for _ in range(2000)][-1]
+    back = [plant._slipped(p, state, -2e-6, 5e-5) for _ in range(2000)]
+    assert forth == pytest.approx(1.0, abs=0.02) and back[-1] == pytest.approx(-1.0, abs=0.02)
+    assert back[10] > 0.5  # it remembers where it came from
+
+
+@pytest.mark.parametrize("family", range(4))
+def test_every_rate_family_rises_from_nothing(family: int) -> None:
+    p = BARE._replace(rate_family=family)
+    torque = [float(plant.rate_part(p, speed)) for speed in (0.0, 0.05, 0.3, 1.0)]
+    assert torque[0] == pytest.approx(0.0, abs=1e-3) and torque == sorted(torque)
+    assert torque[-1] == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_kinematic_error_does_no_work_of_its_own_at_creep() -> None:
+    """At rest without load it asks for nothing; with load, for its slope times the load."""
+    p = BARE._replace(kinematic=1e-4)
+    assert plant._kinematic(p, 0.3, 0.0, 0.0, 0.0, 0.3) == 0.0
+    slope = 1e-4 * 200.0 * math.cos(200.0 * 0.3)
+    assert plant._kinematic(p, 0.3, 0.0, 0.0, 5.0, 0.3) == pytest.approx(5.0 * slope)
+
+
+def test_torque_beyond_the_ceiling_is_bent_by_a_formula_of_its_own() -> None:
+    p = BARE._replace(ceiling=10.0, ceiling_knee=20.0)
+    assert plant._amplified(p, 5.0) == 5.0 and plant._amplified(p, -8.9) == -8.9
+    assert 9.9 < plant._amplified(p, 20.0) <= 10.0 and plant._amplified(p, 10.0) < 10.0
+
+
+def _truth(kind: str, main: list[str], size: float = 5.0, **more: Any) -> dict[str, Any]:
+    return {"case": "c", "kind": kind, "main": main, "present": main, "neutral": [], "controller": "known",
+            "size_ratio": size, "contributors": [], "true_parameters": [], **more}  # fmt: skip
+
+
+def _line(verdict: str, *causes: tuple[str, float], **parameters: Any) -> dict[str, Any]:
+    named = [{"effect": e, "confidence": c, "parameters": parameters} for e, c in causes]
+    return {"diagnosis": {"verdict": verdict, "causes": named}, "seconds": 1.0}
+
+
+def test_scores_count_what_they_say() -> None:
+    known = [{"effect": "stribeck", "parameter": "s", "value": 2.0}]
+    truths = {
+        "right": _truth("single", ["stribeck"], true_parameters=known),
+        "wrong": _truth("single", ["stribeck"]),
+        "cleared": _truth("tolerance", ["friction_level_error"]),
+        "neutral": _truth("none", [], 0.3, neutral=["torque_bias"]),
+        "healthy": _truth("none", [], 0.3),
+        "stranger": _truth("outside", ["unknown"], present=[]),
+        "tied": _truth("single", ["torque_bias"], contributors=[
+            {"name": "torque_bias", "indistinguishable": ["gravity_error"]}]),
+    }  # fmt: skip
+    lines = {
+        "right": _line("explained", ("stribeck", 0.95), s={"value": 2.1, "interval_95": [1.9, 2.2]}),
+        "wrong": _line("explained", ("backlash", 0.95)),
+        "cleared": _line("none"),
+        "neutral": _line("explained", ("torque_bias", 0.99)),
+        "healthy": _line("none"),
+        "stranger": _line("unknown"),
+        "tied": _line("ambiguous", ("gravity_error", 0.55)),
+    }
+    scores = judged.judged(truths, lines)
+    assert (scores["first"]["right"], scores["first"]["of"]) == (1, 4)
+    assert scores["first_or_tied"]["right"] == 2
+    assert (scores["false_none"]["right"], scores["false_none"]["of"]) == (1, 5)
+    assert (scores["sure_and_wrong"]["right"], scores["sure_and_wrong"]["of"]) == (1, 7)
+    assert scores["none"]["right"] == 1 and scores["outside"]["rate"] == 1.0
+    assert (scores["parameters"]["right"], scores["parameters"]["of"]) == (1, 1)
+    # Named: 0.95 right, 0.95 wrong, 0.99 wrong (not there), 0.55 tied.
+    assert scores["brier"] == pytest.approx((0.05**2 + 0.95**2 + 0.99**2 + 0.45**2) / 4)
+    assert scores["calibration_error"] == pytest.approx((abs(0.95 + 0.95 + 0.99 - 1.0) + abs(0.55 - 1.0)) / 4)
+    assert "| wrong | stribeck | backlash |" in judged.page(
+        {"world": "wide", "cases": 7, "seed": 1, "truth_sha256": "", "code_sha256": "",
+         "scores": {**scores, "misses": [dict(m, case="wrong") for m in scores["misses"][:1]]}}
+    )  # fmt: skip
+
+
+def test_a_case_without_an_answer_is_an_error_and_wrong() -> None:
+    scores = judged.judged({"c": _truth("single", ["stribeck"])}, {})
+    assert scores["errors"] and scores["first"]["right"] == 0
+
+
+def test_an_unknown_world_is_refused() -> None:
+    with pytest.raises(UsageError, match="no world is called 'flat'"):
+        run_gap_check(2, worlds=("wide", "flat"))
+    assert list(WORLDS) == ["narrow", "wide", "zoo"]
+
+
+# -- the zoo ------------------------------------------------------------------------------------------------------
+
+
+def _mujoco_has_the_motor() -> bool:
+    mujoco = pytest.importorskip("mujoco")
+    return int(mujoco.__version__.split(".")[0]) >= 4
+
+
+def test_a_joint_of_mujoco_follows_its_controller_and_feels_what_is_withheld() -> None:
+    if not _mujoco_has_the_motor():
+        pytest.skip("MuJoCo without dcmotor")
+    belief = zoo.Model(0.3, 0.1, 4.0, 2.0, 2.0002, 0.05, 4000.0, 0.5)
+    gains = zoo.Gains(200.0, 600.0, 14.0)
+    time_s = zoo.TICK_S * np.arange(1500)
+    command = 0.4 * (1.0 - np.cos(2.0 * time_s))
+    position, torque = zoo.run(belief, gains, command)
+    assert np.abs(position - command).max() < 0.05
+    # The equation of the belief, far from reversals.
+    v, a = 0.8 * np.sin(2.0 * time_s), 1.6 * np.cos(2.0 * time_s)
+    asked = 0.4 * a + 4.0 * np.cos(position) + 2.0 * np.sign(v) + 0.5 * v
+    sliding = np.abs(v) > 0.4
+    assert np.abs(torque - asked)[sliding][100:].mean() < 0.1
+    weak = zoo.run(zoo.Model(0.3, 0.1, 4.0, 2.0, 2.0002, 0.05, 4000.0, 0.5, gain=0.8), gains, command)[1]
+    assert np.abs(weak - torque / 0.8)[sliding][200:].mean() < 0.15
+
+
+def test_an_effect_is_added_to_a_recording_as_large_as_told(tmp_path: Path) -> None:
+    time_s = 0.004 * np.arange(3000)
+    q = 0.5 * np.sin(1.5 * time_s)
+    torque = np.sign(np.cos(1.5 * time_s)) + 0.05 * np.random.default_rng(1).standard_normal(q.size)
+    rows = [wide.Row(n, {"time_s": time_s, "position_rad": q, "torque_nm": torque}) for n in ("a", "b")]
+    nominal = {
+        "joint": {"gear_ratio": 100, "friction": {"velocity_rad_s": [0.2, 0.8], "torque_nm": [1.0, 1.0]}},
+        "experiments": [{"name": "a", "file": "a.csv.gz"}, {"name": "b", "file": "b.csv.gz", "role": "validation"}],
+    }
+    write_rows(tmp_path, nominal, rows)
+    names = set()
+    for index in range(6):
+        _, spoilt_rows, truth = spoilt.draw_spoilt(index, 1, tmp_path)
+        added = spoilt_rows[0].columns["torque_nm"] - torque
+        there = float(np.sqrt(np.mean(spoilt._missing(rows[0].columns, nominal) ** 2)))
+        assert np.sqrt(np.mean(added**2)) == pytest.approx(spoilt.TIMES * there, rel=0.2)
+        names.add(truth["main"][0])
+    assert len(names) > 1
+    assert yaml.safe_load((tmp_path / "nominal.yaml").read_text())["experiments"]
