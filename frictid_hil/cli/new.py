@@ -97,6 +97,29 @@ def robot(
     output.run("new-robot", written, show)
 
 
+@app.command("driver")
+def driver(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the driver, as robot files will have it.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; frictid-NAME here if not given.")] = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """A driver of your own for CAN devices: a package that runs, with a fake device, a robot file and its tests."""
+    from frictid_hil.jobs.new_driver import new_driver
+
+    output = Output(as_json, quiet)
+
+    def written() -> dict[str, Any]:
+        return {"files": [str(path.resolve()) for path in new_driver(name, out)]}
+
+    def show(result: Mapping[str, Any]) -> None:
+        for path in result["files"]:
+            output.out.print(path, soft_wrap=True)
+        output.out.print("now: cd there, `pip install -e .`, `pytest`; then replace the frames by those of your device")
+
+    output.run("new-driver", written, show)
+
+
 def _named(text: str) -> tuple[str, int]:
     name, _, address = text.partition("=")
     if not name or not address.isdecimal():

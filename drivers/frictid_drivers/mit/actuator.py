@@ -9,7 +9,7 @@ from frictid_drivers.mit.frames import TWELVE, Motion
 from frictid_drivers.mit.settings import JointSettings
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup
-from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
+from frictid_hil.protocol.driver import Feedback, JointState
 from frictid_hil.protocol.rows import Command, Report
 from frictid_hil.protocol.wishes import Do, Order, Wish
 
@@ -88,18 +88,14 @@ class Actuator:
         self._limit_nm = torque_nm
         self.wish.limit(torque_nm, position_min_rad, position_max_rad)
 
-    def frame(self, set_point: SetPoint) -> Frame:
-        """Of the coming cycle.
-
-        Raises:
-            SafetyAbort: the set-point is not a number.
-        """
-        order = self.wish.order(set_point)
+    def frame(self, order: Order) -> Frame:
+        """Of the coming cycle."""
         match order.do:
             case Do.REST:
-                return self.off()
+                return self._settings.family.special(self._reader.motor, OFF)
             case Do.BRAKE:
-                return self.brake()
+                # Damping alone: the joint comes to rest, and sinks slowly where gravity pulls.
+                return self._motion(kd_nm_s_per_rad=self._settings.brake_kd)
             case Do.SWITCH_ON:
                 return self._on()
         settings = self._settings
@@ -131,16 +127,6 @@ class Actuator:
             torque_nm += (settings.kp - kp) * error_rad
             torque_nm = min(max(torque_nm, -self._limit_nm), self._limit_nm)
         return self._motion(position_rad, order.velocity_rad_s, kp, settings.kd, torque_nm)
-
-    def off(self) -> Frame:
-        """No power."""
-        return self._settings.family.special(self._reader.motor, OFF)
-
-    def brake(self) -> Frame:
-        """Damping alone: the joint comes to rest, and sinks slowly where gravity pulls. No power where it had none."""
-        if self._reader.feedback.state is not JointState.ENABLED:
-            return self.off()
-        return self._motion(kd_nm_s_per_rad=self._settings.brake_kd)
 
     def _on(self) -> Frame:
         clear = self._reader.feedback.state is JointState.FAULT and not self._cleared

@@ -19,10 +19,11 @@ from frictid_drivers.mit.frames import FULL, TWELVE, Motion, step
 from frictid_drivers.mit.logs import frame_map_values, row_decoder
 from frictid_drivers.mit.models import MODELS
 from frictid_drivers.mit.settings import JointSettings, read_settings
-from frictid_hil.errors import FrictidError, HardwareError, PlanRefused, SafetyAbort
+from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.can_cycle import CanCycle
 from frictid_hil.protocol.can_line import BUSIEST, BusFactory, CanLine, highest_rate_hz
 from frictid_hil.protocol.driver import (
     Capabilities,
@@ -32,17 +33,14 @@ from frictid_hil.protocol.driver import (
     Finding,
     FrameSink,
     JointIdentity,
-    JointState,
     SetPoint,
     Severity,
     Timing,
     WallClock,
 )
-from frictid_hil.protocol.rows import RowDecoder
 
 _ANSWER_S = 0.05
 _TRIES = 3
-_SETTLE_S = 1.5
 _USABLE = 0.9
 """Share of the position range that is used: beyond its end a motor's numbers start again from the other side."""
 
@@ -70,9 +68,8 @@ class MitDriver:
         self._figures: dict[str, dict[str, float]] = {}
         self._restore: list[tuple[str, Parameter, float]] = []
         self._watched: set[str] = set()
-        self._decoder: RowDecoder | None = None
-        self._actuators: dict[str, Actuator] = {}
-        self._cycle_hz = 0.0
+        self._actuators: list[Actuator] = []
+        self._cycle: CanCycle | None = None
 
     # -- reaching them ------------------------------------------------------------------------------------------
 
@@ -142,7 +139,7 @@ class MitDriver:
             PlanRefused: more frames than the bus carries; the message has the highest rate.
             HardwareError: a motor does not take a setting.
         """
-        self._open_line()
+        line = self._open_line()
         for name in active:
             self.setup.joint(name)
         most_hz = self._highest_rate_hz()
@@ -162,15 +159,22 @@ class MitDriver:
                 value = round(max(self._bus_settings.watchdog_s, shortest_s) * family.watchdog_per_s)
                 self._set(joint, family.watchdog, value, "watchdog")
                 self._watched.add(joint.name)
-        self._cycle_hz = cycle_hz
         readers = [
             Reader(at, joint.direction, self._settings[joint.name]) for at, joint in enumerate(self.setup.joints)
         ]
-        self._decoder = row_decoder(readers)
-        self._actuators = {
-            joint.name: Actuator(joint, self._settings[joint.name], reader, 1.0 / cycle_hz)
+        self._actuators = [
+            Actuator(joint, self._settings[joint.name], reader, 1.0 / cycle_hz)
             for joint, reader in zip(self.setup.joints, readers, strict=True)
-        }
+        ]
+        self._cycle = CanCycle(
+            line,
+            self.clock,
+            row_decoder(readers),
+            [actuator.wish for actuator in self._actuators],
+            lambda at, order: self._actuators[at].frame(order),
+            cycle_hz,
+            self._bus_settings.reply_window,
+        )
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Kept by the host in every frame: these motors have no limits of their own but their ranges.
@@ -196,16 +200,13 @@ class MitDriver:
 
     def start_cycling(self) -> None:
         """Run time zero."""
-        line, decoder = self._open_line(), self._decoder
-        if decoder is None:
-            raise HardwareError("start_cycling before configure")
+        line = self._open_line()
+        self._cycling()
         for _ in line.received():
             pass
         restart: Callable[[], None] | None = getattr(self.clock, "restart", None)
         if restart is not None:
             restart()
-        for actuator in self._actuators.values():
-            actuator.wish.disable()
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power; progress is in the feedback.
@@ -227,81 +228,36 @@ class MitDriver:
 
     def disable(self, joint: str) -> None:
         """Ask for power off; a joint that moves is braked first."""
-        self._actuator(joint).wish.disable()
+        self._cycling().wish(joint).disable()
 
     def lock(self, joint: str) -> None:
         """Hold the present target."""
-        self._actuator(joint).wish.lock()
+        self._cycling().wish(joint).lock()
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
-        self._actuator(joint).wish.unlock()
+        self._cycling().wish(joint).unlock()
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
-        """One cycle: all commands, then the answers as they come.
-
-        Raises:
-            SafetyAbort: a set-point is not a number; every joint was told to stop.
-            HardwareError: frames cannot be sent.
-        """
-        line, decoder = self._open_line(), self._decoder
-        if decoder is None:
-            raise HardwareError("exchange before configure")
-        for heard in line.received():
-            decoder.feed(*heard)
-        deadline_ns = self.clock.now_ns() + round(self._bus_settings.reply_window * 1e9 / self._cycle_hz)
-        refused: SafetyAbort | None = None
-        for actuator, set_point in zip(self._actuators.values(), set_points, strict=True):
-            try:
-                frame = actuator.frame(set_point)
-            except SafetyAbort as abort:
-                refused, frame = abort, actuator.brake()
-            decoder.feed(line.send(*frame), *frame)
-        if refused is not None:
-            self.quick_stop()
-            raise refused
-        if decoder.waiting():
-            for heard in line.received(deadline_ns):
-                decoder.feed(*heard)
-                if not decoder.waiting():
-                    break
-        return decoder.feedback
+        """One cycle; see ``CanCycle.exchange``."""
+        return self._cycling().exchange(set_points)
 
     def quick_stop(self) -> None:
         """Damping alone for every joint under power, off for the others; never raises."""
-        line, decoder = self._line, self._decoder
-        if line is None or decoder is None:
-            return
-        for actuator in self._actuators.values():
-            with contextlib.suppress(Exception):
-                actuator.wish.stop()
-                line.send(*actuator.brake())
+        if self._cycle is not None:
+            self._cycle.quick_stop()
 
     def stop_cycling(self) -> None:
-        """Bring every joint to rest and off.
-
-        Raises:
-            SafetyAbort: a joint still reports power; it was told to let go all the same.
-        """
-        if not self._actuators:
-            return
-        try:
-            powered = self._settle()
-        finally:
-            self._let_go()
-            self._actuators, self._decoder = {}, None
-        if powered:
-            raise SafetyAbort(
-                f"did not come to rest and off within {_SETTLE_S:g} s",
-                where=", ".join(f"joint {name}" for name in powered),
-                next_step="switch its supply off, then look at the motor",
-            )
+        """Bring every joint to rest and off; see ``CanCycle.stop``."""
+        cycle, self._cycle = self._cycle, None
+        if cycle is not None:
+            cycle.stop()
 
     def close(self) -> None:
         """Everything to rest, settings as they were, the bus released; safe to call twice and after errors."""
         if self._line is None:
             return
-        if self._actuators:
+        if self._cycle is not None:
             self.quick_stop()
             with contextlib.suppress(FrictidError):
                 self.stop_cycling()
@@ -320,11 +276,14 @@ class MitDriver:
             raise HardwareError("the bus is not open", where=self.setup.bus)
         return self._line
 
+    def _cycling(self) -> CanCycle:
+        if self._cycle is None:
+            raise HardwareError("not configured yet", where=self.setup.bus)
+        return self._cycle
+
     def _actuator(self, joint: str) -> Actuator:
-        name = self.setup.joint(joint).name
-        if name not in self._actuators:
-            raise HardwareError("not configured yet", where=f"joint {name}")
-        return self._actuators[name]
+        self._cycling()
+        return self._actuators[[one.name for one in self.setup.joints].index(self.setup.joint(joint).name)]
 
     def _meet(self, joint: JointSetup) -> None:
         """Read what the motor can tell; where it tells its ranges, they are taken."""
@@ -471,33 +430,6 @@ class MitDriver:
             letters = sum(27 if can_id >> 31 else 22 for can_id, _ in cycle) / 2
             most_hz = min(most_hz, float(int(self._bus_settings.tty_baudrate / 10.0 / letters)))
         return most_hz
-
-    def _settle(self) -> list[str]:
-        """Cycle until every joint is off; names of those that are not in time."""
-        for actuator in self._actuators.values():
-            actuator.wish.disable()
-        set_points = [SetPoint() for _ in self._actuators]
-        period_ns = round(1e9 / self._cycle_hz)
-        powered: list[str] = []
-        for _ in range(max(2, math.ceil(_SETTLE_S * self._cycle_hz))):
-            self.clock.wait_until(self.clock.now_ns() + period_ns)
-            reports = self.exchange(set_points)
-            powered = [
-                joint.name
-                for joint, report in zip(self.setup.joints, reports, strict=True)
-                if report.age_cycles or report.state is JointState.ENABLED
-            ]
-            if not powered:
-                break
-        return powered
-
-    def _let_go(self) -> None:
-        """Off, twice: a lost frame must not keep a joint under power."""
-        line = self._line
-        for actuator in (*self._actuators.values(), *self._actuators.values()):
-            if line is not None:
-                with contextlib.suppress(FrictidError):
-                    line.send(*actuator.off())
 
 
 def _where(joint: JointSetup) -> str:

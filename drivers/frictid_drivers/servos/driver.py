@@ -381,8 +381,6 @@ class ServoDriver:
         return float(int(_BUSIEST / ((asked + answered) * 10.0 / self._line_settings.baud + delays_s)))
 
     def _velocity_delay_s(self) -> float:
-        if self._registers.velocity[1]:
-            return 0.0
         return SPEED_CYCLES / 2.0 / (self._cycle_hz or self.setup.cycle_hz)
 
     def _arm_watchdog(self, seconds: float) -> None:

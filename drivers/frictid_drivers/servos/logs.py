@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from frictid_drivers.servos.models import VELOCITY_RAD_S, Model, Registers
+from frictid_drivers.servos.models import Model, Registers
 from frictid_drivers.servos.packets import WIRES, Packet
 from frictid_drivers.servos.settings import JointSettings
 from frictid_hil.errors import FieldProblem, InputFileError, InvalidFields
@@ -29,7 +29,8 @@ SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11
 
 _SYNC_READ, _SYNC_WRITE = 0x82, 0x83
 SPEED_CYCLES = 8
-"""Position is differenced over so many cycles where the unit of the reported speed is not certain."""
+"""Position is differenced over so many cycles. Reported speeds are not used: a Feetech's unit depends on its firmware,
+and both makers sample a speed that swings from goal to goal."""
 
 
 class Reader:
@@ -105,11 +106,8 @@ class Reader:
         report.position_rad = joint.position_rad(counts)
         track = self._track[at]
         track.append((self._cycle, report.position_rad))
-        if registers.velocity[1]:
-            report.velocity_rad_s = joint.direction * field(*registers.velocity, 15) * VELOCITY_RAD_S
-        else:
-            cycles = track[-1][0] - track[0][0]
-            report.velocity_rad_s = (track[-1][1] - track[0][1]) / (cycles * self._period_s) if cycles else 0.0
+        cycles = track[-1][0] - track[0][0]
+        report.velocity_rad_s = (track[-1][1] - track[0][1]) / (cycles * self._period_s) if cycles else 0.0
         report.torque_nm = joint.direction * joint.torque_nm_per_unit * _effort(model, field)
         if registers.temperature >= 0:
             report.temperature_c = float(block[registers.temperature])

@@ -25,7 +25,6 @@ class Registers:
         position: offset in the block, and bytes.
         load: offset of duty; -1 where there is none.
         current: offset; -1 where there is none.
-        velocity: offset and bytes; (-1, 0) where its unit is not certain, and position is differenced.
         temperature: offset; -1 outside the block.
         watchdog: bus watchdog; 0 where there is none.
         model: number and firmware are read from here.
@@ -42,7 +41,6 @@ class Registers:
     position: tuple[int, int]
     load: int
     current: int
-    velocity: tuple[int, int]
     temperature: int
     watchdog: int
     model: int
@@ -51,9 +49,9 @@ class Registers:
     return_delay: int
 
 
-FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, (-1, 0), 7, 0, 3, 33, 0, 7)
-DYNAMIXEL = Registers(64, 116, 4, 124, 12, (8, 4), -1, 2, (4, 4), -1, 98, 0, 11, 3, 9)
-DYNAMIXEL_LOAD = Registers(64, 116, 4, 124, 12, (8, 4), 2, -1, (4, 4), -1, 98, 0, 11, 3, 9)
+FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, 7, 0, 3, 33, 0, 7)
+DYNAMIXEL = Registers(64, 116, 4, 124, 12, (8, 4), -1, 2, -1, 98, 0, 11, 3, 9)
+DYNAMIXEL_LOAD = Registers(64, 116, 4, 124, 12, (8, 4), 2, -1, -1, 98, 0, 11, 3, 9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,5 +119,3 @@ MODELS = {
     "XL430-W250": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.4, uncertainty_percent=50.0),
     "XC430-W150": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.6, uncertainty_percent=50.0),
 }
-VELOCITY_RAD_S = 0.229 * 2 * math.pi / 60.0
-"""One step of a Dynamixel's velocity."""

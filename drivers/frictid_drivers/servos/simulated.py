@@ -106,9 +106,6 @@ class Servo:
             self._put(registers.block + registers.load, 2, load, 10)
         if registers.current >= 0 and model.current_a:
             self._put(registers.block + registers.current, 2, abs(effort) if registers.load >= 0 else effort, 15)
-        if registers.velocity[1]:
-            rate = round(sign * self.plant.velocity_rad_s / (0.229 * math.tau / 60.0))
-            self._put(registers.block + registers.velocity[0], registers.velocity[1], rate, 15)
         if registers.temperature >= 0:
             self.memory[registers.block + registers.temperature] = 33
         return bytes(self.memory[address : address + count])

@@ -1,0 +1,114 @@
+"""The cycle of devices that answer each command with a report: commands out, reports in, stops and the way to rest."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+
+from frictid_hil.errors import FrictidError, SafetyAbort
+from frictid_hil.protocol.can_line import CanLine
+from frictid_hil.protocol.driver import Clock, Feedback, JointState, SetPoint
+from frictid_hil.protocol.rows import RowDecoder
+from frictid_hil.protocol.wishes import Do, Order, Wish
+
+SETTLE_S = 1.5
+"""How long all joints may take to come to rest and off."""
+
+
+class CanCycle:
+    """Cyclic traffic of all joints.
+
+    Args:
+        line: nobody else reads it meanwhile.
+        clock: run time.
+        rows: given every frame, sent and received.
+        wishes: one per joint, with the feedback that ``rows`` fills.
+        frame: of a joint (index) for an order.
+        cycle_hz: rate.
+        window: share of a cycle that reports are waited for.
+    """
+
+    def __init__(
+        self,
+        line: CanLine,
+        clock: Clock,
+        rows: RowDecoder,
+        wishes: Sequence[Wish],
+        frame: Callable[[int, Order], tuple[int, bytes]],
+        cycle_hz: float,
+        window: float = 0.8,
+    ) -> None:
+        self._line, self._clock, self._rows, self._frame = line, clock, rows, frame
+        self.wishes = list(wishes)
+        self._period_ns = round(1e9 / cycle_hz)
+        self._window_ns = round(window * self._period_ns)
+
+    def wish(self, joint: str) -> Wish:
+        """Of the joint with that name."""
+        return next(wish for wish in self.wishes if wish.joint.name == joint)
+
+    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
+        """All commands, then the reports as they come.
+
+        Raises:
+            SafetyAbort: a set-point is not a number; every joint was told to stop.
+            HardwareError: frames cannot be sent.
+        """
+        line, rows = self._line, self._rows
+        for heard in line.received():
+            rows.feed(*heard)
+        deadline_ns = self._clock.now_ns() + self._window_ns
+        refused: SafetyAbort | None = None
+        for at, (wish, set_point) in enumerate(zip(self.wishes, set_points, strict=True)):
+            try:
+                order = wish.order(set_point)
+            except SafetyAbort as abort:
+                refused, order = abort, Order(Do.BRAKE)
+            frame = self._frame(at, order)
+            rows.feed(line.send(*frame), *frame)
+        if refused is not None:
+            self.quick_stop()
+            raise refused
+        if rows.waiting():
+            for heard in line.received(deadline_ns):
+                rows.feed(*heard)
+                if not rows.waiting():
+                    break
+        return rows.feedback
+
+    def quick_stop(self) -> None:
+        """Brake every joint under power, the others off; never raises."""
+        for at, wish in enumerate(self.wishes):
+            with contextlib.suppress(Exception):
+                wish.stop()
+                on = wish.feedback.state is JointState.ENABLED
+                self._line.send(*self._frame(at, Order(Do.BRAKE if on else Do.REST)))
+
+    def stop(self) -> None:
+        """Cycle until every joint is at rest and off; in the end all are told twice, for a frame may be lost.
+
+        Raises:
+            SafetyAbort: a joint still reports power, or does not report.
+        """
+        for wish in self.wishes:
+            wish.disable()
+        set_points = [SetPoint() for _ in self.wishes]
+        powered: list[str] = []
+        try:
+            for _ in range(max(2, math.ceil(SETTLE_S * 1e9 / self._period_ns))):
+                self._clock.wait_until(self._clock.now_ns() + self._period_ns)
+                reports = zip(self.wishes, self.exchange(set_points), strict=True)
+                powered = [w.joint.name for w, r in reports if r.age_cycles or r.state is JointState.ENABLED]
+                if not powered:
+                    break
+        finally:
+            for at in (*range(len(self.wishes)), *range(len(self.wishes))):
+                with contextlib.suppress(FrictidError):
+                    self._line.send(*self._frame(at, Order(Do.REST)))
+        if powered:
+            raise SafetyAbort(
+                f"did not come to rest and off within {SETTLE_S:g} s",
+                where=", ".join(f"joint {name}" for name in powered),
+                next_step="switch its supply off, then look at the drive",
+            )
