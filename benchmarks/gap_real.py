@@ -1,43 +1,46 @@
-"""The diagnosis on real machines: fitted on some recordings, judged on others, both ways.
+"""The diagnosis on real machines: fitted on some recordings, judged on others, both ways; every set, right or wrong.
 
-Prints one line per set and direction: verdict, causes, and every effect's held-out change; ``--write-docs`` puts the
-tables into ``docs/evidence/gap-real.md``. The recordings are named by
-FRICTID_REAL_DATA; see their README for origin and licences.
+Prints one line per set; ``--write-docs`` puts the tables into ``docs/evidence/gap-real.md``. The recordings are named
+by FRICTID_REAL_DATA and FRICTID_REAL_MORE_DATA; see their READMEs for origin, licences and how the truth was found.
 """
 
 from __future__ import annotations
 
 import ast
+import functools
 import gzip
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import scipy.io
+import yaml
 from scipy import signal
 
+from frictid_hil.errors import FrictidError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.simulation.effects import all_effects
 
 EMPS = {"mass_kg": 95.1089, "viscous_n_s_per_m": 203.5034, "coulomb_n": 20.3935, "offset_n": -3.1648}
 MOTION_HZ = 8.0
 """Band of the pendulum's motion that its rigid-body torque is formed in."""
 DOCS_PAGE = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "gap-real.md"
 BEGIN, END = "<!-- written by benchmarks/gap_real.py -->", "<!-- end of what it wrote -->"
-LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+FALSE_CLEAR = 3.0
+"""Gap over floor from which ``none`` is a false all-clear."""
 SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 
 
-def real_data() -> Path | None:
+def real_data(variable: str = "FRICTID_REAL_DATA", name: str = "real") -> Path | None:
     """Folder of the recordings, or None."""
-    named = os.environ.get("FRICTID_REAL_DATA")
-    folder = Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data" / "real"
+    named = os.environ.get(variable)
+    folder = Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "data" / name
     return folder if folder.is_dir() else None
 
 
@@ -63,10 +66,21 @@ def emps(folder: Path, judge_pulses: bool) -> ExperimentSet:
                 time_s=t,
                 position_rad=q,
                 torque_nm=force,
+                torque_demand_nm=_emps_demand(data, q, step),
                 rigid_body_torque_nm=EMPS["mass_kg"] * acceleration + EMPS["offset_n"],
             )
         )
     return ExperimentSet("emps", Nominal(curve=curve), tuple(experiments))
+
+
+def _emps_demand(data: Mapping[str, np.ndarray], position_m: np.ndarray, step_s: float) -> np.ndarray:
+    """The law kv (kp e - v), in newtons by the drive's gain; ``pulses_N`` is in volts and added to it."""
+    velocity = np.gradient(position_m, step_s)
+    volts = data["kv"].item() * (data["kp"].item() * (data["qg"].ravel() - position_m) - velocity)
+    if "pulses_N" in data:
+        volts = volts + data["pulses_N"].ravel()
+    newtons: np.ndarray = data["gtau"].item() * volts
+    return newtons
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,135 +218,139 @@ def _rows(file: object) -> Iterator[list[str]]:
     yield from csv.reader(file)  # type: ignore[arg-type]
 
 
-def cases(folder: Path) -> Iterator[tuple[str, ExperimentSet]]:
-    """Every set with its name, both ways where there are two."""
-    for pulses in (True, False):
-        yield f"EMPS, judged on {'pulses' if pulses else 'the first'}", emps(folder, pulses)
-    for prefix, number in (("a0", 1), ("a0", 2), ("c1", 1), ("c1", 2)):
-        for odd in (True, False):
-            half = "odd" if odd else "even"
-            yield f"{prefix} joint {number}, judged on {half} logs", double_pendulum(folder, prefix, number, odd)
-    motions = sorted(path.name for path in (folder / "so101").iterdir() if path.is_dir())
-    for joint in SO101_JOINTS:
-        for judged in (motions[::2], motions[1::2]):
-            yield f"SO-101 {joint}, judged on {', '.join(judged)}", so101(folder, joint, judged)
-    yield "SO-101 Elbow, backlash_detection alone", so101(folder, "Elbow", (), ("backlash_detection",))
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What is known of a set's gap, whatever the diagnosis says.
 
+    Attributes:
+        accept: names (or verdicts) that are right first.
+        floors: gap over the floor of machine and noise; None where nobody measured it.
+        certainty: ``certain``, ``likely``, ``not_none`` or ``control``.
+    """
 
-def row(name: str, d: Diagnosis) -> str:
-    """One line of the table."""
-    causes = ", ".join(f"{c.effect} {c.confidence:.2f} ({'/'.join(c.confusable_with)})" for c in d.causes)
-    held_out = " ".join(f"{effect} {value:+.0f}%" for effect, value in sorted(d.held_out.items(), key=lambda x: x[1]))
-    return f"{name} | {d.verdict} | {causes} | {held_out}"
-
-
-GROUPS = {"EMPS": "EMPS, a linear axis", "a0": "Double pendulum, design A.0", "c1": "Double pendulum, design C.1"}
-"""Headings by the beginning of a set's name; the rest is the SO-101 arm."""
+    accept: tuple[str, ...]
+    floors: float | None
+    certainty: str
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
-    """What was expected of some sets before they were diagnosed.
+class Found:
+    """One set, its diagnosis (or why there is none), and what is known."""
 
-    Attributes:
-        text: as a person says it.
-        sets: beginning of the sets' names.
-        holds: whether one diagnosis is as expected.
-    """
+    name: str
+    known: Known
+    diagnosis: Diagnosis | None
+    refused: str = ""
 
-    text: str
-    sets: str
-    holds: Callable[[Diagnosis], bool]
+    @property
+    def first(self) -> str:
+        """The first cause, else the verdict."""
+        d = self.diagnosis
+        return "refused" if d is None else d.causes[0].effect if _names(d) else d.verdict
 
+    @property
+    def right(self) -> bool:
+        """The first answer is right, or the diagnosis says that it can't tell it from a right one."""
+        d = self.diagnosis
+        if self.first in self.known.accept:
+            return True
+        return d is not None and _names(d) and bool(set(self.known.accept) & set(d.causes[0].confusable_with))
 
-def _first(effect: str) -> Callable[[Diagnosis], bool]:
-    return lambda d: bool(d.causes) and d.causes[0].effect == effect
-
-
-def _largest(effect: str) -> Callable[[Diagnosis], bool]:
-    return lambda d: bool(d.held_out) and min(d.held_out, key=lambda name: d.held_out[name]) == effect
-
-
-def _flagged(effect: str, partner: str) -> Callable[[Diagnosis], bool]:
-    return lambda d: any(c.effect == effect and partner in c.confusable_with for c in d.causes)
-
-
-def _play_with_its_partner(d: Diagnosis) -> bool:
-    found = [c for c in d.causes if c.effect in ("backlash", "stiction_breakaway")]
-    return bool(found) and {"backlash", "stiction_breakaway"} & set(found[0].confusable_with) != set()
+    @property
+    def false_clear(self) -> bool:
+        """``none`` beside a gap of three floors."""
+        return self.first == "none" and (self.known.floors or 0.0) >= FALSE_CLEAR
 
 
-EXPECTED = (
-    Expected("EMPS: direction asymmetry named first", "EMPS", _first("direction_asymmetry")),
-    Expected("EMPS: direction asymmetry with the largest held-out change", "EMPS", _largest("direction_asymmetry")),
-    Expected(
-        "EMPS: presliding flagged as its partner", "EMPS", _flagged("direction_asymmetry", "presliding_hysteresis")
-    ),
-    Expected("A.0, first joint: load-dependent friction first", "a0 joint 1", _first("load_dependent_friction")),
-    Expected("A.0, second joint: presliding hysteresis first", "a0 joint 2", _first("presliding_hysteresis")),
-    Expected("C.1, both joints: none", "c1", lambda d: d.verdict == "none"),
-    Expected("SO-101: torque delay named first", "SO-101", _first("torque_delay")),
-    Expected("SO-101: then play or stiction, the other one flagged", "SO-101", _play_with_its_partner),
-    Expected("SO-101, one log of one joint: ambiguous", "SO-101 Elbow, backlash", lambda d: d.verdict == "ambiguous"),
-)
+def _names(d: Diagnosis) -> bool:
+    return d.verdict in ("explained", "ambiguous") and bool(d.causes)
 
 
-def page(found: Mapping[str, Diagnosis]) -> str:
-    """The tables of ``docs/evidence/gap-real.md``."""
-    parts = ["## What was expected, and what came\n", "| expected | sets as expected |", "|---|---|"]
-    for expected in EXPECTED:
-        chosen = {name: d for name, d in found.items() if name.startswith(expected.sets)}
-        held = [name for name, d in chosen.items() if expected.holds(d)]
-        parts.append(f"| {expected.text} | {len(held)} of {len(chosen)} |")
-    for prefix, title in (*GROUPS.items(), ("SO-101", "SO-101, a hobby arm: command and position only")):
-        parts += ["", f"## {title}", "", *_group({n: d for n, d in found.items() if n.startswith(prefix)})]
+def cases(folder: Path | None, more: Path | None) -> Iterator[tuple[str, str, Known, Callable[[], ExperimentSet]]]:
+    """(machine, set, what is known, how to load it), both ways where there are two."""
+    if folder is not None:
+        asymmetric = Known(("direction_asymmetry",), None, "likely")
+        for pulses in (True, False):
+            name = f"EMPS, judged on {'pulses' if pulses else 'the first'}"
+            yield "EMPS, a linear axis", name, asymmetric, functools.partial(emps, folder, pulses)
+        named = {("a0", 1): "load_dependent_friction", ("a0", 2): "presliding_hysteresis", ("c1", 1): "", ("c1", 2): ""}
+        for (prefix, number), cause in named.items():
+            known = Known((cause or "none", "unknown"), None, "likely" if cause else "control")
+            for odd in (True, False):
+                name = f"{prefix} joint {number}, judged on {'odd' if odd else 'even'} logs"
+                make = functools.partial(double_pendulum, folder, prefix, number, odd)
+                yield "Double pendulum", name, known, make
+        late = Known(("torque_delay",), None, "likely")
+        motions = sorted(path.name for path in (folder / "so101").iterdir() if path.is_dir())
+        for joint in SO101_JOINTS:
+            for judged in (motions[::2], motions[1::2]):
+                name = f"{joint}, judged on {', '.join(judged)}"
+                yield "SO-101, command and position", name, late, functools.partial(so101, folder, joint, judged)
+    for path in sorted((more / "cases").glob("*/nominal.yaml")) if more is not None else ():
+        case = path.parent.name
+        truth = yaml.safe_load((path.parents[2] / "truth" / f"{case}.yaml").read_text())
+        control = ["none", "unknown"] if truth["certainty"] == "control" else []
+        accept = tuple(dict.fromkeys([*truth["accept"], *truth["expected"], *control]))
+        known = Known(accept, truth["gap_over_floor"], truth["certainty"])
+        yield str(truth["machine"]), case, known, functools.partial(ExperimentSet.load, path.parent)
+
+
+def diagnosed(name: str, known: Known, make: Callable[[], ExperimentSet]) -> Found:
+    """One set through the diagnosis; a refusal is an answer too, and a wrong one."""
+    try:
+        return Found(name, known, diagnose(make()))
+    except FrictidError as error:
+        return Found(name, known, None, str(error))
+
+
+def page(found: Mapping[str, Sequence[Found]]) -> str:
+    """Every set, by machine, and the counts first."""
+    every = [f for group in found.values() for f in group]
+    sure = [f for f in every if f.known.certainty == "certain"]
+    gaps = [f for f in every if (f.known.floors or 0.0) >= FALSE_CLEAR]
+    parts = [
+        "| of all sets | count |",
+        "|---|---|",
+        f"| right first, or tied with what is right | {sum(f.right for f in every)} of {len(every)} |",
+        f"| ... where the cause is certain | {sum(f.right for f in sure)} of {len(sure)} |",
+        f"| `none` beside {FALSE_CLEAR:g} floors or more | {sum(f.false_clear for f in gaps)} of {len(gaps)} |",
+        f"| refused | {sum(f.diagnosis is None for f in every)} of {len(every)} |",
+    ]
+    for machine, group in found.items():
+        parts += ["", f"## {machine}", "", "| set | floors | known | answer | closes | |", "|---|---|---|---|---|---|"]
+        parts += [_line(f) for f in group]
     return "\n".join(parts)
 
 
-def _group(found: Mapping[str, Diagnosis]) -> list[str]:
-    unit = "rad" if all(d.before.inverse_nm is None for d in found.values()) else "N m"
-    lines = [
-        f"| set | verdict | causes (confidence; confusable with) | gap before, after [{unit}] |",
-        "|---|---|---|---|",
-    ]
-    for letter, (name, d) in zip(LETTERS, found.items(), strict=False):
-        causes = "; ".join(
-            f"{c.effect} ({c.confidence:.2f}{'; ' + ', '.join(c.confusable_with) if c.confusable_with else ''})"
-            for c in d.causes
-        )
-        before, after = (f.inverse_nm if unit == "N m" else f.forward_position_rad for f in (d.before, d.after))
-        lines.append(f"| {letter}: {name} | {d.verdict} | {causes} | {before:.3g}, {after:.3g} |")
-    effects = sorted({effect for d in found.values() for effect in d.held_out})
-    lines += [
-        "",
-        "Change of the held-out RMS when an effect alone is added:"
-        if unit == "rad"
-        else "Change of the held-out RMS when an effect alone is added (negative: better on logs that did not fit it):",
-        "",
-        f"| effect | {' | '.join(LETTERS[: len(found)])} |",
-        f"|---{'|---' * len(found)}|",
-    ]
-    for effect in effects:
-        changes = (d.held_out.get(effect) for d in found.values())
-        cells = ("-" if change is None else f"{change:+.1f} %" for change in changes)
-        lines.append(f"| {effect} | {' | '.join(cells)} |")
-    absent = sorted(set(all_effects()) - set(effects))
-    lines += ["", f"Cannot be formed on these recordings: {', '.join(absent)}.", ""]
-    reasons = {subject: why for d in found.values() for subject, why in d.reasons.items()}
-    lines += [f"- {subject}: {why}" for subject, why in sorted(reasons.items())]
-    return lines
+def _line(f: Found) -> str:
+    known = f"{' or '.join(f.known.accept)} ({f.known.certainty.replace('_', ' ')})"
+    floors = "-" if f.known.floors is None else f"{f.known.floors:.3g}"
+    mark = "right" if f.right else "**false all-clear**" if f.false_clear else "**wrong**"
+    if f.diagnosis is None:
+        return f"| {f.name} | {floors} | {known} | refused: {f.refused} | | {mark} |"
+    d = f.diagnosis
+    told = "; ".join(
+        f"{c.effect} {c.confidence:.2f}{' (or ' + ', '.join(c.confusable_with) + ')' if c.confusable_with else ''}"
+        for c in d.causes
+    )
+    pair = (d.before.inverse_nm, d.after.inverse_nm)
+    if pair[0] is None:
+        pair = (d.before.forward_position_rad, d.after.forward_position_rad)
+    closes = "-" if pair[0] is None or pair[1] is None or pair[0] == 0.0 else f"{100 * (1 - pair[1] / pair[0]):.0f} %"
+    return f"| {f.name} | {floors} | {known} | {d.verdict}{': ' + told if told else ''} | {closes} | {mark} |"
 
 
 def main() -> int:
     """Print a line per set; with ``--write-docs`` put the tables into the docs page."""
-    folder = real_data()
-    if folder is None:
-        print("no recordings: set FRICTID_REAL_DATA", file=sys.stderr)
+    folder, more = real_data(), real_data("FRICTID_REAL_MORE_DATA", "real-more")
+    if folder is None and more is None:
+        print("no recordings: set FRICTID_REAL_DATA, FRICTID_REAL_MORE_DATA", file=sys.stderr)
         return 1
-    found = {}
-    for name, experiments in cases(folder):
-        found[name] = diagnose(experiments)
-        print(row(name, found[name]), flush=True)
+    found: dict[str, list[Found]] = {}
+    for machine, name, known, make in cases(folder, more):
+        begin = time.process_time()
+        found.setdefault(machine, []).append(diagnosed(name, known, make))
+        print(f"{_line(found[machine][-1])} {time.process_time() - begin:.1f} s", flush=True)
     if "--write-docs" in sys.argv:
         before, rest = DOCS_PAGE.read_text().split(BEGIN, 1)
         DOCS_PAGE.write_text(f"{before}{BEGIN}\n\n{page(found)}\n\n{END}{rest.split(END, 1)[1]}")

@@ -112,6 +112,16 @@ def real_data() -> Path | None:
     return _folder("FRICTID_REAL_DATA", "real")
 
 
+def practice_wide_data() -> Path | None:
+    """Folder of the practice cases of the wide world, or None."""
+    return _folder("FRICTID_PRACTICE_WIDE_DATA", "gap-practice-wide")
+
+
+def real_more_data() -> Path | None:
+    """Folder of further real sets with what is known of them, or None."""
+    return _folder("FRICTID_REAL_MORE_DATA", "real-more")
+
+
 def _folder(variable: str, name: str) -> Path | None:
     named = os.environ.get(variable)
     folder = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "data" / name
