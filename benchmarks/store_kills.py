@@ -164,16 +164,16 @@ def many(root: Path, count: int) -> None:
     store.promote("arm", first)
     folder, stamp = root / "arm", profile(0).provenance.created_utc
     template = store.path("arm", first).read_text()
-    assert store.history("arm")[0].baseline == first
+    store.history("arm")
     with sqlite3.connect(folder / "index.sqlite") as index:
-        ((value,),) = index.execute("SELECT value FROM kept WHERE kind = 'profiles'")
+        ((kind, value),) = index.execute("SELECT kind, value FROM kept WHERE kind LIKE 'profiles%'")
         for number in range(1, count):
             later = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(1.7e9 + 3600 * number))
             text = template.replace(stamp, later).encode()
             identity = f"{later.replace('-', '').replace(':', '')}-{hashlib.sha256(text).hexdigest()[:12]}"
             (folder / "profiles" / f"{identity}.yaml").write_bytes(text)
             row = value.replace(f'"id": "{first}"', f'"id": "{identity}"').replace(stamp, later)
-            index.execute("INSERT INTO kept VALUES ('profiles', ?, ?)", (identity, row))
+            index.execute("INSERT INTO kept VALUES (?, ?, ?)", (kind, identity, row))
     history = [sys.executable, "-m", "frictid_hil.cli.app", "profile", "history", "arm", "--store", str(root)]
     page = [sys.executable, "-m", "frictid_hil.cli.app", "report", "--robot", "arm", "--store", str(root)]
     for name, command in (("history", history), ("history --json", [*history, "--json"]), ("index page", page)):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -52,11 +52,6 @@ class Index:
             with suppress(OSError):
                 self._path.unlink()
             return self._values(kind, names, read)
-
-    def forget(self, kind: str, names: Iterable[str]) -> None:
-        """Have these read anew."""
-        with suppress(sqlite3.Error), closing(self._open()) as database, database:
-            database.executemany("DELETE FROM kept WHERE kind = ? AND name = ?", [(kind, name) for name in names])
 
     def _values(self, kind: str, names: Sequence[str], read: Callable[[str], Any]) -> dict[str, Any]:
         with closing(self._open()) as database:

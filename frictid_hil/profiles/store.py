@@ -35,7 +35,7 @@ from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
 from frictid_hil.profiles.index import Index
 from frictid_hil.profiles.promotions import Attempt, Promotion, active_stack, baseline_of
-from frictid_hil.profiles.summary import Reference, Stored, TrendPoint, stored_of, summary
+from frictid_hil.profiles.summary import Stored, TrendPoint, stored_of, summary
 
 _LOCK_TIMEOUT_S = 30.0
 _NAMES = {
@@ -200,20 +200,14 @@ class ProfileStore:
         folder = self._folder(robot)
         names = _names(folder, "profiles")[-last if last else None :]
         baseline = self.baseline(robot)
-        reference = Reference(baseline, None if baseline is None else self.load(robot, baseline))
-        index = Index(folder / "index.sqlite", self._told)
+        reference = None if baseline is None else self.load(robot, baseline)
 
-        def measured() -> list[Stored]:
-            found = index.values(
-                "profiles", names, lambda name: asdict(summary(name, self.load(robot, name), reference))
-            )
-            return [stored_of(value) for value in found.values()]
+        def read_anew(name: str) -> dict[str, Any]:
+            return asdict(summary(name, self.load(robot, name), reference))
 
-        stored = measured()
-        if stale := [one.id for one in stored if one.baseline != baseline]:
-            index.forget("profiles", stale)
-            stored = measured()
-        return stored
+        # Distances are from the baseline: with another one, every profile is read anew, once.
+        found = self._index(folder).values(f"profiles since {baseline}", names, read_anew)
+        return [stored_of(values) for values in found.values()]
 
     def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""
@@ -244,6 +238,9 @@ class ProfileStore:
         return [
             kind(**values) for values in index.values(where, names, lambda n: _note(folder / where, n, kind)).values()
         ]
+
+    def _index(self, folder: Path) -> Index:
+        return Index(folder / "index.sqlite", self._told)
 
     @contextmanager
     def _locked(self, robot: str) -> Iterator[Path]:

@@ -42,14 +42,12 @@ class Stored:
         id: ``<UTC>-<first 12 digits of sha256>``; sorts by time.
         robot: name.
         created_utc: from its provenance.
-        baseline: id of the profile that the distances are from, None before the first promotion.
         joints: summaries by name.
     """
 
     id: str
     robot: str
     created_utc: str
-    baseline: str | None
     joints: Mapping[str, JointSummary]
 
 
@@ -68,21 +66,8 @@ class TrendPoint:
     joint: JointSummary
 
 
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """The baseline and its profile, read once.
-
-    Attributes:
-        id: None before the first promotion.
-        profile: likewise.
-    """
-
-    id: str | None
-    profile: FrictionProfile | None
-
-
-def summary(identity: str, profile: FrictionProfile, reference: Reference) -> Stored:
-    """What is kept of a profile in the index."""
+def summary(identity: str, profile: FrictionProfile, reference: FrictionProfile | None) -> Stored:
+    """What is kept of a profile in the index; ``reference`` is the profile that is the baseline."""
     joints = {
         name: JointSummary(
             coulomb_nm=joint.coulomb_nm.value,
@@ -95,11 +80,11 @@ def summary(identity: str, profile: FrictionProfile, reference: Reference) -> St
         )
         for name, joint in profile.joints.items()
     }
-    return Stored(identity, profile.robot, profile.provenance.created_utc, reference.id, joints)
+    return Stored(identity, profile.robot, profile.provenance.created_utc, joints)
 
 
-def _distance_percent(reference: Reference, name: str, curve: FrictionCurve) -> float | None:
-    known = None if reference.profile is None else reference.profile.joints.get(name)
+def _distance_percent(reference: FrictionProfile | None, name: str, curve: FrictionCurve) -> float | None:
+    known = None if reference is None else reference.joints.get(name)
     if known is None:
         return None
     distance_nm, mean_nm = distance_and_mean_nm(known.curve(), curve)
