@@ -36,10 +36,13 @@ SEED = 20
 
 SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "backlash": {"gap_rad": (1e-3, 4e-3)},
+    "controller_gain_error": {"kp_error_share": (0.05, 0.15), "ki_error_share": (0.05, 0.15)},
     "direction_asymmetry": {"coulomb_share": (0.05, 0.15), "viscous_share": (0.05, 0.15)},
+    "directional_efficiency": {"driving_share": (0.05, 0.15)},
     "electrical_lag": {"time_constant_s": (1.5e-3, 4e-3)},
     "encoder_offset": {"offset_rad": (0.04, 0.12)},
     "encoder_quantisation": {"step_rad": (1e-4, 3e-4)},
+    "friction_level_error": {"error_share": (0.08, 0.2)},
     "gravity_error": {"error_share": (0.05, 0.15)},
     "inertia_error": {"error_share": (0.1, 0.3)},
     "joint_elasticity": {"compliance_rad_per_nm": (1e-4, 4e-4)},
@@ -58,7 +61,9 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "torque_delay": {"delay_s": (2e-3, 4e-3)},
     "torque_ripple": {"amplitude_nm": (0.2, 0.6), "phase_rad": (-3.0, 3.0)},
     "torque_saturation": {"limit_share": (0.335, 0.355)},
+    "transmission_error": {"amplitude_rad": (3e-4, 8e-4), "phase_rad": (-3.0, 3.0)},
     "velocity_lag": {"time_constant_s": (3e-3, 8e-3)},
+    "viscous_error": {"error_share": (0.1, 0.3)},
     "viscous_nonlinearity": {"share": (0.3, 0.8), "knee_rad_s": (0.2, 0.6)},
 }
 

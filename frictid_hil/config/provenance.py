@@ -19,7 +19,7 @@ class Provenance(Strict):
 
     Attributes:
         created_utc: ``2026-11-21T05:15:00Z``.
-        tool_version: of frictid-hil.
+        tool_version: of frictid-hil; "" in a profile that was not written by it.
         git_revision: of the checkout it ran from; "" from an installed wheel.
         robot_file: name of the robot file.
         config_sha256: ``Robot.digest``.
@@ -36,7 +36,7 @@ class Provenance(Strict):
     """
 
     created_utc: str = Field(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")
-    tool_version: str = __version__
+    tool_version: str = ""
     git_revision: str = ""
     robot_file: str = ""
     config_sha256: str = ""
@@ -50,6 +50,11 @@ class Provenance(Strict):
     temperatures_c: dict[str, float] = Field(default_factory=dict)
     command: str = ""
     notes: list[str] = Field(default_factory=list)
+
+    @classmethod
+    def now(cls, **facts: Any) -> Provenance:
+        """Of a profile that this program writes at this moment."""
+        return cls(created_utc=utc_now(), tool_version=__version__, git_revision=git_revision(), **facts)
 
 
 def utc_now() -> str:

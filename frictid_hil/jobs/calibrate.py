@@ -12,7 +12,7 @@ import numpy as np
 
 from frictid_hil.config.policy import WarmUp
 from frictid_hil.config.profile import FrictionProfile, JointProfile
-from frictid_hil.config.provenance import Provenance, git_revision, utc_now
+from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
@@ -312,9 +312,7 @@ class _Measured:
 
     def _provenance(self) -> Provenance:
         order, setup, folder = self._planned.order, self._planned.setup, self._run.folder
-        return Provenance(
-            created_utc=utc_now(),
-            git_revision=git_revision(),
+        return Provenance.now(
             robot_file=order.robot.path.name,
             config_sha256=order.robot.digest,
             driver=order.driver,

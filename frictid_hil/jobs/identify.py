@@ -12,7 +12,7 @@ from typing import Any
 from frictid_hil.columns import ColumnMap
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.profile import FrictionProfile, JointProfile
-from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
+from frictid_hil.config.provenance import Provenance, file_sha256
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, InputFileError, UsageError
 from frictid_hil.files import made_folders, refuse_overwriting
@@ -315,9 +315,7 @@ def _profile(task: _Task, result: _Identified) -> FrictionProfile:
     return FrictionProfile(
         robot=task.setup.name if task.setup else task.log.stem,
         joints=result.joints,
-        provenance=Provenance(
-            created_utc=utc_now(),
-            git_revision=git_revision(),
+        provenance=Provenance.now(
             run=str(task.log.resolve()),
             log_sha256={path.name: file_sha256(path) for path in _files(task.log)},
         ),

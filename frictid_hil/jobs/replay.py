@@ -17,7 +17,7 @@ import can
 import numpy as np
 
 from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile, profile_file
-from frictid_hil.config.provenance import Provenance, file_sha256, git_revision, utc_now
+from frictid_hil.config.provenance import Provenance, file_sha256
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import (
     HardwareError,
@@ -250,9 +250,7 @@ def _write(options: ReplayOptions, robot: Robot, profiles: Mapping[str, JointPro
     FrictionProfile(
         robot=robot.name,
         joints=dict(profiles),
-        provenance=Provenance(
-            created_utc=utc_now(),
-            git_revision=git_revision(),
+        provenance=Provenance.now(
             robot_file=robot.path.name,
             config_sha256=robot.digest,
             run=str(options.source.resolve()),

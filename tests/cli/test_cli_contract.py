@@ -88,7 +88,7 @@ def test_a_users_mistake_is_exit_2_with_a_reason(arguments: list[str], said: str
 @pytest.mark.parametrize(
     ("arguments", "said", "schema"),
     [
-        (("calibrate", "--json"), "Missing option '--robot'", "frictid.calibrate/1"),
+        (("compensate", "--json"), "Missing option '--robot'", "frictid.compensate/1"),
         (("calibrate", "--robot", "hp3j.yaml", "--json", "--bogus"), "No such option", "frictid.calibrate/1"),
         (("calibrate", "--json", "-A", "3"), "has no unit", "frictid.calibrate/1"),
         (("profile", "shwo", "--json"), "No such command", "frictid.profile/1"),

@@ -344,5 +344,6 @@ def test_provenance_knows_time_revision_and_log(tmp_path: Path) -> None:
     log = tmp_path / "samples.mcap"
     log.write_bytes(b"abc" * 100_000)
     assert file_sha256(log) == hashlib.sha256(log.read_bytes()).hexdigest()
-    assert Provenance(created_utc=utc_now()).tool_version
+    assert Provenance.now(run="here").tool_version
+    assert not Provenance(created_utc=utc_now()).tool_version, "a file without it was written by another version"
     assert len(git_revision().rstrip("+")) in (0, 40)

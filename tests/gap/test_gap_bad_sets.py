@@ -139,7 +139,7 @@ def _rows(*broken: tuple[int, str]) -> str:
         (_rows((6, "0.01,0.4,1,0.4")), "line 6: time does not increase"),
         (_rows((1, "time_s,angle,torque_nm,position_command_rad")), "line 1: no column position_rad; the file has"),
         (_rows((1, "time_s,position_rad,current,speed")), "line 1: neither torque_nm nor position_command_rad"),
-        (_rows((1, "time_s;position_rad;torque_nm;speed")), "not separated by commas"),
+        (_rows((1, "time_s;position_rad;torque_nm;speed")), "line 2 has 1 values where the header has 4"),
         (_rows((1, "time_s,position_deg,torque_nm,speed")), "unknown column 'position_deg'; did you mean position_rad"),
         (HEADER + "\n", "at least 2"),
         ("", "empty"),

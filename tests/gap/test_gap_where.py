@@ -14,7 +14,15 @@ from frictid_hil.gap.where import by_region, where
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 
-EFFECTS = {**SINGLES, "backlash": {"gap_rad": 2e-3}}
+EFFECTS = {
+    **SINGLES,
+    "backlash": {"gap_rad": 2e-3},
+    "friction_level_error": {"error_share": 0.1},
+    "viscous_error": {"error_share": 0.2},
+    "controller_gain_error": {"kp_error_share": 0.1},
+    "transmission_error": {"amplitude_rad": 5e-4},
+    "directional_efficiency": {"driving_share": 0.1, "backdriving_share": 0.02},
+}
 
 
 def places(effects: dict[str, dict[str, float]]):

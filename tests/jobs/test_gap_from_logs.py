@@ -111,7 +111,7 @@ def test_a_draft_finds_the_joint_and_says_how_sure_it_is(tmp_path: Path) -> None
 def test_a_draft_is_not_written_over_a_file_unless_told(tmp_path: Path) -> None:
     log, out = _log(tmp_path / "a.csv"), tmp_path / "nominal.yaml"
     out.write_text("mine")
-    with pytest.raises(UsageError, match="is there already"):
+    with pytest.raises(UsageError, match="exists already"):
         draft(Source([log]), out)
     assert out.read_text() == "mine"
     draft(Source([log]), out, force=True)
