@@ -92,7 +92,7 @@ class Estimate(Strict):
         while (
             ends != before and all(isinstance(end, float) and abs(end) < math.inf for end in ends) and ends[0] < ends[1]
         ):
-            places = 2 - math.ceil(math.log10(ends[1] - ends[0]))
+            places = 2 - math.floor(math.log10(ends[1] - ends[0]))
             before, ends = ends, [round(end, places) for end in rounded(ends)]
         return given | {"low": ends[0], "high": ends[1]} if before else given
 

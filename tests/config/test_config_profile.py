@@ -301,7 +301,7 @@ def test_rounding_an_estimate_again_changes_nothing(value: float, width: float) 
     once = Estimate(value=value, low=value - width, high=value + width)
     assert Estimate(**once.model_dump()) == once
     assert once.low is not None and once.high is not None and once.low <= once.high
-    assert abs(once.low - (value - width)) <= 0.1 * width + 1e-5 * (abs(value) + width)
+    assert abs(once.low - (value - width)) <= 0.01 * width + 1e-5 * (abs(value) + width)
 
 
 def test_a_joint_is_a_function_of_velocity(tmp_path: Path) -> None:

@@ -191,8 +191,11 @@ def test_r_falls_where_gravity_is_uncertain_and_the_plan_says_so(robot: Path, pr
     assert law.friction_share(centre_rad) == 1.0
     spread_rad = math.radians(10.0) / math.sqrt(2.0)
     at_end = 0.95 - 0.6 * (math.cos(spread_rad) - math.cos(math.radians(20.0)))
-    assert 0.95 * law.friction_share(centre_rad - math.radians(20.0)) == pytest.approx(at_end)
-    assert planned["doubtful", "ours"].lowest_ratio == pytest.approx(at_end)
+    assert 0.95 * law.friction_share(centre_rad - math.radians(20.0)) == pytest.approx(
+        at_end,
+        abs=3e-4,  # a file rounds an interval to a hundredth of its width
+    )
+    assert planned["doubtful", "ours"].lowest_ratio == pytest.approx(at_end, abs=3e-4)
     assert any("falls from 0.95 to 0.918" in note for note in planned["doubtful", "ours"].plan.notes)
     # As calibrated: within the travel of the task gravity is known to a hundredth of F_0.
     assert 0.94 < (planned["profile", "ours"].lowest_ratio or 0.0) < 0.949

@@ -51,7 +51,7 @@ def identify_joint(
         samples: of the whole run of the joint, with marks; or of a foreign recording, without.
         joint: limits and gear, where a robot file tells.
         method: estimator.
-        procedure: instead of the one that the marks carry; without either, plateaus of constant speed are looked for.
+        procedure: of a recording without marks; without it, plateaus of constant speed are looked for, then any motion.
         late_cycles: control cycles that came late or were missed.
         company: of the joints that moved together with it, where they did, whole runs too; it may be among them.
 
@@ -80,6 +80,13 @@ def identify_joint(
         return _from_cycles(samples, procedure, start_s, joint, method, late_cycles)
     if method == "least-squares":
         return _from_free_motion(samples, [])
+    if samples.marks:
+        raise IdentificationError(
+            "the run holds no cycles of the procedure",
+            where=f"joint {samples.joint}",
+            cause=f"it ended before them: it holds {', '.join(dict.fromkeys(mark.name for mark in samples.marks))}",
+            next_step="continue it by `calibrate --resume RUN`; `--method least-squares` identifies any motion",
+        )
     try:
         return _from_plateaus(samples)
     except IdentificationError as error:
