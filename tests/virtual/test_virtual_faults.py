@@ -5,22 +5,24 @@ import json
 import can
 import pytest
 
-from frictid_drivers.virtual.faults import Fault, FrameFaults, faults_of, missing_objects, read_faults
+from frictid_drivers.virtual.faults import Fault, faults_of, missing_objects, read_faults
 from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.lock_step import LockStepBus
 from frictid_drivers.virtual.rack import Rack
+from frictid_drivers.virtual.wire_faults import WireFaults
 from frictid_hil.errors import InvalidFields, UsageError
 
 MS = 1_000_000
+NODES = {"0": 1, "1": 2}
 TPDO, OTHER = 0x181, 0x182
 
 
 def passed(kind, frames=6, **fields):
     """Indices of the frames that come out, with the time each is due, for frames sent every millisecond."""
-    line = FrameFaults([Fault(kind, at_s=0.002, cob_ids=frozenset({TPDO}), **fields)])
+    line = WireFaults([Fault(kind, at_s=0.002, cob_ids=frozenset({TPDO}), **fields)])
     return [
-        (due // MS, data[0]) for n in range(frames) for due, _, data in line.through(n * MS, TPDO, bytes([n]))
+        (due // MS, data[0]) for n in range(frames) for due, _, data in line.through(n * MS, n * MS, TPDO, bytes([n]))
     ]  # fmt: skip
 
 
@@ -37,17 +39,17 @@ def test_what_each_kind_does_to_frames():
 
 
 def test_other_frames_pass_untouched():
-    line = FrameFaults([Fault("drop", cob_ids=frozenset({TPDO}))])
-    assert line.through(0, OTHER, b"x") == [(0, OTHER, b"x")]
+    line = WireFaults([Fault("drop", cob_ids=frozenset({TPDO}))])
+    assert line.through(0, 0, OTHER, b"x") == [(0, OTHER, b"x")]
 
 
-def test_reading_a_robot_file(make_robot):
+def test_reading_a_robot_file():
     rows = [
         {"kind": "drop", "frames": "tpdo1", "joint": "1", "at_s": 2, "count": 3},
         {"kind": "delay", "frames": "sync", "delay_s": 0.004},
         {"kind": "missing", "index": 0x1016},
     ]
-    drop, delay, missing = read_faults(rows, make_robot())
+    drop, delay, missing = read_faults(rows, NODES)
     assert drop.cob_ids == {0x182} and drop.at_s == 2.0 and drop.count == 3
     assert delay.cob_ids == {0x080}
     assert missing_objects([missing]) == {"0": {0x1016}, "1": {0x1016}}
@@ -65,9 +67,9 @@ def test_reading_a_robot_file(make_robot):
         ([7], ("options", "faults", 0)),
     ],
 )
-def test_mistakes_are_named_by_their_place(make_robot, rows, path):
+def test_mistakes_are_named_by_their_place(rows, path):
     with pytest.raises(InvalidFields) as error:
-        read_faults(rows, make_robot())
+        read_faults(rows, NODES)
     assert path in [problem.path for problem in error.value.problems]
 
 
@@ -182,6 +184,7 @@ def test_bad_cable_in_front_of_any_bus(make_robot):
                 answers.append(answer.arbitration_id)
             return answers
 
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert ask(1) == [] and ask(1) == [0x581]
         assert ask(2) == []
         now_ns[0] = 10 * MS

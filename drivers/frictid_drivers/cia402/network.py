@@ -39,7 +39,7 @@ FORWARDED = (
 )  # fmt: skip
 """Robot-file options that are handed to python-can as they are, when given."""
 
-_FD_BY_LINK = ("socketcan", "udp_multicast", "frictid")
+_FD_BY_LINK = ("socketcan", "udp_multicast", "frictid", "faulty")
 _FD_BY_RATES = ("ixxat", "neovi")
 _FD_BY_TIMING = ("pcan", "kvaser", "vector", "slcan", "nixnet")
 _FD_CLOCK_HZ = 80_000_000
@@ -71,7 +71,7 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
         options: of the robot file; bit rates and a few others go to the interface.
 
     Raises:
-        UsageError: not of that form.
+        UsageError: not of that form, or faults for a bus that injects none.
         HardwareError: interface unknown or without CAN FD where that is wanted, channel absent, or no permission.
     """
     interface, channel = split_bus(bus)
@@ -79,6 +79,14 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
     if interface not in ("socketcan", "virtual"):
         # A SocketCAN link carries its bitrate already; everybody else must be told.
         settings.setdefault("bitrate", DEFAULT_BITRATE)
+    if interface == "faulty":
+        settings["faults"] = options.get("faults")
+    elif "faults" in options:
+        raise UsageError(
+            "`options: faults` spoil a bus that says so in its name, and this one does not",
+            where=bus,
+            next_step=f"leave `faults` out, or write the bus as faulty:{bus}",
+        )
     fd = bool(options.get("fd"))
     try:
         if fd:

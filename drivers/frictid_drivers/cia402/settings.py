@@ -15,6 +15,7 @@ reply_window                            0.7       share of the cycle in which re
 allow_torque_without_watchdog           false     torque modes on drives without 1016 and 6007
 quick_stop_option                       6         605A: 5, 6 or 7 (stop and hold)
 abort_option                            3         6007: 2 (disable voltage) or 3 (quick stop)
+faults                                  -         on a bus ``faulty:INTERFACE:CHANNEL``: what goes wrong on it
 tty_baudrate, port, host, tcp_tune, ... -         handed to the python-can interface as they are (``network.FORWARDED``)
 ======================================  ========  =====================================================================
 
@@ -73,6 +74,7 @@ BUS_OPTIONS = frozenset(
         "allow_torque_without_watchdog",
         "quick_stop_option",
         "abort_option",
+        "faults",
         *FORWARDED,
     }
 )

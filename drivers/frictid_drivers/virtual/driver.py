@@ -7,6 +7,7 @@ difference; this class only builds the bus, takes it exclusively and tears it do
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,8 @@ import can
 
 from frictid_drivers.virtual import channel, side_channel
 from frictid_drivers.virtual.arm import arm_of
-from frictid_drivers.virtual.faults import faults_of, missing_objects
+from frictid_drivers.virtual.faults import HOST_KINDS, faults_of, missing_objects
+from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_drivers.virtual.faulty_rack import FaultyRack, leave_in_fault
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
@@ -87,12 +89,17 @@ class VirtualDriver:
             raise
 
     def _open_bus(self) -> can.BusABC:
+        bus: can.BusABC
         if self._setup.realtime:
-            return SocketBus(self._channel)
-        bus = LockStepBus(self._drives, self._channel)
-        self._rack.power_on()
-        leave_in_fault(self._rack, self._faults)
-        return bus
+            bus = SocketBus(self._channel)
+        else:
+            bus = LockStepBus(self._drives, self._channel)
+            self._rack.power_on()
+            leave_in_fault(self._rack, self._faults)
+        ours = [fault for fault in self._faults if fault.kind in HOST_KINDS]
+        if not ours:
+            return bus
+        return FaultyBus(bus, ours, time.monotonic_ns if self._setup.realtime else lambda: self._rack.now_ns)
 
     def close(self) -> None:
         """Bring everything to rest and let go of the channel."""
@@ -223,7 +230,7 @@ def _told_to_host(setup: RobotSetup) -> RobotSetup:
     """The robot as the host driver shall see it: no faults, and where our drives keep what other drives have not."""
     from frictid_drivers.cia402.settings import BUS_OPTIONS  # late, as above
 
-    problems = unknown_options(setup.options, {*BUS_OPTIONS, "faults"}, ("options",), "virtual")
+    problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "virtual")
     if problems:
         raise InvalidFields(problems)
     options = {name: value for name, value in setup.options.items() if name != "faults"}

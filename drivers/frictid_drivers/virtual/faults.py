@@ -1,26 +1,50 @@
-"""Things that go wrong on a bus and in its drives, by a schedule, the same every time.
+"""Things that go wrong on a bus and in its drives, by a schedule, the same every time: their one list and its schema.
 
 A robot file's ``options.faults`` lists them, as does the environment variable ``FRICTID_VIRTUAL_FAULTS`` (the same list
-as JSON, added to the file's); tests use the classes directly::
+as JSON, added to the file's); tests use the classes directly. In front of any other bus, a real one too, it is
+``bus: faulty:socketcan:can0`` that reads ``options.faults`` (``faulty_bus``)::
 
     options:
       faults:
         - {kind: drop, frames: tpdo1, joint: "1", at_s: 2.0, count: 3}
-        - {kind: stuck_encoder, joint: "1", at_s: 4.5}
+        - {kind: lag, quantity: torque, delay_s: 0.006}
 
 ===============  ============================================  ===========================================
 kind             does                                          fields besides ``at_s`` and ``joint``
 ===============  ============================================  ===========================================
-drop             frames vanish                                 frames, for_s, count
-delay            frames come late                              frames, for_s, count, delay_s
-duplicate        frames come twice                             frames, for_s, count
-reorder          a frame comes after the next of its kind      frames, for_s, count
-corrupt          one bit of a frame is inverted                frames, for_s, count
+on any bus: frames
+-----------------------------------------------------------------------------------------------------------
+drop             frames vanish                                 frames, for_s, count, after
+delay            frames come late                              frames, for_s, count, after, delay_s
+duplicate        frames come twice                             frames, for_s, count, after
+reorder          a frame comes after the next of its kind      frames, for_s, count, after
+corrupt          one bit of a frame is inverted                frames, for_s, count, after
+truncate         a frame ends after ``level`` bytes            frames, for_s, count, after, level
+misaddress       the next node seems to have sent it           frames, for_s, count, after
+foreign          another sender repeats after each frame what  frames, for_s, count, after
+                 was in the first
+abort            the drive's SDO answers are aborts            for_s, count, after, code
 mute             the node neither hears nor speaks             for_s
-emcy             the drive warns                               code
-fault            the drive faults                              code
 reset            the drive resets, as after a power failure
-stuck_encoder    the drive reports the same position for ever
+emcy             the drive warns, ``count`` times at once      code, count
+on any bus: what drives report
+-----------------------------------------------------------------------------------------------------------
+freeze           the same figure for ever                      quantity, for_s
+invert           the figure's sign is wrong                    quantity, for_s
+lag              the figure is late                            quantity, for_s, delay_s
+clip             the figure stays within +-``level``           quantity, for_s, level
+scale            the figure times ``factor``                   quantity, for_s, factor
+jump             the figure plus ``level``                     quantity, for_s, level
+flap             every second statusword says: no power        for_s
+on any bus: what the host's own interface does
+-----------------------------------------------------------------------------------------------------------
+send_error       ``send`` raises                               error, for_s, count, after
+receive_error    ``recv`` raises                               error, for_s, count, after
+bus_off          an error frame, then only errors              for_s
+in simulated drives
+-----------------------------------------------------------------------------------------------------------
+fault            the drive faults                              code
+stuck_encoder    the drive's own encoder stands for ever
 blocked          the brake stays closed                        for_s
 interlock_open   the interlock input opens (60FDh bit 3)       for_s
 missing          the drive has no such object, from the start  index
@@ -28,37 +52,34 @@ left_in_fault    the drive is found in fault, as after a run   code
                  that was cut off (8130h unless told)
 ===============  ============================================  ===========================================
 
-``at_s`` counts from the first SYNC. ``frames`` is ``sync``, ``host_heartbeat``, ``sdo``, ``emcy``, ``heartbeat`` or
-``rpdo1`` to ``tpdo4``; without ``joint`` it means that of every joint.
+``at_s`` counts from the first SYNC; without it a fault is there from the beginning (those of drives: from the first
+SYNC). ``after`` lets so many frames or calls pass first. ``frames`` is ``sync``, ``host_heartbeat``, ``sdo``, ``emcy``,
+``heartbeat`` or ``rpdo1`` to ``tpdo4``; without ``joint`` (or ``node``, its number) it means that of every joint.
+``quantity`` is ``position``, ``velocity`` or ``torque``, and ``level`` of it is in the drive's own units. ``error`` is
+``can``, ``os``, ``runtime`` or ``value``.
 """
 
 from __future__ import annotations
 
-import heapq
 import json
-import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.simulation.fields import Fields
 
-FRAME_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")
-DRIVE_KINDS = (
-    "mute",
-    "emcy",
-    "fault",
-    "reset",
-    "stuck_encoder",
-    "blocked",
-    "interlock_open",
-    "missing",
-    "left_in_fault",
-)
+FRAME_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt", "truncate", "misaddress", "foreign")
+NODE_KINDS = ("abort", "mute", "reset", "emcy")
+REPORT_KINDS = ("freeze", "invert", "lag", "clip", "scale", "jump", "flap")
+HOST_KINDS = ("send_error", "receive_error", "bus_off")
+DRIVE_KINDS = ("fault", "stuck_encoder", "blocked", "interlock_open", "missing", "left_in_fault")
+KINDS = FRAME_KINDS + NODE_KINDS + REPORT_KINDS + HOST_KINDS + DRIVE_KINDS
+QUANTITIES = {"position": 0x6064, "velocity": 0x606C, "torque": 0x6077, "status": 0x6041}
+"""What drives report, and the object that it is."""
+ERRORS = ("can", "os", "runtime", "value")
 SERVICES: dict[str, tuple[int, ...]] = {
     "sync": (0x080,),
     "emcy": (0x080,),
@@ -72,8 +93,8 @@ SERVICES: dict[str, tuple[int, ...]] = {
 }
 """COB-IDs of the predefined connection set, node 0."""
 
+FOREVER_S = 1e9
 _HOST_NODES = range(0x40, 0x80)
-_FOREVER_S = 1e9
 _NO_LIMIT = 10**9
 
 
@@ -83,25 +104,47 @@ class Fault:
 
     Attributes:
         kind: what.
-        at_s: when, after the first SYNC.
+        at_s: when, after the first SYNC; None from the beginning.
         for_s: how long.
-        count: how many frames.
+        count: how many frames or calls.
+        after: how many frames or calls pass first.
         joints: whose.
+        nodes: of these joints.
         cob_ids: which frames.
         delay_s: how late.
-        code: EMCY code.
+        code: EMCY or SDO abort code.
         index: object.
+        quantity: object of the report.
+        level: of the report, in the drive's units; bytes that are left.
+        factor: of the report.
+        error: that the interface raises.
     """
 
     kind: str
-    at_s: float = 0.0
-    for_s: float = _FOREVER_S
+    at_s: float | None = None
+    for_s: float = FOREVER_S
     count: int = _NO_LIMIT
+    after: int = 0
     joints: tuple[str, ...] = ()
+    nodes: tuple[int, ...] = ()
     cob_ids: frozenset[int] = frozenset()
     delay_s: float = 0.0
     code: int = 0
     index: int = 0
+    quantity: int = 0
+    level: int = 0
+    factor: float = 1.0
+    error: str = "can"
+
+    @property
+    def begin_s(self) -> float:
+        """When, where it cannot be before the first SYNC."""
+        return self.at_s or 0.0
+
+    @property
+    def times(self) -> int:
+        """How often, where once is usual."""
+        return 1 if self.count == _NO_LIMIT else self.count
 
 
 ENVIRONMENT = "FRICTID_VIRTUAL_FAULTS"
@@ -119,15 +162,16 @@ def faults_of(setup: RobotSetup) -> tuple[Fault, ...]:
         further = json.loads(text) if text else None
     except ValueError as error:
         raise UsageError(f"not JSON: {error}", where=ENVIRONMENT) from None
-    return read_faults(setup.options.get("faults"), setup) + read_faults(further, setup)
+    nodes = {joint.name: joint.address for joint in setup.joints}
+    return read_faults(setup.options.get("faults"), nodes) + read_faults(further, nodes)
 
 
-def read_faults(rows: Any, setup: RobotSetup) -> tuple[Fault, ...]:
-    """The faults of a robot file.
+def read_faults(rows: Any, nodes: Mapping[str, int]) -> tuple[Fault, ...]:
+    """A list of faults.
 
     Args:
         rows: the list under ``options.faults``; None for none.
-        setup: whose joints it names.
+        nodes: node numbers of the joints that it may name.
 
     Raises:
         InvalidFields: what is wrong, by ``options.faults.N.KEY``.
@@ -140,32 +184,45 @@ def read_faults(rows: Any, setup: RobotSetup) -> tuple[Fault, ...]:
         rows = None
     for number, row in enumerate(rows or ()):
         fields = Fields(row, ("options", "faults", number), top.problems)
-        kind = fields.choice("kind", "", FRAME_KINDS + DRIVE_KINDS)
-        names = tuple(joint.name for joint in setup.joints)
-        joint = fields.choice("joint", "", ("", *names))
-        service = fields.choice("frames", "", ("", *SERVICES))
-        if kind in FRAME_KINDS and not service:
-            fields.problem("frames", f"is required: one of {', '.join(SERVICES)}")
-        joints = (joint,) if joint else names
-        faults.append(
-            Fault(
-                kind=kind,
-                at_s=fields.number("at_s", 0.0, low=0.0),
-                for_s=fields.number("for_s", _FOREVER_S, low=0.0),
-                count=round(fields.number("count", _NO_LIMIT, low=1.0)),
-                joints=joints,
-                cob_ids=_cob_ids(service, [setup.joint(name).address for name in joints]) if service else frozenset(),
-                delay_s=fields.number("delay_s", 0.0, low=0.0),
-                code=round(fields.number("code", 0x8130 if kind == "left_in_fault" else 0x5000, low=1.0, high=0xFFFF)),
-                index=round(fields.number("index", 0.0, low=0.0, high=0xFFFF)),
-            )
-        )
+        faults.append(_fault(fields, nodes))
         fields.no_others()
     top.finish()
     return tuple(faults)
 
 
-def _cob_ids(service: str, nodes: list[int]) -> frozenset[int]:
+def _fault(fields: Fields, known: Mapping[str, int]) -> Fault:
+    kind = fields.choice("kind", "", KINDS)
+    joint = fields.choice("joint", "", ("", *known))
+    node = round(fields.number("node", 0.0, low=1.0, high=127.0)) if "node" in fields else 0
+    service = fields.choice("frames", "", ("", *SERVICES))
+    quantity = fields.choice("quantity", "", ("", *QUANTITIES))
+    if kind in FRAME_KINDS and not service:
+        fields.problem("frames", f"is required: one of {', '.join(SERVICES)}")
+    if kind in REPORT_KINDS and kind != "flap" and not quantity:
+        fields.problem("quantity", f"is required: one of {', '.join(QUANTITIES)}")
+    names = (joint,) if joint else tuple(name for name, number in known.items() if node in (0, number))
+    nodes = tuple(known[name] for name in names) or ((node,) if node else tuple(range(1, 128)))
+    usual_code = {"left_in_fault": 0x8130, "abort": 0x08000020}.get(kind, 0x5000)
+    return Fault(
+        kind=kind,
+        at_s=fields.number("at_s", 0.0, low=0.0) if "at_s" in fields else None,
+        for_s=fields.number("for_s", FOREVER_S, low=0.0),
+        count=round(fields.number("count", 1 if kind == "emcy" else _NO_LIMIT, low=1.0)),
+        after=round(fields.number("after", 0.0, low=0.0)),
+        joints=names,
+        nodes=nodes,
+        cob_ids=_cob_ids(service, nodes) if service else frozenset(),
+        delay_s=fields.number("delay_s", 0.0, low=0.0),
+        code=round(fields.number("code", usual_code, low=1.0, high=0xFFFFFFFF)),
+        index=round(fields.number("index", 0.0, low=0.0, high=0xFFFF)),
+        quantity=QUANTITIES["status"] if kind == "flap" else QUANTITIES.get(quantity, 0),
+        level=round(fields.number("level", 0.0)),
+        factor=fields.number("factor", 1.0),
+        error=fields.choice("error", "can", ERRORS),
+    )
+
+
+def _cob_ids(service: str, nodes: Sequence[int]) -> frozenset[int]:
     if service == "sync":
         return frozenset(SERVICES[service])
     if service == "host_heartbeat":
@@ -181,95 +238,3 @@ def missing_objects(faults: Sequence[Fault]) -> Mapping[str, frozenset[int]]:
             for joint in fault.joints:
                 found[joint] = found.get(joint, frozenset()) | {fault.index}
     return found
-
-
-class _FrameFault:
-    """One frame fault at work: how many frames it has spoilt, and the one it holds back."""
-
-    def __init__(self, fault: Fault) -> None:
-        self.fault = fault
-        self.start_ns = round(fault.at_s * 1e9)
-        self.end_ns = round(min(fault.at_s + fault.for_s, _FOREVER_S) * 1e9)
-        self.done = 0
-        self.held: tuple[int, bytes] | None = None
-
-
-class FrameFaults:
-    """What becomes of each frame that passes a point of the wire.
-
-    Args:
-        faults: those of frames; others are ignored.
-    """
-
-    def __init__(self, faults: Sequence[Fault]) -> None:
-        self._faults = [_FrameFault(fault) for fault in faults if fault.kind in FRAME_KINDS]
-        plain = {cob_id for state in self._faults for cob_id in state.fault.cob_ids}
-        self.cob_ids = frozenset(plain | {cob_id | FD_FRAME for cob_id in plain})
-
-    def through(self, now_ns: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """The frames that come out, each with the time at which it does.
-
-        Args:
-            now_ns: time since the first SYNC.
-            can_id: of the frame that goes in.
-            data: of the frame that goes in.
-        """
-        frames = [(now_ns, can_id, data)]
-        for state in self._faults:
-            if can_id & ~FD_FRAME in state.fault.cob_ids:
-                frames = [out for frame in frames for out in _spoil(state, frame)]
-        return frames
-
-
-def _spoil(state: _FrameFault, frame: tuple[int, int, bytes]) -> list[tuple[int, int, bytes]]:
-    now_ns, can_id, data = frame
-    fault = state.fault
-    if state.held is not None:
-        held, state.held = state.held, None
-        return [frame, (now_ns, *held)]
-    if not state.start_ns <= now_ns < state.end_ns or state.done >= fault.count:
-        return [frame]
-    state.done += 1
-    if fault.kind == "drop":
-        return []
-    if fault.kind == "delay":
-        return [(now_ns + round(fault.delay_s * 1e9), can_id, data)]
-    if fault.kind == "duplicate":
-        return [frame, frame]
-    if fault.kind == "reorder":
-        state.held = (can_id, data)
-        return []
-    return [(now_ns, can_id, _flipped(data, state.done))]
-
-
-def _flipped(data: bytes, number: int) -> bytes:
-    """One bit inverted, another one each time."""
-    if not data:
-        return data
-    bit = (number * 29) % (8 * len(data))
-    spoilt = bytearray(data)
-    spoilt[bit // 8] ^= 1 << bit % 8
-    return bytes(spoilt)
-
-
-class Late:
-    """Frames that wait for their time, in order."""
-
-    def __init__(self) -> None:
-        self._heap: list[tuple[int, int, Callable[[], None]]] = []
-        self._count = 0
-
-    def put(self, due_ns: int, action: Callable[[], None]) -> None:
-        """Do this then."""
-        self._count += 1
-        heapq.heappush(self._heap, (due_ns, self._count, action))
-
-    @property
-    def next_ns(self) -> float:
-        """When the first is due; infinite where none is."""
-        return self._heap[0][0] if self._heap else math.inf
-
-    def run(self, now_ns: int) -> None:
-        """Do all that is due."""
-        while self._heap and self._heap[0][0] <= now_ns:
-            heapq.heappop(self._heap)[2]()

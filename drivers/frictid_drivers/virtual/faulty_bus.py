@@ -1,50 +1,109 @@
-"""Any python-can bus with a bad cable: frames dropped, late, twice, out of order or with a bit inverted, both ways."""
+"""Any python-can bus with a bad cable, a bad interface or bad drives: python-can's interface ``faulty``.
+
+::
+
+    can.Bus(interface="faulty", channel="socketcan:can0", faults=[{"kind": "drop", "frames": "tpdo1", "count": 3}])
+
+In a robot file it is ``bus: faulty:socketcan:can0`` with ``options.faults``; ``faults`` has the list of kinds. Those of
+simulated drives need simulated drives.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import can
 
-from frictid_drivers.virtual.faults import Fault, FrameFaults, Late
+from frictid_drivers.virtual.faults import SERVICES, Fault, read_faults
+from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Injections, Late, WireFaults
+from frictid_hil.errors import InvalidFields
+
+_ERRORS: Mapping[str, Callable[[], Exception]] = {
+    "can": lambda: can.CanOperationError("injected: the controller refuses"),
+    "os": lambda: OSError(105, "injected: no buffer space available"),
+    "runtime": lambda: RuntimeError("injected: the vendor's library failed"),
+    "value": lambda: ValueError("injected: the vendor's library saw a wrong value"),
+}
+_BUS_OFF = can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False, data=bytes(8))
+_OF_A_NODE = frozenset(base for name, bases in SERVICES.items() if name != "host_heartbeat" for base in bases)
 
 
 class FaultyBus(can.BusABC):
     """A bus in front of a bus.
 
     Args:
-        bus: the good one; shut down together with this.
-        faults: frame faults, ``at_s`` from now on.
+        channel: ``interface:channel`` of the good bus, or the bus itself; it is shut down together with this.
+        faults: as read, or as a robot file lists them.
         now_ns: run time; the monotonic clock unless told.
+        arguments: of the good bus.
+
+    Raises:
+        can.CanInitializationError: a fault is not described as it must be.
     """
 
-    def __init__(self, bus: can.BusABC, faults: Sequence[Fault], now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._bus = bus
+    def __init__(
+        self,
+        channel: str | can.BusABC,
+        faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None = None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        **arguments: Any,
+    ) -> None:
+        known = _described(faults)
+        if isinstance(channel, can.BusABC):
+            self._bus = channel
+        else:
+            interface, _, inner = channel.partition(":")
+            self._bus = can.Bus(interface=interface, channel=inner, **arguments)
         self._clock = now_ns
-        self._start_ns = now_ns()
-        self._outgoing, self._incoming = FrameFaults(faults), FrameFaults(faults)
+        self._start_ns: int | None = None
+        self._outgoing, self._incoming = WireFaults(known), WireFaults(known)
+        self._injections = Injections(known)
+        self._send_errors = [FaultAtWork(fault) for fault in known if fault.kind == "send_error"]
+        self._receive_errors = [FaultAtWork(fault) for fault in known if fault.kind == "receive_error"]
+        self._off = [FaultAtWork(fault) for fault in known if fault.kind == "bus_off"]
+        self._told_off = False
         self._late_out, self._late_in = Late(), Late()
         self._received: list[can.Message] = []
-        self.channel_info = f"{bus.channel_info}, with a bad cable"
+        self.channel_info = f"{self._bus.channel_info}, with a bad cable"
         super().__init__(channel="faulty")
+        self._can_protocol = self._bus.protocol
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send what the cable makes of the frame."""
-        self._late_out.run(self._now_ns())
-        for due_ns, _, data in self._outgoing.through(self._now_ns(), msg.arbitration_id, bytes(msg.data)):
-            frame = _with_data(msg, data)
-            if due_ns <= self._now_ns():
+        """Send what the cable makes of the frame.
+
+        Raises:
+            Exception: whatever the faults say.
+        """
+        if msg.arbitration_id == SYNC_ID and self._start_ns is None:
+            self._start_ns = self._clock()
+        self._fail(self._send_errors)
+        if self._is_off():
+            raise can.CanOperationError("injected: the bus is off")
+        self._late_out.run(self._clock())
+        self._inject()
+        now_ns, elapsed_ns = self._clock(), self._elapsed_ns()
+        self._incoming.hear(msg.arbitration_id, bytes(msg.data))
+        for due_ns, can_id, data in self._outgoing.through(now_ns, elapsed_ns, msg.arbitration_id, bytes(msg.data)):
+            frame = _changed(msg, can_id, data)
+            if due_ns <= now_ns:
                 self._bus.send(frame, timeout)
             else:
                 self._late_out.put(due_ns, _later(self._bus.send, frame))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        self._fail(self._receive_errors)
         deadline_s = None if timeout is None else time.monotonic() + timeout
         while True:
-            self._late_out.run(self._now_ns())
-            self._late_in.run(self._now_ns())
+            self._late_out.run(self._clock())
+            self._late_in.run(self._clock())
+            self._inject()
+            off = self._is_off()
+            if off and not self._told_off:
+                self._told_off = True
+                return _BUS_OFF, False
             if self._received:
                 return self._received.pop(0), False
             left_s = 0.01 if deadline_s is None else min(0.01, max(0.0, deadline_s - time.monotonic()))
@@ -52,29 +111,72 @@ class FaultyBus(can.BusABC):
             if msg is None:
                 if deadline_s is not None and time.monotonic() >= deadline_s:
                     return None, False
-                continue
-            for due_ns, _, data in self._incoming.through(self._now_ns(), msg.arbitration_id, bytes(msg.data)):
-                frame = _with_data(msg, data)
-                if due_ns <= self._now_ns():
-                    self._received.append(frame)
-                else:
-                    self._late_in.put(due_ns, _later(self._received.append, frame))
+            elif not off:
+                self._arrive(msg)
+
+    def _arrive(self, msg: can.Message) -> None:
+        now_ns = self._clock()
+        passed = self._incoming.through(now_ns, self._elapsed_ns(), msg.arbitration_id, bytes(msg.data))
+        for due_ns, can_id, data in passed:
+            frame = _changed(msg, can_id, data)
+            if due_ns <= now_ns:
+                self._received.append(frame)
+            else:
+                self._late_in.put(due_ns, _later(self._received.append, frame))
 
     def shutdown(self) -> None:
         """Both buses."""
         super().shutdown()
         self._bus.shutdown()
 
-    def _now_ns(self) -> int:
-        return self._clock() - self._start_ns
+    def _inject(self) -> None:
+        if self._start_ns is None:
+            return
+        to_drives, to_host = self._injections.take(self._elapsed_ns())
+        for can_id, data in to_drives:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        for can_id, data in to_host:
+            stamp_s = time.time()
+            frame = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, timestamp=stamp_s)
+            self._received.append(frame)
+
+    def _fail(self, faults: Sequence[FaultAtWork]) -> None:
+        for work in faults:
+            if work.strikes(self._elapsed_ns()):
+                raise _ERRORS[work.fault.error]()
+
+    def _is_off(self) -> bool:
+        return any(work.strikes(self._elapsed_ns()) for work in self._off)
+
+    def _elapsed_ns(self) -> int:
+        return -1 if self._start_ns is None else self._clock() - self._start_ns
+
+    @staticmethod
+    def _detect_available_configs() -> list[can.typechecking.AutoDetectedConfig]:
+        return []
 
 
-def _with_data(msg: can.Message, data: bytes) -> can.Message:
-    if data == msg.data:
+def _described(faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None) -> list[Fault]:
+    read: list[Fault] = []
+    try:
+        for fault in faults or ():
+            read += [fault] if isinstance(fault, Fault) else read_faults([fault], {})
+    except InvalidFields as problem:
+        raise can.CanInitializationError(f"options.faults: {problem}") from None
+    return [_unheard(fault) if fault.kind == "mute" else fault for fault in read]
+
+
+def _unheard(mute: Fault) -> Fault:
+    """A mute node as a cable sees it: none of its frames pass."""
+    return replace(mute, kind="drop", cob_ids=frozenset(base + node for base in _OF_A_NODE for node in mute.nodes))
+
+
+def _changed(msg: can.Message, can_id: int, data: bytes) -> can.Message:
+    if can_id == msg.arbitration_id and data == msg.data:
         return msg
     return can.Message(
         timestamp=msg.timestamp,
-        arbitration_id=msg.arbitration_id,
+        arbitration_id=can_id,
         is_extended_id=msg.is_extended_id,
         data=data,
         channel=msg.channel,

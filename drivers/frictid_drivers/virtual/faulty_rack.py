@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from frictid_drivers.virtual.faults import Fault, FrameFaults, Late
+from frictid_drivers.virtual.faults import FOREVER_S, Fault
 from frictid_drivers.virtual.rack import Rack, Transmit
 from frictid_drivers.virtual.servo import Servo
-
-_SYNC_ID = 0x80
+from frictid_drivers.virtual.wire_faults import SYNC_ID, Late, WireFaults
 
 
 class FaultyRack:
@@ -23,7 +22,7 @@ class FaultyRack:
         self.transmit: Transmit = _discard
         self._rack = rack
         self._faults = tuple(faults)
-        self._frames = FrameFaults(faults)
+        self._frames = WireFaults(faults)
         self._late = Late()
         self._start_ns: int | None = None
         self._muted: set[int] = set()
@@ -45,12 +44,12 @@ class FaultyRack:
 
     def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """A frame of the host."""
-        if can_id == _SYNC_ID and self._start_ns is None:
+        if can_id == SYNC_ID and self._start_ns is None:
             self._start()
         if can_id not in self._frames.cob_ids:
             self._to_drives(can_id, data, remote)
             return
-        for due_ns, out_id, out in self._frames.through(self._elapsed_ns(), can_id, data):
+        for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
             self._at(due_ns, self._delivery(out_id, out, remote))
 
     def advance(self, to_ns: int) -> None:
@@ -84,15 +83,14 @@ class FaultyRack:
         if can_id not in self._frames.cob_ids:
             self.transmit(can_id, data)
             return
-        for due_ns, out_id, out in self._frames.through(self._elapsed_ns(), can_id, data):
+        for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
             self._at(due_ns, self._departure(out_id, out))
 
     def _departure(self, can_id: int, data: bytes) -> Callable[[], None]:
         return lambda: self.transmit(can_id, data)
 
     def _at(self, due_ns: int, action: Callable[[], None]) -> None:
-        """Now where it is due, else later; ``due_ns`` counts from the first SYNC."""
-        due_ns += self._start_ns or 0
+        """Now where it is due, else later."""
         if due_ns <= self.now_ns:
             action()
         else:
@@ -111,9 +109,9 @@ class FaultyRack:
                 switch = None if servo is None else self._switch(fault, servo)
                 if switch is None:
                     continue
-                self._late.put(self._start_ns + round(fault.at_s * 1e9), _call(switch, True))
-                if fault.for_s < 1e9:
-                    self._late.put(self._start_ns + round((fault.at_s + fault.for_s) * 1e9), _call(switch, False))
+                self._late.put(self._start_ns + round(fault.begin_s * 1e9), _call(switch, True))
+                if fault.for_s < FOREVER_S:
+                    self._late.put(self._start_ns + round((fault.begin_s + fault.for_s) * 1e9), _call(switch, False))
         self._late.run(self.now_ns)
 
     def _switch(self, fault: Fault, servo: Servo) -> Callable[[bool], None] | None:
@@ -127,7 +125,7 @@ class FaultyRack:
                 servo.reset(self.now_ns)
 
         def warn(on: bool) -> None:
-            if on:
+            for _ in range(fault.times if on else 0):
                 servo.warn(fault.code, self.now_ns)
 
         def fail(on: bool) -> None:

@@ -1,0 +1,273 @@
+"""What becomes of the frames that pass a point of the wire: lost, late, twice, spoilt, foreign, or with wrong figures.
+
+A point may be in front of the drives or in front of the host; frames of both directions pass it, and the identifier
+says which way they go. What a report carries, and where, is learnt from the SDO traffic that maps it or reads it back.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from frictid_drivers.virtual.faults import FOREVER_S, FRAME_KINDS, REPORT_KINDS, SERVICES, Fault
+from frictid_hil.protocol.driver import FD_FRAME
+
+SYNC_ID = 0x080
+_SDO_ANSWER, _SDO_REQUEST = 0x580, 0x600
+_WITHOUT_POWER = 0x21
+"""State bits of a statusword: ready to switch on."""
+
+Passed = tuple[int, int, bytes]
+"""When a frame comes out, its identifier and its data."""
+
+
+class FaultAtWork:
+    """One fault of frames or calls: whether it is its turn.
+
+    Attributes:
+        fault: which.
+        start_ns: when it begins, after the first SYNC.
+        done: how many frames or calls it has spoilt.
+        held: the frame that it holds back, or repeats.
+    """
+
+    def __init__(self, fault: Fault) -> None:
+        self.fault = fault
+        self.start_ns = -math.inf if fault.at_s is None else round(fault.at_s * 1e9)
+        self._end_ns = round(min((fault.at_s or 0.0) + fault.for_s, FOREVER_S) * 1e9)
+        self._passed = 0
+        self.done = 0
+        self.held: tuple[int, bytes] | None = None
+
+    def strikes(self, elapsed_ns: float) -> bool:
+        """Whether the frame or call that comes now is spoilt; it is counted."""
+        if not self.start_ns <= elapsed_ns < self._end_ns or self.done >= self.fault.count:
+            return False
+        if self._passed < self.fault.after:
+            self._passed += 1
+            return False
+        self.done += 1
+        return True
+
+
+class WireFaults:
+    """What becomes of each frame that passes a point of the wire.
+
+    Args:
+        faults: those of frames and reports; others are ignored.
+    """
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        self._frames = [(FaultAtWork(fault), _ids(fault)) for fault in faults if fault.kind in (*FRAME_KINDS, "abort")]
+        self._reports = [_ReportFault(fault) for fault in faults if fault.kind in REPORT_KINDS]
+        self._mapping = ReportMapping()
+        plain = {cob_id for _, cob_ids in self._frames for cob_id in cob_ids}
+        for report in self._reports:
+            plain |= {base + node for node in report.fault.nodes for base in (_SDO_ANSWER, _SDO_REQUEST)}
+            plain |= {base + node for node in report.fault.nodes for n in "1234" for base in SERVICES[f"tpdo{n}"]}
+        self.cob_ids = frozenset(plain | {cob_id | FD_FRAME for cob_id in plain})
+
+    def hear(self, can_id: int, data: bytes) -> None:
+        """A frame that passes elsewhere, and may tell what reports carry."""
+        if self._reports:
+            self._mapping.learn(can_id & ~FD_FRAME, data)
+
+    def through(self, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> list[Passed]:
+        """The frames that come out, each with the time at which it does.
+
+        Args:
+            now_ns: on the caller's clock.
+            elapsed_ns: since the first SYNC; -1 before it.
+            can_id: of the frame that goes in.
+            data: of the frame that goes in.
+        """
+        plain = can_id & ~FD_FRAME
+        if self._reports:
+            self._mapping.learn(plain, data)
+            for report in self._reports:
+                data = report.applied(self._mapping, now_ns, elapsed_ns, plain, data)
+        frames = [(now_ns, can_id, data)]
+        for state, cob_ids in self._frames:
+            if plain in cob_ids:
+                frames = [out for frame in frames for out in _spoil(state, elapsed_ns, frame)]
+        return frames
+
+
+def _ids(fault: Fault) -> frozenset[int]:
+    return frozenset(_SDO_ANSWER + node for node in fault.nodes) if fault.kind == "abort" else fault.cob_ids
+
+
+def _spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]:
+    now_ns, can_id, data = frame
+    fault = state.fault
+    if fault.kind == "reorder" and state.held is not None:
+        held, state.held = state.held, None
+        return [frame, (now_ns, *held)]
+    if not state.strikes(elapsed_ns):
+        return [frame]
+    if fault.kind == "drop":
+        return []
+    if fault.kind == "delay":
+        return [(now_ns + round(fault.delay_s * 1e9), can_id, data)]
+    if fault.kind == "duplicate":
+        return [frame, frame]
+    if fault.kind == "reorder":
+        state.held = (can_id, data)
+        return []
+    if fault.kind == "foreign":
+        state.held = state.held or (can_id, data)
+        return [frame, (now_ns, *state.held)]
+    if fault.kind == "truncate":
+        return [(now_ns, can_id, data[: fault.level])]
+    if fault.kind == "misaddress":
+        return [(now_ns, can_id + 1, data)]
+    if fault.kind == "abort":
+        return [(now_ns, can_id, b"\x80" + data[1:4] + fault.code.to_bytes(4, "little"))]
+    return [(now_ns, can_id, _flipped(data, state.done))]
+
+
+def _flipped(data: bytes, number: int) -> bytes:
+    """One bit inverted, another one each time."""
+    if not data:
+        return data
+    bit = (number * 29) % (8 * len(data))
+    spoilt = bytearray(data)
+    spoilt[bit // 8] ^= 1 << bit % 8
+    return bytes(spoilt)
+
+
+class ReportMapping:
+    """Where drives' figures stand in their reports, as the SDO traffic tells."""
+
+    def __init__(self) -> None:
+        self._cob_ids: dict[tuple[int, int], int] = {}
+        self._entries: dict[tuple[int, int], dict[int, int]] = {}
+
+    def learn(self, can_id: int, data: bytes) -> None:
+        """An expedited download or the answer to an upload; anything else tells nothing."""
+        node, service = can_id & 0x7F, can_id & 0x780
+        if len(data) != 8 or service not in (_SDO_ANSWER, _SDO_REQUEST):
+            return
+        if data[0] & 0xE2 != (0x22 if service == _SDO_REQUEST else 0x42):
+            return
+        index, subindex = int.from_bytes(data[1:3], "little"), data[3]
+        value = int.from_bytes(data[4:8], "little")
+        if index & 0xFE00 == 0x1800 and subindex == 1 and not value >> 31:
+            self._cob_ids[node, index & 0x1FF] = value & 0x7FF
+        elif index & 0xFE00 == 0x1A00:
+            entries = self._entries.setdefault((node, index & 0x1FF), {})
+            entries[subindex] = value & 0xFF if subindex == 0 else value
+
+    def places(self, can_id: int, index: int) -> list[slice]:
+        """The bytes of an object in a report; empty where it is not there."""
+        found = []
+        for (node, number), entries in self._entries.items():
+            if self._cob_ids.get((node, number)) != can_id or can_id & 0x7F != node:
+                continue
+            bit = 0
+            for subindex in range(1, entries.get(0, 0) + 1):
+                entry = entries.get(subindex, 0)
+                if entry >> 16 == index:
+                    found.append(slice(bit // 8, (bit + (entry & 0xFF)) // 8))
+                bit += entry & 0xFF
+        return found
+
+
+class _ReportFault:
+    """One figure of the reports of some nodes, gone wrong."""
+
+    def __init__(self, fault: Fault) -> None:
+        self.fault = fault
+        self._work = FaultAtWork(fault)
+        self._before: dict[int, deque[tuple[int, int]]] = {}
+        self._turn = False
+
+    def applied(self, mapping: ReportMapping, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> bytes:
+        """The report as it goes on."""
+        if can_id & 0x7F not in self.fault.nodes or not 0x180 <= can_id < 0x580:
+            return data
+        for place in mapping.places(can_id, self.fault.quantity):
+            signed = self.fault.kind != "flap"
+            value = int.from_bytes(data[place], "little", signed=signed)
+            before = self._before.setdefault(can_id & 0x7F, deque())
+            before.append((now_ns, value))
+            if self._work.strikes(elapsed_ns):
+                value = self._wrong(before, now_ns, value)
+            elif self.fault.kind != "lag":
+                before.clear()
+            size = place.stop - place.start
+            most = (1 << 8 * size - 1) - 1 if signed else (1 << 8 * size) - 1
+            value = max(-most if signed else 0, min(most, value))
+            data = data[: place.start] + value.to_bytes(size, "little", signed=signed) + data[place.stop :]
+        return data
+
+    def _wrong(self, before: deque[tuple[int, int]], now_ns: int, value: int) -> int:
+        kind, level = self.fault.kind, self.fault.level
+        if kind == "freeze":
+            return before[0][1]
+        if kind == "invert":
+            return -value
+        if kind == "clip":
+            return max(-level, min(level, value))
+        if kind == "scale":
+            return round(value * self.fault.factor)
+        if kind == "jump":
+            return value + level
+        if kind == "flap":
+            self._turn = not self._turn
+            return value & ~0x6F | _WITHOUT_POWER if self._turn else value
+        due_ns = now_ns - round(self.fault.delay_s * 1e9)
+        while len(before) > 1 and before[1][0] <= due_ns:
+            before.popleft()
+        return before[0][1]
+
+
+class Injections:
+    """Frames that nobody sent, in their time: resets and warnings, for a bus whose drives know no faults.
+
+    Args:
+        faults: of kind ``reset`` and ``emcy``; others are ignored.
+    """
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        self._due = sorted(
+            (fault for fault in faults if fault.kind in ("reset", "emcy")), key=lambda fault: fault.begin_s
+        )
+
+    def take(self, elapsed_ns: float) -> tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]]:
+        """What goes to the drives, and what to the host."""
+        to_drives, to_host = [], []
+        while self._due and self._due[0].begin_s * 1e9 <= elapsed_ns:
+            fault = self._due.pop(0)
+            for node in fault.nodes:
+                if fault.kind == "reset":
+                    to_drives.append((0x000, bytes([0x81, node])))
+                else:
+                    warning = fault.code.to_bytes(2, "little") + b"\x81" + bytes(5)
+                    to_host += [(SYNC_ID + node, warning)] * fault.times
+        return to_drives, to_host
+
+
+class Late:
+    """Frames that wait for their time, in order."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, Callable[[], None]]] = []
+        self._count = 0
+
+    def put(self, due_ns: int, action: Callable[[], None]) -> None:
+        """Do this then."""
+        self._count += 1
+        heapq.heappush(self._heap, (due_ns, self._count, action))
+
+    @property
+    def next_ns(self) -> float:
+        """When the first is due; infinite where none is."""
+        return self._heap[0][0] if self._heap else math.inf
+
+    def run(self, now_ns: int) -> None:
+        """Do all that is due."""
+        while self._heap and self._heap[0][0] <= now_ns:
+            heapq.heappop(self._heap)[2]()
