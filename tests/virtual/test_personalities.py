@@ -32,21 +32,32 @@ NEEDS: dict[str, dict[str, Any]] = {
     "epos4": {"position_units_per_revolution": COUNTS},
     "nanotec": {"raise_torque_limit": True},
 }
-RATES = {"prbt": 125}
+ROBOT: dict[str, dict[str, Any]] = {
+    # A drive without torque offset needs torque mode, and without a watch of its own a person's word for that.
+    "eyou": {"options": {"allow_torque_without_watchdog": True}},
+    "prbt": {"cycle_hz": 125, "procedure": {"amplitude_rad": 0.35, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8}},
+}
+TORQUE_MODE = ("eyou", "nanotec")
+LEAST_SHARE = 0.7
+"""Of what friction costs in tracking, that the compensation has to win back."""
 
 
-def robot(family: str, folder: Path, **options: object) -> Path:
+def robot(family: str, folder: Path, friction_share: float = 1.0, **options: object) -> Path:
     joint = {
         "node": 3, "gear_ratio": 100, "max_velocity_rad_s": 3.0, "max_torque_nm": 60.0, "rated_torque_nm": 40.0,
         "position_min_rad": -2.0, "position_max_rad": 2.0, "start_position_rad": -0.2, "locked_position_rad": 0.0,
         "options": {"personality": family, **NEEDS.get(family, {}), **options},
-        "simulated": {"inertia_kg_m2": 0.3, "friction": {"coulomb_nm": COULOMB_NM, "viscous_nm_s_per_rad": 1.5}},
+        "simulated": {
+            "inertia_kg_m2": 0.3,
+            "friction": {"coulomb_nm": COULOMB_NM * friction_share, "viscous_nm_s_per_rad": 1.5 * friction_share},
+        },
     }  # fmt: skip
     values = {
         "schema": "frictid.robot/1", "name": family, "driver": "virtual", "bus": f"virtual:{family}{os.getpid()}",
-        "cycle_hz": RATES.get(family, 1000),
-        "procedure": {"amplitude_rad": 0.35, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8},
-        "joints": {"0": {key: value for key, value in joint.items()}},
+        "cycle_hz": 500,
+        "procedure": {"amplitude_rad": 0.2, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8},
+        "joints": {"0": joint},
+        **ROBOT.get(family, {}),
     }  # fmt: skip
     path = folder / f"{family}.yaml"
     path.write_text(yaml.safe_dump(values, sort_keys=False))
@@ -131,30 +142,31 @@ def test_a_family_that_does_not_exist(tmp_path):
         driver.open()
 
 
+def tracked(path: Path, profile: Path, modes: tuple[str, ...], drive_mode: Mode, **more: Any) -> Any:
+    """The tracking error that `compensate` reached, by mode, and its remarks."""
+    wanted = Wanted(task="track", modes=modes, duration_s=2.0, drive_mode=drive_mode, **more)
+    options = CompensateOptions(str(path), profile, "0", wanted, out=path.parent / f"compensated {len(modes)}")
+    result = compensate(options, Silent()).to_json()
+    assert result["outcome"] == "ok", result
+    return {mode: figures["tracking_rms_rad"] for mode, figures in result["modes"].items()}, result["remarks"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
-def test_checked_and_calibrated(family, tmp_path):
+def test_checked_calibrated_and_compensated(family, tmp_path):
+    mode = Mode.TORQUE if family in TORQUE_MODE else Mode.POSITION
     path = robot(family, tmp_path)
     assert check(str(path))["ok"]
     result = calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent()).to_json()
     assert result["outcome"] == "ok", result
     assert result["joints"]["0"]["coulomb_nm"] == pytest.approx(COULOMB_NM, rel=0.01)
-    print("F_0", family, result["joints"]["0"]["coulomb_nm"], result["joints"]["0"]["duration_s"])
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", FAMILIES)
-def test_compensated(family, tmp_path):
-    # A drive without torque offset needs torque mode, and without a watch of its own a person's word for that.
-    path = robot(family, tmp_path)
-    if family == "eyou":
-        values = yaml.safe_load(path.read_text())
-        values["options"] = {"allow_torque_without_watchdog": True}
-        path.write_text(yaml.safe_dump(values))
-    calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent())
-    mode = Mode.TORQUE if family in ("eyou", "nanotec") else Mode.POSITION
-    wanted = Wanted(task="track", modes=("nc", "mo"), duration_s=4.0, drive_mode=mode)
-    options = CompensateOptions(str(path), tmp_path / "run", "0", wanted, out=tmp_path / "two")
-    result = compensate(options, Silent()).to_json()
-    assert result["outcome"] == "ok", result
-    assert result["modes"]["mo"]["reduction_percent"] > 20
+    # The drive's own loop lags and cannot turn at once: at 125 Hz that makes 92 % of the error. The same joint with a
+    # fiftieth of its friction tells how much of the error friction makes; nothing but that can be won back.
+    error_rad, remarks = tracked(path, tmp_path / "run", ("nc", "mo"), mode)
+    assert any("7.1 ms late, which makes 92 %" in remark for remark in remarks) is (family == "prbt")
+    path = robot(family, tmp_path, friction_share=0.02)
+    floor_rad, _ = tracked(path, tmp_path / "run", ("nc",), mode, force=True)
+    costs_rad = error_rad["nc"] - floor_rad["nc"]
+    assert costs_rad > 0.05 * error_rad["nc"]
+    assert error_rad["nc"] - error_rad["mo"] > LEAST_SHARE * costs_rad

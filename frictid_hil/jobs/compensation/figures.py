@@ -136,6 +136,12 @@ def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
     return None if ceiling is None else ceiling >= DOMINATED_PERCENT
 
 
+def following_lag_s(run: ModeRun) -> float:
+    """Time by which the joint follows its path, by least squares of the tracking error on the speed of the path, s."""
+    speed = np.gradient(run.reference_rad, run.time_s)
+    return float((run.reference_rad - run.position_rad) @ speed / (speed @ speed))
+
+
 def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:
     """(acceleration rad/s^2, hand torque N m) through the same smoothing, ends cut off; for runs with a hand torque.
 

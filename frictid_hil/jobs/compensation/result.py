@@ -11,11 +11,19 @@ from typing import Any
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.config.robot import Robot
 from frictid_hil.errors import FrictidError
-from frictid_hil.jobs.compensation.figures import DOMINATED_PERCENT, ModeFigures, ModeRun, figures, friction_dominates
+from frictid_hil.jobs.compensation.figures import (
+    DOMINATED_PERCENT,
+    ModeFigures,
+    ModeRun,
+    figures,
+    following_lag_s,
+    friction_dominates,
+)
 from frictid_hil.jobs.compensation.plan import CompensationPlan
 from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.control import Compensated
+from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.samples import Mark
@@ -24,6 +32,9 @@ from frictid_hil.report.pages import write_page
 from frictid_hil.report.words import plain
 from frictid_hil.runner.events import JointRun
 from frictid_hil.runs.life import Ended, Run
+
+_LATE_PERCENT = 50.0
+"""Of the tracking error, from which on the lag of a drive's own loop is told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +126,7 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
             **_service_figures(wanted, progress.service),
         },
         "friction_dominates": friction_dominates(found),
-        "remarks": _remarks(found),
+        "remarks": [*_remarks(found), *_late(wanted, progress.runs, found)],
     }
     ended = run.end(error)
     if not progress.runs:
@@ -149,6 +160,22 @@ def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
     return [
         f"inertia has a large part in the tracking error: {exact}, more than {100.0 - DOMINATED_PERCENT:.0f} %; "
         "at a lower `--speed` friction dominates"
+    ]
+
+
+def _late(wanted: Wanted, runs: Mapping[str, ModeRun], found: Mapping[str, ModeFigures]) -> list[str]:
+    """Where a drive's own loop tracks: how much of the error is its being late, which is nothing of friction's."""
+    base = found.get("nc")
+    if wanted.drive_mode is Mode.TORQUE or base is None or not base.tracking_rms_rad or len(runs) < 2:
+        return []
+    lag_s = min(following_lag_s(run) for run in runs.values())
+    share_percent = 100.0 * lag_s * wanted.peak_rad_s / base.tracking_rms_rad
+    if share_percent < _LATE_PERCENT:
+        return []
+    return [
+        f"the drive follows its set-points {1e3 * lag_s:.1f} ms late, which makes {share_percent:.0f} % of the "
+        "tracking error without compensation; no friction compensation takes that away. A higher `cycle_hz` does, "
+        "and at a lower `--speed` friction has the larger part"
     ]
 
 
