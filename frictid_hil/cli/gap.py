@@ -43,7 +43,19 @@ JointNameOption = Annotated[
 
 @app.command("diagnose")
 def diagnose(
-    logs: LogsArgument,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[SET | LOG...]", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option("--model", metavar="FILE", help="Your own robot model, MJCF or URDF: every joint is diagnosed."),
+    ] = None,
+    more_logs: Annotated[
+        list[Path] | None, typer.Option("--log", metavar="LOG", help="A recording; as those without an option.")
+    ] = None,
     columns: ColumnsOption = None,
     nominal: Annotated[
         Path | None, typer.Option("--nominal", metavar="FILE", help="What the simulator believes (nominal.yaml).")
@@ -51,7 +63,33 @@ def diagnose(
     profile: Annotated[
         Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
     ] = None,
-    joint: JointNameOption = None,
+    joint: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--joint",
+            "-j",
+            metavar="JOINT",
+            help="The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
+        ),
+    ] = None,
+    hold: Annotated[
+        list[str] | None,
+        typer.Option("--hold", metavar="JOINT=20deg", help="Where a joint of the model stood that no log has."),
+    ] = None,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--tolerance",
+            metavar="NUMBER=SIGMA",
+            help="One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
+        ),
+    ] = None,
+    executor: Annotated[
+        str | None,
+        typer.Option(
+            "--executor", metavar="WHERE", help="processes:N, or dask://host:port, for the joints of a model."
+        ),
+    ] = None,
     validation: Annotated[
         list[str] | None,
         typer.Option(
@@ -78,11 +116,28 @@ def diagnose(
     quiet: QuietOption = False,
 ) -> None:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
+    from frictid_hil.cli.model_words import model_logs, print_arm
     from frictid_hil.jobs.gap_diagnose import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
+    from frictid_hil.jobs.gap_diagnose_arm import diagnose_arm
 
-    source = Source(logs, columns, nominal, profile, joint, validation or ())
     output = Output(as_json, quiet)
+    every = [*(logs or ()), *(more_logs or ())]
+    if model is not None:
+        output.run(
+            "gap_diagnose",
+            lambda: diagnose_arm(
+                model_logs(model, every, joint, columns, hold, tolerance, validation, nominal, profile, mujoco),
+                out=out,
+                force=force,
+                executor_name=executor,
+            ),
+            lambda result: print_arm(output, result),
+        )
+    if hold or tolerance or executor or len(joint or ()) > 1 or not every:
+        why = "needs a set or logs" if not every else "--hold, --tolerance, --executor and several joints need --model"
+        output.refuse("gap_diagnose", UsageError(why))
+    source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or ())
     output.run(
         "gap_diagnose",
         lambda: job(source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force),

@@ -29,7 +29,7 @@ class RigidBodies:
     """
 
     def __init__(self, model: ArmModel) -> None:
-        mujoco = _library()
+        mujoco = mujoco_library()
         self._library = mujoco
         self._model = mujoco.MjModel.from_xml_string(_described(model))
         self._data = mujoco.MjData(self._model)
@@ -48,13 +48,18 @@ class RigidBodies:
         return matrix, data.qfrc_bias.copy()
 
 
-def _library() -> mujoco:
+def mujoco_library() -> mujoco:
+    """The package ``mujoco``.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
     try:
         import mujoco
     except ImportError:
         raise ConfigError(
-            "a simulated arm needs the package mujoco for its rigid-body dynamics",
-            next_step="pip install 'frictid-hil[arm]', or use a robot file without `simulated_arm`",
+            "the rigid-body dynamics of an arm need the package mujoco",
+            next_step="pip install 'frictid-hil[arm]', or do without `simulated_arm` and --model",
         ) from None
     return mujoco
 

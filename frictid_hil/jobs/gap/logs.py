@@ -7,6 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from frictid_hil.columns import ColumnMap
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.nominal import Experiment as Entry
 from frictid_hil.config.nominal import NominalFile, load_nominal
@@ -48,24 +52,14 @@ def set_from_logs(
         UsageError: several joints and none named, or a validation log that is not there.
         InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
     """
-    read_logs = [(_name_of(path), _samples(path, columns, joint)) for path in logs]
-    names = [name for name, _ in read_logs]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise UsageError(f"two logs are called {twice[0]}", next_step="rename one of the files")
-    absent = [name for name in validation if name not in names]
-    if absent:
-        raise UsageError(
-            f"no log is called {absent[0]}", where="--validation", next_step=f"name of: {', '.join(names)}"
-        )
+    read_logs = [(name_of(path), _samples(path, columns, joint)) for path in logs]
     data, told, where = _belief(nominal, profile, joint)
     entries = {entry.name: entry for entry in told.experiments}
     if not validation:
+        names = [name for name, _ in read_logs]
         validation = [name for name in names if name in entries and entries[name].role == "validation"]
-    if validation:
-        parts = [(name, samples, name in validation) for name, samples in read_logs]
-    else:
-        parts = _split_by_time(read_logs)
+    whole = dict(read_logs)
+    parts = [(name, whole[source].select(keep), judged) for name, source, keep, judged in parted(read_logs, validation)]
     listed = []
     for order, (name, samples, judged) in enumerate(parts):
         payload = entries[name].payload if name in entries else False
@@ -74,17 +68,44 @@ def set_from_logs(
     return experiment_set(told, data, where, logs[0].resolve().parent.name, listed)
 
 
-def _split_by_time(logs: Sequence[tuple[str, Samples]]) -> list[tuple[str, Samples, bool]]:
-    """(name, samples, judged on): the last third of one log, else the last logs that make up a quarter or more."""
-    if len(logs) == 1:
+def parted(
+    logs: Sequence[tuple[str, Samples]], validation: Sequence[str] = ()
+) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
+    """What is fitted and what is judged on.
+
+    Unless told: the last third of one log, else the last logs that make up a quarter or more.
+
+    Args:
+        logs: names and samples.
+        validation: names of the logs to judge on.
+
+    Raises:
+        UsageError: two logs of one name, or a name that no log has.
+
+    Returns:
+        (name of the part, name of its log, its rows, judged on).
+    """
+    names = [name for name, _ in logs]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise UsageError(f"two logs are called {twice[0]}", next_step="rename one of the files")
+    absent = [name for name in validation if name not in names]
+    if absent:
+        raise UsageError(
+            f"no log is called {absent[0]}", where="--validation", next_step=f"name of: {', '.join(names)}"
+        )
+    if len(logs) == 1 and not validation:
         ((name, samples),) = logs
         cut = samples.time_s[0] + (1.0 - VALIDATION_SHARE) * (samples.time_s[-1] - samples.time_s[0])
         early = samples.time_s < cut
-        return [(name, samples.select(early), False), (f"{name}, last third", samples.select(~early), True)]
+        return [(name, name, early, False), (f"{name}, last third", name, ~early, True)]
+    every = [(name, name, np.ones(len(samples), dtype=np.bool_)) for name, samples in logs]
+    if validation:
+        return [(*part, part[0] in validation) for part in every]
     spans = [float(samples.time_s[-1] - samples.time_s[0]) for _, samples in logs]
     after = [sum(spans[k:]) for k in range(len(spans))]
     first = max(k for k in range(1, len(logs)) if after[k] >= 0.75 * VALIDATION_SHARE * after[0] or k == 1)
-    return [(name, samples, k >= first) for k, (name, samples) in enumerate(logs)]
+    return [(*part, k >= first) for k, part in enumerate(every)]
 
 
 def _belief(nominal: Path | None, profile: Path | None, joint: str | None) -> tuple[dict[str, Any], NominalFile, str]:
@@ -135,8 +156,21 @@ def _samples(path: Path, columns: str | None, joint: str | None) -> Samples:
     return replace(found[0], prismatic=False)  # a linear axis is diagnosed like a rotary one, m for rad, N for N m
 
 
-def _name_of(path: Path) -> str:
+def samples_of_all(path: Path, columns: ColumnMap | None) -> list[Samples]:
+    """Every joint of a recording.
+
+    Raises:
+        InputFileError: unusable, or without a joint.
+    """
+    found = read(path, columns)
+    if not found:
+        raise InputFileError("no joint in this recording", where=str(path))
+    return found
+
+
+def name_of(path: Path) -> str:
+    """What a recording is called: its file's name without ending."""
     name = path.name
-    for ending in (".gz", ".csv", ".txt", ".mat", ".mcap"):
+    for ending in (".gz", ".csv", ".txt", ".mat", ".mcap", ".npz", ".parquet", ".h5", ".hdf5", ".bag", ".db3"):
         name = name.removesuffix(ending)
     return name or str(path)

@@ -1,0 +1,107 @@
+"""``gap diagnose --model``: its options as values, its result as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+
+from frictid_hil.cli.output import Output, Result
+from frictid_hil.errors import UsageError
+from frictid_hil.units import parse_quantity
+
+if TYPE_CHECKING:
+    from frictid_hil.jobs.gap.from_model import ModelLogs
+
+
+def model_logs(
+    model: Path,
+    logs: Sequence[Path],
+    joints: Sequence[str] | None,
+    columns: str | None,
+    hold: Sequence[str] | None,
+    tolerance: Sequence[str] | None,
+    validation: Sequence[str] | None,
+    nominal: Path | None,
+    profile: Path | None,
+    mujoco: Path | None,
+) -> ModelLogs:
+    """The options as one value.
+
+    Raises:
+        UsageError: one that cannot be read, or that does not go with a model.
+    """
+    from frictid_hil.jobs.gap.from_model import ModelLogs
+
+    for name, given in (("--profile", profile), ("--export-mujoco", mujoco)):
+        if given is not None:
+            raise UsageError(
+                f"{name} does not go with --model",
+                next_step="the model brings its own friction; --write-model writes the improved model",
+            )
+    return ModelLogs(
+        model=model,
+        logs=logs,
+        joints=joints or (),
+        columns=columns,
+        held=dict(_held(word) for word in hold or ()),
+        tolerances=dict(_tolerance(word) for word in tolerance or ()),
+        validation=validation or (),
+        nominal=nominal,
+    )
+
+
+def _held(word: str) -> tuple[str, float]:
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise UsageError(f"--hold {word}: no place is given", next_step="write it as --hold elbow=20deg")
+    length = value.strip().endswith("m")
+    return name, parse_quantity(value, "length" if length else "angle")
+
+
+def _tolerance(word: str) -> tuple[str, float | str]:
+    name, equals, value = word.partition("=")
+    if value in ("data_sheet", "cad", "profile"):
+        return name, value
+    try:
+        share = float(value.removesuffix("%")) * (0.01 if value.endswith("%") else 1.0)
+    except ValueError:
+        share = -1.0
+    if not equals or not share >= 0.0:
+        raise UsageError(
+            f"--tolerance {word} is no one-sigma", next_step="write it as --tolerance inertia_kg_m2=5% (or =cad)"
+        )
+    return name, share
+
+
+def print_arm(output: Output, result: Result) -> None:
+    """Joints as rows, then the arm."""
+    table = Table("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor")
+    for name, joint in result["joints"].items():
+        causes = joint["causes"]
+        gap = [joint["gap"][state]["inverse_nm"] for state in ("before", "after", "noise_floor")]
+        table.add_row(
+            name,
+            joint["verdict"],
+            ", ".join(cause["effect"] for cause in causes),
+            ", ".join(f"{cause['confidence']:.2f}" for cause in causes),
+            *("-" if value is None else f"{value:.3g} N m" for value in gap),
+        )
+    output.out.print(table)
+    output.out.print(result["summary"], markup=False, soft_wrap=True)
+    for line, names in _same_lines(result["joints"]).items():
+        who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
+        output.out.print(f"{who}: {line}", markup=False, soft_wrap=True)
+    for name, place in result["held"].items():
+        output.out.print(f"{name}: held at {place:.4g}", markup=False)
+
+
+def _same_lines(joints: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What is asked and what could not be concluded, each line once, with the joints that it is about."""
+    found: dict[str, list[str]] = {}
+    for name, joint in joints.items():
+        for line in (*joint["asked"], *(f"{subject}: {why}" for subject, why in joint["reasons"].items())):
+            found.setdefault(line, []).append(name)
+    return found

@@ -1,0 +1,117 @@
+"""``frictid-hil gap diagnose --model``: every joint of a user's own robot model, from recordings of the whole arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from frictid_hil.errors import FrictidError, UsageError
+from frictid_hil.files import part_of_path, refuse_overwriting
+from frictid_hil.gap.diagnose import diagnose as find_causes
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
+from frictid_hil.jobs.identification.executors import answers, executor
+from frictid_hil.report.gap import gap_page
+from frictid_hil.report.pages import write_page
+
+
+def diagnose_arm(
+    asked: ModelLogs,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+    executor_name: str | None = None,
+) -> dict[str, Any]:
+    """Diagnose the joints of a model.
+
+    Args:
+        asked: model and logs.
+        out: folder for one page a joint; None writes none.
+        force: write over files that are there.
+        executor_name: ``processes:N`` or ``dask://host:port``; None chooses.
+
+    Raises:
+        InputFileError, ConfigError: model, logs or map are unusable.
+        UsageError: a joint that is not there, or a file that is there already.
+
+    Returns:
+        The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
+        ``asked``; ``held``, ``logs`` and ``summary`` of the arm.
+    """
+    arm = sets_from_model(asked)
+    pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
+    refuse_overwriting(pages.values(), force=force)
+    found = diagnosed(arm, executor_name)
+    joints = {name: _told(arm.joints[name], diagnosis) for name, diagnosis in found.items()}
+    result: dict[str, Any] = {
+        "outcome": "ok",
+        "model_in": str(asked.model.resolve()),
+        "logs": [{"name": m.name, "validation": m.validation} for m in arm.motions],
+        "held": dict(arm.held),
+        "summary": summary(found),
+        "joints": joints,
+    }
+    if out is not None:
+        _make_folder(out)
+        for name, page in pages.items():
+            told = gap_page(found[name], (), missing_torque(arm.joints[name].experiments))
+            joints[name]["report"] = str(write_page(told, page).resolve())
+    return result
+
+
+def diagnosed(arm: ArmSet, executor_name: str | None = None) -> dict[str, Diagnosis]:
+    """The diagnosis of every joint.
+
+    Raises:
+        FrictidError: a worker was lost.
+    """
+    found: dict[str, Diagnosis] = {}
+    sets = [joint.experiments for joint in arm.joints.values()]
+    with executor(executor_name, len(sets)) as pool:
+        for name, answer in zip(arm.joints, answers(pool, _diagnosed, sets), strict=True):
+            if isinstance(answer, FrictidError):
+                raise answer
+            found[name] = answer
+    return found
+
+
+def _diagnosed(experiments: ExperimentSet) -> Diagnosis:
+    return find_causes(experiments)
+
+
+def summary(found: Mapping[str, Diagnosis]) -> str:
+    """One sentence about the arm."""
+    named = [
+        f"{name} ({' and '.join(c.effect for c in d.causes)})" for name, d in found.items() if d.verdict == "explained"
+    ]
+    open_ones = [f"{name} ({d.verdict})" for name, d in found.items() if d.verdict in ("ambiguous", "unknown")]
+    healthy = sum(d.verdict == "none" for d in found.values())
+    parts = [f"{healthy} of {len(found)} joints are as the model says"]
+    if named:
+        parts.append(f"causes are named on {', '.join(named)}")
+    if open_ones:
+        parts.append(f"open: {', '.join(open_ones)}")
+    return "; ".join(parts) + "."
+
+
+def _told(joint: JointSet, found: Diagnosis) -> dict[str, Any]:
+    told = found.to_json()
+    del told["schema"]  # the command line's own
+    belief = {key: value for key, value in joint.document.items() if key not in ("case", "robot_joint", "tolerance")}
+    return {
+        **told,
+        "believed": belief,
+        "tolerances": list(joint.experiments.nominal.tolerances.lines()),
+        "drafted": dict(joint.drafted),
+        "asked": list(joint.asked),
+    }
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot be created: {error.strerror}", where=str(out)) from error
