@@ -58,7 +58,7 @@ def mujoco_library() -> mujoco:
         import mujoco
     except ImportError:
         raise ConfigError(
-            "the rigid-body dynamics of an arm need the package mujoco",
+            "an arm needs the package mujoco for its rigid-body dynamics",
             next_step="pip install 'frictid-hil[arm]', or do without `simulated_arm` and --model",
         ) from None
     return mujoco
