@@ -192,26 +192,12 @@ class CyclicLoop:
             self._pump()
         return feedback
 
-    def run(self, source: SetPointSource, joint: int, *, ending: SetPointSource | None = None) -> None:
-        """Stream one motion of one joint to its end.
-
-        Args:
-            source: of its set-points.
-            joint: index.
-            ending: brings the joint to rest when asked to; without one its commanded position is decelerated.
-
-        Raises:
-            SafetyAbort: by the supervisor.
-            Interrupted: asked to stop; the joint has been decelerated to rest first unless a quick stop was asked.
-        """
-        self.run_together({joint: source}, ending=ending)
-
-    def run_together(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
+    def run(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
         """Stream one motion of every joint that moves, cycle by cycle, until the first one ends.
 
         Args:
             sources: of the set-points, by index of the joint.
-            ending: as for ``run``; only where one joint moves.
+            ending: brings the only joint to rest when asked to; without one all decelerate along their paths.
 
         Raises:
             SafetyAbort: by the supervisor.

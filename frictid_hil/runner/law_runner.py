@@ -18,7 +18,6 @@ from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Driver, Feedback
-from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.runaway import RunawayWatch
@@ -34,7 +33,7 @@ _NOISE_SHARE = 0.05
 
 
 class LawRunner:
-    """Runs the ``Compensated`` motions of one joint.
+    """Takes one joint into its ``Compensated`` motions and out of them.
 
     Args:
         driver: cycling.
@@ -63,12 +62,12 @@ class LawRunner:
         self._drive_mode = Mode.POSITION
         self._source: LawSource | None = None
 
-    def run(self, motion: Compensated) -> Mark:
-        """One stretch; the joint goes over first where it is not under this law yet.
+    def source(self, motion: Compensated) -> LawSource:
+        """The set-points of one stretch; the joint goes over first where it is not under this law yet.
 
         Raises:
             SafetyAbort: by the supervisor, or the drive did not take the mode.
-            Interrupted: asked to stop; compensation was faded out first.
+            Interrupted: asked to stop.
         """
         loop = self._loop
         source = self._source
@@ -81,9 +80,11 @@ class LawRunner:
             controller = source.controller
         self._source = source = LawSource(controller, motion, loop.period_s)
         self._supervisor.set_limits(self._index, self._bounds(motion))
-        start_ns = loop.now_ns()
-        loop.run(source, self._index, ending=FadeOut(source, round(_FADE_S / loop.period_s)))
-        return Mark(motion.name, start_ns, loop.now_ns(), motion.details())
+        return source
+
+    def fade_out(self, source: LawSource) -> FadeOut:
+        """What ends a law."""
+        return FadeOut(source, round(_FADE_S / self._loop.period_s))
 
     def leave(self) -> bool:
         """Back to position control, standing where the joint is; False where it was there already."""
@@ -92,7 +93,7 @@ class LawRunner:
             return False
         loop, index = self._loop, self._index
         self._source = None
-        loop.run(FadeOut(source, round(_FADE_S / loop.period_s)), index)
+        loop.run({index: self.fade_out(source)})
         self._supervisor.watch_runaway(None)
         if self._drive_mode is not Mode.POSITION:
             self._take_mode(Mode.POSITION)

@@ -1,24 +1,27 @@
-"""The motions of one joint, each streamed, supervised and marked; some of them watched more closely than that.
+"""The motions of the joints that move, each streamed, supervised and marked; some of them watched more closely.
 
-A rehearsal judges the sign of friction under half the torque, a probe compares friction with a profile, a warm-up ends
-when friction has settled, and control laws take the joint out of position control.
+Joints that move together do so in step: the same stretches, over at the same cycle, each joint held to its own travel,
+speed, torque and following error. A rehearsal judges the sign of friction under half the torque, a probe compares
+friction with a profile, a warm-up ends when friction has settled, and control laws take a single joint out of position
+control.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from frictid_hil.errors import ProfileMismatch
 from frictid_hil.plan.control import Compensated, Probe
-from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move, WarmUp
+from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move, WarmUp, stretch_name
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.samples import Mark
-from frictid_hil.runner.cycle import CyclicLoop, SetPointSource, Stream
+from frictid_hil.runner.cycle import CycleCount, CyclicLoop, SetPointSource, Stream
 from frictid_hil.runner.events import Event, Marked, PhaseStarted, Warned
 from frictid_hil.runner.law_runner import LawRunner
 from frictid_hil.runner.probe import ProbeWatch
@@ -34,27 +37,24 @@ REHEARSAL_TORQUE = 0.5
 
 def from_here(here_rad: float, motions: Sequence[Motion], approach_rad_s: float) -> list[Motion]:
     """The motions, after a small approach where the joint does not stand exactly at their beginning."""
-    first_rad = float(motions[0].position_rad(np.zeros(1))[0])
-    if abs(first_rad - here_rad) <= AT_RAD:
-        return list(motions)
-    return [Move.within(here_rad, first_rad, approach_rad_s, name="approach"), *motions]
+    approach = _approach(here_rad, motions[0], approach_rad_s)
+    return list(motions) if abs(approach.to_rad - here_rad) <= AT_RAD else [approach, *motions]
 
 
-def stream(loop: CyclicLoop, index: int, motion: Motion) -> Mark:
+def stream(loop: CyclicLoop, index: int, motion: Motion) -> None:
     """One motion of one joint, from its first set-point to its last."""
-    return _streamed(loop, index, motion, _set_points(motion, loop.period_s))
+    loop.run({index: _set_points({index: motion}, loop.period_s)[index]})
 
 
 class Motions:
-    """One joint's motions.
+    """The motions of one joint, or of several in step.
 
     Args:
         driver: cycling.
-        loop: of the stretch; the joint follows its set-points, all others are locked.
+        loop: of the stretch; these joints follow their set-points, all others are locked.
         supervisor: of the loop.
-        joint: that moves.
-        index: of it.
-        limits: of the joint while it is in position control.
+        joints: that move, by index.
+        limits: of them while they are in position control, by index.
         approach_rad_s: speed of small approaches.
         notify: told what happens.
     """
@@ -64,102 +64,128 @@ class Motions:
         driver: Driver,
         loop: CyclicLoop,
         supervisor: Supervisor,
-        joint: JointSetup,
-        index: int,
-        limits: JointLimits,
+        joints: Mapping[int, JointSetup],
+        limits: Mapping[int, JointLimits],
         *,
         approach_rad_s: float,
         notify: Callable[[Event], None],
     ) -> None:
         self._loop = loop
         self._supervisor = supervisor
-        self._joint = joint
-        self._index = index
+        self._joints = joints
         self._limits = limits
         self._approach_rad_s = approach_rad_s
         self._notify = notify
-        self._laws = LawRunner(driver, loop, supervisor, joint, index, limits)
+        self._laws = {
+            index: LawRunner(driver, loop, supervisor, joint, index, limits[index]) for index, joint in joints.items()
+        }
 
-    def run(self, plan: JointPlan) -> list[Mark]:
-        """All motions of the plan, in order.
+    def run(self, plans: Mapping[int, JointPlan]) -> dict[int, list[Mark]]:
+        """All motions of the plans, in order; the marks of each joint.
 
         Raises:
             SafetyAbort: by the supervisor, or friction is not what it must be.
-            Interrupted: asked to stop; the joint was brought to rest.
+            Interrupted: asked to stop; all joints were brought to rest.
         """
-        marks: list[Mark] = []
-        for motion in self._from_here(plan.motions):
-            if not isinstance(motion, Compensated) and self._laws.leave():
-                for back in self._from_here([motion])[:-1]:
-                    stream(self._loop, self._index, back)
-            self._notify(PhaseStarted(plan.joint, motion.name, motion.duration_s))
-            mark = self._one(motion)
-            self._notify(Marked(plan.joint, mark))
-            marks.append(mark)
+        loop, name = self._loop, stretch_name(list(plans.values()))
+        marks: dict[int, list[Mark]] = {index: [] for index in plans}
+        for motions in self._from_here({index: plan.motions for index, plan in plans.items()}):
+            self._leave_laws(motions)
+            first = next(iter(motions.values()))
+            self._notify(PhaseStarted(name, first.name, first.duration_s))
+            sources, ending = self._sources(motions)
+            start_ns, before = loop.now_ns(), replace(loop.count)
+            loop.run(sources, ending=ending)
+            end_ns = loop.now_ns()
+            for index, motion in motions.items():
+                details = {**motion.details(), **self._told(before), **self._judged(index, motion, sources[index])}
+                marks[index].append(Mark(motion.name, start_ns, end_ns, details))
+            for index in motions:
+                self._notify(Marked(self._joints[index].name, marks[index][-1]))
         return marks
 
-    def _one(self, motion: Motion) -> Mark:
-        if isinstance(motion, Compensated):
-            return self._laws.run(motion)
+    def _from_here(self, motions: Mapping[int, Sequence[Motion]]) -> list[dict[int, Motion]]:
+        """The stretches, after a small approach where a joint does not stand exactly at its beginning."""
+        stretches = [dict(zip(motions, stretch, strict=True)) for stretch in zip(*motions.values(), strict=True)]
+        approach = {
+            index: _approach(self._loop.set_points[index].position_rad, own[0], self._approach_rad_s)
+            for index, own in motions.items()
+        }
+        if not any(abs(move.to_rad - move.from_rad) > AT_RAD for move in approach.values()):
+            return stretches
+        longest_s = max(move.duration_s for move in approach.values())
+        return [{index: replace(move, duration_s=longest_s) for index, move in approach.items()}, *stretches]
+
+    def _leave_laws(self, motions: Mapping[int, Motion]) -> None:
+        """Back to position control, and to where the next motion begins."""
+        for index, motion in motions.items():
+            if not isinstance(motion, Compensated) and self._laws[index].leave():
+                for back in self._from_here({index: [motion]})[:-1]:
+                    stream(self._loop, index, back[index])
+
+    def _sources(self, motions: Mapping[int, Motion]) -> tuple[Mapping[int, SetPointSource], SetPointSource | None]:
+        """Set-points of every joint, watched as its motion asks; and what ends a control law."""
+        ((index, motion), *others) = motions.items()
+        if isinstance(motion, Compensated) and not others:
+            law = self._laws[index].source(motion)
+            return {index: law}, self._laws[index].fade_out(law)
+        streams = _set_points(motions, self._loop.period_s)
+        return {index: self._watched(index, motions[index], stream) for index, stream in streams.items()}, None
+
+    def _watched(self, index: int, motion: Motion, points: Stream) -> SetPointSource:
+        joint = self._joints[index]
         if isinstance(motion, Probe):
-            return self._probe(motion)
+            return ProbeWatch(points, motion, joint.name)
         if isinstance(motion, WarmUp):
-            return self._warm_up(motion)
-        if motion.name == REHEARSAL:
-            return self._rehearse(motion)
-        return stream(self._loop, self._index, motion)
+            return WarmUpWatch(points, motion, self._loop.period_s)
+        if motion.name != REHEARSAL:
+            return points
+        # The full travel, slowly, with the torque bound at half; the sign of friction must be right.
+        slow = replace(self._limits[index], torque_nm=REHEARSAL_TORQUE * joint.max_torque_nm)
+        self._supervisor.set_limits(index, slow)
+        return SignWatch(points, joint.name)
 
-    def _rehearse(self, motion: Motion) -> Mark:
-        """The full travel, slowly, with the torque bound at half; the sign of friction must be right."""
-        slow = replace(self._limits, torque_nm=REHEARSAL_TORQUE * self._joint.max_torque_nm)
-        self._supervisor.set_limits(self._index, slow)
-        watch = SignWatch(self._set_points(motion), self._joint.name)
-        mark = _streamed(self._loop, self._index, motion, watch)
-        self._supervisor.set_limits(self._index, self._limits)
-        watch.judge()
-        return mark
+    def _judged(self, index: int, motion: Motion, source: SetPointSource) -> dict[str, Any]:
+        """What the mark of a watched motion tells besides.
 
-    def _probe(self, probe: Probe) -> Mark:
-        """A slow sine whose torque must be what the profile says."""
-        watch = ProbeWatch(self._set_points(probe), probe, self._joint.name)
-        mark = _streamed(self._loop, self._index, probe, watch)
-        try:
-            watch.judge()
-        except ProfileMismatch as mismatch:
-            if probe.enforced:
-                raise
-            self._notify(Warned(f"forced in spite of: {mismatch}"))
-        return mark
+        Raises:
+            SafetyAbort: friction helps motion, or the joint did not move.
+            ProfileMismatch: the profile is not this joint's.
+        """
+        if isinstance(source, SignWatch):
+            self._supervisor.set_limits(index, self._limits[index])
+            source.judge()
+        elif isinstance(source, ProbeWatch) and isinstance(motion, Probe):
+            try:
+                source.judge()
+            except ProfileMismatch as mismatch:
+                if motion.enforced:
+                    raise
+                self._notify(Warned(f"forced in spite of: {mismatch}"))
+        elif isinstance(source, WarmUpWatch):
+            rate = source.percent_per_min
+            if source.settled is False:
+                changing = "could not be told" if rate is None else f"still changed by {rate:.2g} % per minute"
+                name, lasted_s = self._joints[index].name, motion.duration_s
+                self._notify(Warned(f"joint {name}: friction {changing} after {lasted_s:.0f} s of warm-up"))
+            return {"settled": source.settled, "percent_per_min": rate, "cycles": source.cycles}
+        return {}
 
-    def _warm_up(self, motion: WarmUp) -> Mark:
-        """Repeated cycles until friction settles, or the time is over."""
-        watch = WarmUpWatch(self._set_points(motion), motion, self._loop.period_s)
-        mark = _streamed(self._loop, self._index, motion, watch)
-        if watch.settled is False:
-            rate = watch.percent_per_min
-            changing = "could not be told" if rate is None else f"still changed by {rate:.2g} % per minute"
-            self._notify(
-                Warned(f"joint {self._joint.name}: friction {changing} after {motion.duration_s:.0f} s of warm-up")
-            )
-        ended = {"settled": watch.settled, "percent_per_min": watch.percent_per_min, "cycles": watch.cycles}
-        return replace(mark, details={**mark.details, **ended})
-
-    def _from_here(self, motions: Sequence[Motion]) -> list[Motion]:
-        return from_here(self._loop.set_points[self._index].position_rad, motions, self._approach_rad_s)
-
-    def _set_points(self, motion: Motion) -> Stream:
-        return _set_points(motion, self._loop.period_s)
+    def _told(self, before: CycleCount) -> dict[str, Any]:
+        """Of the cycles since: how many were limited by the drive where one joint moved, or who moved together."""
+        count = self._loop.count
+        if len(self._joints) > 1:
+            return {"together": [joint.name for joint in self._joints.values()]}
+        limited = count.limited - before.limited
+        return {"limited_share": limited / (count.streamed - before.streamed)} if limited else {}
 
 
-def _set_points(motion: Motion, period_s: float) -> Stream:
-    steps = max(1, math.ceil(motion.duration_s / period_s))
-    return Stream(motion.position_rad(np.arange(steps) * period_s).tolist(), period_s)
+def _approach(here_rad: float, motion: Motion, speed_rad_s: float) -> Move:
+    return Move.within(here_rad, float(motion.position_rad(np.zeros(1))[0]), speed_rad_s, name="approach")
 
 
-def _streamed(loop: CyclicLoop, index: int, motion: Motion, source: SetPointSource) -> Mark:
-    start_ns, streamed, limited = loop.now_ns(), loop.count.streamed, loop.count.limited
-    loop.run(source, index)
-    details = motion.details()
-    if loop.count.limited > limited:
-        details = {**details, "limited_share": (loop.count.limited - limited) / (loop.count.streamed - streamed)}
-    return Mark(motion.name, start_ns, loop.now_ns(), details)
+def _set_points(motions: Mapping[int, Motion], period_s: float) -> dict[int, Stream]:
+    """Of one stretch: as many for every joint."""
+    steps = max(1, math.ceil(max(motion.duration_s for motion in motions.values()) / period_s - 1e-9))
+    times_s = np.arange(steps) * period_s
+    return {index: Stream(motion.position_rad(times_s).tolist(), period_s) for index, motion in motions.items()}

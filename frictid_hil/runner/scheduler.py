@@ -21,16 +21,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
-from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
+from frictid_hil.plan.plan import JointPlan, Plan, stretch_name
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Remarking, Severity
-from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.batch import BatchDriver, BatchRunner
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import GO_ON, CyclicLoop, StopRequest
-from frictid_hil.runner.events import Configured, Event, JointRun, Marked, PhaseStarted, Preflight, Warned
-from frictid_hil.runner.in_step import InStep
+from frictid_hil.runner.events import Configured, Event, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.motions import Motions
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
@@ -105,7 +103,16 @@ class Scheduler:
         """
         first: FrictidError | None = None
         try:
-            self._run_all()
+            self._driver.open(self._recorder.frame)
+            preflight = self._preflight()
+            self._notify(preflight)
+            if not self._proceed(preflight):
+                raise PlanRefused("not confirmed; nothing has moved")
+            for session, stretch in enumerate(self._plan.stretches):
+                if self._stop.level:
+                    raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
+                for run in self._run_stretch(session, stretch):
+                    self._notify(run)
         except FrictidError as error:
             first = error
         except OSError as error:
@@ -118,18 +125,6 @@ class Scheduler:
             first = _with_power_left(first, powered)
         if first is not None:
             raise first
-
-    def _run_all(self) -> None:
-        self._driver.open(self._recorder.frame)
-        preflight = self._preflight()
-        self._notify(preflight)
-        if not self._proceed(preflight):
-            raise PlanRefused("not confirmed; nothing has moved")
-        for session, stretch in enumerate(self._plan.stretches):
-            if self._stop.level:
-                raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
-            for run in self._run_stretch(session, stretch):
-                self._notify(run)
 
     def _preflight(self) -> Preflight:
         identities = self._driver.identify()
@@ -205,11 +200,15 @@ class Scheduler:
         arm = Arm(driver, self._setup.joints, loop, supervisor, self._care)
         try:
             self._make_ready(arm, moving, name)
-            if len(moving) > 1:
-                marks = self._in_step(loop, supervisor, moving, name)
-            else:
-                ((index, plan),) = moving.items()
-                marks = {index: self._alone(loop, supervisor, index, plan, limits[index])}
+            marks = Motions(
+                driver,
+                loop,
+                supervisor,
+                {index: self._setup.joints[index] for index in moving},
+                {index: limits[index] for index in moving},
+                approach_rad_s=self._care.approach_rad_s,
+                notify=self._notify,
+            ).run(moving)
             arm.power_off()
         except BaseException:
             arm.stop()
@@ -267,39 +266,6 @@ class Scheduler:
         self._notify(PhaseStarted(name, "enable", 0.0))
         arm.enable()
         arm.lock_all_but(moving, planned_rad)
-
-    def _alone(
-        self, loop: CyclicLoop, supervisor: Supervisor, index: int, plan: JointPlan, limits: JointLimits
-    ) -> list[Mark]:
-        return Motions(
-            self._driver,
-            loop,
-            supervisor,
-            self._setup.joints[index],
-            index,
-            limits,
-            approach_rad_s=self._care.approach_rad_s,
-            notify=self._notify,
-        ).run(plan)
-
-    def _in_step(
-        self, loop: CyclicLoop, supervisor: Supervisor, moving: Mapping[int, JointPlan], name: str
-    ) -> dict[int, list[Mark]]:
-        """Every stretch of all joints at once."""
-        company = InStep(loop, supervisor, {index: self._setup.joints[index] for index in moving})
-        marks: dict[int, list[Mark]] = {index: [] for index in moving}
-        for stretch in company.stretches({at: plan.motions for at, plan in moving.items()}, self._care.approach_rad_s):
-            first = next(iter(stretch.values()))
-            self._notify(PhaseStarted(name, first.name, first.duration_s))
-            if first.name == REHEARSAL:
-                limits = {index: self._limits(self._setup.joints[index], plan) for index, plan in moving.items()}
-                done = company.rehearse(stretch, limits)
-            else:
-                done = company.stream(stretch)
-            for index, mark in done.items():
-                self._notify(Marked(self._names[index], mark))
-                marks[index].append(mark)
-        return marks
 
 
 def _with_power_left(first: FrictidError | None, joints: Sequence[str]) -> FrictidError:

@@ -18,7 +18,7 @@ waiting for any answer.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import can
@@ -162,7 +162,12 @@ class Cycle:
         begun = False
         try:
             self._take_late(clock.now_ns())
-            self._send_commands(set_points)
+            for outgoing, axis in self._due(set_points):
+                self._send(outgoing.message, clock.now_ns())
+                outgoing.told = bytes(outgoing.data)
+                outgoing.told_cycle = decoder.cycle
+                if outgoing.command is axis.primary:
+                    axis.sent()
             if self._overflow:
                 self._counter = self._counter % self._overflow + 1
                 self._sync.data[0] = self._counter
@@ -251,7 +256,8 @@ class Cycle:
 
     # -- sending ------------------------------------------------------------------------------------------------
 
-    def _send_commands(self, set_points: Sequence[SetPoint]) -> None:
+    def _due(self, set_points: Sequence[SetPoint]) -> Iterator[tuple[_Outgoing, Axis]]:
+        """What is sent in this cycle: every moving joint's frame, and one more that has changed."""
         decoder = self._decoder
         changed = False
         for at, axis in enumerate(self._axes):
@@ -272,30 +278,21 @@ class Cycle:
                         outgoing.told = b""
             if self._active[at]:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
-                self._send_command(regular, axis)
+                yield regular, axis
                 changed = changed or other.data != other.told
             else:
                 changed = changed or primary.data != primary.told or secondary.data != secondary.told
-        if changed:
-            self._send_one_changed()
-
-    def _send_one_changed(self) -> None:
-        """One more frame: the next that differs from what its drive was told, each joint in its turn."""
+        if not changed:
+            return
+        # The next that differs from what its drive was told, each joint in its turn.
         count = len(self._axes)
         for step in range(count):
             at = (self._turn + step) % count
             for outgoing in (self._secondary[at], self._primary[at]):
                 if outgoing.data != outgoing.told and self._decoder.position_units(at) is not None:
                     self._turn = at + 1
-                    self._send_command(outgoing, self._axes[at])
+                    yield outgoing, self._axes[at]
                     return
-
-    def _send_command(self, outgoing: _Outgoing, axis: Axis) -> None:
-        self._send(outgoing.message, self._clock.now_ns())
-        outgoing.told = bytes(outgoing.data)
-        outgoing.told_cycle = self._decoder.cycle
-        if outgoing.command is axis.primary:
-            axis.sent()
 
     def _send(self, message: can.Message, t_ns: int) -> None:
         if self._sink is not None:

@@ -1,14 +1,13 @@
 """The ``virtual`` driver: simulated drives behind a bus, spoken to by the very driver that real drives get.
 
 In lock-step the drives live in this process and run time is theirs; with ``setup.realtime`` they live in a process of
-their own and the wall clock rules. Everything a run asks for is forwarded to ``Cia402Driver``, which cannot tell the
+their own and the wall clock rules. Everything a run asks for is the ``Cia402Driver``'s own doing, which cannot tell the
 difference; this class only builds the bus, takes it exclusively and tears it down.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,16 +23,11 @@ from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
 from frictid_drivers.virtual.socket_bus import SocketBus
 from frictid_hil.errors import InvalidFields, UsageError
-from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import (
     Capabilities,
     DriverKind,
-    Feedback,
-    Finding,
     FrameSink,
-    JointIdentity,
-    SetPoint,
     WallClock,
     unknown_options,
 )
@@ -41,8 +35,6 @@ from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
     import filelock
-
-    from frictid_hil.plan.plan import Plan
 
 
 class VirtualDriver:
@@ -68,7 +60,18 @@ class VirtualDriver:
         self._drives = FaultyRack(self._rack, self._faults) if self._faults else self._rack
         self._process: RunningRack | None = None
         self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._drives)
-        self._host = Cia402Driver(_told_to_host(setup), bus_factory=self._open_bus, clock=self.clock)
+        self._host = host = Cia402Driver(_told_to_host(setup), bus_factory=self._open_bus, clock=self.clock)
+        self.identify, self.check, self.faults, self.reset_faults = (
+            host.identify,
+            host.check,
+            host.faults,
+            host.reset_faults,
+        )
+        self.configure, self.set_limits, self.remarks = host.configure, host.set_limits, host.remarks
+        self.frame_map_values = host.frame_map_values
+        self.start_cycling, self.exchange, self.stop_cycling = host.start_cycling, host.exchange, host.stop_cycling
+        self.enable, self.disable, self.lock, self.unlock = host.enable, host.disable, host.lock, host.unlock
+        self.quick_stop = host.quick_stop
 
     # -- life cycle ----------------------------------------------------------------------------------------------------
 
@@ -156,74 +159,6 @@ class VirtualDriver:
                 side_channel.write(bus, self._setup.joint(joint).address, index, subindex, value)
         else:
             self._rack.servos[joint].write(index, subindex, value, self._rack.now_ns)
-
-    # -- forwarded -----------------------------------------------------------------------------------------------------
-
-    def identify(self) -> dict[str, JointIdentity]:
-        """As ``Driver.identify``."""
-        return self._host.identify()
-
-    def check(self, plan: Plan | None) -> list[Finding]:
-        """As ``Driver.check``."""
-        return self._host.check(plan)
-
-    def faults(self) -> list[Finding]:
-        """As ``driver.Resettable``."""
-        return self._host.faults()
-
-    def reset_faults(self) -> None:
-        """As ``driver.Resettable``."""
-        self._host.reset_faults()
-
-    def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
-        """As ``Driver.configure``."""
-        self._host.configure(cycle_hz, active)
-
-    def remarks(self) -> list[Finding]:
-        """As ``driver.Remarking``."""
-        return self._host.remarks()
-
-    def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
-        """As ``Driver.set_limits``."""
-        self._host.set_limits(
-            joint, torque_nm=torque_nm, position_min_rad=position_min_rad, position_max_rad=position_max_rad
-        )
-
-    def frame_map_values(self) -> Mapping[str, Any]:
-        """As ``driver.FrameMapped``."""
-        return self._host.frame_map_values()
-
-    def start_cycling(self) -> None:
-        """As ``Driver.start_cycling``."""
-        self._host.start_cycling()
-
-    def enable(self, joint: str, mode: Mode) -> None:
-        """As ``Driver.enable``."""
-        self._host.enable(joint, mode)
-
-    def disable(self, joint: str) -> None:
-        """As ``Driver.disable``."""
-        self._host.disable(joint)
-
-    def lock(self, joint: str) -> None:
-        """As ``Driver.lock``."""
-        self._host.lock(joint)
-
-    def unlock(self, joint: str) -> None:
-        """As ``Driver.unlock``."""
-        self._host.unlock(joint)
-
-    def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
-        """As ``Driver.exchange``."""
-        return self._host.exchange(set_points)
-
-    def quick_stop(self) -> None:
-        """As ``Driver.quick_stop``."""
-        self._host.quick_stop()
-
-    def stop_cycling(self) -> None:
-        """As ``Driver.stop_cycling``."""
-        self._host.stop_cycling()
 
 
 def _told_to_host(setup: RobotSetup) -> RobotSetup:
