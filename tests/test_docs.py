@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 
+import frictid_drivers
+import frictid_hil
 from frictid_hil.config import reference
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.robot import load_robot
+from frictid_hil.config.search import find
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")})
@@ -40,6 +43,19 @@ def test_a_file_shown_in_a_guide_loads(page: str, block: str, tmp_path: Path) ->
     path.write_text(block, encoding="utf-8")
     loaders = {"frictid.robot": load_robot, "frictid.columns": load_columns}
     assert loaders[re.match(r"schema: ([\w.]+)/", block)[1]](path)
+
+
+def test_the_map_of_the_house_names_files_that_exist() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert len(re.findall(r"^\| .*\? \| ", text.split("## Ten everyday questions")[1], flags=re.MULTILINE)) == 10
+    named = re.findall(r"`((?:frictid_hil|drivers/frictid_drivers|profiles)/[\w/.]*)`", text)
+    roots = {
+        "frictid_hil": Path(frictid_hil.__file__).parent,
+        "drivers": Path(frictid_drivers.__file__).parents[1],
+        "profiles": find("hp3j.yaml").parent,
+    }
+    missing = [name for name in named if not (roots[name.split("/")[0]] / name.partition("/")[2]).exists()]
+    assert len(named) > 20 and missing == []
 
 
 def test_the_page_of_files_is_that_of_the_schemas() -> None:

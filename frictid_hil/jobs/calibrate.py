@@ -266,7 +266,7 @@ class _Measured:
         }
         try:
             profile = identify_joint(
-                self._run.samples(moved),
+                self._run.folder.samples(moved),
                 self._planned.setup.joint(moved.joint),
                 method=self._planned.method,
                 late_cycles=moved.late_cycles + moved.missed_cycles,
@@ -308,7 +308,7 @@ class _Measured:
         """Samples of the joints that moved together with this one."""
         plan = self._planned.plan
         others = [entry.joint for entry in plan.joints if plan.together and entry.joint != moved.joint]
-        return [self._run.samples(replace(moved, joint=other)) for other in others]
+        return [self._run.folder.samples(replace(moved, joint=other)) for other in others]
 
     def _provenance(self) -> Provenance:
         order, setup, folder = self._planned.order, self._planned.setup, self._run.folder

@@ -157,7 +157,7 @@ def _refuse_mode(mode: Mode, preflight: Preflight) -> None:
 def _measure(moved: JointRun, run: Run, asked: Asked, progress: Progress) -> None:
     """Cut each mode's task out of what the joint has done."""
     progress.run = moved if moved.cycles else None
-    samples = run.samples(moved)
+    samples = run.folder.samples(moved)
     motions = {m.name: m for m in asked.plan.joints[0].motions if isinstance(m, Compensated)}
     for mark in samples.marks:
         task, _, mode = mark.name.partition(" ")

@@ -448,7 +448,7 @@ class _Recording:
         manifest.setdefault("in_set", {})[str(place.resolve())] = [e.name for e in done]
 
     def _keep(self, moved: JointRun) -> None:
-        self._logs.update(_cut(self._run.samples(moved), self._planned.experiments))
+        self._logs.update(_cut(self._run.folder.samples(moved), self._planned.experiments))
         self._session += 1
         if self._in_lock_step() and self._session < len(self._planned.loaded):
             self._mount()
@@ -457,7 +457,7 @@ class _Recording:
         """Of a stretch that was ended early."""
         half = self._run.so_far(self._planned.joint.name)
         if half is not None:
-            self._logs.update(_cut(self._run.samples(half), self._planned.experiments))
+            self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
 
     def _ready_for(self, plan: Plan) -> bool:
         """Ask for the payload where a person has to mount it; without a yes its experiments are left out.

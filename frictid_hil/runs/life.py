@@ -27,7 +27,7 @@ from frictid_hil.errors import Defect, FrictidError, GateFailed, Interrupted, Us
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver
-from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Rows
@@ -242,11 +242,6 @@ class Run:
         self._folder = RunFolder.resume(self._order.resume, self._order.robot)
         self._folder.begin()
         self.state = State.MEASURING
-
-    def samples(self, run: JointRun) -> Samples:
-        """The moving joint's samples of what it has just done, with its marks."""
-        self._in(State.MEASURING)
-        return self.folder.samples(run)
 
     def so_far(self, joint: str) -> JointRun | None:
         """What a joint had finished of its plan when it was ended early; None where nothing."""
