@@ -87,6 +87,11 @@ class Policy(Strict):
     warm_up: WarmUp = WarmUp()
     unattended: Unattended | None = None
 
+    @property
+    def drift_limit_percent(self) -> float | None:
+        """Limit of the distance from the baseline; None where drift is measured from the active profile."""
+        return self.drift_percent if self.drift_reference == "baseline" else None
+
     @model_validator(mode="after")
     def _drift_before_refusal(self) -> Policy:
         if self.refuse_percent <= self.drift_percent and self.drift_reference == "active":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,14 @@ def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) 
     trends, nights = store.trends(robot), store.attempts(robot)
     if not trends and not nights:
         raise _unknown(store, robot)
-    page = index_page(robot, trends, store.promotions(robot), nights, store.active(robot), store.baseline(robot))
-    return write_page(page, path or store.root / robot / "index.html")
+    path = path or store.root / robot / "index.html"
+    addresses = {
+        one.utc: Path(os.path.relpath(page, path.parent.resolve())).as_posix()
+        for one in nights
+        if one.run and (page := Path(one.run).resolve() / "recalibration.html").exists()
+    }
+    active, baseline = store.active(robot), store.baseline(robot)
+    return write_page(index_page(robot, trends, store.promotions(robot), nights, active, baseline, addresses), path)
 
 
 def _unknown(store: ProfileStore, robot: str) -> UsageError:

@@ -27,7 +27,12 @@ from frictid_hil.recording.parquet import is_lerobot
 from frictid_hil.recording.read import READABLE, read
 from frictid_hil.recording.ros import is_bag
 from frictid_hil.recording.samples import Samples
+from frictid_hil.report.calibration import calibration_page
+from frictid_hil.report.pages import Page, write_page
 from frictid_hil.runs.folder import load_manifest
+
+_MOST_PAGES = 50
+"""Recordings of one call that get a page each; a page holds its own plotting library, a megabyte."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +50,8 @@ class IdentifyOptions:
         method: estimator.
         columns: column map of foreign files.
         executor: ``processes:N`` or ``dask://host:port``; None chooses.
-        out: folder for profiles.
-        force: write over profiles that are there.
+        out: folder for profiles and their pages.
+        force: write over files that are there.
     """
 
     logs: tuple[Path, ...]
@@ -73,6 +78,7 @@ class _Task:
     procedure: Procedure | None
     method: str
     columns: ColumnMap | None
+    with_page: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +88,7 @@ class _Identified:
     joints: dict[str, JointProfile]
     failed: dict[str, str]
     error: FrictidError | None = None
+    page: Page | None = None
 
     def told(self) -> str:
         """One line for whoever waits."""
@@ -100,10 +107,13 @@ def identify(options: IdentifyOptions, note: Callable[[str], None] = lambda _: N
         IdentificationError: the only recording gives no curve.
     """
     logs = recordings(options.logs)
+    with_pages = options.out is not None and len(logs) <= _MOST_PAGES
     if options.out is not None:
-        refuse_overwriting([options.out / name for name in profile_names(logs)], force=options.force)
+        profiles = [options.out / name for name in profile_names(logs)]
+        pages = [_page_beside(profile) for profile in profiles] if with_pages else []
+        refuse_overwriting([*profiles, *pages], force=options.force)
         made_folders(options.out)
-    tasks = [_task(log, options) for log in logs]
+    tasks = [_task(log, options, with_page=with_pages) for log in logs]
     results: list[_Identified] = []
     with executor(options.executor, len(tasks)) as pool:
         for task, answer in zip(tasks, answers(pool, _identified, tasks), strict=True):
@@ -131,7 +141,7 @@ def identified_profile(options: IdentifyOptions) -> FrictionProfile:
     result = _identified(task)
     if result.error is not None:
         raise result.error
-    return _profile(task, result)
+    return _profile(task, result.joints)
 
 
 def recordings(named: Sequence[Path]) -> list[Path]:
@@ -165,12 +175,12 @@ def _in_folder(folder: Path) -> list[Path]:
     return [path.parent if path.name.startswith("samples") and path.suffix == ".mcap" else path for path in inside]
 
 
-def _task(log: Path, options: IdentifyOptions) -> _Task:
+def _task(log: Path, options: IdentifyOptions, *, with_page: bool = False) -> _Task:
     robot = load_robot(options.robot) if options.robot else None
     setup = robot.to_setup() if robot else None
     procedure = given_procedure(options.amplitude_rad, options.velocity_rad_s, options.cycles, options.ratio)
     columns = load_columns(options.columns) if options.columns else None
-    return _Task(log, options.joints, setup, procedure, options.method, columns)
+    return _Task(log, options.joints, setup, procedure, options.method, columns, with_page)
 
 
 def _identified(task: _Task) -> _Identified:
@@ -194,7 +204,11 @@ def _identified(task: _Task) -> _Identified:
         except FrictidError as error:
             last = _with_damage(error, samples)
             failed[samples.joint] = str(error).removeprefix(f"joint {samples.joint}: ")
-    return _Identified(joints, failed, None if joints else last)
+    page = None
+    if task.with_page and joints:
+        samples_of = {samples.joint: samples for samples in wanted if samples.joint in joints}
+        page = calibration_page(_profile(task, joints), samples_of, outcome="ok")
+    return _Identified(joints, failed, None if joints else last, page)
 
 
 def _with_damage(error: FrictidError, samples: Samples) -> FrictidError:
@@ -255,6 +269,7 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
             {
                 "log": str(task.log.resolve()),
                 "profile": str(profile_path.resolve()) if profile_path else None,
+                "report": str(_page_beside(profile_path).resolve()) if profile_path and result.page else None,
                 "error": str(result.error) if result.error else None,
                 "joints": joints,
             }
@@ -264,11 +279,11 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
     whole: dict[str, Any] = {"outcome": "ok" if sound else "gate_failed", "run": None}
     if len(entries) == 1:
         count, of = len(_failed(entries[0])), f"{len(entries[0]['joints'])} joints"
-        whole.update(recordings=[], profile=entries[0]["profile"], joints=entries[0]["joints"])
+        whole.update(recordings=[], **{key: entries[0][key] for key in ("profile", "report", "joints")})
         said = _failed(entries[0])
     else:
         count, of = len(failures), f"{len(entries)} recordings"
-        whole.update(recordings=entries, profile=None, joints={})
+        whole.update(recordings=entries, profile=None, report=None, joints={})
         said = [f"{Path(entry['log']).name}: {entry['error'] or '; '.join(_failed(entry))}" for entry in failures]
     if not sound:
         more = f"; and {len(said) - 5} more" if len(said) > 5 else ""
@@ -307,14 +322,21 @@ def profile_names(logs: Sequence[Path]) -> list[str]:
 def _write(task: _Task, result: _Identified, path: Path) -> Path | None:
     if not result.joints:
         return None
-    _profile(task, result).save(path)
+    _profile(task, result.joints).save(path)
+    if result.page is not None:
+        write_page(result.page, _page_beside(path))
     return path
 
 
-def _profile(task: _Task, result: _Identified) -> FrictionProfile:
+def _page_beside(profile: Path) -> Path:
+    """``report.html`` beside ``profile.yaml``; ``NAME.html`` beside ``NAME.yaml``."""
+    return profile.with_name("report.html" if profile.name == "profile.yaml" else f"{profile.stem}.html")
+
+
+def _profile(task: _Task, joints: dict[str, JointProfile]) -> FrictionProfile:
     return FrictionProfile(
         robot=task.setup.name if task.setup else task.log.stem,
-        joints=result.joints,
+        joints=joints,
         provenance=Provenance.now(
             run=str(task.log.resolve()),
             log_sha256={path.name: file_sha256(path) for path in _files(task.log)},

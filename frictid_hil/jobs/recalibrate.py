@@ -94,7 +94,7 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
     except Exception as error:
         _note_failure(store, robot, began_utc, Defect.of(error))
         raise
-    store.note_attempt(robot.name, _attempt(began_utc, result))
+    store.note_attempt(robot.name, _attempt(began_utc, result, robot.policy))
     # The history is on the disk; a page that cannot be written must not turn a good night into a bad one.
     with contextlib.suppress(FrictidError):
         result["history"] = str(write_index_page(store, robot.name).resolve())
@@ -278,7 +278,7 @@ def _terminable() -> Iterator[None]:
 # -- history --------------------------------------------------------------------------------------------------------
 
 
-def _attempt(began_utc: str, result: dict[str, Any]) -> Attempt:
+def _attempt(began_utc: str, result: dict[str, Any], policy: Policy) -> Attempt:
     return Attempt(
         utc=began_utc,
         outcome=result["outcome"],
@@ -286,6 +286,7 @@ def _attempt(began_utc: str, result: dict[str, Any]) -> Attempt:
         promoted=result["promoted"],
         profile=result["stored"] or "",
         drift_percent={name: figures["distance_percent"] for name, figures in result["drift"].items()},
+        drift_limit_percent=policy.drift_limit_percent,
         drifted=tuple(result["drifted"]),
         reason=result["reason"],
         next_step=result["next_step"],

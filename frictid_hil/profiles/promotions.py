@@ -38,6 +38,7 @@ class Attempt:
         promoted: its profile became the active one.
         profile: id in the store; "" where nothing was identified.
         drift_percent: distance (15) from the reference by joint; None where there was none.
+        drift_limit_percent: of the distance from the baseline, by the policy; None where drift is measured otherwise.
         drifted: joints beyond the policy's limit.
         reason: why it was promoted or not, in a sentence.
         next_step: for the person who reads it.
@@ -50,6 +51,7 @@ class Attempt:
     promoted: bool = False
     profile: str = ""
     drift_percent: Mapping[str, float | None] = field(default_factory=dict)
+    drift_limit_percent: float | None = None
     drifted: Sequence[str] = ()
     reason: str = ""
     next_step: str = ""

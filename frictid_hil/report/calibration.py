@@ -96,7 +96,7 @@ def _moved(procedure: ProcedureUsed | None, samples: Samples | None, *, prismati
 
 def _compared_with(previous: FrictionProfile | None) -> str:
     if previous is None:
-        return "No profile of this robot was active then, so there is nothing to compare with."
+        return "There is no earlier profile to compare with."
     return f"Compared with the profile that was active then, of {when(previous.provenance.created_utc)}."
 
 
@@ -139,9 +139,11 @@ def _joint(name: str, joint: JointProfile, samples: Samples | None, previous: Fr
 
 
 def _cycles(samples: Samples | None) -> Samples | None:
-    """The samples of the cycles, where they are at hand."""
-    marks = [] if samples is None else samples.marked("cycles")
-    return samples.during(marks[0]) if samples is not None and marks else None
+    """The samples of the cycles; all of them where nothing in the recording is marked."""
+    if samples is None or not samples.marks:
+        return samples
+    marks = samples.marked("cycles")
+    return samples.during(marks[0]) if marks else None
 
 
 def _axes(joint: JointProfile) -> tuple[str, str, float]:
@@ -240,7 +242,9 @@ def _loops_figure(name: str, joint: JointProfile, part: Samples, velocity: Array
     middle = float(np.mean([np.quantile(torque, q) for q in (0.05, 0.95)]))
     inside = _in_windows(joint.procedure, part.time_s - part.time_s[0], velocity)
     traces = [cloud("measured", velocity[~inside] * scale, torque[~inside] - middle, MEASURED)]
-    caption = "Torque as measured with its constant part removed; what opens the loops is inertia, which cancels."
+    caption = "Torque as measured with its constant part removed; what opens the loops is inertia" + (
+        ", which cancels." if joint.procedure else " and gravity, which are fitted along."
+    )
     if inside.any():
         traces.append(
             cloud("inside the windows", velocity[inside] * scale, torque[inside] - middle, PUBLISHED, opacity=0.8)

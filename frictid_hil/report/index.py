@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from frictid_hil.profiles.promotions import Attempt, Promotion
 from frictid_hil.profiles.summary import TrendPoint
-from frictid_hil.report.pages import Page, Section, Table
+from frictid_hil.report.calendar import STATES, calendar, state_of
+from frictid_hil.report.pages import Link, Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 from frictid_hil.report.words import sentence, when, with_interval
 
@@ -21,6 +22,7 @@ def index_page(
     nights: Sequence[Attempt],
     active: Promotion | None,
     baseline: str | None,
+    addresses: Mapping[str, str] | None = None,
 ) -> Page:
     """The page of one robot.
 
@@ -31,7 +33,9 @@ def index_page(
         nights: recalibrations, oldest first.
         active: what is in force; None where nothing is.
         baseline: id of the profile that drift is measured from.
+        addresses: of the page of a night, by its ``utc``; only of nights that have one.
     """
+    addresses = addresses or {}
     headline = f"Profile {active.id} is active since {when(active.utc)}." if active else "No profile was promoted yet."
     if nights:
         last = nights[-1]
@@ -42,13 +46,24 @@ def index_page(
         if not last.promoted and last.next_step:
             headline += f" Next step: {sentence(last.next_step)}"
     sections = [
-        Section("Joints", words=(_baseline(baseline),), tables=(_joints(trends),), figures=trend_figures(trends)),
-        Section("Recalibrations", tables=(_nights(nights),)) if nights else None,
+        Section("Nights", calendar=calendar(nights, addresses)) if nights else None,
+        Section(
+            "Joints",
+            words=(_baseline(baseline),),
+            tables=(_joints(trends),),
+            figures=trend_figures(trends, drift_limit_percent=_limit(nights)),
+        ),
+        Section("Recalibrations", tables=(_nights(nights, addresses),)) if nights else None,
         Section("Promotions", tables=(_promotions(promotions),)) if promotions else None,
     ]
     count = max((len(points) for points in trends.values()), default=0)
     facts = {"profiles kept": str(count), "recalibrations": str(len(nights)), "baseline": baseline or "none"}
     return Page(f"Friction history of {robot}", headline, [section for section in sections if section], facts)
+
+
+def _limit(nights: Sequence[Attempt]) -> float | None:
+    """The policy's limit of drift when the newest night began that tells it."""
+    return next((one.drift_limit_percent for one in reversed(nights) if one.drift_limit_percent is not None), None)
 
 
 def _baseline(baseline: str | None) -> str:
@@ -80,11 +95,11 @@ def _joints(trends: Mapping[str, Sequence[TrendPoint]]) -> Table:
     return Table(headings, tuple(rows), caption=caption)
 
 
-def _nights(nights: Sequence[Attempt]) -> Table:
+def _nights(nights: Sequence[Attempt], addresses: Mapping[str, str]) -> Table:
     rows = tuple(
         (
-            when(one.utc),
-            _word(one.outcome),
+            Link(when(one.utc), addresses[one.utc]) if one.utc in addresses else when(one.utc),
+            f"{STATES[state_of(one)][0]} {_word(one.outcome)}",
             "promoted" if one.promoted else "not promoted",
             ", ".join(one.drifted) or "none",
             sentence(one.reason),

@@ -14,15 +14,24 @@ import jinja2
 from markupsafe import Markup, escape
 
 from frictid_hil.files import write_whole
+from frictid_hil.report.calendar import Calendar
 from frictid_hil.report.figures import Figure
 
 
 @dataclass(frozen=True, slots=True)
+class Link:
+    """Words that lead to another page, by its address relative to this one."""
+
+    words: str
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
-    """Rows under headings; cells are text."""
+    """Rows under headings; cells are text or lead to another page."""
 
     headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: tuple[tuple[str | Link, ...], ...]
     caption: str = ""
 
 
@@ -37,6 +46,7 @@ class Section:
         tables: of facts.
         figures: of data.
         links: title and relative address of pages that lie beside this one.
+        calendar: of nights.
     """
 
     title: str
@@ -45,6 +55,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
     links: tuple[tuple[str, str], ...] = ()
+    calendar: Calendar | None = None
 
 
 @dataclass(frozen=True, slots=True)

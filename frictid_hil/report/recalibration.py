@@ -43,7 +43,7 @@ def recalibration_page(
     curves = tuple(_curves(name, joint, active, baseline) for name, joint in newer.joints.items())
     sections = [
         Section("Verdict", (_policy(policy),), _checks(result), (_drift(result, newer),), links=pages),
-        Section("Over time", figures=trend_figures(trends, drift_limit_percent=_limit(policy))),
+        Section("Over time", figures=trend_figures(trends, drift_limit_percent=policy.drift_limit_percent)),
         Section("Curves", figures=curves),
     ]
     facts = {
@@ -69,11 +69,6 @@ def _policy(policy: Policy) -> str:
         f"{_REFERENCE[policy.drift_reference]} is told as drifted; one that changed by more than "
         f"{policy.refuse_percent:g} % since the active profile is refused. {promotion}"
     )
-
-
-def _limit(policy: Policy) -> float | None:
-    """Drift over time is drawn from the baseline: the limit means something there if it is measured from it, too."""
-    return policy.drift_percent if policy.drift_reference == "baseline" else None
 
 
 def _checks(result: Mapping[str, Any]) -> tuple[tuple[bool, str], ...]:

@@ -257,7 +257,7 @@ def test_the_page_compares_with_the_profile_in_force(interrupted: tuple[str, Pat
     robot, run = interrupted
     whole, store = tmp_path / "run", ProfileStore(tmp_path / "store")
     shutil.copytree(run, whole)
-    assert "there is nothing to compare with" in (whole / "report.html").read_text()
+    assert "There is no earlier profile to compare with" in (whole / "report.html").read_text()
     old = load_profile(whole / "profile.yaml")
     slower = {
         n: one.model_copy(update={"torque_nm": tuple(1.5 * t for t in one.torque_nm)}) for n, one in old.joints.items()

@@ -66,6 +66,8 @@ def check_as_alone(logs: Path, executor: str, out: Path) -> None:
         assert entry["error"] is None
         assert entry["joints"] == alone["joints"]
         assert load_profile(Path(entry["profile"])).joints == load_profile(Path(alone["profile"])).joints
+        assert Path(entry["report"]).stem == Path(entry["profile"]).stem and Path(alone["report"]).name == "report.html"
+        assert "torque over velocity" in Path(alone["report"]).read_text(), "the loops, though nothing was marked"
 
 
 def test_over_processes_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, tmp_path: Path) -> None:
@@ -83,6 +85,8 @@ def test_profiles_of_recordings_with_one_name_do_not_overwrite_each_other(logs: 
     result = identify(options(tmp_path / "night*", executor="processes:1", out=tmp_path / "out"))
     names = [Path(entry["profile"]).name for entry in result["recordings"]]
     assert names == ["night1-arm-log.csv.yaml", "night2-arm-log.csv.yaml"] and result["outcome"] == "ok"
+    with pytest.raises(UsageError, match="exists already"):
+        identify(options(tmp_path / "night*", executor="processes:1", out=tmp_path / "out"))
 
 
 def test_names_of_profiles_come_from_whole_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

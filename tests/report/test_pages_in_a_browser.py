@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 import shutil
 import subprocess
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from frictid_hil.profiles.judgement import judge
 from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.report.calendar import calendar
 from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.figures import line
@@ -79,7 +82,12 @@ def history(tmp_path: Path) -> ProfileStore:
 
 
 def pages(store: ProfileStore) -> dict[str, Page]:
-    nights = [Attempt(f"2026-03-{day:02d}T02:00:00Z", "ok", 0, True, reason="fine") for day in range(1, 6)]
+    nights = [
+        Attempt(f"2026-03-{day:02d}T02:00:00Z", "ok", 0, True, "id", drift_limit_percent=10.0, reason="fine")
+        for day in range(1, 6)
+    ]
+    nights.append(Attempt("2026-03-06T02:00:00Z", "ok", 0, profile="id", drifted=("1",)))
+    nights.append(Attempt("2026-03-09T02:00:00Z", "refused", 3, reason="no drive answers"))
     new, old = profile(1.3, 6), profile(1.0, 1)
     verdict = judge(Policy(), new, old, old, failed={})
     result = {
@@ -87,7 +95,13 @@ def pages(store: ProfileStore) -> dict[str, Page]:
         "stored": "id", "drift": verdict.joints, "joints": {name: {"outcome": "ok"} for name in new.joints},
     }  # fmt: skip
     index = index_page(
-        "arm", store.trends("arm"), store.promotions("arm"), nights, store.active("arm"), store.baseline("arm")
+        "arm",
+        store.trends("arm"),
+        store.promotions("arm"),
+        nights,
+        store.active("arm"),
+        store.baseline("arm"),
+        {"2026-03-06T02:00:00Z": "../runs/six/recalibration.html"},
     )
     return {
         "calibration": calibration_page(
@@ -175,8 +189,26 @@ def in_browser(page: Path, profile_folder: Path) -> tuple[str, list[str]]:
         f"--user-data-dir={profile_folder}", "--enable-logging=stderr", "--virtual-time-budget=8000", "--dump-dom",
         page.as_uri(),
     ]  # fmt: skip
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     return shown.stdout, [line for line in shown.stderr.splitlines() if ":CONSOLE" in line]
+
+
+def with_axe(page: Path) -> Path:
+    """The page, telling in an element of its own which rules of axe-core it breaks."""
+    axe = files("axe_core_python").joinpath("axe.min.js").read_text()
+    report = (
+        "axe.run().then(found => { const told = document.createElement('pre'); told.id = 'axe';"
+        " told.textContent = JSON.stringify(found.violations.map(v => [v.id, v.impact, v.nodes.length,"
+        " v.nodes[0].html.slice(0, 200)])); document.body.append(told); });"
+    )
+    page.write_text(page.read_text().replace("</body>", f"<script>{axe}</script><script>{report}</script></body>"))
+    return page
+
+
+def serious(dom: str) -> list[list[object]]:
+    """Rules broken with serious or critical impact: contrast, names of things, the keyboard's way."""
+    (told,) = re.findall(r'<pre id="axe">(.*?)</pre>', dom, flags=re.DOTALL)
+    return [broken for broken in json.loads(html.unescape(told)) if broken[1] in ("serious", "critical")]
 
 
 @needs_browser
@@ -185,8 +217,9 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
     page = pages(history)[name]
     figures = [figure for section in page.sections for figure in section.figures]
     assert figures
-    dom, console = in_browser(write_page(page, tmp_path / f"{name}.html"), tmp_path / "browser")
+    dom, console = in_browser(with_axe(write_page(page, tmp_path / f"{name}.html")), tmp_path / "browser")
     assert console == []
+    assert serious(dom) == []
     drawn = re.split(r'id="figure-\d+"', dom)[1:]
     assert len(drawn) == len(figures)
     for figure, svg in zip(figures, drawn, strict=True):
@@ -198,6 +231,32 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
         assert figure.traces and all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure.traces)
         assert all(any(y is not None for y in trace["y"]) for trace in figure.traces), "a trace without data"
         assert len(re.findall(r'class="[^"]*(?:js-line|js-fill|point)"', svg)) >= len(figure.traces)
+
+
+@needs_browser
+def test_the_contrast_holds_in_the_dark_too(history: ProfileStore, tmp_path: Path) -> None:
+    path = write_page(pages(history)["index"], tmp_path / "index.html")
+    path.write_text(path.read_text().replace("screen and (prefers-color-scheme: dark)", "screen"))
+    dom, _ = in_browser(with_axe(path), tmp_path / "browser")
+    assert serious(dom) == []
+
+
+def test_the_calendar_tells_every_night_and_leads_to_its_page(history: ProfileStore, tmp_path: Path) -> None:
+    text = write_page(pages(history)["index"], tmp_path / "index.html").read_text()
+    # The first of March 2026 is a Sunday: it stands alone in the first of three weeks.
+    assert re.findall(r'<th scope="row">([^<]*)</th>', text) == ["2026-03-01", "2026-03-02", "2026-03-09"]
+    days = re.findall(r'class="day (\w*)"[^>]*aria-label="([^"]*)"', text)
+    assert [state for state, _ in days] == ["promoted"] * 5 + ["drifted", "", "", "failed"]
+    assert days[5][1] == "2026-03-06: drifted (joint 1)" and days[6][1].endswith("no recalibration")
+    assert text.count('href="../runs/six/recalibration.html"') == 2, "in the calendar and in the table"
+
+
+def test_a_long_history_shows_its_newest_year() -> None:
+    nights = [Attempt(f"{year}-06-15T02:00:00Z", "ok", 0, True) for year in (2019, 2025, 2026)]
+    shown = calendar(nights, {})
+    days = [day for week in shown.weeks for day in week if day is not None and day.state]
+    assert [day.date for day in days] == ["2025-06-15", "2026-06-15"] or [day.date for day in days] == ["2026-06-15"]
+    assert len(shown.weeks) == 53 and all(len(week) == 7 for week in shown.weeks)
 
 
 @needs_browser
