@@ -77,7 +77,7 @@ class LowPass:
 
     def thinned(self, columns: Array) -> Array:
         """Every ``stride``-th row of the filtered columns, by the filter's own impulse response: shape (m, k)."""
-        taps = _impulse_response(self.rate_hz, self.cutoff_hz)
+        taps = impulse_response(self.rate_hz, self.cutoff_hz)
         half = min(taps.size // 2, columns.shape[0] - 1)
         taps = taps[taps.size // 2 - half : taps.size // 2 + half + 1]
         first, last = 2.0 * columns[0], 2.0 * columns[-1]
@@ -104,7 +104,8 @@ def _butterworth(rate_hz: float, cutoff_hz: float) -> tuple[Array, Array]:
 
 
 @functools.cache
-def _impulse_response(rate_hz: float, cutoff_hz: float) -> Array:
+def impulse_response(rate_hz: float, cutoff_hz: float) -> Array:
+    """Of the low-pass forwards and backwards, centred, shape (taps,)."""
     b, a = signal.butter(4, cutoff_hz / (0.5 * rate_hz))
     half = int(3.0 * rate_hz / cutoff_hz)
     pulse = np.zeros(4 * half + 1)
@@ -150,7 +151,7 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
     elif nominal.controller is not None and experiment.position_command_rad is not None:
         demand = demand_of(nominal.controller, experiment, step_s)
     if experiment.torque_nm is not None:
-        view = _view(nominal, experiment, step_s, start_s, velocity)
+        view = view_of(nominal, experiment, step_s, start_s, velocity)
         plant = view.torque_nm - nominal_torque(nominal, experiment, view)
         # The ends have no second difference.
         plant[0], plant[-1] = plant[1], plant[-2]
@@ -185,7 +186,8 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     return replace(experiment, time_s=time, **columns), step_s, True
 
 
-def _view(nominal: Nominal, experiment: Experiment, step_s: float, start_s: float, velocity: Array) -> View:
+def view_of(nominal: Nominal, experiment: Experiment, step_s: float, start_s: float, velocity: Array) -> View:
+    """What inverse forms see of one experiment."""
     q = experiment.position_rad
     assert experiment.torque_nm is not None
     acceleration = np.zeros_like(q)

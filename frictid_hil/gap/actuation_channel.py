@@ -1,0 +1,223 @@
+"""The actuation channel: measured torque against the controller's demand, replayed on the measured position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import Builder, Channel, Rows, Term
+from frictid_hil.gap.experiment_set import Controller, Nominal, ReportFilter
+from frictid_hil.gap.plant_channel import (
+    BEYOND,
+    SIZES,
+    family,
+    report_of,
+    reported,
+    stride_of,
+    thinned,
+    without_nuisances,
+)
+from frictid_hil.gap.residuals import LowPass, Recording, demand_of, demand_parts, held, rms, settled
+from frictid_hil.simulation.drive_form import ActuationForm, DriveView
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.inverse_loops import lagged
+
+SAME_RATE = 0.05
+"""Log and control loop may differ by so much of their rate for a replay row by row to be one of the controller."""
+
+
+def forms() -> dict[str, ActuationForm]:
+    """Every effect's form in this channel, in the order in which they act."""
+    found = {name: effect.actuation for name, effect in all_effects().items() if effect.actuation is not None}
+    return dict(sorted(found.items(), key=lambda item: item[1].order))
+
+
+def through(demand_nm: Array, effects: Mapping[str, Mapping[str, float]], step_s: float, limit_nm: float) -> Array:
+    """Torque reported for a demand in force from each sample on: the mean over the step before, shape (n,)."""
+    torque = held(demand_nm)
+    for name, form in forms().items():
+        if name not in effects or form.torque is None:
+            continue
+        values = effects[name]
+        if values[form.parameter] != all_effects()[name].off[form.parameter]:
+            detail = (values.get(form.detail, form.details[0]),) if form.detail else ()
+            torque = form.torque(torque, values[form.parameter], step_s, limit_nm, *detail)
+    return torque
+
+
+def why_not_replayed(nominal: Nominal, recordings: Sequence[Recording]) -> str | None:
+    """Why the controller's demand cannot be formed; None where it can."""
+    logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
+    if not logs:
+        return "no controller is known, so nothing stands against the reported torque but the joint"
+    controller = nominal.controller
+    if controller is None:
+        return None
+    if all(abs(controller.rate_hz * r.step_s - 1.0) > SAME_RATE for r in logs):
+        return "the logs hold not every row of the controller, so its demand cannot be replayed"
+    return None
+
+
+def actuation_channel(
+    nominal: Nominal, recordings: Sequence[Recording], library: Collection[str], seen: Mapping[str, float]
+) -> Channel | None:
+    """The channel of a set; None where the demand cannot be formed.
+
+    Args:
+        nominal: the believed joint.
+        recordings: all logs of the set.
+        library: effects that may be used.
+        seen: effect -> value found in the kinematic channel.
+    """
+    if why_not_replayed(nominal, recordings) is not None:
+        return None
+    logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
+    controller = nominal.controller
+    limit_nm = controller.torque_limit_nm if controller is not None else math.inf
+    believed = nominal.believed_effects
+    demands = [r.demand_nm for r in logs if r.demand_nm is not None]
+    base = [through(d, believed, r.step_s, limit_nm) for d, r in zip(demands, logs, strict=True)]
+    views = [_view(r, controller, limit_nm) for r in logs]
+    builder = Builder([[] for _ in logs])
+    nuisances, candidates = _gains(nominal, views, builder, library)
+    nuisances += _timing(nominal, base, logs, builder)
+    scale = rms(np.concatenate([r.actuation_nm for r in logs if r.actuation_nm is not None]))
+    for name, form in forms().items():
+        if name not in library:
+            continue
+        for value, columns in _shapes(name, form, views, logs, nominal, base, seen):
+            numbers = builder.add(columns)
+            spread = 0.3 if form.late else 0.1
+            candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread)))
+    for name, columns in _generic(logs, base).items():
+        numbers = builder.add(columns)
+        candidates += [family(name, size * scale, numbers, columns) for size in SIZES]
+    low_pass = LowPass.at(1.0 / logs[0].step_s)
+    report = report_of(nominal.torque_report_filter, logs, low_pass)
+    rows = tuple(_rows(r, base[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
+    rows = without_nuisances(rows, nuisances, candidates)
+    return Channel("actuation", logs[0].step_s * stride_of(low_pass), rows, tuple(nuisances), tuple(candidates), scale)
+
+
+def _view(recording: Recording, controller: Controller | None, limit_nm: float) -> DriveView:
+    e = recording.experiment
+    assert e.torque_nm is not None and recording.demand_nm is not None
+    parts: Array = np.empty((0, 3))
+    if controller is not None and e.position_command_rad is not None:
+        parts = demand_parts(controller, e.position_rad, e.position_command_rad, recording.step_s)
+    return DriveView(recording.step_s, limit_nm, recording.demand_nm, e.torque_nm, parts)
+
+
+def _gains(
+    nominal: Nominal, views: Sequence[DriveView], builder: Builder, library: Collection[str]
+) -> tuple[list[Term], list[Term]]:
+    """Errors of the demand itself: inside their tolerance, and beyond it."""
+    nuisances, candidates = [], []
+    for name, effect in all_effects().items():
+        if effect.demand is None or not all(v.parts_nm.size for v in views):
+            continue
+        columns = [np.concatenate([np.zeros((1, c.shape[1])), c[:-1]]) for c in effect.demand.regressors(views)]
+        numbers, count = builder.add(columns), columns[0].shape[1]
+        sigma = getattr(nominal.tolerances, effect.belief).relative
+        if sigma > 0.0:
+            nuisances.append(Term(name, {}, numbers, np.zeros(count), np.full(count, sigma)))
+        if name in library:
+            beyond = BEYOND * max(sigma, 0.02)
+            candidates.append(Term(name, {}, numbers, np.zeros(count), np.full(count, beyond)))
+    return nuisances, candidates
+
+
+def _timing(nominal: Nominal, base: Sequence[Array], logs: Sequence[Recording], builder: Builder) -> list[Term]:
+    """What a delay or lag within its tolerance leaves, per second."""
+    tolerances = nominal.tolerances
+    columns = [-np.gradient(b, r.step_s)[:, None] for b, r in zip(base, logs, strict=True)]
+    report = nominal.torque_report_filter
+    unsure_s = 0.5 * report.order * report.time_constant_s if report else 0.0
+    numbers = builder.add(columns)
+    level: list[Array] = []
+    for k, b in enumerate(base):
+        level.append(np.zeros((b.size, len(base))))
+        level[-1][:, k] = 1.0
+    # The integral of the controller is unknown where a log begins.
+    start = Term("", {}, builder.add(level), np.zeros(len(base)), np.full(len(base), rms(np.concatenate(base))))
+    terms = [start, Term("torque_delay", {}, numbers, np.zeros(1), np.array([tolerances.torque_delay_s.of(0.0)]))]
+    if unsure_s > 0.0:
+        terms.append(Term("", {}, numbers, np.zeros(1), np.array([unsure_s])))
+    return terms
+
+
+def _shapes(
+    name: str,
+    form: ActuationForm,
+    views: Sequence[DriveView],
+    logs: Sequence[Recording],
+    nominal: Nominal,
+    base: Sequence[Array],
+    seen: Mapping[str, float],
+) -> list[tuple[dict[str, float], list[Array]]]:
+    """(parameters, columns) of one effect at every value worth trying."""
+    limit_nm, believed = views[0].limit_nm, nominal.believed_effects
+    result: list[tuple[dict[str, float], list[Array]]] = []
+    for value in form.guesses(views, seen.get(name)):
+        for detail in form.details or (0.0,):
+            values = {form.parameter: float(value), **({form.detail: detail} if form.detail else {})}
+            if form.torque is None:
+                changed = [
+                    through(
+                        demand_of(nominal.controller, r.experiment, r.step_s, float(value)),
+                        believed,
+                        r.step_s,
+                        limit_nm,
+                    )
+                    for r in logs
+                    if nominal.controller is not None
+                ]
+            else:
+                held_by = believed.get(name, {}).get(form.parameter, 0.0) if form.late else 0.0
+                effects = {**believed, name: {**values, form.parameter: held_by + float(value)}}
+                changed = [through(v.demand_nm, effects, v.step_s, limit_nm) for v in views]
+            if len(changed) == len(base):
+                result.append((values, [(c - b)[:, None] for c, b in zip(changed, base, strict=True)]))
+    return result
+
+
+def _generic(logs: Sequence[Recording], base: Sequence[Array]) -> dict[str, list[Array]]:
+    """Families of functions of demand and motion that no effect of a drive names."""
+    top_nm = max(float(np.max(np.abs(b))) for b in base)
+    table: dict[str, list[Array]] = {"demand": [], "late demand": [], "motion": [], "time": []}
+    for k, (log, demand) in enumerate(zip(logs, base, strict=True)):
+        q, t = log.experiment.position_rad, demand / top_nm
+        step_s = log.step_s
+        velocity = LowPass.at(1.0 / step_s)(np.gradient(q, step_s))
+        acceleration = np.gradient(velocity, step_s)
+        table["demand"].append(top_nm * np.stack([t, t * np.abs(t), t**3, np.abs(t)], axis=1))
+        late = [lagged(demand, step_s, lag) - demand for lag in (0.003, 0.01, 0.03, 0.1)]
+        table["late demand"].append(np.stack([*late, np.gradient(demand, step_s)], axis=1))
+        places = [np.cos(q), np.sin(q), velocity, np.abs(velocity), np.sign(velocity), acceleration]
+        table["motion"].append(np.stack(places, axis=1))
+        clock = np.linspace(0.0, 1.0, q.size) + k
+        table["time"].append(np.stack([clock, clock * demand, clock**2 * demand], axis=1))
+    return table
+
+
+def _rows(
+    recording: Recording, base: Array, parts: list[Array], low_pass: LowPass, report: ReportFilter | None
+) -> Rows:
+    e = recording.experiment
+    assert e.torque_nm is not None
+    model = np.concatenate([*parts, base[:, None]], axis=1)
+    if report is not None:
+        model = reported(model, report, recording.step_s)
+    residual = settled(e.torque_nm - model[:, -1], recording.step_s)
+    table = thinned(np.concatenate([model[:, :-1], residual[:, None]], axis=1), low_pass)[1:-2]
+    return Rows(
+        e.name,
+        e.validation,
+        recording.step_s * stride_of(low_pass),
+        table[:, -1],
+        table[:, :-1],
+        np.zeros(table.shape[0]),
+    )

@@ -1,0 +1,143 @@
+"""One channel of residuals as a linear problem: rows of all logs, and the columns by which each cause would show.
+
+A channel is built once for a set: the plant (torque against what the believed joint asks for), the actuation (torque
+against the controller's demand) and the tracking (position against command) differ in their columns alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.inverse import Shape
+
+FAMILY = "family "
+"""Prefix of generic functions: they compete like a cause, and have no name that anybody could repair."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A way in which one cause can show in a channel: columns, and what is believed of their coefficients.
+
+    Attributes:
+        effect: the cause; empty for what has no name (timing, a rigid-body column that is off as a whole).
+        shape: the cause's nonlinear parameters.
+        columns: numbers of its columns in the channel's table.
+        mean: of the coefficients before anything is recorded, shape (k,).
+        deviation: one-sigma of the same, shape (k,).
+        least: of the first coefficient; below, it is another effect.
+        largest: of the first coefficient.
+    """
+
+    effect: str
+    shape: Shape
+    columns: tuple[int, ...]
+    mean: Array
+    deviation: Array
+    least: float = -math.inf
+    largest: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """One log, low-passed and thinned.
+
+    Attributes:
+        name: of the experiment.
+        validation: judged on, not fitted.
+        start_s: time of its first row in the log.
+        y: the residual, shape (n,).
+        x: every column of the channel, shape (n, m).
+        known_noise: a sample of that part of y's noise which is known beforehand, shape (n,).
+    """
+
+    name: str
+    validation: bool
+    start_s: float
+    y: Array
+    x: Array
+    known_noise: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of one set.
+
+    Attributes:
+        name: ``plant``, ``actuation`` or ``tracking``.
+        step_s: of the rows.
+        logs: in run order.
+        nuisances: what the belief may be wrong by within its tolerance; always in.
+        candidates: what may be there besides.
+        scale: what a cause may well make of y, in its unit.
+    """
+
+    name: str
+    step_s: float
+    logs: tuple[Rows, ...]
+    nuisances: tuple[Term, ...]
+    candidates: tuple[Term, ...]
+    scale: float
+
+    @property
+    def fitted(self) -> tuple[Rows, ...]:
+        """The identification logs; all where there are none."""
+        return tuple(log for log in self.logs if not log.validation) or self.logs
+
+    @property
+    def judged(self) -> tuple[Rows, ...]:
+        """The validation logs; all where there are none."""
+        return tuple(log for log in self.logs if log.validation) or self.logs
+
+
+@dataclass
+class Builder:
+    """Collects columns log by log, and hands out their numbers.
+
+    Attributes:
+        parts: per log, blocks of columns of shape (n, k).
+        width: columns so far.
+    """
+
+    parts: list[list[Array]]
+    width: int = 0
+    terms: list[Term] = field(default_factory=list)
+
+    def add(self, columns: Sequence[Array]) -> tuple[int, ...]:
+        """Take in one block of columns per log; their numbers."""
+        for part, block in zip(self.parts, columns, strict=True):
+            part.append(block)
+        first, self.width = self.width, self.width + columns[0].shape[1]
+        return tuple(range(first, self.width))
+
+
+def effect_prior(
+    effect: str, shape: Shape, columns: Sequence[Array], scale: float, bounds: tuple[float, float]
+) -> tuple[Array, Array]:
+    """(mean, one-sigma) of an effect's coefficients, shape (k,) each.
+
+    A cause makes about the channel's scale: no more than the gap, since causes that cancel are no explanation, and no
+    more than a third of the joint's friction, whatever the units of its numbers. No coefficient may carry a strength
+    beyond its bound. Where the first coefficient has two finite bounds, it multiplies a whole model of the cause and
+    is 1 where that is right.
+    """
+    low, high = bounds
+    if math.isfinite(low) and math.isfinite(high):
+        return np.array([1.0, *np.zeros(columns[0].shape[1] - 1)]), np.full(columns[0].shape[1], 0.25 * (high - low))
+    squares = sum(np.sum(block**2, axis=0) for block in columns)
+    size = np.sqrt(squares / sum(block.shape[0] for block in columns))
+    count = size.size
+    deviation = scale / (math.sqrt(count) * np.maximum(size, 1e-12 * scale + 1e-300))
+    form = all_effects()[effect].inverse
+    if form is not None:
+        strengths = {p.name: max(abs(p.lower), abs(p.upper)) for p in all_effects()[effect].strengths}
+        for k in range(count):
+            told = form.parameters(shape, np.eye(count)[k])
+            caps = [strengths[name] / abs(value) for name, value in told.items() if name in strengths and value]
+            deviation[k] = min([deviation[k], *caps])
+    return np.zeros(count), deviation

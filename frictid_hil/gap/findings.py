@@ -1,0 +1,185 @@
+"""What a posterior says of each cause: how likely it shows, how large it is, its numbers, and what passes for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import FAMILY, Term
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.posterior import Draw, Posterior
+from frictid_hil.simulation.effects import all_effects
+
+DRAWS = 400
+"""Samples of each channel's posterior: a chance is known to 0.025."""
+VISIBLE = 0.5
+"""Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
+ALIKE = 0.05
+"""Chance of another cause in the place of one from which the two are called confusable."""
+SURE = 0.99
+"""Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One cause.
+
+    Attributes:
+        effect: its name.
+        chance: that it shows.
+        size: RMS of what it makes of the residual, over the noise floor; root mean square over the draws.
+        leads: chance that it is the largest cause.
+        parameters: medians with 95 % intervals; empty where only its size is known.
+        rivals: causes that stand in its place in other draws.
+        where: name of the channel in which it shows most.
+    """
+
+    effect: str
+    chance: float
+    size: float
+    leads: float
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    rivals: tuple[str, ...] = ()
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sampled:
+    """Draws of one channel's posterior.
+
+    Attributes:
+        posterior: of the channel.
+        draws: samples.
+        sizes: by cause, its size over the floor in every draw, shape (draws,); 0 where it is not in.
+        generic: the same of all generic functions together.
+    """
+
+    posterior: Posterior
+    draws: Sequence[Draw]
+    sizes: Mapping[str, Array]
+    generic: Array
+
+
+def sampled(posterior: Posterior) -> Sampled:
+    """Draws with the sizes of their causes, over all logs of the channel."""
+    draws = posterior.draws(posterior.search(), DRAWS)
+    x = np.concatenate([log.x for log in posterior.channel.logs])
+    x = x - np.mean(x, axis=0) * (posterior.channel.name == "actuation")
+    gram = x.T @ x / x.shape[0]
+    sizes: dict[str, Array] = {}
+    generic = np.zeros(len(draws))
+    for k, draw in enumerate(draws):
+        parts = posterior.contributions(draw)
+        for effect, (columns, values) in parts.items():
+            if effect and not effect.startswith(FAMILY):
+                size = math.sqrt(max(0.0, float(values @ gram[np.ix_(columns, columns)] @ values)))
+                sizes.setdefault(effect, np.zeros(len(draws)))[k] = size / posterior.floor
+        families = [part for name, part in parts.items() if name.startswith(FAMILY)]
+        if families:
+            columns = np.concatenate([c for c, _ in families])
+            values = np.concatenate([v for _, v in families])
+            generic[k] = math.sqrt(max(0.0, float(values @ gram[np.ix_(columns, columns)] @ values))) / posterior.floor
+    return Sampled(posterior, draws, sizes, generic)
+
+
+def findings(channels: Sequence[Sampled]) -> list[Finding]:
+    """All causes of all channels, the one that is expected to make most first."""
+    names = sorted({name for channel in channels for name in channel.sizes})
+    if not names:
+        return []
+    table = np.array([_joined([c.sizes.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
+    shown = np.where(table > VISIBLE, table, 0.0)
+    leads = np.bincount(np.argmax(shown, axis=0)[np.max(shown, axis=0) > 0.0], minlength=len(names)) / DRAWS
+    result = []
+    for row, name in enumerate(names):
+        there = shown[row] > 0.0
+        chance = float(np.mean(there))
+        if chance == 0.0:
+            continue
+        home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
+        result.append(
+            Finding(
+                name,
+                min(SURE, chance),
+                math.sqrt(float(np.mean(shown[row] ** 2))),
+                float(leads[row]),
+                _values(name, channels),
+                _rivals(row, names, there, shown),
+                home.posterior.channel.name,
+            )
+        )
+    return sorted(result, key=lambda f: -f.size)
+
+
+def _joined(sizes: Sequence[Array]) -> Array:
+    return np.sqrt(sum((size**2 for size in sizes), np.zeros(DRAWS)))
+
+
+def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> tuple[str, ...]:
+    """Causes that show where this one does not, and hardly where it does."""
+    if there.all():
+        return ()
+    found = []
+    for other, name in enumerate(names):
+        instead = float(np.mean(shown[other][~there] > 0.0)) * float(np.mean(~there))
+        beside = float(np.mean(shown[other][there] > 0.0)) if there.any() else 0.0
+        if other != row and instead > ALIKE and beside < 0.5 * float(np.mean(shown[other][~there] > 0.0)):
+            found.append((instead, name))
+    return tuple(name for _, name in sorted(found, reverse=True)[:3])
+
+
+def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
+    """The effect's parameters over all draws that hold it."""
+    told: dict[str, list[float]] = {}
+    for k in range(DRAWS):
+        joined: dict[str, float] = {}
+        for channel in channels:
+            for name, value in parameters(effect, channel, channel.draws[k]).items():
+                joined[name] = joined.get(name, 0.0) + value if name in joined else value
+        for name, value in joined.items():
+            told.setdefault(name, []).append(value)
+    result = {}
+    for name, values in told.items():
+        low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
+        result[name] = Value(float(middle), float(low), float(high))
+    return result
+
+
+def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
+    """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
+    posterior = channel.posterior
+    terms = [*posterior.channel.nuisances, *(posterior.channel.candidates[t] for t in draw.model.terms)]
+    at, total, shape = 0, None, None
+    for term in terms:
+        values = draw.values[at : at + len(term.columns)]
+        at += len(term.columns)
+        if term.effect != effect or "stiffness" in term.shape:
+            continue
+        total = values if total is None or total.size != values.size else total + values
+        shape = term
+    if shape is None or total is None:
+        return {}
+    return _read(effect, posterior.channel.name, shape, total)
+
+
+def _read(effect: str, channel: str, term: Term, values: Array) -> dict[str, float]:
+    form = all_effects()[effect]
+    if channel == "plant" and form.inverse is not None:
+        return form.inverse.parameters(term.shape, values)
+    if channel == "tracking":
+        return dict(term.shape)
+    if form.demand is not None:
+        return dict(zip(form.demand.parameters, (float(v) for v in values), strict=True))
+    if form.actuation is None:
+        return {}
+    strength = form.actuation.parameter
+    told = dict(term.shape)
+    if not told:
+        return {strength: float(values[0])}
+    if form.actuation.late:
+        told[strength] *= float(values[0])
+    return told

@@ -1,0 +1,127 @@
+"""What a believed joint may be wrong by within its tolerances, as terms of the plant channel that are always in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import Builder, Term
+from frictid_hil.gap.experiment_set import Nominal
+from frictid_hil.gap.residuals import Recording, friction_scales, slip_state
+from frictid_hil.gap.tolerances import Sigma
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.inverse import View
+
+FREE = 10.0
+"""One-sigma of a share that was fitted to these very logs: nothing is believed of it."""
+STIFFER = 0.1
+"""Step of the presliding stiffness by which its derivative is formed."""
+_ESTIMATED = {
+    "inertia_error": "inertia",
+    "gravity_error": "inertia",
+    "friction_level_error": "friction",
+    "viscous_error": "friction",
+}
+
+
+def nuisances(
+    nominal: Nominal, views: Sequence[View], logs: Sequence[Recording], builder: Builder, estimated: Collection[str]
+) -> list[Term]:
+    """All terms; those that are errors of a believed number carry the name of that effect.
+
+    Args:
+        nominal: the believed joint.
+        views: what columns are made of.
+        logs: the recordings themselves.
+        builder: takes the columns in.
+        estimated: ``inertia`` and ``friction`` where they were fitted to these logs.
+    """
+    terms = []
+    for name, deviation in _one_sigma(nominal).items():
+        form = all_effects()[name].inverse
+        assert form is not None
+        columns = form.regressors(views, {})
+        if not any(float(np.max(np.abs(c))) > 0.0 for c in columns):
+            continue
+        free = _ESTIMATED.get(name) in estimated
+        terms.append(_term("" if free else name, builder.add(columns), FREE if free else deviation))
+    terms.append(_timing(nominal, views, builder))
+    terms += _friction_shape(nominal, views, builder)
+    own = [r.experiment.rigid_body_torque_nm for r in logs if r.experiment.rigid_body_torque_nm is not None]
+    if len(own) == len(logs):
+        terms.append(_term("", builder.add([o[:, None] for o in own]), nominal.tolerances.rigid_body_torque.relative))
+    return terms
+
+
+def _term(effect: str, columns: tuple[int, ...], deviation: float) -> Term:
+    return Term(effect, {}, columns, np.zeros(len(columns)), np.full(len(columns), deviation))
+
+
+def _one_sigma(nominal: Nominal) -> dict[str, float]:
+    """Of the coefficient of each effect that is an error of a believed number."""
+    tolerances = nominal.tolerances
+    inertia = nominal.inertia_kg_m2 or 0.0
+    link = inertia * (1.0 - (nominal.motor_inertia_share or 0.0))
+    gravity = math.hypot(nominal.gravity_cos_nm, nominal.gravity_sin_nm)
+    return {
+        "inertia_error": tolerances.inertia_kg_m2.of(inertia) / link if link > 0.0 else 0.0,
+        "gravity_error": _relative(tolerances.gravity_torque_nm, gravity),
+        "friction_level_error": tolerances.friction_torque.relative,
+        "viscous_error": tolerances.viscous.relative,
+        "torque_constant_error": tolerances.torque_constant.relative,
+        "encoder_offset": tolerances.zero_offset_rad.of(0.0),
+    }
+
+
+def _relative(sigma: Sigma, value: float) -> float:
+    return sigma.of(value) / value if value > 0.0 else 0.0
+
+
+def _timing(nominal: Nominal, views: Sequence[View], builder: Builder) -> Term:
+    """When a torque was reported, in s.
+
+    A declared filter is known by name and number, rarely by its exact form: half of its lag may be missing. A report
+    is taken somewhere within a tenth of its sample.
+    """
+    report = nominal.torque_report_filter
+    filter_s = 0.5 * report.order * report.time_constant_s if report is not None else 0.0
+    deviation_s = math.hypot(nominal.tolerances.torque_delay_s.of(0.0), 0.1 * views[0].step_s, filter_s)
+    return _term("", builder.add([np.gradient(v.torque_nm, v.step_s)[:, None] for v in views]), deviation_s)
+
+
+def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[Term]:
+    """Presliding stiffness, and the curve below its first pair."""
+    _, stiffness = friction_scales(nominal)
+    stiffer = []
+    for v in views:
+        slip = slip_state(v.position_rad, (1.0 + STIFFER) * v.stiffness_nm_per_rad / v.coulomb_nm)
+        stiffer.append((v.coulomb_nm * (slip - v.slip) / STIFFER)[:, None])
+    stated = nominal.presliding_stiffness_nm_per_rad is not None
+    deviation = nominal.tolerances.presliding_stiffness.of(stiffness) / stiffness if stated else 1.0
+    numbers = builder.add(stiffer)
+    name = "presliding_hysteresis" if stated else ""
+    terms = [Term(name, {"stiffness": 1.0}, numbers, np.zeros(1), np.array([deviation]))]
+    bend_nm = _unmeasured_nm(nominal)
+    if bend_nm > 0.0 and nominal.curve is not None:
+        first = nominal.curve.measured_range_rad_s[0]
+        below: list[Array] = [
+            (bend_nm * v.slip * np.maximum(0.0, 1.0 - np.abs(v.velocity_rad_s) / first))[:, None] for v in views
+        ]
+        terms.append(_term("", builder.add(below), 1.0))
+    return terms
+
+
+def _unmeasured_nm(nominal: Nominal) -> float:
+    """What the curve below its first pair may be off by, N m: a line through the pairs against a parabola in sqrt(v).
+
+    No friction was measured there, and the two are the straightest and the most bent curve that friction commonly has.
+    """
+    curve = nominal.curve
+    if curve is None or len(curve.velocity_rad_s) < 3:
+        return 0.0
+    speed, torque = np.array(curve.velocity_rad_s[:3]), np.array(curve.torque_nm[:3])
+    bent = np.polynomial.polynomial.polyfit(np.sqrt(speed), torque, 2)[0]
+    return min(abs(float(bent) - curve.coulomb_nm), curve.coulomb_nm / 3.0)

@@ -1,0 +1,239 @@
+"""The plant channel: measured torque against what the believed joint asks for along the measured motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import signal
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import FAMILY, Builder, Channel, Rows, Term, effect_prior
+from frictid_hil.gap.experiment_set import Nominal, ReportFilter
+from frictid_hil.gap.generic import families
+from frictid_hil.gap.nuisances import nuisances
+from frictid_hil.gap.position_noise import quiet_views
+from frictid_hil.gap.residuals import (
+    LowPass,
+    Recording,
+    first_slide,
+    impulse_response,
+    rms,
+)
+from frictid_hil.simulation.effect import Region
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.inverse import View
+
+BEYOND = 6.0
+"""One-sigma of a belief that is plainly wrong, over its tolerance: what a maker calls 5 % and is not may be 30 %."""
+SIZES = (0.1, 0.3, 1.0)
+"""Sizes of a generic function, over what a cause may well make: half decades."""
+BANDS_HZ = (20.0, 40.0, 80.0, 160.0)
+"""Cut-offs to choose from."""
+LINE_SHARE = 0.1
+"""Part of what a low-pass takes away that a line over position must describe to be let through; noise gives 1e-3."""
+
+
+def plant_channel(
+    nominal: Nominal, recordings: Sequence[Recording], library: Collection[str], estimated: Collection[str]
+) -> Channel | None:
+    """The channel of a set; None where no log has a torque.
+
+    Args:
+        nominal: the believed joint.
+        recordings: all logs of the set.
+        library: effects that may be used.
+        estimated: ``inertia`` and ``friction`` where they were fitted to these logs, so that they are free.
+    """
+    logs = [r for r in recordings if r.view is not None and r.plant_nm is not None]
+    if not logs:
+        return None
+    views, noises = quiet_views(nominal, logs)
+    builder = Builder([[] for _ in logs])
+    friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
+    scale = min(friction_nm / 3.0, _gap_nm(logs))
+    known = nuisances(nominal, views, logs, builder, estimated)
+    candidates = []
+    for name in (n for n in all_effects() if n in library):
+        form = all_effects()[name].inverse
+        if form is None:
+            continue
+        told = [t for t in known if t.effect == name and name not in ("presliding_hysteresis",)]
+        for term in told:
+            candidates.append(replace(term, deviation=BEYOND * term.deviation))
+        if told:
+            continue
+        for shape in form.grid_for(views):
+            columns = form.regressors(views, shape)
+            mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
+            candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
+    generic = {**families(views), "each log": _by_log(views)}
+    for name, columns in generic.items():
+        numbers = builder.add(columns)
+        for size in SIZES:
+            candidates.append(family(name, size * scale, numbers, columns))
+    low_pass = band(logs, candidates, builder.parts)
+    report = report_of(nominal.torque_report_filter, logs, low_pass)
+    rows = tuple(_rows(r, builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
+    rows = without_nuisances(rows, known, candidates)
+    step_s = logs[0].step_s * stride_of(low_pass)
+    return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale)
+
+
+def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[Array]) -> Term:
+    """A family of generic functions whose sum has about the given size."""
+    squares = sum(np.sum(block**2, axis=0) for block in columns)
+    each = np.sqrt(squares / sum(block.shape[0] for block in columns))
+    count = int(np.count_nonzero(each > 1e-9 * max(float(each.max()), 1e-300)))
+    deviation = np.where(each > 1e-9 * each.max(), size / (math.sqrt(max(count, 1)) * np.maximum(each, 1e-300)), 0.0)
+    return Term(FAMILY + name, {"size": size}, numbers, np.zeros(each.size), deviation)
+
+
+def _gap_nm(logs: Sequence[Recording]) -> float:
+    """RMS of the residual behind the usual low-pass, N m."""
+    low_pass = LowPass.at(1.0 / logs[0].step_s)
+    return rms(np.concatenate([low_pass(r.plant_nm)[5:-5] for r in logs if r.plant_nm is not None]))
+
+
+def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> tuple[Rows, ...]:
+    """The logs with that part of generic functions taken off which the belief's own tolerances can say."""
+    known = [c for term in nuisances for c in term.columns]
+    generic = sorted({c for term in candidates if term.effect.startswith(FAMILY) for c in term.columns})
+    x = np.concatenate([log.x for log in logs])
+    weights = np.linalg.pinv(x[:, known]) @ x[:, generic]
+    result = []
+    for log in logs:
+        table = log.x.copy()
+        table[:, generic] -= log.x[:, known] @ weights
+        result.append(replace(log, x=table))
+    return tuple(result)
+
+
+def _by_log(views: Sequence[View]) -> list[Array]:
+    """A constant and a friction level of each log by itself."""
+    blocks: list[Array] = []
+    for k, v in enumerate(views):
+        block: Array = np.zeros((v.slip.size, 2 * len(views)))
+        block[:, 2 * k] = 1.0
+        block[:, 2 * k + 1] = v.slip
+        blocks.append(block)
+    return blocks
+
+
+def band(logs: Sequence[Recording], candidates: Sequence[Term], parts: Sequence[Sequence[Array]]) -> LowPass:
+    """The low-pass: 20 Hz, or as much more as lines over position need that stand above it.
+
+    Noise of the position grows with frequency, so that no more is let through than a cause can use.
+    """
+    rate = 1.0 / logs[0].step_s
+    usable = [hertz for hertz in BANDS_HZ if hertz <= 0.2 * rate] or [0.2 * rate]
+    lines = [t for t in candidates if not t.effect.startswith(FAMILY) and _is_line(t.effect)]
+    if len(usable) == 1 or not lines:
+        return LowPass(rate, usable[0])
+    tables = [np.concatenate(part, axis=1) for part in parts]
+    gained = []
+    for hertz in usable:
+        low_pass = LowPass(rate, hertz)
+        gained.append(max(_described(logs, tables, low_pass, t.columns) for t in lines))
+    worth = [hertz for hertz, gain in zip(usable, gained, strict=True) if gain > LINE_SHARE]
+    return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
+
+
+def _is_line(effect: str) -> bool:
+    """Whether an effect looks for lines over position in the recordings themselves."""
+    form = all_effects()[effect].inverse
+    return (
+        form is not None and form.shapes_for is not None and Region.POSITION in all_effects()[effect].signature.regions
+    )
+
+
+def _described(logs: Sequence[Recording], tables: Sequence[Array], low_pass: LowPass, columns: Sequence[int]) -> float:
+    """Share of what a low-pass takes away that some columns describe in rows that they were not fitted to."""
+    halves: list[list[Array]] = [[], []]
+    for log, table in zip(logs, tables, strict=True):
+        assert log.plant_nm is not None
+        rows = min(20_000, table.shape[0])
+        joined = np.concatenate([table[:rows, list(columns)], log.plant_nm[:rows, None]], axis=1)
+        high = joined - low_pass(joined)
+        halves[0].append(high[: rows // 2])
+        halves[1].append(high[rows // 2 :])
+    known, unseen = np.concatenate(halves[0]), np.concatenate(halves[1])
+    weights = np.linalg.lstsq(known[:, :-1], known[:, -1], rcond=None)[0]
+    left = unseen[:, -1] - unseen[:, :-1] @ weights
+    return 1.0 - float(left @ left) / max(float(unseen[:, -1] @ unseen[:, -1]), 1e-300)
+
+
+def stride_of(low_pass: LowPass) -> int:
+    """Thinning to 2.5 rows per period of the cut-off: what is above half that rate is 2 % of its power."""
+    return max(1, int(low_pass.rate_hz / (2.5 * low_pass.cutoff_hz)))
+
+
+def thinned(columns: Array, low_pass: LowPass) -> Array:
+    """Low-passed columns at the thinned rows alone, shape (m, k)."""
+    taps = impulse_response(low_pass.rate_hz, low_pass.cutoff_hz)
+    half = min(taps.size // 2, columns.shape[0] - 1)
+    taps = taps[taps.size // 2 - half : taps.size // 2 + half + 1]
+    padded = np.concatenate(
+        [2.0 * columns[0] - columns[half:0:-1], columns, 2.0 * columns[-1] - columns[-2 : -half - 2 : -1]]
+    )
+    down = stride_of(low_pass)
+    every = signal.upfirdn(taps, padded.T, 1, down, axis=-1).T if down == 1 else None
+    if every is None:
+        first = np.concatenate([np.zeros((-2 * half % down, padded.shape[1])), padded])
+        every = signal.upfirdn(taps, np.ascontiguousarray(first.T), 1, down, axis=-1).T
+        start = (2 * half + (-2 * half % down)) // down
+    else:
+        start = 2 * half
+    rows = (columns.shape[0] - 1) // down + 1
+    return np.ascontiguousarray(every[start : start + rows])
+
+
+def _rows(
+    recording: Recording, parts: list[Array], noise_nm: Array, low_pass: LowPass, report: ReportFilter | None
+) -> Rows:
+    view, torque = recording.view, recording.experiment.torque_nm
+    assert view is not None and torque is not None and recording.plant_nm is not None
+    model = np.stack([noise_nm, view.torque_nm - recording.plant_nm, view.torque_nm], axis=1)
+    model = np.concatenate([*parts, model], axis=1)
+    if report is not None:
+        model[:, :-1] = reported(model[:, :-1], report, recording.step_s)
+    table = thinned(model, low_pass)
+    held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
+    first = min(held // stride_of(low_pass) + 1, table.shape[0] // 3)
+    table = table[first:-2]
+    return Rows(
+        recording.experiment.name,
+        recording.experiment.validation,
+        first * stride_of(low_pass) * recording.step_s,
+        table[:, -1] - table[:, -2],
+        table[:, :-3],
+        table[:, -3],
+    )
+
+
+def report_of(told: ReportFilter | None, logs: Sequence[Recording], low_pass: LowPass) -> ReportFilter | None:
+    """The declared filter as it is meant: some give the time constant of each of its lags, some that of the whole."""
+    if told is None or told.order == 1:
+        return told
+    meant = (told, ReportFilter(1, told.time_constant_s))
+    left = [0.0, 0.0]
+    for log in logs:
+        view, plant = log.view, log.plant_nm
+        assert view is not None and plant is not None
+        model = np.stack([view.torque_nm - plant, view.acceleration_rad_s2, view.slip, np.ones_like(plant)], axis=1)
+        for k, form in enumerate(meant):
+            table = low_pass(np.concatenate([reported(model, form, log.step_s), view.torque_nm[:, None]], axis=1))
+            weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
+            left[k] += float(np.sum((table[:, -1] - table[:, :-1] @ weights) ** 2))
+    return meant[int(np.argmin(left))]
+
+
+def reported(columns: Array, report: ReportFilter, step_s: float) -> Array:
+    """Columns as a drive reports them that low-passes its torque, shape unchanged."""
+    share = 1.0 - math.exp(-step_s / report.time_constant_s)
+    for _ in range(report.order):
+        start = (1.0 - share) * columns[:1]
+        columns, _ = signal.lfilter([share], [1.0, share - 1.0], columns, axis=0, zi=start)
+    return columns

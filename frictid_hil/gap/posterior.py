@@ -1,0 +1,345 @@
+"""One posterior over sets of causes: how well each predicts the recordings, tolerances and noise integrated out.
+
+A *model* of a channel is its nuisances (what the belief may be wrong by), a set of terms (causes), a discrepancy (a
+flexible function of motion and time of unknown size) and coloured noise with a slow part of unknown size. All are
+Gaussian, so the chance of the recordings is a closed form: the product of the chances with which each row is predicted
+from the rows before it, the first from belief alone. Every unknown size is integrated over a grid. A cause wins only
+by what it predicts better than the discrepancy and the slow noise do, and what nobody predicts widens all intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap import noise
+from frictid_hil.gap.channel import Channel
+
+SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
+"""Variance of the slow part over that of the noise: half decades."""
+MEMORY_S = (0.1, 0.5)
+"""Its time constants: a reversal, a move."""
+LOCAL_S = 0.3
+"""Time over which the size of the noise may change: a reversal, a stop."""
+CARE = (0.1, 0.3, 1.0)
+"""True one-sigma of a belief over the stated one: makers round up, rarely down."""
+EXPECTED = 1.0
+"""Causes that a joint is expected to have, before anything is recorded."""
+WORTH = 10.0
+"""Log-odds below the best from which a set of causes is not grown further: a chance of 1 in 20 000."""
+MOST = 8
+"""Terms of a model at most."""
+TRIED = 6
+"""Extensions of a model that are scored at every point of the grid."""
+POINTS = 4
+"""Points of the grid, the likeliest, at which all candidates are compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One point of the grid: slow variance and memory, care of the belief's maker."""
+
+    slow: float
+    memory_s: float
+    care: float
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A set of terms with its score.
+
+    Attributes:
+        terms: numbers of the channel's candidates.
+        effects: their causes.
+        score: logarithm of the chance of the recordings, its prior included.
+        by_setting: the same by point of the grid, shape (g,).
+    """
+
+    terms: tuple[int, ...]
+    effects: frozenset[str]
+    score: float
+    by_setting: Array
+
+
+class Posterior:
+    """Scores of models of one channel.
+
+    Args:
+        channel: what is explained.
+    """
+
+    def __init__(self, channel: Channel, library: int) -> None:
+        self.channel = channel
+        self._chance = math.log(EXPECTED / library)
+        self.settings: list[Setting] = []
+        self._prepare()
+        self._reduce()
+        self._known: dict[tuple[int, ...], Model] = {}
+        self._prepare_blocks()
+
+    # -- tables ---------------------------------------------------------------------------------------------------
+
+    def _prepare(self) -> None:
+        channel = self.channel
+        terms = (*channel.nuisances, *channel.candidates)
+        ends = np.cumsum([len(term.columns) for term in terms])
+        self._own = [np.arange(end - len(term.columns), end) for term, end in zip(terms, ends, strict=True)]
+        self._columns = np.array([c for term in terms for c in term.columns], dtype=int)
+        self._scale: Array = np.concatenate([term.deviation for term in terms])
+        self._mean: Array = np.concatenate([term.mean for term in terms])
+        self._tables = [
+            np.concatenate([log.x[:, self._columns] * self._scale, log.y[:, None]], axis=1) for log in channel.fitted
+        ]
+        known = [log.known_noise for log in channel.fitted]
+        rests, _ = self._richest()
+        total = [np.hypot(rest, sample) for rest, sample in zip(rests, known, strict=True)]
+        self.floor = math.sqrt(float(np.mean(np.concatenate(total) ** 2)))
+        # A stuck spring's noise counts where the joint is stuck.
+        sizes = noise.local_size(total, round(LOCAL_S / channel.step_s) + 1)
+        self._tables = [table / size[:, None] for table, size in zip(self._tables, sizes, strict=True)]
+        rests, stretch = self._richest()
+        known = [sample / size for sample, size in zip(known, sizes, strict=True)]
+        self._covariance = noise.autocovariance(rests, stretch) + noise.autocovariance(known)
+
+    def _richest(self) -> tuple[list[Array], float]:
+        """(what all terms together leave, rows over rows less fitted freedoms); ridges as large as the noise."""
+        table = np.concatenate(self._tables)
+        x, y = table[:, :-1], table[:, -1]
+        values, vectors = np.linalg.eigh(x.T @ x)
+        values = np.maximum(values, 0.0)
+        variance, stretch = float(np.mean(np.diff(y) ** 2)) / 2.0 + 1e-300, 1.0
+        rests = [t[:, -1] for t in self._tables]
+        for _ in range(3):
+            weights = vectors @ ((vectors.T @ (x.T @ y)) / (values + variance))
+            rests = [t[:, -1] - t[:, :-1] @ weights for t in self._tables]
+            stretch = y.size / max(y.size - float(np.sum(values / (values + variance))), 0.1 * y.size)
+            variance = stretch * float(np.mean(np.concatenate(rests) ** 2)) + 1e-300
+        return rests, stretch
+
+    def _reduce(self) -> None:
+        """Integrate the nuisances out, at every point of the grid."""
+        channel = self.channel
+        terms, nuisances = self._columns.size, sum(len(t.columns) for t in channel.nuisances)
+        combinations = [(0.0, MEMORY_S[0])] + [(s, m) for s in SLOW[1:] for m in MEMORY_S]
+        base, grams, rights = [], [], []
+        self._left: list[Array] = []
+        for slow_share, memory_s in combinations:
+            covariance = self._covariance + noise.slow(slow_share * self._covariance[0], memory_s / channel.step_s)
+            gram, rows = np.zeros((terms + 1, terms + 1)), 0
+            for table in self._tables:
+                white, deviation = noise.whitened(table, covariance)
+                gram += white.T @ white
+                rows += white.shape[0]
+            log_density = -rows * (math.log(deviation) + 0.5 * math.log(2.0 * math.pi)) - 0.5 * float(gram[-1, -1])
+            self._left.append(gram)
+            for care in CARE:
+                scaled = gram.copy()
+                scaled[:nuisances] *= care
+                scaled[:, :nuisances] *= care
+                final, more = _integrated(scaled, np.arange(nuisances), np.arange(nuisances, terms + 1))
+                base.append(log_density + more)
+                grams.append(final[:-1, :-1])
+                rights.append(final[:-1, -1])
+                self.settings.append(Setting(slow_share, memory_s, care))
+        self._first = nuisances
+        self._base = np.array(base)
+        self._grams = np.array(grams)
+        self._rights = np.array(rights)
+        self._prior = -math.log(len(base))
+
+    # -- scores ---------------------------------------------------------------------------------------------------
+
+    def _prepare_blocks(self) -> None:
+        """Candidates by number of columns, so that all of one size are scored at once."""
+        candidates = self.channel.candidates
+        shapes = Counter(term.effect for term in candidates)
+        self._log_prior = np.array([self._chance - math.log(shapes[term.effect]) for term in candidates])
+        self._local = [own - self._first for own in self._own[len(self.channel.nuisances) :]]
+        self._blocks = {
+            size: np.array([t for t, own in enumerate(self._local) if own.size == size])
+            for size in {own.size for own in self._local}
+        }
+        safe = np.where(self._scale > 0.0, self._scale, np.inf)
+        self._centre = (self._mean / safe)[self._first :]
+        first = [own[0] for own in self._local]
+        self._low = np.array([t.least for t in candidates]) / safe[self._first :][first]
+        self._high = np.array([t.largest for t in candidates]) / safe[self._first :][first]
+        middle = self._centre[first]
+        self._before = _log_between(self._low - middle, self._high - middle)
+
+    def model(self, terms: Sequence[int]) -> Model:
+        """The score of a set of candidates."""
+        terms = tuple(sorted(terms))
+        if terms not in self._known:
+            by_setting = self._base + self._prior
+            if terms:
+                by_setting = by_setting + np.array([self._gain(terms, g) for g in range(self._base.size)])
+            effects = frozenset(self.channel.candidates[t].effect for t in terms)
+            self._known[terms] = Model(terms, effects, float(special.logsumexp(by_setting)), by_setting)
+        return self._known[terms]
+
+    def _gain(self, terms: tuple[int, ...], g: int) -> float:
+        """What a set adds to the log chance at one point of the grid, its prior included."""
+        at = np.concatenate([self._local[t] for t in terms])
+        inner = self._grams[g][np.ix_(at, at)] + np.eye(at.size)
+        right = self._rights[g][at] + self._centre[at]
+        covariance = np.linalg.inv(inner)
+        mean = covariance @ right
+        gain = 0.5 * float(right @ mean) - 0.5 * float(self._centre[at] @ self._centre[at])
+        gain -= 0.5 * float(np.linalg.slogdet(inner)[1]) - float(np.sum(self._log_prior[list(terms)]))
+        start = 0
+        for t in terms:
+            if math.isfinite(self._low[t]) or math.isfinite(self._high[t]):
+                spread = math.sqrt(covariance[start, start])
+                low, high = (self._low[t] - mean[start]) / spread, (self._high[t] - mean[start]) / spread
+                gain += float(_log_between(np.array(low), np.array(high)) - self._before[t])
+            start += self._local[t].size
+        return gain
+
+    def _extended(self, terms: Sequence[int], g: int) -> Array:
+        """What each candidate would add to a set at one point of the grid, shape (candidates,)."""
+        gram, right = self._grams[g], self._rights[g]
+        if terms:
+            at = np.concatenate([self._local[t] for t in terms])
+            solved = np.linalg.solve(gram[np.ix_(at, at)] + np.eye(at.size), gram[at])
+            right = right - solved.T @ (right[at] + self._centre[at])
+            gram = gram - gram[:, at] @ solved
+        gains = np.full(len(self._local), -np.inf)
+        for size, block in self._blocks.items():
+            columns = np.array([self._local[t] for t in block])
+            inner = gram[columns[:, :, None], columns[:, None, :]] + np.eye(size)
+            target = right[columns] + self._centre[columns]
+            covariance = np.linalg.inv(inner)
+            mean = np.einsum("bij,bj->bi", covariance, target)
+            found = 0.5 * np.einsum("bi,bi->b", mean, target) - 0.5 * np.sum(self._centre[columns] ** 2, axis=1)
+            found -= 0.5 * np.linalg.slogdet(inner)[1]
+            spread = np.sqrt(np.maximum(covariance[:, 0, 0], 1e-300))
+            low, high = (self._low[block] - mean[:, 0]) / spread, (self._high[block] - mean[:, 0]) / spread
+            bounded = np.isfinite(self._low[block]) | np.isfinite(self._high[block])
+            found += np.where(bounded, _log_between(low, high) - self._before[block], 0.0)
+            gains[block] = found + self._log_prior[block]
+        names = {self.channel.candidates[t].effect for t in terms}
+        gains[[c.effect in names for c in self.channel.candidates]] = -np.inf
+        return gains
+
+    def _extensions(self, model: Model) -> list[int]:
+        """Candidates worth adding, the best first: the best shape of each cause, at the points that matter."""
+        points = np.argsort(-model.by_setting)[:POINTS]
+        weight = model.by_setting[points]
+        total = special.logsumexp(np.array([self._extended(model.terms, g) for g in points]) + weight[:, None], axis=0)
+        best: dict[str, int] = {}
+        for t in np.argsort(-total):
+            if total[t] < model.score - WORTH:
+                break
+            best.setdefault(self.channel.candidates[t].effect, int(t))
+        return list(best.values())
+
+    def search(self) -> list[Model]:
+        """Models worth a look, the likeliest first: grown from the empty one, then every neighbour of the best."""
+        best = self.model(())
+        while len(best.terms) < MOST:
+            grown = [self.model((*best.terms, t)) for t in self._extensions(best)[:TRIED]]
+            if not grown or max(m.score for m in grown) <= best.score:
+                break
+            best = max(grown, key=lambda m: m.score)
+        for _ in range(MOST):
+            better = max(self._neighbours(best), key=lambda m: m.score, default=best)
+            if better.score <= best.score:
+                break
+            best = better
+        least = best.score - WORTH
+        return sorted((m for m in self._known.values() if m.score > least), key=lambda m: -m.score)
+
+    def _neighbours(self, model: Model) -> Iterator[Model]:
+        """The model less one term, with one more, and with one in the place of another."""
+        for term in model.terms:
+            without = self.model(tuple(t for t in model.terms if t != term))
+            yield without
+            for t in self._extensions(without)[:TRIED]:
+                if t not in model.terms:
+                    yield self.model((*without.terms, t))
+        for t in self._extensions(model)[:TRIED] if len(model.terms) < MOST else ():
+            yield self.model((*model.terms, t))
+
+    # -- what follows --------------------------------------------------------------------------------------------
+
+    def draws(self, models: Sequence[Model], count: int, seed: int = 0) -> list[Draw]:
+        """Samples of the posterior, over models, grid and coefficients."""
+        random = np.random.default_rng(seed)
+        weights = np.exp([m.score - models[0].score for m in models])
+        chosen = random.choice(len(models), count, p=weights / weights.sum())
+        result = []
+        cache: dict[tuple[int, int], tuple[np.ndarray, Array, Array]] = {}
+        for k in chosen:
+            model = models[k]
+            chance = np.exp(model.by_setting - model.score)
+            g = int(random.choice(chance.size, p=chance / chance.sum()))
+            if (k, g) not in cache:
+                cache[k, g] = self._coefficients(model, g)
+            at, mean, root = cache[k, g]
+            values = self._scale[at] * (mean + root @ random.standard_normal(mean.size))
+            result.append(Draw(model, g, at, values))
+        return result
+
+    def _coefficients(self, model: Model, g: int) -> tuple[np.ndarray, Array, Array]:
+        """(columns, mean, square root of the covariance) of scaled coefficients at one point of the grid."""
+        nuisances = np.arange(self._first)
+        own = [self._own[len(self.channel.nuisances) + t] for t in model.terms]
+        at = np.concatenate([nuisances, *own]).astype(int)
+        gram = self._left[g // len(CARE)]
+        care = np.ones(at.size)
+        care[: nuisances.size] = self.settings[g].care
+        inner = gram[np.ix_(at, at)] * care[:, None] * care + np.eye(at.size)
+        mean0 = self._mean[at] / np.where(self._scale[at] > 0.0, self._scale[at], 1.0)
+        covariance = np.linalg.inv(inner)
+        mean = covariance @ (gram[at, -1] * care + mean0)
+        root = np.linalg.cholesky(covariance + 1e-14 * np.eye(at.size))
+        return at, care * mean, care[:, None] * root
+
+    def contributions(self, draw: Draw) -> dict[str, tuple[np.ndarray, Array]]:
+        """By cause: (columns of the channel's table, coefficients), nuisances and terms together."""
+        result: dict[str, tuple[list[int], list[float]]] = {}
+        at = 0
+        for term in (*self.channel.nuisances, *(self.channel.candidates[t] for t in draw.model.terms)):
+            columns, values = result.setdefault(term.effect, ([], []))
+            columns += term.columns
+            values += list(draw.values[at : at + len(term.columns)])
+            at += len(term.columns)
+        return {name: (np.array(c, dtype=int), np.array(v)) for name, (c, v) in result.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """One sample of the posterior: model, point of the grid, numbers and values of the coefficients."""
+
+    model: Model
+    setting: int
+    at: np.ndarray
+    values: Array
+
+
+def _log_between(low: Array, high: Array) -> Array:
+    """Logarithm of a standard normal's chance between two bounds."""
+    chance = special.ndtr(high) - special.ndtr(low)
+    return np.log(np.maximum(chance, 1e-12))
+
+
+def _integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[Array, float]:
+    """(Gram matrix of ``outside`` with the ``inside`` columns integrated out, what that adds to the log chance).
+
+    The last of ``outside`` is the residual itself; the inside coefficients have zero mean and unit variance.
+    """
+    left = gram[np.ix_(outside, outside)].copy()
+    if inside.size == 0:
+        return left, 0.0
+    lower = np.linalg.cholesky(gram[np.ix_(inside, inside)] + np.eye(inside.size))
+    solved = np.linalg.solve(lower, gram[np.ix_(inside, outside)])
+    left -= solved.T @ solved
+    gain = 0.5 * float(solved[:, -1] @ solved[:, -1])
+    return left, gain - float(np.sum(np.log(np.diag(lower))))
