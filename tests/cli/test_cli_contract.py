@@ -10,6 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
+
+from frictid_hil.cli.progress import print_plan
+from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
 
 VERBS = ["check", "calibrate", "identify", "compare", "compensate", "replay", "recalibrate", "schedule"]
 VERBS += ["profile", "emulate", "gap", "report"]
@@ -52,6 +56,21 @@ def test_a_dry_run_prints_the_plan_and_opens_nothing(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "115 deg/s" in result.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("bus", "told"),
+    [
+        ("virtual:hp3j", "SIMULATED: no real robot moves (bus virtual:hp3j)"),
+        ("socketcan:can9", "REAL: the robot on socketcan:can9 moves"),
+    ],
+)
+def test_a_plan_says_first_whether_a_real_robot_moves(bus: str, told: str) -> None:
+    options = CalibrateOptions("hp3j", bus=bus, joints=("5",))
+    planned = plan_calibration(options)
+    console = Console(record=True, width=150)
+    print_plan(console, planned.plan, planned.setup)
+    assert console.export_text().startswith(told)
 
 
 def test_a_dry_run_in_json_carries_the_plan() -> None:

@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from frictid_drivers.cia402.fleet import Fleet
-from frictid_drivers.virtual.channel import runtime_folder
+from frictid_drivers.cia402.network import BusLock
 from frictid_hil.cli.app import app
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
@@ -70,8 +70,12 @@ def held_by_another_recalibration(place: Path) -> Iterator[None]:
 
 @contextmanager
 def bus_held(_: Path) -> Iterator[None]:
-    with filelock.FileLock(runtime_folder() / "endings.lock"):
+    lock = BusLock("socketcan:held0")
+    lock.acquire()
+    try:
         yield
+    finally:
+        lock.release()
 
 
 @contextmanager
@@ -137,7 +141,9 @@ ENDINGS = {
     "no watchdog": Ending(2, "refused", "no watchdog of their own", "person present", ALLOWED, meanwhile=no_watchdog),
     "no permission": Ending(2, "refused", "unattended", "add policy.unattended", more=NO_CAN),
     "not reachable": Ending(3, "aborted", "cannot open the bus", "ip link set no0 up", ALLOWED, NO_CAN),
-    "bus held": Ending(3, "aborted", "in use", "wait for it", meanwhile=bus_held),
+    "bus held": Ending(
+        3, "aborted", "held by another", "wait for it", ALLOWED, ("--bus", "socketcan:held0"), meanwhile=bus_held
+    ),
     "another at work": Ending(
         3, "aborted", "another recalibration", "wait for it", meanwhile=held_by_another_recalibration
     ),

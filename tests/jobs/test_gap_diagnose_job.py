@@ -10,6 +10,7 @@ import pytest
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
+from frictid_hil.errors import UsageError
 from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.replay import Controller, closed_loop
@@ -114,3 +115,16 @@ def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_
     assert asked["verdict"] == result["verdict"], "the diagnosis is told all the same"
     assert asked["model"] is None and "closed loop" in asked["model_refused"]
     assert not (tmp_path / "improved.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("write_model", "better.yaml"), ("mujoco", "better.xml"), ("mujoco", "better.py"), ("out", "gap.html")],
+)
+def test_no_output_is_written_over_a_file_unless_told(tmp_path: Path, option: str, name: str) -> None:
+    mine = tmp_path / name
+    mine.write_text("mine")
+    asked = tmp_path if option == "out" else mine.with_suffix(".xml" if option == "mujoco" else ".yaml")
+    with pytest.raises(UsageError) as told:
+        diagnose(tmp_path / "no set", **{option: asked})
+    assert "--force" in told.value.next_step and mine.read_text() == "mine"

@@ -13,6 +13,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.compensation.profile_fit import doubts_of_file
+from frictid_hil.jobs.identification.joint_profile import joint_result
 from frictid_hil.jobs.profiles import diff, named_profile, promote, rollback, show
 from frictid_hil.profiles.store import ProfileStore
 
@@ -88,3 +89,9 @@ def test_a_linear_axis_speaks_newtons_in_json_too(tmp_path: Path) -> None:
     assert {"velocity_m_s", "force_n", "coulomb_n"} <= shown.keys()
     told = [shown, diff(str(path), str(path))["joints"]["x"], compare(path, path, None)["joints"]["x"]]
     assert not [key for values in told for key in values if "_nm" in key or "_rad" in key]
+
+
+def test_a_calibrated_linear_axis_speaks_newtons_in_json() -> None:
+    told = joint_result(joint(prismatic=True))
+    assert told.keys() >= {"velocity_m_s", "force_n", "force_interval_n", "coulomb_n", "mass_kg"}
+    assert not [key for key in told if key.endswith(("_nm", "_rad_s", "_kg_m2", "_per_rad"))]

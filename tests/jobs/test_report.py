@@ -17,6 +17,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.jobs.report import report
 from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
+from frictid_hil.report.calibration import calibration_page
 
 
 def profile(factor: float, day: int) -> FrictionProfile:
@@ -73,3 +74,11 @@ def test_one_page_at_a_time(store: ProfileStore, tmp_path: Path) -> None:
             report(run, robot=robot, store=store.root)
     with pytest.raises(UsageError):
         report(tmp_path)
+
+
+@pytest.mark.parametrize(("driver", "seed", "word"), [("virtual", 3, "SIMULATED: "), ("cia402", None, "REAL: ")])
+def test_a_page_says_at_once_whether_the_robot_was_real(driver: str, seed: int | None, word: str) -> None:
+    whole = profile(1.0, 1)
+    made = whole.model_copy(update={"provenance": whole.provenance.model_copy(update={"driver": driver, "seed": seed})})
+    page = calibration_page(made, {}, outcome="ok")
+    assert page.headline.startswith(word)

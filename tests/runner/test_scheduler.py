@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, load_driver
+from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import Stream
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
@@ -240,7 +242,7 @@ MS = 1_000_000
 TRAVEL = (ROBOT.file.joints["3"].start_position_rad, ROBOT.file.joints["3"].start_position_rad + 4 * DEG)
 
 
-@pytest.mark.parametrize("after", [40, 100, 130, 170, 230, 290])
+@pytest.mark.parametrize("after", [40, 100, 130, 170, 230, 290, *random.Random(13).sample(range(300), 4)])
 def test_a_stop_on_request_stays_within_the_planned_travel_and_in_time(after: int) -> None:
     """A short, fast travel: the stop has less room than a tenth of a second at full speed would take."""
     stop = Stop(1, after=after)
@@ -275,3 +277,61 @@ def test_a_joint_that_runs_away_at_power_on_is_stopped_within_50_ms_of_the_first
     still = mine["t_ns"] > mine["t_ns"][bad] + 50 * MS
     assert np.abs(mine["velocity_rad_s"][still]).max() < 1 * DEG
     assert np.ptp(mine["position_rad"]) < 5 * DEG
+
+
+class TimedStop(Stop):
+    """Knows when it asked."""
+
+    clock: Any = None
+    asked_ns: int | None = None
+
+    @property
+    def level(self) -> int:
+        level = super().level
+        if level and self.asked_ns is None:
+            self.asked_ns = self.clock.now_ns()
+        return level
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_stop_at_any_moment_with_power_on_ends_in_time_and_within_the_plan(seed: int) -> None:
+    """While power comes, on the way, in a rehearsal: half a second, which holds the longest planned deceleration."""
+    dice = random.Random(seed)
+    stop = TimedStop(1, phase=("enable", "move", "rehearsal", "reversal")[seed], after=dice.randrange(5, 150))
+
+    def see(driver: Any, _: str) -> None:
+        stop.clock = driver.clock
+
+    _, rows, _, ended = run(stop=stop, tamper=see)
+    assert isinstance(ended, Interrupted) and stop.asked_ns is not None
+    mine = rows[rows["joint"] == 3]
+    assert TRAVEL[0] - 0.35 * DEG <= mine["position_rad"].min()
+    assert mine["position_rad"].max() <= ROBOT.file.joints["3"].locked_position_rad + 0.35 * DEG
+    moving = mine["t_ns"][np.abs(mine["velocity_rad_s"]) > 1 * DEG]
+    assert moving.size == 0 or moving[-1] - stop.asked_ns < 500 * MS
+    assert np.abs(mine["velocity_rad_s"][-20:]).max() < 0.5 * DEG
+
+
+class Lost:
+    """A driver whose library breaks while the joints are being brought to rest."""
+
+    def __init__(self) -> None:
+        self.stops = 0
+
+    def quick_stop(self) -> None:
+        self.stops += 1
+
+
+def test_what_breaks_while_stopping_never_hides_what_ended_the_run() -> None:
+    class Loop:
+        def settle(self, duration_s: float) -> None:
+            raise ZeroDivisionError("a defect of the driver's library")
+
+    driver = Lost()
+    arm = Arm(driver, (), Loop(), None, Care())  # type: ignore[arg-type]
+    with pytest.raises(SafetyAbort, match="the first error"):
+        try:
+            raise SafetyAbort("the first error")
+        finally:
+            arm.stop()
+    assert driver.stops == 2

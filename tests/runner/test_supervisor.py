@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -6,6 +7,7 @@ import pytest
 from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
+from frictid_hil.runner.interlock import Interlock
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
 LIMITS = JointLimits(-0.1, 0.5, 2.5, 100.0, following_error_rad=0.05, power_w=150.0, torque_s=0.003)
@@ -102,3 +104,29 @@ def test_a_decimated_joint_may_be_older() -> None:
     watching.check([SetPoint(0.21), SetPoint()], [healthy(), healthy(position_rad=0.0, age_cycles=30)])
     with pytest.raises(SafetyAbort):
         watching.check([SetPoint(0.21), SetPoint()], [healthy(), healthy(position_rad=0.0, age_cycles=31)])
+
+
+@pytest.mark.parametrize("cycle_hz", [250.0, 1000.0, 4000.0])
+def test_a_bound_lasts_as_long_at_every_rate(cycle_hz: float) -> None:
+    limits = replace(LIMITS, torque_s=0.02, silence_s=0.02)
+    interlock = Interlock("0", 0)
+
+    def lasting_s(spoil: Callable[[int], Feedback]) -> float:
+        watching = Supervisor(["0", "1"], [limits, limits], cycle_hz, interlock)
+        watching.watch(0, Mode.POSITION, {1: 0.0})
+        still = healthy(position_rad=0.0, velocity_rad_s=0.0)
+        watching.arm_interlock([healthy(digital_inputs=1), still])
+        for cycle in range(1, 10_000):
+            try:
+                watching.check([SetPoint(0.21), SetPoint()], [spoil(cycle), still])
+            except SafetyAbort:
+                return cycle / cycle_hz
+        return math.inf
+
+    period_s = 1.0 / cycle_hz
+    for allowed_s, spoil in (
+        (0.02, lambda _: healthy(torque_nm=101.0, digital_inputs=1)),
+        (0.02, lambda cycle: healthy(age_cycles=cycle, digital_inputs=1)),
+        (0.1, lambda cycle: healthy(digital_inputs=1, digital_inputs_age_cycles=cycle)),
+    ):
+        assert lasting_s(spoil) == pytest.approx(allowed_s + period_s)

@@ -127,14 +127,17 @@ def test_hand_needs_to_be_in_the_robot_file(make_robot):
     driver.close()
 
 
-def test_one_bus_one_owner(make_robot):
-    first, second = VirtualDriver(make_robot()), VirtualDriver(make_robot())
-    first.open()
-    with pytest.raises(HardwareBusy, match="in use"):
-        second.open()
-    first.close()
-    second.open()
-    second.close()
+def test_two_buses_of_one_name_in_lock_step_know_nothing_of_each_other(make_robot):
+    def reported(run):
+        return [(report.t_ns, report.position_rad, report.torque_nm) for report in run.cycle(100, swing)]
+
+    first, second = Run(make_robot()), Run(make_robot())
+    told = [reported(first), reported(second)]
+    alone = Run(make_robot())
+    assert told == [reported(alone)] * 2
+    for run in (first, second, alone):
+        run.driver.stop_cycling()
+        run.driver.close()
 
 
 def test_a_driver_can_be_opened_again(make_robot):
@@ -147,14 +150,14 @@ def test_a_driver_can_be_opened_again(make_robot):
     run.driver.close()
 
 
-def test_one_bus_one_process(make_robot, own_folder):
+def test_one_bus_on_the_wall_clock_has_one_owner(make_robot, own_folder):
     code = (
         "import sys; from frictid_drivers.virtual import channel\n"
         "lock = channel.take('bench'); print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert holder.stdout.readline() == "held\n"
-    driver = VirtualDriver(make_robot())
+    driver = VirtualDriver(make_robot(realtime=True))
     with pytest.raises(HardwareBusy):
         driver.open()
     holder.communicate("")

@@ -1,4 +1,7 @@
-"""One virtual bus belongs to one process at a time, as a real one would: a lock per channel, and where files live."""
+"""A virtual bus on the wall clock belongs to one process at a time, as a real one would: locks, and where files live.
+
+In lock-step there is nothing to lock: the bus cannot be reached from outside its process.
+"""
 
 from __future__ import annotations
 

@@ -76,10 +76,10 @@ class VirtualDriver:
     # -- life cycle ----------------------------------------------------------------------------------------------------
 
     def open(self, frame_sink: FrameSink | None = None) -> None:
-        """Take the channel, power the drives and reach them."""
-        self._lock = channel.take(self._channel)
+        """Power the drives and reach them; on the wall clock, where others could reach them too, take the channel."""
         try:
             if self._setup.realtime:
+                self._lock = channel.take(self._channel)
                 for joint in self._setup.joints:
                     JointModel.of(joint, joint.name)  # a mistake is better told here than by another process
                 arm_of(self._setup)
@@ -96,7 +96,8 @@ class VirtualDriver:
         if self._setup.realtime:
             bus = SocketBus(self._channel)
         else:
-            bus = LockStepBus(self._drives, self._channel)
+            # A channel of its own: this bus lives in one process, and may do so more than once.
+            bus = LockStepBus(self._drives, f"{self._channel}-{id(self)}")
             self._rack.power_on()
             leave_in_fault(self._rack, self._faults)
         ours = [fault for fault in self._faults if fault.kind in HOST_KINDS]
