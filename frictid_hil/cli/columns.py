@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.options import JsonOption, QuietOption
+from frictid_hil.cli.options import ForceOption, JsonOption, QuietOption
 from frictid_hil.cli.output import Output, Result
 
 
@@ -24,6 +24,7 @@ def columns(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write the draft to this file.")
     ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -50,4 +51,4 @@ def columns(
         if result.get("written"):
             output.out.print(f"column map: {result['written']}", markup=False, soft_wrap=True)
 
-    output.run("columns", lambda: job(log, columns=known, out=out), show)
+    output.run("columns", lambda: job(log, columns=known, out=out, force=force), show)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from frictid_hil.cli.options import JsonOption, QuietOption, quantity
+from frictid_hil.cli.options import ForceOption, JsonOption, QuietOption, quantity
 from frictid_hil.cli.output import Output
 from frictid_hil.errors import UsageError
 from frictid_hil.units import parse_quantity
@@ -55,12 +55,13 @@ def robot(
     read: Annotated[bool, typer.Option("--read", help="Ask the drives for gear and rated torque; nothing moves.")] = (
         False
     ),
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
     """A robot file for your robot. On a terminal it asks for what you did not give; one answer holds for all joints."""
-    from frictid_hil.jobs.new_robot import JointAnswers, new_robot, refuse_to_replace
+    from frictid_hil.files import refuse_overwriting
+    from frictid_hil.jobs.new_robot import JointAnswers, new_robot
 
     output = Output(as_json, quiet)
     asks = sys.stdin.isatty() and not as_json
@@ -73,7 +74,7 @@ def robot(
         return str(typer.prompt(question, err=True))
 
     def written() -> dict[str, Any]:
-        refuse_to_replace(path, force=force)
+        refuse_overwriting([path], force=force)
         names = joint or answer(None, "joints, as NAME=ADDRESS NAME=ADDRESS", "--joint").split()
         spot = answer(bus, "bus, as interface:channel", "--bus")
         low, high = _travel(answer(travel, "travel of the joints, as LOW..HIGH (-90deg..90deg)", "--travel"))

@@ -11,6 +11,7 @@ from rich.table import Table
 from frictid_hil.cli.options import (
     AmplitudeOption,
     CyclesOption,
+    ForceOption,
     JointOption,
     JsonOption,
     MethodOption,
@@ -60,6 +61,7 @@ def replay(
         bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
     ] = True,
     out: OutOption = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -84,6 +86,7 @@ def replay(
             echo=echo,
             simulation=simulate,
             out=out,
+            force=force,
         )
         return job(options, output.err.print)
 

@@ -77,10 +77,6 @@ class Estimate:
     notes: tuple[str, ...] = ()
     figures: Mapping[str, float] = field(default_factory=dict)
 
-    def half_width_at(self, speed_rad_s: Array) -> Array:
-        """Half of the 95 % interval of phi at any speed, same shape."""
-        return intervals.curve_half_width_nm(self.curve, self.half_width_nm, speed_rad_s)
-
 
 def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimate:
     """Identify one joint.

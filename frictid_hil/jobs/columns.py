@@ -7,8 +7,8 @@ from typing import Any
 
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.write import dump
-from frictid_hil.errors import FrictidError, UsageError
-from frictid_hil.files import write_whole
+from frictid_hil.errors import FrictidError
+from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.recording.draft import draft
 from frictid_hil.recording.mcap_reader import is_ours
 from frictid_hil.recording.read import open_table, read
@@ -42,8 +42,7 @@ def columns(log: Path, *, columns: str | None = None, out: Path | None = None, f
     text = _TITLE + "".join(f"# {line}\n" for line in found.findings) + dump(dict(found.document))
     result |= {"map": text, "findings": list(found.findings), "left_out": list(found.left_out), "joints": {}}
     if out is not None:
-        if out.exists() and not force:
-            raise UsageError("exists already", where=str(out), next_step="choose another name")
+        refuse_overwriting([out], force=force)
         write_whole(out, text)
         result["written"] = str(out.resolve())
         try:

@@ -10,7 +10,7 @@ from typing import Any
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
-from frictid_hil.files import write_whole
+from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import Driver, kind_of, load_driver
 
@@ -85,7 +85,7 @@ def new_robot(
         ConfigError: the answers make no robot; every problem with its place.
         HardwareError: the bus or a drive cannot be reached.
     """
-    refuse_to_replace(path, force=force)
+    refuse_overwriting([path], force=force)
     found = _read(path.stem, driver, bus, joints, cycle_hz) if read else {joint.name: {} for joint in joints}
     text = _text(path.stem, driver, bus, joints, cycle_hz, found)
     draft = path.with_name(f".{path.name}.draft")
@@ -96,12 +96,6 @@ def new_robot(
         draft.unlink(missing_ok=True)
     write_whole(path, text)
     return NewRobot(path, found)
-
-
-def refuse_to_replace(path: Path, *, force: bool) -> None:
-    """Raise ``UsageError`` where a file is there that nobody allowed to replace."""
-    if path.exists() and not force:
-        raise UsageError("the file exists", where=str(path), next_step="another name, or `--force` to replace it")
 
 
 def _read(

@@ -24,6 +24,7 @@ from frictid_hil.errors import (
     IdentificationError,
     InputFileError,
 )
+from frictid_hil.files import refuse_overwriting
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
@@ -52,6 +53,7 @@ class ReplayOptions:
         echo: bus on which the frames are sent again.
         simulation: stream the set-points to the simulated joints as well.
         out: folder for profile and CSV files.
+        force: write over those that are there.
     """
 
     source: Path
@@ -66,17 +68,20 @@ class ReplayOptions:
     echo: str | None = None
     simulation: bool = True
     out: Path | None = None
+    force: bool = False
 
 
 def replay(options: ReplayOptions, note: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """Play a recording back.
 
     Raises:
-        UsageError: nothing says which frame is what, or options contradict each other.
+        UsageError: nothing says which frame is what, options contradict each other, or a file would be overwritten.
         InputFileError: the recording is unreadable or unusable.
     """
     robot = load_robot(options.robot)
     robot.check_joints(options.joints)
+    if options.out is not None:
+        refuse_overwriting([options.out / "profile.yaml", *options.out.glob("simulated-*.csv")], force=options.force)
     account = Account()
     late: dict[str, int] = {}
     if is_log(options.source):

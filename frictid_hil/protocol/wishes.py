@@ -104,11 +104,6 @@ class Wish:
         """Follow the set-point again, from the moment it changes."""
         self._locked, self._since_rad = False, None
 
-    @property
-    def wants_power(self) -> bool:
-        """Whether power was asked for and neither taken back nor stopped."""
-        return self._target is JointState.ENABLED
-
     def order(self, set_point: SetPoint) -> Order:
         """For the coming cycle.
 

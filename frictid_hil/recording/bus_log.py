@@ -6,8 +6,6 @@ and a killed file is readable up to its last flush. Read is whatever python-can 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -54,12 +52,6 @@ class Frames:
 
     def __len__(self) -> int:
         return int(self.t_ns.size)
-
-    def unknown_to(self, known: Collection[int]) -> dict[int, int]:
-        """How many frames there are of each id that is not among ``known``, most frequent first."""
-        ids, counts = np.unique(self.can_id & ~np.uint32(FD_FRAME), return_counts=True)
-        unknown = Counter({int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in known})
-        return dict(unknown.most_common())
 
 
 class BusLogWriter:

@@ -35,11 +35,6 @@ class LogBus(can.BusABC):
         self._began_ns = 0
         self._next = next(self._frames, None)
 
-    @property
-    def exhausted(self) -> bool:
-        """Every frame was received."""
-        return self._next is None
-
     def take(self, timeout_s: float | None = None) -> tuple[int, int, bytes] | None:
         """The next frame as ``(run time in ns, CAN id, data)``; None when it does not come in time, or none is left."""
         taken = self._next

@@ -73,6 +73,22 @@ def test_a_plan_says_first_whether_a_real_robot_moves(bus: str, told: str) -> No
     assert console.export_text().startswith(told)
 
 
+def test_a_plan_tells_each_joints_limits_and_which_of_them_another_file_states(tmp_path: Path) -> None:
+    site = tmp_path / "site.yaml"
+    dropped = "".join(f'  "{name}": null\n' for name in range(4))
+    site.write_text(
+        f'schema: frictid.robot/1\nextends: hp3j.yaml\nname: site\njoints:\n{dropped}  "5": {{max_torque_nm: 9.0}}\n'
+    )
+    planned = plan_calibration(CalibrateOptions(str(site)))
+    console = Console(record=True, width=200)
+    print_plan(console, planned.plan, planned.setup)
+    told = console.export_text()
+    assert [entry.joint for entry in planned.plan.joints] == ["4", "5"]
+    assert "of 9.0" in told and "of 28.5" in told
+    assert "position_max_rad" in told and "of joint 5 are inherited from hp3j.yaml" in told
+    assert "max_torque_nm of joint 4 are inherited from hp3j.yaml" in told.replace("\n", " ")
+
+
 def test_a_dry_run_in_json_carries_the_plan() -> None:
     plan = as_json(run("calibrate", "--robot", "hp3j.yaml", "--dry-run", "--joint", "1", "--json"))
     assert plan["schema"] == "frictid.calibrate/1"

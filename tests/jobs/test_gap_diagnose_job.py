@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_
 def test_no_output_is_written_over_a_file_unless_told(tmp_path: Path, option: str, name: str) -> None:
     mine = tmp_path / name
     mine.write_text("mine")
-    asked = tmp_path if option == "out" else mine.with_suffix(".xml" if option == "mujoco" else ".yaml")
+    asked: Any = tmp_path if option == "out" else mine.with_suffix(".xml" if option == "mujoco" else ".yaml")
     with pytest.raises(UsageError) as told:
         diagnose(tmp_path / "no set", **{option: asked})
     assert "--force" in told.value.next_step and mine.read_text() == "mine"

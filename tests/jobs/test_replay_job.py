@@ -69,6 +69,14 @@ def test_set_points_on_the_simulated_joint_move_it_as_recorded(run: Path, robot:
     assert len(first.split(",")) == len(header.split(","))
 
 
+@pytest.mark.parametrize("name", ["profile.yaml", "simulated-5.csv"])
+def test_nothing_is_written_over_unless_told(run: Path, robot: str, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UsageError, match="exists already") as told:
+        replay(ReplayOptions(run, robot, out=tmp_path))
+    assert "--force" in told.value.next_step and (tmp_path / name).read_text() == "mine"
+
+
 def test_another_joint_is_told_apart(run: Path, robot: str, tmp_path: Path) -> None:
     values = load_robot(robot).values()
     values["joints"]["5"]["simulated"]["inertia_kg_m2"] *= 3.0

@@ -72,7 +72,6 @@ PROGRAMMES = {
         Programme("quick", (30 / _TOP, 1.0), "least-squares", 0.45),
     )
 }
-DEFAULT = PROGRAMMES["thorough"]
 
 
 def programme(name: str) -> Programme:
