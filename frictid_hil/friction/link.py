@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.signal import cont2discrete, lfilter
 
 from frictid_hil.friction.least_squares import few_knots
 from frictid_hil.friction.recording import CycleRecording, Motion
@@ -79,6 +78,9 @@ def swinging(motion: Motion, frequency_hz: float, damping: float) -> Array:
     w, step_s = 2 * np.pi * frequency_hz, motion.smoother.step_s
     # -(s/w)^2 / (1 + 2 z s/w + (s/w)^2), exact where the acceleration is a line between samples.
     through = np.array([-1.0 / w**2, 0.0, 0.0]), np.array([1.0 / w**2, 2 * damping / w, 1.0])
+    # Here, since it loads the whole of scipy.stats: half a second that most verbs can do without.
+    from scipy.signal import cont2discrete, lfilter
+
     numerator, denominator, _ = cont2discrete(through, step_s, method="foh")
     moved: Array = lfilter(numerator.ravel(), denominator, motion.acceleration_rad_s2)
     return moved

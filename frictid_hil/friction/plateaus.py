@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.curve import FrictionCurve
@@ -201,7 +201,7 @@ def _half_widths(position: Array, force: Array, groups: list[list[_Plateau]]) ->
     pass_power = sum(within) / free_within if free_within else 0.0
     # Both directions pass the same places, and a place that resists more resists both ways.
     deviation = np.sqrt(place_power * (1 / counts).mean(axis=1) + pass_power / 2)
-    half: Array = student.ppf(0.975, min(free_between, 30)) * deviation
+    half: Array = stdtrit(min(free_between, 30), 0.975) * deviation
     return half
 
 

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import curve_fit
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.rigid_body import Measured
@@ -114,7 +114,7 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
 
 
 def _mean(values: Array) -> Measured:
-    half = float(student.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size))
+    half = float(stdtrit(values.size - 1, 0.975) * values.std(ddof=1) / np.sqrt(values.size))
     return Measured(float(values.mean()), half)
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Prior, Solved, solve
@@ -141,7 +141,7 @@ def measured_skew(shaken: CycleRecording, link: Link | None = None) -> MeasuredS
             raise _undetermined(shaken.where)
         delay_s -= float(solved.values[_JERK]) / inertia
     # A few passes disagree, as in ``intervals``.
-    seen_s = math.sqrt(float(solved.covariance[_JERK, _JERK])) / inertia * float(student.ppf(0.975, 8)) / COVERAGE
+    seen_s = math.sqrt(float(solved.covariance[_JERK, _JERK])) / inertia * float(stdtrit(8, 0.975)) / COVERAGE
     whole_s = shaken.skew.torque_delay_s + delay_s - shaken.skew.position_delay_s
     deviation_s = math.hypot(seen_s, _UNSEEN[0], _UNSEEN[1] * whole_s)
     if link is not None:
