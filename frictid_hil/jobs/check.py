@@ -8,7 +8,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import PlanRefused
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.limits import refuse_beyond_limits
-from frictid_hil.protocol.driver import Driver, Finding, Severity, load_driver
+from frictid_hil.protocol.driver import Finding, Severity, new_driver
 
 
 def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
                 )
             )
     with robot.document.locating():
-        driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+        driver = new_driver(robot.driver(bus), setup)
     identities = {}
     try:
         with robot.document.locating():

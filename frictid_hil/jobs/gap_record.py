@@ -37,7 +37,7 @@ from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.plan import REHEARSAL, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Driver, load_driver
+from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.mcap_reader import read_mcap
 from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.events import JointRun, Preflight
@@ -393,7 +393,7 @@ class _Recording:
         plans = self._planned.plans
         if not plans:
             self._run.reopen()
-        for plan in [_joined(plans)] if plans and self._in_lock_step() else plans:
+        for plan in [_joined(plans)] if plans and self._planned.order.setup.lock_step else plans:
             try:
                 if not self._ready_for(plan):
                     break
@@ -450,7 +450,7 @@ class _Recording:
     def _keep(self, moved: JointRun) -> None:
         self._logs.update(_cut(self._run.folder.samples(moved), self._planned.experiments))
         self._session += 1
-        if self._in_lock_step() and self._session < len(self._planned.loaded):
+        if self._planned.order.setup.lock_step and self._session < len(self._planned.loaded):
             self._mount()
 
     def _keep_whole_experiments(self) -> None:
@@ -480,19 +480,9 @@ class _Recording:
 
     def _mount(self, _: Preflight | None = None) -> None:
         """Put the payload on a simulated joint, or take it off; a real one has been prepared by the person."""
-        order = self._planned.order
-        driver = self._driver or _new_driver(order.driver, order.setup)
-        mount: Callable[[str, bool], None] | None = getattr(driver, "mount_payload", None)
+        mount: Callable[[str, bool], None] | None = getattr(self._driver, "mount_payload", None)
         if mount is not None:
             mount(self._planned.joint.name, self._planned.loaded[self._session])
-
-    def _in_lock_step(self) -> bool:
-        return _new_driver(self._planned.order.driver, self._planned.order.setup).clock.lock_step
-
-
-def _new_driver(name: str, setup: RobotSetup) -> Driver:
-    driver: Driver = load_driver(name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
-    return driver
 
 
 def _joined(plans: Sequence[Plan]) -> Plan:

@@ -12,7 +12,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Driver, kind_of, load_driver
+from frictid_hil.protocol.driver import kind_of, new_driver
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def _read(
 ) -> dict[str, dict[str, float]]:
     """What each drive says of its gear and rated torque."""
     setup = RobotSetup(name, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))
-    drives: Driver = load_driver(driver)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    drives = new_driver(driver, setup)
     try:
         drives.open()
         identities = drives.identify()

@@ -7,7 +7,7 @@ from typing import Any
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import PlanRefused, UsageError
-from frictid_hil.protocol.driver import Driver, Finding, Resettable, load_driver
+from frictid_hil.protocol.driver import Finding, Resettable, new_driver
 
 
 def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Finding]], bool]) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Findin
     robot = load_robot(robot_name)
     setup = robot.to_setup(bus)
     with robot.document.locating():
-        driver: Driver = load_driver(robot.driver(bus))(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+        driver = new_driver(robot.driver(bus), setup)
     if not isinstance(driver, Resettable):
         raise UsageError(
             f"the {robot.driver(bus)} driver cannot reset faults",

@@ -80,6 +80,11 @@ class RobotSetup:
     care: Mapping[str, float] = field(default_factory=dict)
     folder: Path | None = None
 
+    @property
+    def lock_step(self) -> bool:
+        """Time is virtual: cycles run as fast as the processor allows, in the process that started them."""
+        return self.simulated and not self.realtime
+
     def joint(self, name: str) -> JointSetup:
         """The joint of that name.
 

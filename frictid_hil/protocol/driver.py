@@ -478,6 +478,16 @@ def load_driver(name: str) -> type[Driver]:
     )
 
 
+def new_driver(name: str, setup: RobotSetup) -> Driver:
+    """A driver of this kind for this robot, not yet opened.
+
+    Raises:
+        InvalidFields: no such driver, or options that it does not take.
+    """
+    driver: Driver = load_driver(name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    return driver
+
+
 def kind_of(name: str) -> DriverKind:
     """What the driver registered under ``name`` is; that of a plain CAN driver where it does not say.
 

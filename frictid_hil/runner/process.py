@@ -32,7 +32,7 @@ from multiprocessing.context import SpawnProcess
 from frictid_hil.errors import Defect, FrictidError, Interrupted, SafetyAbort
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import load_driver
+from frictid_hil.protocol.driver import new_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import frame_ring, sample_ring
@@ -218,7 +218,7 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
         warning = _raise_priority()
         if warning:
             tell(Warned(warning))
-        driver = load_driver(order.driver)(order.setup)  # type: ignore[call-arg]  # protocols carry no constructor
+        driver = new_driver(order.driver, order.setup)
         gc.collect()
         gc.freeze()
         gc.disable()

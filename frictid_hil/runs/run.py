@@ -11,7 +11,7 @@ from typing import Protocol
 
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import Driver, load_driver
+from frictid_hil.protocol.driver import Driver, new_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.process import run_in_own_process
@@ -63,7 +63,7 @@ def run_plan(
         FrictidError: see ``Scheduler.run``; what was measured has been given to the keeper by then.
     """
     care = care or Care()
-    driver: Driver = load_driver(driver_name)(setup)  # type: ignore[call-arg]  # protocols carry no constructor
+    driver = new_driver(driver_name, setup)
     own_process = not driver.clock.lock_step
     with sample_ring(shared=own_process) as samples, frame_ring(shared=own_process) as frames:
         recorder = Recorder(samples, frames)

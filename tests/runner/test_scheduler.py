@@ -17,7 +17,7 @@ from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, load_driver
+from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, new_driver
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import Stream
@@ -71,7 +71,7 @@ def run(
             tamper(driver, event.phase)
             stop.armed = stop.armed or event.phase == stop.phase
 
-    driver = load_driver("virtual")(setup)  # type: ignore[call-arg]
+    driver = new_driver("virtual", setup)
     samples = sample_ring(1 << 17)
     scheduler = Scheduler(
         driver, setup, plan, Recorder(samples, frame_ring()), notify=notify, proceed=lambda _: proceed, stop=stop
