@@ -15,7 +15,7 @@ all with ``--kept FOLDER``.
 the joint and lets go of it in full swing; ``PD hold``: the low-gain PD of the track task brings it to a place and holds
 it; forwards and backwards.
 
-``pushes``: the same R and K, without the bus, by the product's own controller on the simulated joint: pushed to 3 to 20
+``pushes``: the same R and K, without the bus, by the product's own law on the simulated joint: pushed to 3 to 20
 deg/s, forwards and backwards, and let go.
 
 ``limits``: R and K upwards from our setting in steps of 0.01 until a joint pushed to 20 deg/s, either way, no longer
@@ -53,7 +53,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Hold, Motion, Move, Plan, joint_plan
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Feedback
-from frictid_hil.runner.compensation import Controller
+from frictid_hil.runner.compensation import LawInForce
 from frictid_hil.runner.events import Event, PhaseStarted
 from frictid_hil.runs.run import run_plan
 from frictid_hil.simulation.joint import JointModel
@@ -329,17 +329,17 @@ def alone(
     loop.brake(False)
     loop.power(True)
     loop.set_mode(Mode.TORQUE.value)
-    controller = Controller(law, 0.001, law.gravity.torque_nm(centre))
+    in_force = LawInForce(law, 0.001, law.gravity.torque_nm(centre))
     step_nm = setup.rated_torque_nm / 1000.0
     # One cycle of the delay is the simulated joint's own.
-    queue = [controller.torque_nm] * (delay_cycles - 1)
+    queue = [in_force.torque_nm] * (delay_cycles - 1)
     assert law.friction is not None
     push_nm = 2.0 * push * law.friction.coulomb_nm
     report, velocities, pushing = Feedback(valid=True), [], True
     free, fastest = 0, 0.0
     for k in range(5000):
         report.position_rad, report.velocity_rad_s = loop.measured_position_rad, loop.velocity_rad_s
-        torque = controller.update(report, (centre, 0.0))
+        torque = in_force.update(report, (centre, 0.0))
         pushing = pushing and k < 1000 and abs(loop.true_velocity_rad_s) < pushed_rad_s
         queue.append(torque + (push_nm if pushing else 0.0))
         loop.advance(0.001, torque_nm=round(queue.pop(0) / step_nm) * step_nm)

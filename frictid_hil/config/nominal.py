@@ -77,7 +77,7 @@ class Joint(Open):
         return self
 
 
-class Payload(Open):
+class PayloadFile(Open):
     """What is mounted on the link where an experiment says so."""
 
     inertia_kg_m2: NotNegative | None = None
@@ -100,7 +100,7 @@ def _law(name: Any) -> Any:
     return {"p_pi": "cascade", "p_pi_cascade": "cascade", "pd": "pid", "pid_feedforward": "pid"}.get(plain, plain)
 
 
-class Controller(Open):
+class ControllerFile(Open):
     """The position loop: what law it follows, and its numbers.
 
     ``pid``: ``kp*e + integral(ki*e) + kd*(dcommand/dt - v)``. ``cascade``: ``kv*w + integral(ki*w)`` with ``w = kp*e +
@@ -121,7 +121,7 @@ class Controller(Open):
     feedforward: FeedForward | None = None
 
     @model_validator(mode="after")
-    def _whole(self) -> Controller:
+    def _whole(self) -> ControllerFile:
         needed = {"pid": ("rate_hz", "kp"), "cascade": ("rate_hz", "kp", "kv")}.get(self.type, ())
         for name in needed:
             if getattr(self, name) is None:
@@ -189,7 +189,7 @@ class Tolerance(Strict):
         return self
 
 
-class Experiment(Open):
+class ExperimentFile(Open):
     """One recording."""
 
     name: str = Field(min_length=1)
@@ -204,12 +204,12 @@ class NominalFile(Open):
     """The whole file."""
 
     joint: Joint
-    payload: Payload | None = None
-    controller: Controller | None = None
+    payload: PayloadFile | None = None
+    controller: ControllerFile | None = None
     drive: Drive | None = None
     encoder: Encoder | None = None
     tolerance: Tolerance | None = None
-    experiments: Annotated[tuple[Experiment, ...], BeforeValidator(as_tuple)] = ()
+    experiments: Annotated[tuple[ExperimentFile, ...], BeforeValidator(as_tuple)] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from frictid_hil.config.schema import Strict
 
 
-class WarmUp(Strict):
+class WarmUpPolicy(Strict):
     """How a joint is brought to its working temperature before it is measured.
 
     Attributes:
@@ -84,7 +84,7 @@ class Policy(Strict):
     promotion: Literal["automatic", "by_person"] = "automatic"
     max_age_days: float = Field(default=180.0, gt=0)
     max_temperature_difference_c: float = Field(default=20.0, gt=0)
-    warm_up: WarmUp = WarmUp()
+    warm_up: WarmUpPolicy = WarmUpPolicy()
     unattended: Unattended | None = None
 
     @property

@@ -237,7 +237,7 @@ class DriveIdentity(Strict):
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
-class Gate(Strict):
+class JudgedGate(Strict):
     """One question asked of a measurement, and its answer in plain words."""
 
     name: str
@@ -341,7 +341,7 @@ class JointProfile(Strict):
     procedure: ProcedureUsed | None = None
     drive: DriveIdentity = DriveIdentity()
     quality: Figures = Field(default_factory=dict)
-    gates: Annotated[tuple[Gate, ...], BeforeValidator(_gates)] = ()
+    gates: Annotated[tuple[JudgedGate, ...], BeforeValidator(_gates)] = ()
     identified_utc: str = ""
 
     @model_validator(mode="before")

@@ -227,7 +227,7 @@ def experiment_set(
     data: Mapping[str, Any],
     where: str,
     name: str,
-    logs: Sequence[tuple[config.Experiment, Samples]],
+    logs: Sequence[tuple[config.ExperimentFile, Samples]],
 ) -> ExperimentSet:
     """A set from a checked ``nominal.yaml`` and its recordings, in run order.
 
@@ -261,13 +261,13 @@ def experiment_set(
     return ExperimentSet(name, nominal, moving, at_rest)
 
 
-def sorted_by_run(experiments: Sequence[config.Experiment]) -> list[config.Experiment]:
+def sorted_by_run(experiments: Sequence[config.ExperimentFile]) -> list[config.ExperimentFile]:
     """In run order; those that do not say keep their place in the file."""
     placed = [(index if e.run_order is None else e.run_order, e) for index, e in enumerate(experiments)]
     return [e.model_copy(update={"run_order": place}) for place, e in sorted(placed, key=lambda pair: pair[0])]
 
 
-def _log_of(folder: Path, told: config.Experiment) -> Path:
+def _log_of(folder: Path, told: config.ExperimentFile) -> Path:
     path = folder / (told.file or f"{told.name}.csv")
     if not path.exists() and path.with_name(path.name + ".gz").exists():
         path = path.with_name(path.name + ".gz")
@@ -324,7 +324,7 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
     )
 
 
-def _controller(told: config.Controller) -> Controller | None:
+def _controller(told: config.ControllerFile) -> Controller | None:
     """The law as one form; None where it is unknown or only its demand is recorded.
 
     ``kv*w + integral(ki*w)`` of a cascade, ``w = kp*e + c*dcommand/dt - v``, is ``(kv*kp + ki)*(b*command - q) +
@@ -387,7 +387,7 @@ def _curve(friction: config.Friction | None, where: str) -> FrictionCurve | None
     return FrictionCurve.through(speeds, friction.coulomb_nm + viscous * speeds, where=where)
 
 
-def _experiment(told: config.Experiment, samples: Samples) -> Experiment:
+def _experiment(told: config.ExperimentFile, samples: Samples) -> Experiment:
     columns = {name: getattr(samples, name) for name in _LOG_COLUMNS}
     role, order = told.role == "validation", told.run_order or 0
     return Experiment(name=told.name, validation=role, payload=told.payload, run_order=order, **columns)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.policy import WarmUp
+from frictid_hil.config.policy import WarmUpPolicy
 from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import Robot, load_robot
@@ -86,7 +86,7 @@ class CalibrateOptions:
     resume: Path | None = None
     out: Path | None = None
     verb: str = VERB
-    warm_up: WarmUp | None = None
+    warm_up: WarmUpPolicy | None = None
     interlock: Interlock | None = None
     store: Path | None = None
 

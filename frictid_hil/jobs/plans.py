@@ -44,7 +44,7 @@ def calibration_motions(
     procedure: Procedure,
     *,
     rehearse: bool,
-    warm_up: policy.WarmUp | None = None,
+    warm_up: policy.WarmUpPolicy | None = None,
     place: int | None = None,
     measure_skew: bool = False,
 ) -> list[Motion]:
@@ -122,7 +122,7 @@ def calibration_plan(
     *,
     rehearse: Sequence[str] = (),
     notes: Sequence[str] = (),
-    warm_up: policy.WarmUp | None = None,
+    warm_up: policy.WarmUpPolicy | None = None,
     together: bool = False,
     measure_skew: bool = False,
 ) -> Plan:

@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 
 import filelock
 
-from frictid_hil.config.policy import Policy, WarmUp
+from frictid_hil.config.policy import Policy, WarmUpPolicy
 from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
@@ -141,7 +141,7 @@ def _permission(robot: Robot, bus: str | None) -> Interlock | None:
     return Interlock(named.joint, named.bit, named.closed_when)
 
 
-def _warm_up(policy: Policy) -> WarmUp | None:
+def _warm_up(policy: Policy) -> WarmUpPolicy | None:
     return None if policy.warm_up.fixed_s == 0.0 else policy.warm_up
 
 

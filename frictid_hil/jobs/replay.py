@@ -16,7 +16,7 @@ from typing import Any
 import can
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, Gate, JointProfile, load_profile, profile_file
+from frictid_hil.config.profile import FrictionProfile, JointProfile, JudgedGate, load_profile, profile_file
 from frictid_hil.config.provenance import Provenance, file_sha256
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import (
@@ -191,7 +191,7 @@ def _identify(
             failed[samples.joint] = str(error)
             continue
         gate = account.gate(samples.joint)
-        gates: tuple[Gate, ...] = profile.gates if gate is None else (*profile.gates, gate)
+        gates: tuple[JudgedGate, ...] = profile.gates if gate is None else (*profile.gates, gate)
         drive = profile.drive if known is None else known.drive
         profiles[samples.joint] = profile.model_copy(update={"gates": gates, "drive": drive})
     return profiles, failed

@@ -271,7 +271,7 @@ SystemCallErrorNumber=EPERM
 
 
 def _timer(options: ScheduleOptions, robot: Robot) -> str:
-    missed = "Persistent=true" if robot.driver(options.bus) == "virtual" else "Persistent=false"
+    missed = "Persistent=true" if robot.kind(options.bus).simulated else "Persistent=false"
     return f"""\
 [Unit]
 Description=When robot {robot.name} is recalibrated

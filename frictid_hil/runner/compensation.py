@@ -1,6 +1,6 @@
 """A control law in force: once per cycle from what the joint reports to the torque it is given.
 
-``Controller`` holds the state of one law (friction spring, last torque); ``LawSource`` feeds it with a path and writes
+``LawInForce`` holds the state of one law (friction spring, last torque); ``LawSource`` feeds it with a path and writes
 the set-point of the drive's mode; ``FadeOut`` ends it: friction compensation fades, gravity and the reference stay.
 """
 
@@ -27,7 +27,7 @@ Reference = tuple[float, float]
 """Position, rad, and velocity, rad/s."""
 
 
-class Controller:
+class LawInForce:
     """One law of one joint.
 
     Args:
@@ -81,16 +81,16 @@ class Controller:
 
 
 class LawSource:
-    """A controller along a path, as a source of set-points.
+    """A law in force along a path, as a source of set-points.
 
     Args:
-        controller: of the law.
+        in_force: of the law.
         motion: path and drive mode.
         period_s: of the cycle.
     """
 
-    def __init__(self, controller: Controller, motion: Compensated, period_s: float) -> None:
-        self.controller = controller
+    def __init__(self, in_force: LawInForce, motion: Compensated, period_s: float) -> None:
+        self.in_force = in_force
         self.drive_mode = motion.drive_mode
         self.reference: Reference = (float(motion.position_rad(np.zeros(1))[0]), 0.0)
         self._path = _references(motion, period_s)
@@ -106,7 +106,7 @@ class LawSource:
 
     def write(self, feedback: Feedback, set_point: SetPoint) -> None:
         """The law's torque at the present reference, in the way the drive's mode takes it."""
-        torque_nm = self.controller.update(feedback, self.reference)
+        torque_nm = self.in_force.update(feedback, self.reference)
         position_rad, velocity_rad_s = self.reference
         # In torque mode nobody follows it; it is recorded beside the measured position.
         set_point.position_rad = position_rad
@@ -137,7 +137,7 @@ class FadeOut:
         if self._done >= self._cycles:
             return False
         self._done += 1
-        self._source.controller.friction_share = 1.0 - self._done / self._cycles
+        self._source.in_force.friction_share = 1.0 - self._done / self._cycles
         self._source.reference = (self._source.reference[0], 0.0)
         self._source.write(feedback, set_point)
         return True

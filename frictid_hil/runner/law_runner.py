@@ -18,7 +18,7 @@ from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Driver, Feedback
-from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
+from frictid_hil.runner.compensation import FadeOut, LawInForce, LawSource
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.runaway import RunawayWatch
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
@@ -71,14 +71,14 @@ class LawRunner:
         """
         loop = self._loop
         source = self._source
-        if source is None or source.controller.law != motion.law or self._drive_mode is not motion.drive_mode:
+        if source is None or source.in_force.law != motion.law or self._drive_mode is not motion.drive_mode:
             self.leave()
-            controller = self._enter(motion)
+            in_force = self._enter(motion)
             free = motion.law.gains is None and motion.drive_mode is Mode.TORQUE
             self._supervisor.watch_runaway(RunawayWatch(loop.period_s, motion.bounds.growth_s) if free else None)
         else:
-            controller = source.controller
-        self._source = source = LawSource(controller, motion, loop.period_s)
+            in_force = source.in_force
+        self._source = source = LawSource(in_force, motion, loop.period_s)
         self._supervisor.set_limits(self._index, self._bounds(motion))
         return source
 
@@ -108,13 +108,13 @@ class LawRunner:
             loop.hold(1)
         return True
 
-    def _enter(self, motion: Compensated) -> Controller:
+    def _enter(self, motion: Compensated) -> LawInForce:
         loop, index = self._loop, self._index
         set_point = loop.set_points[index]
         if motion.drive_mode is not Mode.TORQUE:
             if motion.drive_mode is not Mode.POSITION:
                 self._take_mode(motion.drive_mode)
-            return Controller(motion.law, loop.period_s, 0.0)
+            return LawInForce(motion.law, loop.period_s, 0.0)
         cycles = max(1, round(_LISTEN_S / loop.period_s))
         holding_nm = 0.0
         for _ in range(cycles):
@@ -132,7 +132,7 @@ class LawRunner:
             gravity_nm = motion.law.gravity.torque_nm(loop.feedback[index].position_rad)
             set_point.torque_nm = (1.0 - share) * holding_nm + share * min(limit_nm, max(-limit_nm, gravity_nm))
             loop.hold(1)
-        return Controller(motion.law, loop.period_s, set_point.torque_nm)
+        return LawInForce(motion.law, loop.period_s, set_point.torque_nm)
 
     def _take_mode(self, mode: Mode) -> None:
         """Ask for a mode and cycle until the drive shows it; the set-point stays where the joint is."""

@@ -14,8 +14,8 @@ from frictid_hil.config.profile import (
     DriveIdentity,
     Estimate,
     FrictionProfile,
-    Gate,
     JointProfile,
+    JudgedGate,
     PairList,
     ProcedureUsed,
     Ripple,
@@ -51,7 +51,7 @@ def joint(**changes: object) -> JointProfile:
         "procedure": ProcedureUsed(amplitude_rad=0.349, velocity_rad_s=2.007, cycles=4, ratio=0.8),
         "drive": DriveIdentity(serial="00012345", rated_torque_nm=50.0, gear_ratio=100.0, settings={"6072": 1000}),
         "quality": {"tracking_rms_rad": 0.0012, "samples_per_window": [402, 400, 398, 395]},
-        "gates": (Gate(name="tracking", passed=True, message="0.98 of the commanded peak speed was reached"),),
+        "gates": (JudgedGate(name="tracking", passed=True, message="0.98 of the commanded peak speed was reached"),),
     }
     return JointProfile(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -69,7 +69,7 @@ def test_what_was_saved_is_loaded_to_the_last_bit(tmp_path: Path) -> None:
     saved.save(tmp_path / "p.yaml")
     loaded = load_profile(tmp_path / "p.yaml")
     left_out = {"measured_range_rad_s": None, "slopes_nm_s_per_rad": None, "published": None}
-    gates = tuple(Gate(name=gate.name, passed=True, message=f"{gate.name}: passed") for gate in joint().gates)
+    gates = tuple(JudgedGate(name=gate.name, passed=True, message=f"{gate.name}: passed") for gate in joint().gates)
     for name, original in saved.joints.items():
         read = loaded.joint(name).model_copy(update=left_out)
         assert read == original.model_copy(update={"published": None, "gates": gates})
@@ -123,7 +123,7 @@ def stored_joints(draw: st.DrawFn) -> JointProfile:
         temperature_c=draw(st.one_of(st.none(), figures)),
         torque_source=draw(words),
         drive=DriveIdentity(settings={"a": {"joints": 1}, "gates": [{"name": draw(words)}]}),
-        gates=tuple(Gate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
+        gates=tuple(JudgedGate(name=name, passed=draw(st.booleans()), message=draw(words)) for name in ("a", "b: c")),
     )
 
 
@@ -275,7 +275,9 @@ def test_six_joints_are_twelve_kilobytes_that_a_person_reads(tmp_path: Path) -> 
                 "asymmetry_nm": (f / 30).tolist(),
                 "notes": [],
             },
-            gates=tuple(Gate(name=name, passed=True, message="0.98 of the peak speed " * 4) for name in "abcdefgh"),
+            gates=tuple(
+                JudgedGate(name=name, passed=True, message="0.98 of the peak speed " * 4) for name in "abcdefgh"
+            ),
         )
 
     whole = profile(**{str(address): measured(address) for address in range(6)})

@@ -12,7 +12,7 @@ from pathlib import Path
 import filelock
 import pytest
 
-from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile
+from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, JudgedGate
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.profiles import index as index_module
@@ -33,7 +33,7 @@ def profile(factor: float = 1.0, night: int = 1, joints: str = "0", robot: str =
         torque_interval_nm=tuple((t - 0.1, t + 0.1) for t in torque),
         coulomb_nm=Estimate(value=7.8 * factor, low=7.7 * factor, high=7.9 * factor),
         temperature_c=25.0 + night % 10,
-        gates=(Gate(name="tracking", passed=factor < 2, message="..."),),
+        gates=(JudgedGate(name="tracking", passed=factor < 2, message="..."),),
     )
     day = f"20{26 + night // 360}-{1 + night % 360 // 30:02d}-{1 + night % 30:02d}"
     return FrictionProfile(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile, ProcedureUsed, load_profile
+from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, JudgedGate, ProcedureUsed, load_profile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
@@ -26,7 +26,7 @@ def joint(level_nm: float = 5.0, *, cycles: int = 10, prismatic: bool = False) -
         torque_nm=(level_nm, level_nm + 1, level_nm + 2),
         coulomb_nm=Estimate(value=level_nm - 1),
         procedure=ProcedureUsed(amplitude_rad=0.35, velocity_rad_s=2.0, cycles=cycles, ratio=0.8),
-        gates=(Gate(name="tracking", passed=True, message=""),),
+        gates=(JudgedGate(name="tracking", passed=True, message=""),),
     )
 
 

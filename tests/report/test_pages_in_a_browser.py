@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.config.policy import Policy
-from frictid_hil.config.profile import Estimate, FrictionProfile, Gate, JointProfile, ProcedureUsed
+from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile, JudgedGate, ProcedureUsed
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -52,7 +52,7 @@ def profile(factor: float, day: int) -> FrictionProfile:
         coulomb_nm=Estimate(value=4.0 * factor, low=3.9 * factor, high=4.1 * factor),
         temperature_c=20.0 + day,
         procedure=ProcedureUsed(amplitude_rad=0.35, velocity_rad_s=2.0, cycles=4, ratio=0.8),
-        gates=(Gate(name="tracking", passed=True, message="the speeds were reached"),),
+        gates=(JudgedGate(name="tracking", passed=True, message="the speeds were reached"),),
     )
     return FrictionProfile(
         robot="arm", joints={"0": joint, "1": joint}, provenance=Provenance(created_utc=f"2026-03-{day:02d}T02:00:00Z")

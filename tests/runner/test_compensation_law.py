@@ -20,7 +20,7 @@ from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Gravity, P
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Corners, Hold, Sine, joint_plan
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
-from frictid_hil.runner.compensation import Controller, FadeOut, LawSource
+from frictid_hil.runner.compensation import FadeOut, LawInForce, LawSource
 from frictid_hil.runner.cycle import Stream
 from frictid_hil.runner.probe import ProbeWatch
 from frictid_hil.runner.runaway import RunawayWatch
@@ -49,9 +49,9 @@ def moving(position: float, velocity: float, t_ns: int = 0) -> Feedback:
 
 
 def test_a_standing_joint_is_given_its_gravity_alone() -> None:
-    controller = Controller(law(slew_nm_per_s=1e9), DT, 0.0)
+    in_force = LawInForce(law(slew_nm_per_s=1e9), DT, 0.0)
     for _ in range(3):
-        torque = controller.update(moving(0.3, 0.0), (0.3, 0.0))
+        torque = in_force.update(moving(0.3, 0.0), (0.3, 0.0))
     assert torque == pytest.approx(10.0 * math.cos(0.3) + 2.0 * math.sin(0.3) + 0.5)
 
 
@@ -67,9 +67,9 @@ def test_less_friction_is_given_where_gravity_may_be_wrong() -> None:
     assert law(gravity=Gravity(unsure_nm=3 * f_0)).friction_share(math.pi) == 0.0
     torques = []
     for one in (known, uncertain):
-        controller = Controller(replace(one, slew_nm_per_s=1e9), DT, 0.0)
+        in_force = LawInForce(replace(one, slew_nm_per_s=1e9), DT, 0.0)
         for k in range(200):
-            torques.append(controller.update(moving(1.0 + k * DT, 1.0), (0.0, 0.0)))
+            torques.append(in_force.update(moving(1.0 + k * DT, 1.0), (0.0, 0.0)))
     friction = torques[199] - gravity.torque_nm(1.199)
     assert torques[399] - gravity.torque_nm(1.199) == pytest.approx(uncertain.friction_share(1.199) * friction)
     assert uncertain.friction_share(1.199) < 0.85
@@ -77,8 +77,8 @@ def test_less_friction_is_given_where_gravity_may_be_wrong() -> None:
 
 def test_torque_is_clamped_and_changes_no_faster_than_it_may() -> None:
     gains = PositionGains(1e4, 0.0)
-    controller = Controller(law(gains=gains), DT, 0.0)
-    torques = [controller.update(moving(0.0, 0.0), (1.0, 0.0)) for _ in range(40)]
+    in_force = LawInForce(law(gains=gains), DT, 0.0)
+    torques = [in_force.update(moving(0.0, 0.0), (1.0, 0.0)) for _ in range(40)]
     assert np.max(np.diff([0.0, *torques])) == pytest.approx(2.0)
     assert torques[-1] == 30.0
 
@@ -87,10 +87,10 @@ def test_torque_is_clamped_and_changes_no_faster_than_it_may() -> None:
 @given(st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-6.0, 6.0)), min_size=1, max_size=60))
 def test_whatever_a_drive_reports_torque_stays_in_its_bounds(reports: list[tuple[float, float]]) -> None:
     ripple = RippleTorque(0.1, (0.0, 1.0, 0.0, -1.0))
-    controller = Controller(law(gains=PositionGains(1e4, 50.0), ripple=ripple), DT, 5.0)
+    in_force = LawInForce(law(gains=PositionGains(1e4, 50.0), ripple=ripple), DT, 5.0)
     last = 5.0
     for k, (position, velocity) in enumerate(reports):
-        torque = controller.update(moving(position, velocity, k * 1_000_000), (0.0, 0.0))
+        torque = in_force.update(moving(position, velocity, k * 1_000_000), (0.0, 0.0))
         assert abs(torque) <= 30.0
         assert abs(torque - last) <= 2.0 + 1e-9
         last = torque
@@ -98,7 +98,7 @@ def test_whatever_a_drive_reports_torque_stays_in_its_bounds(reports: list[tuple
 
 def test_a_drive_without_velocity_is_helped_out_through_late_and_missed_cycles() -> None:
     free = law(gravity=Gravity(), slew_nm_per_s=1e9)
-    with_velocity, without = Controller(free, DT, 0.0), Controller(free, DT, 0.0)
+    with_velocity, without = LawInForce(free, DT, 0.0), LawInForce(free, DT, 0.0)
     ticks = [0, 1, 2, 3, 5, 6, 7, 17, 18, 18.4, 19, 20]
     for tick in ticks:
         at, t_ns = 0.01 + tick * 0.5 * DT, 1_000_000 + round(tick * 1e6)
@@ -113,7 +113,7 @@ def test_a_drive_without_velocity_is_helped_out_through_late_and_missed_cycles()
 def test_no_travel_is_lost_where_cycles_were_missed() -> None:
     curve = FrictionCurve((0.2, 2.0), (5.5, 7.5))
     soft = CompensationSettings.of(curve, "mo", stiffness_nm_per_rad=10.0, ratio=0.9)
-    every, some = (Controller(law(gravity=Gravity(), friction=soft, slew_nm_per_s=1e9), DT, 0.0) for _ in range(2))
+    every, some = (LawInForce(law(gravity=Gravity(), friction=soft, slew_nm_per_s=1e9), DT, 0.0) for _ in range(2))
     for k in range(101):
         expected = every.update(moving(k * 1e-3, 1.0, k * 1_000_000), (0.0, 0.0))
         if k % 7 == 0 or k == 100:
@@ -134,7 +134,7 @@ def test_each_drive_mode_is_told_in_its_own_way(mode: Mode) -> None:
     motion = Compensated(
         "track", Corners("triangle", (0.0, 1.0), (0.0, 0.5)), law(slew_nm_per_s=1e9), Bounds(-1, 1, 1, 1), mode
     )
-    source = LawSource(Controller(motion.law, DT, 0.0), motion, DT)
+    source = LawSource(LawInForce(motion.law, DT, 0.0), motion, DT)
     set_point = SetPoint()
     assert source.update(moving(0.0, 0.0), set_point)
     gravity = 10.5
@@ -152,13 +152,13 @@ def test_a_path_ends_and_an_endless_one_does_not() -> None:
     still = moving(0.0, 0.0)
     for duration, expected in ((0.01, 10), (math.inf, 500)):
         motion = Compensated("hand", Swing(0.0, 0.3, 0.5, duration), law(), Bounds(-1, 1, 1, 1))
-        source = LawSource(Controller(motion.law, DT, 0.0), motion, DT)
+        source = LawSource(LawInForce(motion.law, DT, 0.0), motion, DT)
         assert sum(source.update(still, SetPoint()) for _ in range(500)) == expected
 
 
 def test_compensation_fades_and_gravity_stays() -> None:
     motion = Compensated("hand", Hold(0.0, 1.0), law(slew_nm_per_s=1e9), Bounds(-1, 1, 1, 1))
-    source = LawSource(Controller(motion.law, DT, 0.0), motion, DT)
+    source = LawSource(LawInForce(motion.law, DT, 0.0), motion, DT)
     set_point = SetPoint()
     for k in range(50):
         source.update(moving(k * DT, 1.0), set_point)

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.config.columns import load_columns
-from frictid_hil.config.nominal import Experiment as Entry
-from frictid_hil.config.nominal import NominalFile, load_nominal
+from frictid_hil.config.nominal import ExperimentFile, NominalFile, load_nominal
 from frictid_hil.errors import InputFileError, UsageError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set
@@ -304,7 +303,9 @@ def _joint_set(
         samples = motion.samples[name] if alone else replace(motion.samples[name], rigid_body_torque_nm=column)
         listed.append(
             (
-                Entry(name=motion.name, role="validation" if motion.validation else "identification", run_order=order),
+                ExperimentFile(
+                    name=motion.name, role="validation" if motion.validation else "identification", run_order=order
+                ),
                 samples,
             )
         )
@@ -348,7 +349,7 @@ def _gravity(robot: RobotModel, motions: Sequence[Motion], name: str) -> tuple[f
     return float(cos), float(sin)
 
 
-def _friction(believed: ModelJoint, logs: Sequence[tuple[Entry, Samples]]) -> dict[str, Any] | None:
+def _friction(believed: ModelJoint, logs: Sequence[tuple[ExperimentFile, Samples]]) -> dict[str, Any] | None:
     """The file's friction as pairs over the speeds that were driven; None where the file has no dry friction."""
     torques = [s.torque_nm for _, s in logs if s.torque_nm is not None]
     size = float(np.sqrt(np.mean(np.concatenate(torques) ** 2))) if torques else 0.0
@@ -366,7 +367,7 @@ def _friction(believed: ModelJoint, logs: Sequence[tuple[Entry, Samples]]) -> di
 
 
 def _drafted_friction(
-    told: dict[str, Any], listed: Sequence[tuple[Entry, Samples]], robot: RobotModel, name: str
+    told: dict[str, Any], listed: Sequence[tuple[ExperimentFile, Samples]], robot: RobotModel, name: str
 ) -> dict[str, Any]:
     """Friction by least squares where the file has none; written into ``told``."""
     fitted = [pair for pair in listed if pair[0].role == "identification" and pair[1].torque_nm is not None]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from frictid_hil.columns import ColumnMap
 from frictid_hil.config.columns import load_columns
-from frictid_hil.config.nominal import Experiment as Entry
-from frictid_hil.config.nominal import NominalFile, load_nominal
+from frictid_hil.config.nominal import ExperimentFile, NominalFile, load_nominal
 from frictid_hil.config.profile import JointProfile, load_profile, profile_file
 from frictid_hil.errors import InputFileError, UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set, read_log
@@ -63,7 +62,9 @@ def set_from_logs(
     listed = []
     for order, (name, samples, judged) in enumerate(parts):
         payload = entries[name].payload if name in entries else False
-        entry = Entry(name=name, role="validation" if judged else "identification", payload=payload, run_order=order)
+        entry = ExperimentFile(
+            name=name, role="validation" if judged else "identification", payload=payload, run_order=order
+        )
         listed.append((entry, samples))
     return experiment_set(told, data, where, logs[0].resolve().parent.name, listed)
 

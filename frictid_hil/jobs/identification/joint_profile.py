@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import DriveIdentity, Gate, JointProfile, PairList, ProcedureUsed, Ripple, TimeSkew
+from frictid_hil.config.profile import (
+    DriveIdentity,
+    JointProfile,
+    JudgedGate,
+    PairList,
+    ProcedureUsed,
+    Ripple,
+    TimeSkew,
+)
 from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
@@ -196,7 +204,7 @@ def _from_cycles(
             "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
             "notes": [*notes, *result.notes],
         },
-        gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
+        gates=tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
     )
 
 
@@ -263,7 +271,7 @@ def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
             "torque_rms_nm": found.torque_rms_nm,
             "notes": [*_damage(samples), *notes],
         },
-        gates=tuple(Gate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in found.gates),
+        gates=tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in found.gates),
         inertia_kg_m2=body["inertia_kg_m2"],
         gravity_cos_nm=body["gravity_cos_nm"],
         gravity_sin_nm=body["gravity_sin_nm"],

@@ -20,7 +20,7 @@ _EDS_SCHEMA = "frictid.frames/1"
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class LoggedMotion:
     """One joint's motion in a log.
 
     Attributes:
@@ -48,7 +48,7 @@ class Log:
     path: Path
     frame_map: Mapping[str, Any]
     identities: Mapping[str, Mapping[str, Any]]
-    motions: tuple[Motion, ...]
+    motions: tuple[LoggedMotion, ...]
 
 
 def is_log(source: Path) -> bool:
@@ -110,12 +110,12 @@ def logs_of(source: Path, given: Mapping[str, Any] | None) -> list[Log]:
     return logs
 
 
-def _motions(manifest: Mapping[str, Any], folder: Path, log: str) -> tuple[Motion, ...]:
+def _motions(manifest: Mapping[str, Any], folder: Path, log: str) -> tuple[LoggedMotion, ...]:
     """What a run did during one of its logs; where it was cut off, what its samples say."""
     parts = parts_of(folder)
     part = next((number for path, number in parts if path.name == log), None)
     motions = [
-        Motion(
+        LoggedMotion(
             session["joint"],
             tuple(Mark(**mark) for mark in session["marks"]),
             session["late_cycles"] + session["missed_cycles"],
@@ -127,5 +127,7 @@ def _motions(manifest: Mapping[str, Any], folder: Path, log: str) -> tuple[Motio
     samples = folder / log.replace("bus", "samples").replace(".blf", ".mcap")
     last = part is not None and part == parts[-1][1]
     if last and manifest.get("outcome") != "ok" and samples.exists():
-        motions += [Motion(one.joint, one.marks) for one in read(samples) if one.marks and one.joint not in finished]
+        motions += [
+            LoggedMotion(one.joint, one.marks) for one in read(samples) if one.marks and one.joint not in finished
+        ]
     return tuple(motions)

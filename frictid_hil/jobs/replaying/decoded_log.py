@@ -11,9 +11,9 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from frictid_hil.config.profile import Gate
+from frictid_hil.config.profile import JudgedGate
 from frictid_hil.errors import InputFileError
-from frictid_hil.jobs.replaying.bus_logs import Log, Motion
+from frictid_hil.jobs.replaying.bus_logs import Log, LoggedMotion
 from frictid_hil.protocol.frames import LogDecoder, LoggedFrame, frame_decoders, joint_names
 from frictid_hil.recording.bus_log import Frames, read_frames
 from frictid_hil.recording.playback import LogBus
@@ -59,15 +59,17 @@ class Account:
         self.lost_rows[samples.joint] = self.lost_rows.get(samples.joint, 0) + lost
         self.lost_percent[samples.joint] = max(self.lost_percent.get(samples.joint, 0.0), percent)
 
-    def gate(self, joint: str) -> Gate | None:
+    def gate(self, joint: str) -> JudgedGate | None:
         """What a profile must say of this joint's log; None for a whole one."""
         lost, percent = self.lost_rows.get(joint, 0), self.lost_percent.get(joint, 0.0)
         if not lost:
             return None
         message = f"{lost} rows ({percent:.2g} %) are missing from the log"
         if percent > MOST_LOST_PERCENT:
-            return Gate(name="log", passed=False, message=f"{message}; up to {MOST_LOST_PERCENT:g} % are tolerated")
-        return Gate(name="log", passed=True, message=f"{message}; the others were used")
+            return JudgedGate(
+                name="log", passed=False, message=f"{message}; up to {MOST_LOST_PERCENT:g} % are tolerated"
+            )
+        return JudgedGate(name="log", passed=True, message=f"{message}; the others were used")
 
 
 def lost_rows(time_ns: NDArray[np.int64]) -> tuple[int, float]:
@@ -227,7 +229,7 @@ def samples_in(
         began_ns = int(frames.t_ns[0])
         with LogBus(frames, paced=paced, echo=echo) as bus:
             rows = rows_by_joint(iter(bus.take, None), log.frame_map, account, partial(_tell, at, began_ns))
-        for motion in log.motions or [Motion(name) for name in rows]:
+        for motion in log.motions or [LoggedMotion(name) for name in rows]:
             if motion.joint in rows and (not joints or motion.joint in joints):
                 identity = log.identities.get(motion.joint, {})
                 samples = samples_of(motion.joint, rows[motion.joint], motion.marks, identity, robot, account)
