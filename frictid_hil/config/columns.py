@@ -51,7 +51,7 @@ class TimeFile(Strict):
 
     @property
     def source(self) -> Source:
-        """As a value."""
+        """The source as a plain value."""
         if self.column is None:
             return Source((), 1e9 / (self.rate_hz or 1.0))
         return Source((self.column,), TIME_UNITS_NS[self.unit])

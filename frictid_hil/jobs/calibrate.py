@@ -111,12 +111,12 @@ class Planned:
 
     @property
     def robot(self) -> Robot:
-        """Its file."""
+        """The robot's file."""
         return self.order.robot
 
     @property
     def setup(self) -> RobotSetup:
-        """As the driver knows it."""
+        """The robot as its driver knows it."""
         return self.order.setup
 
 

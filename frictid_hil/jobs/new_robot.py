@@ -51,7 +51,7 @@ class NewRobot:
     read: Mapping[str, Mapping[str, float]]
 
     def to_json(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """The JSON of the verb."""
         return {
             "outcome": "ok",
             "robot_file": str(self.path.resolve()),

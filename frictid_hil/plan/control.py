@@ -42,7 +42,7 @@ class Gravity:
     unsure_nm: float = 0.0
 
     def torque_nm(self, position_rad: float) -> float:
-        """At one position."""
+        """Torque that holds the joint at one position."""
         return self.cos_nm * math.cos(position_rad) + self.sin_nm * math.sin(position_rad) + self.bias_nm
 
     def doubt_nm(self, position_rad: float) -> float:
@@ -162,15 +162,15 @@ class Probe:
 
     @property
     def duration_s(self) -> float:
-        """Of the sine."""
+        """How long the sine lasts."""
         return self.sine.duration_s
 
     def position_rad(self, time_s: Array) -> Array:
-        """The sine's."""
+        """Position on the sine."""
         return self.sine.position_rad(time_s)
 
     def details(self) -> Mapping[str, Any]:
-        """The sine's, and the tolerance."""
+        """What the sine tells, and the tolerance."""
         return {**self.sine.details(), "tolerance": self.tolerance}
 
 
@@ -250,11 +250,11 @@ class Compensated:
 
     @property
     def duration_s(self) -> float:
-        """Of the path."""
+        """How long the path lasts."""
         return self.path.duration_s
 
     def position_rad(self, time_s: Array) -> Array:
-        """The path's."""
+        """Position on the path."""
         return self.path.position_rad(time_s)
 
     def details(self) -> Mapping[str, Any]:

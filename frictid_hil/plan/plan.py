@@ -52,18 +52,18 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Stand still."""
+    """The joint stands still."""
 
     at_rad: float
     duration_s: float
     name: str = "hold"
 
     def position_rad(self, time_s: Array) -> Array:
-        """Constant."""
+        """The same position all the time."""
         return np.full(np.shape(time_s), self.at_rad)
 
     def details(self) -> Mapping[str, Any]:
-        """Where."""
+        """Where it stands."""
         return {"at_rad": self.at_rad}
 
 
@@ -83,7 +83,7 @@ class Move:
         return Move(from_rad, to_rad, duration_s, name)
 
     def position_rad(self, time_s: Array) -> Array:
-        """Quintic blend."""
+        """A quintic from one end to the other."""
         u = np.clip(np.asarray(time_s) / self.duration_s, 0.0, 1.0)
         blend: Array = u**3 * (10 - 15 * u + 6 * u**2)
         return self.from_rad + (self.to_rad - self.from_rad) * blend
@@ -103,7 +103,7 @@ class Cycles:
 
     @property
     def duration_s(self) -> float:
-        """T_{N+1}."""
+        """T_{N+1}: the end of the last cycle."""
         return self.procedure.duration_s
 
     def position_rad(self, time_s: Array) -> Array:
@@ -240,7 +240,7 @@ class WarmUp:
 
     @property
     def duration_s(self) -> float:
-        """Whole cycles."""
+        """The longest time, in whole cycles."""
         return max(1, math.ceil(self.longest_s / self.cycle_s)) * self.cycle_s
 
     def position_rad(self, time_s: Array) -> Array:
@@ -273,7 +273,7 @@ class Corners:
 
     @property
     def duration_s(self) -> float:
-        """Last corner."""
+        """Time of the last corner."""
         return self.times_s[-1]
 
     def position_rad(self, time_s: Array) -> Array:
@@ -281,7 +281,7 @@ class Corners:
         return np.interp(time_s, self.times_s, self.positions_rad)
 
     def details(self) -> Mapping[str, Any]:
-        """How many."""
+        """How many corners there are."""
         return {"corners": len(self.times_s)}
 
 

@@ -56,7 +56,7 @@ class Decode(Protocol):
     """What a frame is; fills the feedback where it is a report. Raises nothing, whatever the bytes; None: unknown."""
 
     def __call__(self, can_id: int, data: bytes) -> Command | Report | Service | None:
-        """One frame."""
+        """Take one frame."""
         ...
 
 

@@ -105,7 +105,7 @@ class Wish:
         self._locked, self._since_rad = False, None
 
     def order(self, set_point: SetPoint) -> Order:
-        """For the coming cycle.
+        """What the drive is told in the coming cycle.
 
         Raises:
             SafetyAbort: the set-point is not a finite number; the joint is asked to stop by then.

@@ -1,7 +1,7 @@
 """A bus log as a python-can bus of its own: what was recorded comes again, at the recorded pace or at full speed.
 
-Nothing answers on this bus: no drive is on it, and what is sent to it goes nowhere but into the ears of whoever shares
-the ``echo`` bus. Everything that takes a python-can bus (a ``can.Notifier``, ``canopen``) can listen to a log this way.
+Nothing answers on this bus: no drive is on it, and what is sent to it only reaches those who share the ``echo`` bus.
+Everything that takes a python-can bus (a ``can.Notifier``, ``canopen``) can listen to a log this way.
 """
 
 from __future__ import annotations

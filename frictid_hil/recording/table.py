@@ -38,12 +38,12 @@ class Table(Protocol):
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """The file that was read."""
         ...
 
     @property
     def names(self) -> Sequence[str]:
-        """Of the columns."""
+        """Names of the columns."""
         ...
 
     @property

@@ -41,12 +41,12 @@ class Run(Protocol):
 
     @property
     def reference_rad(self) -> Array:
-        """The path."""
+        """Position on the planned path."""
         ...
 
     @property
     def external_torque_nm(self) -> Array | None:
-        """A person's."""
+        """Torque of the person who guides the joint."""
         ...
 
 

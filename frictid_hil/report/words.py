@@ -17,7 +17,7 @@ def when(utc: str) -> str:
 
 
 def sentence(words: str) -> str:
-    """The same, beginning large and ending in a full stop."""
+    """The same text with a capital first letter and a full stop at its end."""
     words = words.strip()
     return words and words[0].upper() + words[1:] + ("" if words.endswith((".", "!", "?")) else ".")
 

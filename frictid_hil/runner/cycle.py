@@ -89,7 +89,7 @@ class CycleCount:
 
     @property
     def rate_hz(self) -> float:
-        """Achieved rate."""
+        """Cycles per second that were achieved."""
         span_ns = self.last_ns - self.first_ns
         return (self.cycles - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
 

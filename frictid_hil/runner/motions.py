@@ -133,10 +133,10 @@ class Motions:
         return {index: self._watched(index, motions[index], stream) for index, stream in streams.items()}, None
 
     def _watched(self, index: int, motion: Motion, points: Stream) -> SetPointSource:
-        joint = self._joints[index]
-        if isinstance(motion, Probe):
+        joint, alone = self._joints[index], len(self._joints) == 1
+        if isinstance(motion, Probe) and alone:
             return ProbeWatch(points, motion, joint.name)
-        if isinstance(motion, WarmUp):
+        if isinstance(motion, WarmUp) and alone:  # of several, one that settles must not end the others' motion
             return WarmUpWatch(points, motion, self._loop.period_s)
         if motion.name != REHEARSAL:
             return points

@@ -44,7 +44,7 @@ class ProbeWatch:
         return self._source.update(feedback, set_point)
 
     def judge(self) -> None:
-        """Compare.
+        """Compare what was measured with the profile.
 
         Raises:
             SafetyAbort: the joint did not move both ways.

@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,14 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.plans import calibration_plan, expected_of
-from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.plan import Plan, WarmUp
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver, Feedback, JointState, SetPoint, new_driver
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import Stream
 from frictid_hil.runner.events import Event, JointRun, Marked, PhaseStarted, Preflight
+from frictid_hil.runner.motions import Motions
 from frictid_hil.runner.ring import Rows, frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
 
@@ -186,6 +188,21 @@ def test_joints_that_move_together_do_so_in_step() -> None:
         np.testing.assert_allclose(path - start_rad, paths[0] - paths[0][0], atol=1e-4)
     for index in (0, 2, 5):
         assert np.ptp(during["position_rad"][during["joint"] == index]) < 0.25 * DEG
+
+
+def test_no_joint_that_has_warmed_up_ends_the_motion_of_the_others() -> None:
+    """Only a joint alone stops at the end of a cycle: the cycles of others end at other times."""
+    loop: Any = SimpleNamespace(period_s=0.001)
+    joints = dict(enumerate(ROBOT.to_setup().joints[:2]))
+
+    def sources(*indices: int) -> list[str]:
+        mine: Any = {index: joints[index] for index in indices}
+        motions = Motions(None, loop, None, mine, dict.fromkeys(mine), approach_rad_s=0.1, notify=print)  # type: ignore[arg-type]
+        warm_ups = {index: WarmUp(0.0, 0.1 + 0.1 * index, 1.0, 60.0, 1.0) for index in indices}
+        return [type(source).__name__ for source in motions._sources(warm_ups)[0].values()]
+
+    assert sources(0) == ["WarmUpWatch"]
+    assert sources(0, 1) == ["Stream", "Stream"]
 
 
 @pytest.mark.parametrize("level", [1, 2])

@@ -119,7 +119,7 @@ class LiveFigures:
             self._live(_live_line(recent))
 
     def frames(self, rows: Rows) -> None:
-        """Keep frames."""
+        """Keep the frames of the bus."""
         self._keeper.frames(rows)
 
     def mark(self) -> Mark:

@@ -76,7 +76,7 @@ class ModeFigures:
     reasons: Mapping[str, str] | None = None
 
     def values(self) -> dict[str, object]:
-        """As JSON has it."""
+        """The figures as plain values for JSON."""
         return {
             "velocity_rms_rad_s": self.velocity_rms_rad_s,
             "torque_rms_nm": self.torque_rms_nm,

@@ -27,7 +27,7 @@ _HAND_SLACK_RAD = math.radians(8.0)
 _STAND_SLACK_RAD = math.radians(1.0)
 _STAND_RAD_S = math.radians(5.0)
 _TOLD_SHARE = 0.999
-"""R is told to fall where it falls below this share of itself."""
+"""The plan says that R falls where it falls below this share of its full value."""
 _POWER_SHARE = 0.8
 """Of the product of the bounds of torque and speed."""
 _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3

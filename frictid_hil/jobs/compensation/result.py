@@ -61,7 +61,7 @@ class Asked:
 
     @property
     def plan(self) -> Plan:
-        """Frozen."""
+        """The plan that ran."""
         return self.planned.plan
 
 

@@ -83,7 +83,7 @@ class Wanted:
 
     @property
     def endless(self) -> bool:
-        """Until interrupted."""
+        """It runs until it is interrupted."""
         return self.duration_s == 0.0
 
     @property

@@ -58,7 +58,7 @@ class PathTime:
 
     @property
     def said(self) -> str:
-        """For a person."""
+        """What a person should know of it."""
         longest_ms = 1e-6 * self.stopped_ns.max()
         return (
             f"the path stood still {self.after_ns.size} times for missed set-points, {longest_ms:.1f} ms at most; the "
