@@ -16,6 +16,7 @@ raw units (encoder counts, pulses, per mille of rated torque) and keeps the conv
 from __future__ import annotations
 
 import difflib
+import functools
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -464,6 +465,7 @@ def known_drivers() -> list[str]:
     return sorted(point.name for point in entry_points(group="frictid_hil.drivers"))
 
 
+@functools.cache  # looking through every installed package takes its time
 def load_driver(name: str) -> type[Driver]:
     """The driver class registered under ``name``.
 
