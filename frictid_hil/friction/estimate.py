@@ -94,7 +94,7 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     published = _published(recording, notes, required=method == "function-a")
     clean = cleaned(recording, notes)
     solved = _solved(clean, notes, required=method == "least-squares")
-    drift = intervals.repeated(clean.recording, clean.motion, clean.windows)
+    drift = intervals.repeated(clean.recording, clean.motion, clean.windows, solved)
     others = None if solved is None else _beside(clean, solved)
     if method == "least-squares":
         assert solved is not None

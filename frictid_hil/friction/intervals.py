@@ -17,6 +17,7 @@ pass is counted once, not per sample), and the model term from the bend that a l
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -147,7 +148,7 @@ def window_terms(
         model=np.zeros_like(slope)
         if solved is None or others is None or weights is None
         else _apart(pairs, solved, scatter, others, weights),
-        drift=pairs.torque_nm * _drift_shares(recording, (starts_s[:-1] + starts_s[1:]) / 2, scatter, drift),
+        drift=pairs.torque_nm * _drift_shares(recording, (starts_s[:-1] + starts_s[1:]) / 2, drift),
         beside=np.zeros_like(slope) if others is None or weights is None else others.deviation(weights),
         link=np.zeros_like(slope)
         if link is None
@@ -191,7 +192,7 @@ def least_squares_terms(
         scatter=np.sqrt(np.diag(solved.covariance)[odd_block])[kept] * stdtrit(8, 0.975) / COVERAGE,
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
         model=bend[kept],
-        drift=(np.abs(odd) * _drift_shares(recording, seen_s, _scatter(recording, motion, solved), drift))[kept],
+        drift=(np.abs(odd) * _drift_shares(recording, seen_s, drift))[kept],
         beside=np.zeros_like(odd[kept]) if others is None else others.deviation(others.on_knots)[kept],
         link=np.zeros_like(odd[kept]) if link is None else _spread(solved.per_doubt[odd_block], link.covariance)[kept],
     )
@@ -224,12 +225,14 @@ class Drift:
         first_nm: F_n of the first run.
         change: relative change to the second run.
         apart_s: time between the two.
+        chance: standard deviation of ``change`` where friction did not change at all.
     """
 
     cycle: int
     first_nm: float
     change: float
     apart_s: float
+    chance: float
 
     def over(self, duration_s: float, change: float | None = None) -> float:
         """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most.
@@ -241,7 +244,7 @@ class Drift:
         return (self.change if change is None else change) * min(duration_s / self.apart_s, 3.0)
 
 
-def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) -> Drift | None:
+def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs, solved: Fit | None) -> Drift | None:
     """The repeated cycle against its first run in ``pairs``; None where none was repeated completely."""
     repeat = recording.repeat
     if repeat is None:
@@ -271,10 +274,13 @@ def repeated(recording: CycleRecording, motion: Motion, pairs: IdentifiedPairs) 
         once.torque_nm[rising],
     )
     change_nm = float(twice.torque_nm[nth]) - first_nm - float(slower[1] - slower[0])
-    return Drift(repeat.cycle, first_nm, change_nm / first_nm, float(repeat.start_s - first))
+    chance_nm = math.sqrt(2.0) * float(_scatter(recording, motion, solved)[nth])
+    return Drift(
+        repeat.cycle, first_nm, change_nm / first_nm, float(repeat.start_s - first), chance=chance_nm / first_nm
+    )
 
 
-def _drift_shares(recording: CycleRecording, seen_s: Array, scatter_nm: Array, drift: Drift | None) -> Array:
+def _drift_shares(recording: CycleRecording, seen_s: Array, drift: Drift | None) -> Array:
     """Standard deviation that a steady drift over the run means for what was seen at these times, as shares of it.
 
     The truth may be the friction at any moment of the run, the farthest included: a rectangular distribution as wide
@@ -283,8 +289,7 @@ def _drift_shares(recording: CycleRecording, seen_s: Array, scatter_nm: Array, d
     if drift is None:
         return np.zeros_like(seen_s)
     duration_s = recording.procedure.duration_s
-    noise = np.sqrt(2.0) * float(scatter_nm[drift.cycle - 1]) / drift.first_nm
-    most = abs(drift.over(duration_s)) + drift.over(duration_s, noise)
+    most = abs(drift.over(duration_s)) + drift.over(duration_s, drift.chance)
     farthest = 0.5 + np.abs(seen_s / duration_s - 0.5)
     shares: Array = most * farthest / np.sqrt(3.0)
     return shares

@@ -90,7 +90,10 @@ def calibration_motions(
 
 def rehearsal_note(joints: Sequence[str]) -> str:
     """For the plan of joints whose travel was never seen on this robot."""
-    return f"first run of this travel on this robot: joints {', '.join(joints)} rehearse it slowly, torque watched"
+    return (
+        f"first run of this travel on this robot: joints {', '.join(joints)} prove their units by "
+        "a few encoder steps and 0.5 deg, then rehearse it slowly, torque watched"
+    )
 
 
 def inherited_notes(robot: Robot, joints: Sequence[str]) -> list[str]:

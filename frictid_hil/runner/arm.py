@@ -16,6 +16,7 @@ from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.motions import AT_RAD, stream
 from frictid_hil.runner.reference import verify_reference
 from frictid_hil.runner.supervisor import Supervisor
+from frictid_hil.runner.unit_proof import UnitProof
 
 _POWER_TIMEOUT_S = 15.0
 _STANDSTILL_S = 0.2
@@ -79,6 +80,23 @@ class Arm:
         # The bumpless set-point is where the drive stood when it was enabled.
         self._aim_where_it_stands()
         self._settling()
+
+    def prove_units(
+        self, moving: Collection[int], planned_rad: Mapping[str, float], resolution_rad: Mapping[str, float]
+    ) -> None:
+        """Every joint that is going to move, one by one, by a few encoder steps and by 0.5 deg, the others locked.
+
+        Raises:
+            SafetyAbort: command, position and velocity of a joint tell of different motions.
+        """
+        loop = self._loop
+        for index, joint in enumerate(self._joints):
+            here_rad = loop.set_points[index].position_rad
+            if index not in moving and abs(planned_rad.get(joint.name, here_rad) - here_rad) <= AT_RAD:
+                continue
+            self._supervisor.watch(index, Mode.POSITION, self._lock([index]))
+            resolution, droop = resolution_rad.get(joint.name, math.nan), self._care.droop_rad.get(joint.name, 0.0)
+            loop.run({index: UnitProof(joint, here_rad, resolution, droop, loop.period_s)})
 
     def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
         """Every other joint at its planned place, locked there; and all of them seen to stand.

@@ -9,7 +9,9 @@ The order is always the same, and nothing in it is optional::
     per joint, or once for all that move together:
         configure, limits         written and read back
         position reference        every joint reports, inside its limits, near where the plan expects it
-        enable, lock others       and see them stand still
+        enable                    each held where it stands
+    prove units               on the first run of a travel: a few encoder steps, then 0.5 deg
+    lock others               and see them stand still
         motions                   each streamed, supervised and marked
         unlock, disable
     whatever happens              quick stop, standstill, power off, bus released
@@ -21,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import cast
 
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
-from frictid_hil.plan.plan import JointPlan, Plan, stretch_name
+from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Remarking, Severity
 from frictid_hil.runner.arm import Arm
@@ -32,6 +34,7 @@ from frictid_hil.runner.events import Configured, Event, JointRun, PhaseStarted,
 from frictid_hil.runner.motions import Motions
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.runner.unit_proof import PROOF
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
 
 _LOCKED_REPORT_S = 0.010
@@ -91,6 +94,7 @@ class Scheduler:
         self._care = care or Care()
         self._names = [joint.name for joint in setup.joints]
         self._command_delay_s = 0.0
+        self._resolution_rad: Mapping[str, float] = {}
 
     def run(self) -> None:
         """The whole plan.
@@ -128,6 +132,7 @@ class Scheduler:
 
     def _preflight(self) -> Preflight:
         identities = self._driver.identify()
+        self._resolution_rad = {name: one.position_resolution_rad for name, one in identities.items()}
         findings = self._driver.check(self._plan)
         capabilities = self._driver.capabilities()
         self._command_delay_s = capabilities.command_delay_s
@@ -265,6 +270,9 @@ class Scheduler:
         arm.verify(planned_rad)
         self._notify(PhaseStarted(name, "enable", 0.0))
         arm.enable()
+        if any(motion.name == REHEARSAL for plan in moving.values() for motion in plan.motions):
+            self._notify(PhaseStarted(name, PROOF, 0.0))
+            arm.prove_units(moving, planned_rad, self._resolution_rad)
         arm.lock_all_but(moving, planned_rad)
 
 

@@ -1,4 +1,4 @@
-"""Friction must oppose motion: seen in the rehearsal, before any speed."""
+"""What a rehearsal must show before any speed: friction opposes motion, and velocity is the rate of the position."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from frictid_hil.errors import SafetyAbort
 from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.runner.cycle import SetPointSource
+from frictid_hil.runner.unit_proof import Travelled
 
 
 class SignWatch:
@@ -25,6 +26,7 @@ class SignWatch:
         self._sum = [0.0, 0.0]
         self._count = [0, 0]
         self._least, self._most = math.inf, -math.inf
+        self._travelled = Travelled()
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Count the report, then pass the next set-point on."""
@@ -33,14 +35,18 @@ class SignWatch:
             self._sum[backward] += feedback.torque_nm
             self._count[backward] += 1
             self._least, self._most = min(self._least, feedback.torque_nm), max(self._most, feedback.torque_nm)
-        return self._source.update(feedback, set_point)
+        before_rad = set_point.position_rad
+        goes_on = self._source.update(feedback, set_point)
+        self._travelled.add(feedback, (set_point.position_rad > before_rad) - (set_point.position_rad < before_rad))
+        return goes_on
 
     def judge(self) -> None:
-        """Nothing to say where one direction was never seen.
+        """Of friction there is nothing to say where one direction was never seen.
 
         Raises:
-            SafetyAbort: torque helps motion.
+            SafetyAbort: torque helps motion, or position and velocity tell of different motions.
         """
+        self._travelled.judge(self._joint)
         if not all(self._count):
             return
         if self._least == self._most:

@@ -103,6 +103,7 @@ def test_joints_run_one_by_one_in_the_planned_order(
         "configure",
         "reference",
         "enable",
+        "units",
         "move",
         "rehearsal",
         "hold",
@@ -157,6 +158,27 @@ def test_a_lost_position_reference_is_refused_before_power() -> None:
     assert isinstance(ended, SafetyAbort)
     assert "joint 1" in str(ended) and "expected" in str(ended)
     assert "enable" not in [event.phase for event in events if isinstance(event, PhaseStarted)]
+
+
+@pytest.mark.parametrize(
+    ("lie", "said"),
+    [
+        # A position that is absurdly coarse, one that is wrong by a factor, a velocity that is.
+        ({"position_units_per_revolution": 3600.0 * 3}, "one unit of position would be"),
+        ({"position_units_per_revolution": 131_072.0 * 50 * 3}, "position says that it moved by"),
+        ({"velocity_unit_rad_s": 4e-4}, "its reported velocity says"),
+    ],
+)
+def test_a_drive_that_lies_about_its_units_is_refused_before_motion_proper(lie: dict[str, float], said: str) -> None:
+    def lying(setup: RobotSetup) -> RobotSetup:
+        joints = [replace(joint, options={**joint.options, **lie}) for joint in setup.joints[3:4]]
+        return replace(setup, joints=(*setup.joints[:3], *joints, *setup.joints[4:]))
+
+    events, rows, _, ended = run(change=lying)
+    assert ended is not None and said in str(ended) and "joint 3" in str(ended)
+    phases = [event.phase for event in events if isinstance(event, PhaseStarted)]
+    assert phases == [] or phases[-1] == "units"
+    assert rows.size == 0 or np.ptp(rows["position_rad"][rows["joint"] == 3]) < 1 * DEG
 
 
 @pytest.mark.parametrize("level", [1, 2])

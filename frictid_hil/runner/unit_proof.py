@@ -1,0 +1,170 @@
+"""Units proven by motion: a few encoder steps, then 0.5 deg, before anything else moves on a robot's first run.
+
+A drive that lies about its units gives a plausible report of a wrong motion. Three figures come by different ways: the
+command, the position and the velocity. They must tell of one and the same motion. What a wrong gear ratio in the robot
+file does to all three alike cannot be seen from the bus: a person watches the first motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from frictid_hil.errors import SafetyAbort
+from frictid_hil.plan.plan import Move
+from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import Feedback, SetPoint
+from frictid_hil.units import format_angle
+
+PROOF = "units"
+"""Phase of a run."""
+
+_STEPS = 10
+_STEPS_LEAST_RAD, _STEPS_MOST_RAD = math.radians(0.005), math.radians(0.1)
+_PROOF_RAD = math.radians(0.5)
+_PEAK_RAD_S = math.radians(3.0)
+_HOLD_S = 0.1
+_RUNAWAY = 3.0
+_SLACK_RAD = math.radians(0.1)
+_FOLLOWED = 0.3
+"""Of a motion, that a position loop may leave undone beyond its declared droop."""
+_VELOCITY_OFF = 0.2
+"""By which two travels may differ: a lie about units is a factor of 2 at least."""
+_COARSE = 0.25
+"""Of the mean speed: steps of the reported velocity above this tell nothing."""
+
+
+class Travelled:
+    """The way of a joint, there and back, by its position and by its velocity."""
+
+    def __init__(self) -> None:
+        self.by_position_rad = 0.0
+        self.by_velocity_rad = 0.0
+        self._time_s = 0.0
+        self._step_rad_s = math.inf
+        self._last: tuple[int, float, float] | None = None
+
+    def add(self, report: Feedback, direction: float) -> None:
+        """One report, in which the joint was commanded forward (+1), backward (-1) or to stand (0)."""
+        velocity = report.velocity_rad_s
+        if report.age_cycles or not math.isfinite(velocity) or not math.isfinite(report.position_rad):
+            return
+        now = (report.t_ns, report.position_rad, velocity)
+        last, self._last = self._last, now
+        if last is None or not direction:
+            return
+        elapsed_s = (now[0] - last[0]) * 1e-9
+        change_rad_s = abs(velocity - last[2])
+        if change_rad_s > 0.0:
+            self._step_rad_s = min(self._step_rad_s, change_rad_s)
+        self._time_s += elapsed_s
+        self.by_position_rad += direction * (now[1] - last[1])
+        self.by_velocity_rad += direction * 0.5 * (velocity + last[2]) * elapsed_s
+
+    def judge(self, joint: str) -> None:
+        """Nothing to say of a drive without velocity, or with one too coarse for this motion.
+
+        Raises:
+            SafetyAbort: position and velocity tell of different motions.
+        """
+        travel_rad = self.by_position_rad
+        if self._time_s <= 0.0 or travel_rad <= 0.0:
+            return
+        if math.isfinite(self._step_rad_s) and self._step_rad_s > _COARSE * travel_rad / self._time_s:
+            return
+        if abs(self.by_velocity_rad / travel_rad - 1.0) <= _VELOCITY_OFF:
+            return
+        raise SafetyAbort(
+            f"position says that it moved by {format_angle(travel_rad)}, velocity by "
+            f"{format_angle(self.by_velocity_rad)}",
+            where=f"joint {joint}",
+            cause="the drive's position or its velocity is in other units than the driver takes them for",
+            next_step="give the unit that is wrong in the robot file (`position_units_per_revolution`, "
+            "`velocity_unit_rad_s`), or correct it in the drive",
+        )
+
+
+class UnitProof:
+    """Set-points of the proof, from where the joint stands and back to it; every report is held against them.
+
+    Args:
+        joint: that is proven.
+        here_rad: where it stands; it moves towards the middle of its range.
+        resolution_rad: one encoder step; NaN where it is not known.
+        droop_rad: what its position loop may leave undone.
+        period_s: of the cycle.
+    """
+
+    def __init__(
+        self, joint: JointSetup, here_rad: float, resolution_rad: float, droop_rad: float, period_s: float
+    ) -> None:
+        self._joint = joint
+        self._here_rad = here_rad
+        self._droop_rad = droop_rad
+        self._step_rad = resolution_rad if math.isfinite(resolution_rad) else 0.0
+        inward = math.copysign(1.0, (joint.position_min_rad + joint.position_max_rad) / 2 - here_rad)
+        few_rad = min(max(_STEPS * self._step_rad, _STEPS_LEAST_RAD), _STEPS_MOST_RAD)
+        self._path = _there_and_back(here_rad, (inward * few_rad, inward * _PROOF_RAD), period_s)
+        self._started_rad = math.nan
+        self._asked_rad = self._furthest_rad = 0.0
+        self._drift_rad = 0.0
+        self._travelled = Travelled()
+
+    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
+        """Judge the report, then give the next set-point.
+
+        Raises:
+            SafetyAbort: the joint does not do what it was asked.
+        """
+        before_rad = set_point.position_rad
+        following = next(self._path, None)
+        if following is None:
+            set_point.velocity_rad_s = 0.0
+            self._judge()
+            return False
+        set_point.position_rad, direction, set_point.velocity_rad_s = following
+        self._see(feedback, direction, before_rad)
+        return True
+
+    def _see(self, report: Feedback, direction: float, commanded_rad: float) -> None:
+        if math.isnan(self._started_rad):
+            self._started_rad = report.position_rad
+        moved_rad = abs(report.position_rad - self._started_rad)
+        self._furthest_rad = max(self._furthest_rad, moved_rad)
+        self._asked_rad = max(self._asked_rad, abs(commanded_rad - self._here_rad))
+        self._travelled.add(report, direction)
+        most_rad = _RUNAWAY * self._asked_rad + _SLACK_RAD + self._droop_rad + 4 * self._step_rad
+        if moved_rad > most_rad:
+            self._refuse(moved_rad, "moved further than it was asked to")
+        if abs(self._travelled.by_velocity_rad) > 2 * most_rad:
+            self._travelled.judge(self._joint.name)
+
+    def _judge(self) -> None:
+        undone_rad = abs(self._furthest_rad - self._asked_rad)
+        if undone_rad > _FOLLOWED * self._asked_rad + self._droop_rad + 4 * self._step_rad:
+            self._refuse(self._furthest_rad, "did not do what it was asked")
+        self._travelled.judge(self._joint.name)
+
+    def _refuse(self, moved_rad: float, said: str) -> None:
+        raise SafetyAbort(
+            f"{said}: {format_angle(moved_rad)} instead of {format_angle(self._asked_rad)}",
+            where=f"joint {self._joint.name}",
+            cause="command and report are in different units, or the drive's position loop does not follow",
+            next_step="compare both units with the drive's manual and the robot file; nothing may block the joint",
+        )
+
+
+def _there_and_back(
+    here_rad: float, reaches_rad: tuple[float, ...], period_s: float
+) -> Iterator[tuple[float, float, float]]:
+    """Position, direction and speed, cycle by cycle; a pause after each stroke still belongs to it."""
+    for reach_rad in reaches_rad:
+        for start_rad, end_rad in ((here_rad, here_rad + reach_rad), (here_rad + reach_rad, here_rad)):
+            move = Move.within(start_rad, end_rad, _PEAK_RAD_S)
+            times_s = np.arange(0.0, move.duration_s + _HOLD_S, period_s)
+            positions = move.position_rad(times_s)
+            speeds = np.gradient(positions, period_s)
+            direction = math.copysign(1.0, end_rad - start_rad)
+            yield from ((at, direction, speed) for at, speed in zip(positions.tolist(), speeds.tolist(), strict=True))
