@@ -198,6 +198,8 @@ def recorded(path: Path, machine: Machine, target: Array, seed: int, noise: floa
     applied, random = forces(model, machine), np.random.default_rng(seed)
     size = noise * model.jnt_stiffness * model.jnt_springyield
     data.qpos[:] = target[0]
+    # Springs that yield begin relaxed.
+    data.plastic[:] = data.qpos
     mujoco.mj_forward(model, data)
     position, torque = np.empty_like(target), np.empty_like(target)
     mean = data.qfrc_actuator.copy()

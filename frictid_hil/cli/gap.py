@@ -97,7 +97,12 @@ def diagnose(
         ),
     ] = None,
     write_model: Annotated[
-        Path | None, typer.Option("--write-model", metavar="FILE", help="Write the improved joint as a robot file.")
+        Path | None,
+        typer.Option(
+            "--write-model",
+            metavar="FILE",
+            help="Write the improved joint as a robot file; with --model, your own file with the causes added.",
+        ),
     ] = None,
     mujoco: Annotated[
         Path | None,
@@ -128,6 +133,8 @@ def diagnose(
             "gap_diagnose",
             lambda: diagnose_arm(
                 model_logs(model, every, joint, columns, hold, tolerance, validation, nominal, profile, mujoco),
+                write=write_model,
+                apply=apply,
                 out=out,
                 force=force,
                 executor_name=executor,

@@ -91,11 +91,39 @@ def print_arm(output: Output, result: Result) -> None:
         )
     output.out.print(table)
     output.out.print(result["summary"], markup=False, soft_wrap=True)
+    _print_export(output, result)
     for line, names in _same_lines(result["joints"]).items():
         who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
         output.out.print(f"{who}: {line}", markup=False, soft_wrap=True)
     for name, place in result["held"].items():
         output.out.print(f"{name}: held at {place:.4g}", markup=False)
+
+
+def _print_export(output: Output, result: Result) -> None:
+    """The user's simulator before and after, and what was written where."""
+    loop = result["closed_loop"]
+    if "reason" in loop:
+        output.out.print(f"closed loop of your model: {loop['reason']}", markup=False, soft_wrap=True)
+    else:
+        table = Table("your model in MuJoCo", "torque before", "after", "position before", "after")
+        for name, before in loop["before"].items():
+            after = loop["after"][name]
+            torques = [f"{state['torque_nm']:.3g} N m" for state in (before, after)]
+            table.add_row(name, *torques, *(f"{1e3 * state['position_rad']:.3g} mrad" for state in (before, after)))
+        output.out.print(table)
+    for name, joint in result.get("export", {}).get("joints", {}).items():
+        off = joint["torque_difference_percent"]
+        output.out.print(f"{name}: the export is {off:.2f} % of torque from our simulation on withheld motion")
+        for effect, where in joint["placed"].items():
+            output.out.print(f"  {effect}: {where}", markup=False, soft_wrap=True)
+        for effect, why in joint["lost"].items():
+            output.out.print(f"  lost of {effect}: {why}", markup=False, soft_wrap=True)
+    for remark in {r for joint in result.get("export", {}).get("joints", {}).values() for r in joint["remarks"]}:
+        output.out.print(remark, markup=False, soft_wrap=True)
+    if result.get("model"):
+        output.out.print(f"model: {result['model']}", soft_wrap=True, markup=False)
+    if result.get("model_refused"):
+        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
 
 
 def _same_lines(joints: Mapping[str, Any]) -> dict[str, list[str]]:

@@ -13,6 +13,7 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
+from frictid_hil.jobs.gap.write_model import Export, closed_loop_gap, exports, write_model
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.gap import gap_page
 from frictid_hil.report.pages import write_page
@@ -21,6 +22,8 @@ from frictid_hil.report.pages import write_page
 def diagnose_arm(
     asked: ModelLogs,
     *,
+    write: Path | None = None,
+    apply: bool = False,
     out: Path | None = None,
     force: bool = False,
     executor_name: str | None = None,
@@ -29,6 +32,8 @@ def diagnose_arm(
 
     Args:
         asked: model and logs.
+        write: where to write the user's model with the causes added; the user's own file is edited in place.
+        apply: write the likeliest causes of open verdicts too.
         out: folder for one page a joint; None writes none.
         force: write over files that are there.
         executor_name: ``processes:N`` or ``dask://host:port``; None chooses.
@@ -39,11 +44,13 @@ def diagnose_arm(
 
     Returns:
         The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
-        ``asked``; ``held``, ``logs`` and ``summary`` of the arm.
+        ``asked``; ``held``, ``logs`` and ``summary`` of the arm; ``closed_loop`` of the user's model
+        before and after in MuJoCo; ``export`` of a model that was written.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
-    refuse_overwriting(pages.values(), force=force)
+    outputs = [*pages.values(), *([write] if write is not None else [])]
+    refuse_overwriting(outputs, force=force)
     found = diagnosed(arm, executor_name)
     joints = {name: _told(arm.joints[name], diagnosis) for name, diagnosis in found.items()}
     result: dict[str, Any] = {
@@ -54,12 +61,24 @@ def diagnose_arm(
         "summary": summary(found),
         "joints": joints,
     }
+    made = exports(arm, found, apply=apply)
+    result["closed_loop"] = closed_loop_gap(arm, made)
+    if write is not None:
+        result |= _written(arm, made, write, force)
     if out is not None:
         _make_folder(out)
         for name, page in pages.items():
             told = gap_page(found[name], (), missing_torque(arm.joints[name].experiments))
             joints[name]["report"] = str(write_page(told, page).resolve())
     return result
+
+
+def _written(arm: ArmSet, made: Mapping[str, Export], write: Path, force: bool) -> dict[str, Any]:
+    if not made:
+        why = "no cause is sure enough to change the model; record what is asked for, or add --apply"
+        return {"model": None, "model_refused": why}
+    told = write_model(arm, made, write, force=force)
+    return {"model": told["model"], "export": told}
 
 
 def diagnosed(arm: ArmSet, executor_name: str | None = None) -> dict[str, Diagnosis]:

@@ -1,16 +1,16 @@
 """A joint for MuJoCo: what MJCF can say as joint parameters, the rest as a callback, and what neither can say.
 
 ``described`` writes the model. Inertia, armature, gravity, compliance, play, the torque limit and the torque constant
-are joint and actuator parameters, with every effect on them included. Friction is ``frictionloss`` and ``damping``
-there: one level and one slope, which is as much as MuJoCo knows. ``MujocoJoint`` installs the callback that puts the
+are joint and actuator parameters, with every effect on them included. Friction is a spring that yields and a damping of
+three numbers (MuJoCo 4), see ``native``. ``MujocoJoint`` installs the callback that puts the
 joint's own friction, drive and sensors in their place, by the very formulas of the simulation.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
-from frictid_hil.simulation.steady import true_curve_nm
+from frictid_hil.simulation.native import FRICTION, Native, Use, largest_torque, native_elements
+from frictid_hil.simulation.robot_model import ModelJoint
 
 STEP_S = 1e-4
 """Time step of the model; the slip spring asks for it."""
@@ -66,12 +67,14 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     play = float(state[plant.PLAY])
     cos_nm = functions.gravity_torque(parameters, 0.0)
     sin_nm = functions.gravity_torque(parameters, 0.5 * math.pi)
-    nothing = functions.shaft_torque(parameters, 0.0, 0.0, model.gear_ratio)
-    gain = functions.shaft_torque(parameters, 1.0, 0.0, model.gear_ratio) - nothing
-    level, slope = _level_and_slope(model)
-    limit = _largest_torque(model)
+    # A ripple has an element of its own.
+    even = packing.parameters(replace(model, effects={k: v for k, v in model.effects.items() if k != "torque_ripple"}))
+    nothing = functions.shaft_torque(even, 0.0, 0.0, model.gear_ratio)
+    gain = functions.shaft_torque(even, 1.0, 0.0, model.gear_ratio) - nothing
+    limit = largest_torque(model) if math.isfinite(model.drive.torque_limit_nm) else math.inf
     soft = stiffness > 0.0
-    on_joint = f'armature="{motor:.9g}" frictionloss="{level:.9g}" damping="{slope:.9g}"'
+    own = _own_friction(model)
+    on_joint = f'armature="{motor:.9g}" ' + " ".join(f'{key}="{value}"' for key, value in own.joint.items())
     body = _body(link, cos_nm, sin_nm)
     if soft and play > 0.0:
         # A play is a limit on either side of the gap that yields like a spring: with an impedance near 0 a constraint's
@@ -90,7 +93,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
         else body
     )
     xml = f"""<mujoco model="{name}">
-  <!-- Written by frictid-hil. The angle of "joint" is that of the motor; friction is one level and one slope here. -->
+  <!-- Written by frictid-hil. The angle of "joint" is that of the motor. -->
   <compiler angle="radian" autolimits="false"/>
   <option timestep="{STEP_S:g}" gravity="0 0 -{GRAVITY_M_S2}" integrator="implicitfast"/>
   <worldbody>
@@ -102,7 +105,11 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
   <actuator>
     <general name="motor" joint="joint" gaintype="fixed" gainprm="{gain:.9g}" biastype="affine"
              biasprm="{nothing:.9g} 0 0" {_limits(limit)}/>
+    {_lines(own.more_actuators)}
   </actuator>
+  <tendon>
+    {_lines(own.more_tendons)}
+  </tendon>
   <sensor>
     <jointpos name="position" joint="joint"/>
     <jointvel name="velocity" joint="joint"/>
@@ -110,17 +117,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
   </sensor>
 </mujoco>
 """
-    return Exported(xml, *_accounts(model, soft))
-
-
-def _largest_torque(model: JointModel) -> float:
-    """What the drive gives in the end when everything is asked of it, whatever effect clips it."""
-    if not math.isfinite(model.drive.torque_limit_nm):
-        return math.inf
-    parameters, state = packing.parameters(model), packing.state()
-    state[plant.DEMAND] = model.drive.torque_limit_nm
-    current = [kernel().motor_torque(parameters, state, 1e-3) for _ in range(2000)]
-    return float(current[-1])
+    return Exported(xml, *_accounts(model, soft, own))
 
 
 def _limits(limit_nm: float) -> str:
@@ -140,27 +137,28 @@ def _body(inertia_kg_m2: float, cos_nm: float, sin_nm: float) -> str:
     )
 
 
-def _level_and_slope(model: JointModel) -> tuple[float, float]:
-    """Coulomb level and viscosity that fit the odd part of steady sliding best, all effects included."""
-    speed = np.linspace(0.02, 2.0, 100)
-    torque = true_curve_nm(model, speed)
-    columns = np.stack([np.ones_like(speed), speed], axis=1)
-    level, slope = np.linalg.lstsq(columns, torque, rcond=None)[0]
-    return max(0.0, float(level)), max(0.0, float(slope))
+def _own_friction(model: JointModel) -> Native:
+    """Friction and ripple as elements of MuJoCo, without the callback."""
+    bare = ModelJoint("joint", False, None, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0), None, 0.0, None)
+    use = Use(np.linspace(0.02, 2.0, 100), np.linspace(-0.5, 0.5, 11), STEP_S)
+    kept = {name: values for name, values in model.effects.items() if name in FRICTION or name == "torque_ripple"}
+    form = "lugre" if "stribeck" in kept else "spring"
+    return native_elements(bare, replace(model, effects=kept), use, form, friction=True)
 
 
-def _accounts(model: JointModel, soft: bool) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:
+def _lines(elements: Sequence[str]) -> str:
+    return "\n    ".join(elements)
+
+
+def _accounts(model: JointModel, soft: bool, own: Native) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:
     native = {
         "inertia": "link body and armature",
         "gravity": "mass and centre of the link body",
-        "friction": "frictionloss and damping: a level and a slope",
+        "friction": own.placed.get("friction") or next(iter(own.placed.values())),
         "torque limit": "ctrlrange",
     }
     callback = {"friction curve": "as measured, behind the presliding spring"}
-    lost = [
-        "without the callback: presliding, and friction that is no straight line over speed (MuJoCo's friction loss "
-        "is a soft constraint, so that a joint at rest creeps)"
-    ]
+    lost = ["without the callback: what a damping of three numbers cannot follow of the friction curve"]
     for name in model.effects:
         stages = {hook.stage for hook in all_effects()[name].hooks} - {"settle"}
         if stages <= _IN_MJCF:
@@ -173,9 +171,12 @@ def _accounts(model: JointModel, soft: bool) -> tuple[dict[str, str], dict[str, 
                 lost.append(f"{name}: it changes only what a drive reports; MuJoCo's sensors report the true motion")
         elif name in ("torque_bias", "torque_constant_error", "torque_saturation"):
             native[name] = "the actuator's biasprm, gainprm and ctrlrange"
+        elif name in own.placed:
+            callback[name] = f"by the formulas of the simulation; the model alone: {own.placed[name]}"
+            lost += [f"{name}: without the callback, {why}" for effect, why in own.lost.items() if effect == name]
         else:
-            callback[name] = "by the formulas of the simulation; the model alone holds its mean at most"
-            lost.append(f"{name}: without the callback but for its part in level and slope of friction")
+            callback[name] = "by the formulas of the simulation"
+            lost.append(f"{name}: without the callback, all of it")
     if soft:
         lost.append("MuJoCo integrates the transmission explicitly in time: halve the time step for stiffer gears")
     return native, callback, tuple(lost)
@@ -220,6 +221,11 @@ class MujocoJoint:
         self._soft = model.nv > 1
         model.dof_frictionloss[0] = 0.0
         model.dof_damping[0] = 0.0
+        model.dof_dampingpoly[0] = 0.0
+        model.jnt_stiffness[0] = 0.0
+        model.tendon_stiffness[:] = 0.0
+        # Passive elements have neither control nor, from now on, a force.
+        model.actuator_gear[1:] = 0.0
         model.actuator_gainprm[0, 0] = 0.0
         model.actuator_biasprm[0, 0] = 0.0
         data.qpos[0] = state[plant.MOTOR_POSITION]

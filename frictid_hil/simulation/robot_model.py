@@ -359,6 +359,25 @@ def inverse_torque(
     return out
 
 
+def relax(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Let springs that yield begin without force where the joints stand.
+
+    MuJoCo keeps how far such a spring has slipped in ``data.plastic``. Where positions are set by hand and that is not,
+    the first step feels the whole stretch: thousands of N m.
+    """
+    plastic = getattr(data, "plastic", None)
+    if plastic is None or plastic.size == 0:
+        return
+    mujoco_library().mj_fwdPosition(model, data)
+    for k, at in enumerate(model.jnt_plasticadr):
+        if at >= 0:
+            place = int(model.jnt_qposadr[k])
+            plastic[at] = data.qpos[place] - model.qpos_spring[place]
+    for k, at in enumerate(model.tendon_plasticadr):
+        if at >= 0:
+            plastic[at : at + 2] = data.ten_length[k] - model.tendon_lengthspring[k]
+
+
 def is_urdf(path: Path) -> bool:
     """Whether a file is a URDF: by its root element, whatever its name.
 

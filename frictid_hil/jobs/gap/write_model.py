@@ -1,0 +1,267 @@
+"""The improved model in the user's own file, and how near it comes: measured in the user's engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from frictid_hil.config.write import dump
+from frictid_hil.errors import FrictidError
+from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, Motion
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
+from frictid_hil.simulation.model_edit import changed_elsewhere, compiled_with, edited_files
+from frictid_hil.simulation.model_replay import replayed, why_not_replayed
+from frictid_hil.simulation.native import FORMS, FRICTION, Native, Use, native_elements
+from frictid_hil.simulation.native_check import in_posture, torque_difference
+
+CHECKED_S = 10.0
+"""Length of the withheld motion along which an export is compared with our own simulation."""
+PRESLIDING_RAD = 2e-4
+"""Travel in which friction builds up, where nobody says it."""
+CUTOFF_HZ = 20.0
+"""Low-pass of torques that are compared with measured ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """One joint's part of an improved model.
+
+    Attributes:
+        model: the joint with its causes, as we simulate it.
+        native: what is changed in the file.
+        form: of its friction.
+        off: by form that was tried, torque on withheld motion against our own simulation, over its RMS.
+    """
+
+    model: JointModel
+    native: Native
+    form: str
+    off: Mapping[str, float]
+
+
+def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False) -> dict[str, Export]:
+    """What to change in the user's model, by joint; only joints with named causes, or drafted friction.
+
+    Args:
+        arm: model and recordings.
+        found: diagnosis of every joint.
+        apply: take the likeliest causes where the verdict is open, too.
+    """
+    made = {}
+    for name, joint in arm.joints.items():
+        effects = applied(found[name], apply=apply)
+        if (effects or joint.drafted) and joint.experiments.nominal.curve is not None:
+            made[name] = _export(arm, joint, effects)
+    return made
+
+
+def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
+    """The effects that the verdict allows to be written, with parameters within their bounds."""
+    if found.verdict != "explained" and not (apply and found.verdict in ("ambiguous", "unknown")):
+        return {}
+    effects = {}
+    for cause in found.causes:
+        limits = {p.name: p for p in all_effects()[cause.effect].parameters}
+        values = {n: float(np.clip(v.value, limits[n].lower, limits[n].upper)) for n, v in cause.parameters.items()}
+        if values:
+            effects[cause.effect] = all_effects()[cause.effect].complete(values)
+    return effects
+
+
+def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
+    """The believed joint with effects, as we simulate it; only for a joint with a friction curve."""
+    nominal = joint.experiments.nominal
+    assert nominal.curve is not None and nominal.inertia_kg_m2 is not None
+    motor = joint.believed.motor
+    limit = motor.torque_limit_nm if motor is not None else float("inf")
+    rated = nominal.rated_torque_nm or (limit if np.isfinite(limit) else 1.0)
+    return JointModel(
+        inertia_kg_m2=nominal.inertia_kg_m2,
+        motor_inertia_share=min(0.99, max(0.01, nominal.motor_inertia_share or 0.3)),
+        gravity_cos_nm=nominal.gravity_cos_nm,
+        gravity_sin_nm=nominal.gravity_sin_nm,
+        gear_ratio=nominal.gear_ratio or 1.0,
+        friction=nominal.curve,
+        presliding_stiffness_nm_per_rad=nominal.presliding_stiffness_nm_per_rad
+        or nominal.curve.coulomb_nm / PRESLIDING_RAD,
+        encoder=Encoder("motor", 0.0),
+        drive=Drive(rated, limit, 0.0, 0.0, 0.0),
+        servo=ServoGains(0.0, 0.0, 0.0),
+    ).with_effects(effects)
+
+
+def _export(arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> Export:
+    robot, name = arm.robot, joint.believed.name
+    model = joint_model(joint, effects)
+    use = _use(arm, name)
+    rewritten = bool(joint.drafted or FRICTION & set(effects))
+    forms = FORMS if rewritten and not robot.urdf else ("loss",)
+    time, command, posture = _withheld(arm, name)
+    ours = in_posture(robot, name, model, posture)
+    tried: dict[str, float] = {}
+    natives = {}
+    for form in forms:
+        native = native_elements(joint.believed, model, use, form, friction=rewritten)
+        try:
+            exported = compiled_with(robot, {name: native})
+            tried[form] = torque_difference(robot, exported, name, ours, posture, time, command)
+        except FrictidError:
+            # An older MuJoCo has not every element.
+            continue
+        natives[form] = native
+    if not tried:
+        compiled_with(robot, {name: native})  # raises, and says why
+    best = min(tried, key=lambda form: tried[form] if np.isfinite(tried[form]) else np.inf)
+    return Export(model, natives[best], best, tried)
+
+
+def _use(arm: ArmSet, name: str) -> Use:
+    samples = [motion.samples[name] for motion in arm.motions]
+    speed = np.concatenate([np.abs(np.gradient(s.position_rad, s.time_s)) for s in samples])
+    position = np.concatenate([s.position_rad for s in samples])
+    moving = speed[speed > 0.02 * float(np.quantile(speed, 0.99))]
+    top = float(np.quantile(moving, 0.999))
+    step_s = float(arm.robot.compiled.opt.timestep)
+    return Use(moving[moving <= top], position, step_s, _own_gravity_share(arm, name))
+
+
+def _own_gravity_share(arm: ArmSet, name: str) -> float:
+    """Gravity torque of the joint's own body over that of all that it carries, along the recordings."""
+    robot = arm.robot
+    names = tuple(arm.joints)
+    every = np.concatenate([motion.position_rad for motion in arm.motions])
+    some = every[:: max(1, every.shape[0] // 200)]
+    still, column = np.zeros_like(some), names.index(name)
+    whole = robot.rigid_body_torque(names, some, still, still, arm.held)[:, column]
+    body = int(robot.compiled.jnt_bodyid[robot.number(name)])
+    masses = robot.compiled.body_mass.copy()
+    try:
+        robot.compiled.body_mass[[k for k in range(masses.size) if k != body]] = 0.0
+        own = robot.rigid_body_torque(names, some, still, still, arm.held)[:, column]
+    finally:
+        robot.compiled.body_mass[:] = masses
+    return float(own @ whole) / max(float(whole @ whole), 1e-12) or 1e-9
+
+
+def _withheld(arm: ArmSet, name: str) -> tuple[Array, Array, Array]:
+    """(time, command, posture of the whole model) of a motion that was not fitted."""
+    motion = next((m for m in arm.motions if m.validation), arm.motions[-1])
+    samples = motion.samples[name]
+    command = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
+    keep = samples.time_s - samples.time_s[0] <= CHECKED_S
+    middle = {other: float(np.median(s.position_rad)) for other, s in motion.samples.items()}
+    return samples.time_s[keep], command[keep], arm.robot.posture({**arm.held, **middle})
+
+
+def write_model(arm: ArmSet, made: Mapping[str, Export], out: Path, *, force: bool = False) -> dict[str, Any]:
+    """Write the user's model with the changes, after comparing it with the original.
+
+    Raises:
+        UsageError: a file is there already.
+        FrictidError: the edited model is not the old one in all else; nothing is written.
+
+    Returns:
+        ``model`` and ``files`` (absolute paths), ``joints`` by name: where each effect went, what is lost, and the
+        torque difference in percent.
+    """
+    natives = {name: export.native for name, export in made.items()}
+    after = compiled_with(arm.robot, natives)
+    if changed := changed_elsewhere(arm.robot.compiled, after, natives):
+        raise FrictidError(
+            f"the edit would change more than was meant: {', '.join(changed[:5])}; nothing is written",
+            where=str(arm.robot.path),
+        )
+    files = edited_files(arm.robot, natives, out)
+    if arm.robot.urdf:
+        files[out.with_suffix(".effects.yaml")] = _sidecar(made).encode()
+    refuse_overwriting(files, force=force)
+    for path, content in files.items():
+        write_whole(path, content)
+    return {
+        "model": str(out.resolve()),
+        "files": [str(path.resolve()) for path in files],
+        "joints": {name: _account(export, urdf=arm.robot.urdf) for name, export in made.items()},
+    }
+
+
+def _account(export: Export, *, urdf: bool) -> dict[str, Any]:
+    placed = dict(export.native.placed)
+    lost = dict(export.native.lost)
+    if urdf:
+        held = {"friction": "dynamics: damping and friction", "torque_saturation": "limit: effort"}
+        lost |= {
+            e: "a URDF cannot hold it: see the file of effects beside it"
+            for e in placed
+            if e not in FRICTION | set(held)
+        }
+        placed = {e: held["friction" if e in FRICTION else e] for e in placed if e in FRICTION | set(held)}
+    return {
+        "effects": {name: dict(values) for name, values in export.model.effects.items()},
+        "placed": placed,
+        "lost": lost,
+        "remarks": list(export.native.remarks),
+        "friction_form": export.form,
+        "torque_difference_percent": 100.0 * export.off[export.form],
+        "tried_percent": {form: 100.0 * off for form, off in export.off.items()},
+    }
+
+
+def _sidecar(made: Mapping[str, Export]) -> str:
+    """All effects of the joints, as a robot file has them under ``simulated``; a URDF cannot hold most."""
+    return dump({name: {"effects": export.model.effects} for name, export in made.items()})
+
+
+def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
+    """The user's own model, as it was and improved, run in MuJoCo along the logs that were not fitted.
+
+    Returns:
+        ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
+        torque behind a low-pass), or ``reason``.
+    """
+    judged = [motion for motion in arm.motions if motion.validation]
+    commanded = all(s.position_command_rad is not None for m in judged for s in m.samples.values())
+    names = tuple(arm.joints)
+    if reason := why_not_replayed(arm.robot, names, commanded):
+        return {"reason": reason}
+    natives = {name: export.native for name, export in made.items()}
+    models = {"before": arm.robot.compiled, "after": compiled_with(arm.robot, natives)}
+    told: dict[str, Any] = {}
+    for when, model in models.items():
+        torque: list[Array] = []
+        position: list[Array] = []
+        for motion in judged:
+            off = _off(arm, model, motion)
+            torque.append(off[0])
+            position.append(off[1])
+        rms = [np.sqrt(np.mean(np.concatenate(part) ** 2, axis=0)) for part in (torque, position)]
+        told[when] = {
+            name: {"torque_nm": float(rms[0][k]), "position_rad": float(rms[1][k])} for k, name in enumerate(names)
+        }
+    return told
+
+
+def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
+    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten."""
+    names = tuple(motion.samples)
+    samples = list(motion.samples.values())
+    time = samples[0].time_s
+    command = np.stack([s.position_command_rad for s in samples if s.position_command_rad is not None], axis=1)
+    ran = replayed(arm.robot, model, names, arm.held, time, motion.position_rad, command)
+    begin = int(np.searchsorted(time, time[0] + 1.0))
+    position = (motion.position_rad - ran.position_rad)[begin:]
+    measured = [s.torque_nm for s in samples]
+    if any(torque is None for torque in measured):
+        return np.zeros_like(position), position
+    torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
+    rate_hz = 1.0 / float(np.median(np.diff(time)))
+    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
+    return np.asarray(signal.filtfilt(b, a, torque, axis=0))[begin:], position

@@ -1,0 +1,99 @@
+"""The user's own model in closed loop: commands of a recording in, position and torque of every joint out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.native_check import control_of, force_of
+from frictid_hil.simulation.rigid_bodies import mujoco_library
+from frictid_hil.simulation.robot_model import RobotModel, relax
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What the model did; arrays of shape (n, k) on the rows of the recording.
+
+    Attributes:
+        position_rad: at each row.
+        torque_nm: mean of what the joint's drive gave since the row before.
+    """
+
+    position_rad: Array
+    torque_nm: Array
+
+
+def why_not_replayed(robot: RobotModel, joints: Sequence[str], commanded: bool) -> str | None:
+    """Why the user's model cannot be run along a recording, or None where it can."""
+    if not commanded:
+        return "the logs have no position commands"
+    for name in joints:
+        motor = robot.joint(name).motor
+        if motor is None or motor.law != "position":
+            return f"joint {name} has no position actuator in the file, so its loop is not in the user's simulator"
+    return None
+
+
+def replayed(
+    robot: RobotModel,
+    model: mujoco.MjModel,
+    joints: Sequence[str],
+    held: Mapping[str, float],
+    time_s: Array,
+    position_rad: Array,
+    command_rad: Array,
+) -> Replayed:
+    """Run a model along the commands of a recording, from where the recording begins.
+
+    Args:
+        robot: the user's model as it was; tells the actuators.
+        model: the one to run, as it was or edited.
+        joints: of the recording, k of them, all driven by position.
+        held: where the others stand; they are not moved.
+        time_s: shape (n,).
+        position_rad: measured, shape (n, k); only the first row is used.
+        command_rad: shape (n, k).
+    """
+    library, m = mujoco_library(), model
+    data = library.MjData(m)
+    for name, place in held.items():
+        data.qpos[int(m.joint(name).qposadr[0])] = place
+    places = [int(m.joint(name).qposadr[0]) for name in joints]
+    motors = [robot.joint(name).motor for name in joints]
+    drives = [m.actuator(motor.names[0]).id for motor in motors if motor is not None]
+    controls = [control_of(m, drive) for drive in drives]
+    gears = np.array([float(m.actuator_gear[drive][0]) for drive in drives])
+    forces = [force_of(m, drive) for drive in drives]
+    data.qpos[places] = position_rad[0]
+    frozen = _frozen(m, held)
+    steps = np.maximum(1, np.round(np.diff(time_s) / float(m.opt.timestep)).astype(int))
+    positions, torques = np.empty_like(position_rad), np.empty_like(position_rad)
+    data.ctrl[controls] = gears * command_rad[0]
+    relax(m, data)
+    library.mj_forward(m, data)
+    mean = gears * data.actuator_force[forces]
+    for row, wanted in enumerate(command_rad):
+        positions[row], torques[row] = data.qpos[places], mean
+        if row == len(steps):
+            break
+        data.ctrl[controls] = gears * wanted
+        total = np.zeros(len(joints))
+        for _ in range(steps[row]):
+            library.mj_step(m, data)
+            total += data.actuator_force[forces]
+            if frozen is not None:
+                data.qvel[frozen] = 0.0
+        mean = gears * total / steps[row]
+    return Replayed(positions, torques)
+
+
+def _frozen(model: Any, held: Mapping[str, float]) -> list[int] | None:
+    dofs = [int(model.joint(name).dofadr[0]) for name in held]
+    return dofs or None

@@ -1,0 +1,403 @@
+"""Physical effects as MuJoCo's own elements: which effect goes where in an MJCF, and what is lost.
+
+``native_elements`` says what to change on a joint so that a model without any code beside it moves like the simulated
+joint. Sliding friction has three forms, and whoever writes the file measures which one is nearest:
+
+- ``spring``: a spring that yields (MuJoCo 4) carries the level, ``damping`` of three numbers the rest. No creep.
+- ``lugre``: the same, and a passive ``dcmotor`` with LuGre friction for what rises above the level near standstill.
+- ``loss``: ``frictionloss`` with the solver settings that creep least.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation import packing, plant
+from frictid_hil.simulation.compose import kernel
+from frictid_hil.simulation.joint import JointModel
+from frictid_hil.simulation.robot_model import ModelJoint
+from frictid_hil.simulation.steady import steady_friction_nm
+
+FORMS = ("spring", "lugre", "loss")
+
+FRICTION = {
+    "stribeck", "viscous_nonlinearity", "direction_asymmetry", "load_dependent_friction", "directional_efficiency",
+    "presliding_hysteresis", "stiction_breakaway", "friction_level_error", "viscous_error", "temperature_drift",
+}  # fmt: skip
+"""Effects that are a part of sliding friction."""
+_STEEP = 1.2
+"""The damping polynomial may not fall up to this multiple of the fastest speed."""
+_STIFFEST = 0.4
+"""Stiffness times squared step over inertia, at most: what an explicit spring bears without ringing."""
+_STEP_RULE = 1.3
+"""sigma1 over the least that LuGre needs at the model's step."""
+_RISE_BASE = 0.05
+"""Level that LuGre needs at speed, over its rise; taken off the spring."""
+FAR_RAD = 3e5
+"""Where a spring is anchored whose torque shall not depend on the joint."""
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """How and where the joint is used.
+
+    Attributes:
+        speed_rad_s: speeds of the recordings, shape (n,), positive.
+        position_rad: positions of the recordings, shape (n,).
+        timestep_s: of the user's model.
+        own_gravity_share: gravity torque of the joint's own body over that of all that it carries.
+    """
+
+    speed_rad_s: Array
+    position_rad: Array
+    timestep_s: float
+    own_gravity_share: float = 1.0
+
+
+@dataclass(slots=True)
+class Native:
+    """What to change.
+
+    Attributes:
+        joint: attributes of the joint.
+        actuators: attributes of its actuators, by name in MuJoCo's tables (of those that drive it).
+        gravity_share: error of the gravity of its own body; None leaves the body as it is.
+        more_joints: joints to stand after it in its body.
+        more_actuators: passive actuators.
+        more_tendons: fixed tendons.
+        placed: where each effect went, by name.
+        lost: what is lost, by effect.
+        remarks: what its user has to do.
+    """
+
+    joint: dict[str, str] = field(default_factory=dict)
+    actuators: dict[str, str] = field(default_factory=dict)
+    gravity_share: float | None = None
+    more_joints: list[str] = field(default_factory=list)
+    more_actuators: list[str] = field(default_factory=list)
+    more_tendons: list[str] = field(default_factory=list)
+    placed: dict[str, str] = field(default_factory=dict)
+    lost: dict[str, str] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def native_elements(believed: ModelJoint, model: JointModel, use: Use, form: str, *, friction: bool) -> Native:
+    """What makes the user's joint move like ``model``.
+
+    Args:
+        believed: the joint as the file has it.
+        model: with its effects.
+        use: of the joint.
+        form: of friction, one of ``FORMS``.
+        friction: write friction anew; else it stays as the file has it, as no cause concerns it.
+    """
+    native = Native()
+    if friction:
+        _write_friction(native, believed, model, use, form)
+    _write_plant(native, believed, model, use)
+    _write_drive(native, believed, model, use)
+    _write_transmission(native, believed, model)
+    for name, why in _NOWHERE.items():
+        if name in model.effects:
+            native.lost[name] = why
+    return native
+
+
+_NOWHERE = {
+    "velocity_lag": "MuJoCo's loop acts on the true velocity: filter it in your own controller",
+    "encoder_quantisation": "MuJoCo's sensors have no steps: round the position in your own code",
+    "transmission_error": "MuJoCo has no element for it: add it to the position in your own code",
+}
+
+
+# -- friction -----------------------------------------------------------------------------------------------------
+
+
+def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use: Use, form: str) -> None:
+    fastest = float(np.max(use.speed_rad_s))
+    speed = np.unique(np.concatenate([np.quantile(use.speed_rad_s, np.linspace(0.02, 1.0, 150)), [1e-3 * fastest]]))
+    odd, even = _sliding(model, speed, use)
+    soft_nm = _soft_nm(model)
+    if form == "lugre":
+        dry, rise, at, poly = _with_stribeck(speed, odd, fastest)
+    else:
+        dry, a, b, c = _level_and_damping(speed, odd, fastest)
+        rise, at, poly = 0.0, 0.0, (a, b, c)
+    # Friction builds up over a travel that does not depend on the level.
+    stiffness = model.presliding_stiffness_nm_per_rad * dry / model.friction.coulomb_nm
+    dry = max(1e-9, dry - soft_nm)
+    inertia, step = model.inertia_kg_m2, use.timestep_s
+    stiffness = min(stiffness * dry / (dry + soft_nm), _STIFFEST * inertia / step**2)
+    name = believed.name
+    native.joint |= {"damping": _words(poly), "frictionloss": "0"}
+    if form == "lugre" and rise > 0.0:
+        base = _RISE_BASE * rise
+        sigma = min(stiffness * rise / dry, inertia / (_STEP_RULE * step**2))
+        lugre = (sigma, _STEP_RULE * step * sigma, base, base + rise, at)
+        native.more_actuators.append(_passive(name, "stribeck", f'lugre="{_words(lugre)}"'))
+        dry -= base
+    if form in ("spring", "lugre") and believed.spring_nm_per_rad == 0.0:
+        native.joint |= {"stiffness": _word(stiffness), "springyield": _word(dry / stiffness), "springref": "0"}
+        where = "joint: springyield and damping of three numbers"
+        native.remarks.append(_PLASTIC)
+    elif form in ("spring", "lugre"):
+        native.more_tendons.append(_slipping(f"{name}_friction", name, stiffness, dry / stiffness))
+        where = "tendon with springyield, and damping of three numbers"
+        native.remarks.append(_PLASTIC)
+    else:
+        native.joint |= {"frictionloss": _word(dry), "solimpfriction": "0.9999 0.9999", "solreffriction": "0.004 1"}
+        where = "joint: frictionloss (stiff solver settings) and damping of three numbers"
+        if believed.presliding_nm_per_rad is not None and believed.spring_nm_per_rad == 0.0:
+            native.joint["stiffness"] = "0"
+    if soft_nm > 0.0:
+        values = model.effects["presliding_hysteresis"]
+        travel = values["distance_rad"]
+        native.more_tendons.append(_slipping(f"{name}_presliding", name, soft_nm / travel, travel))
+        where += "; presliding: a second spring that yields"
+    if abs(even) > 1e-3 * max(dry, 1e-9):
+        native.more_tendons.append(_constant(f"{name}_asymmetry", name, even))
+        where += "; asymmetry: a far spring (constant torque)"
+    if form == "lugre":
+        where += "; the rise near standstill: passive dcmotor (LuGre)"
+    present = sorted(FRICTION & set(model.effects))
+    native.placed |= dict.fromkeys(present or ["friction"], where)
+    native.lost |= {effect: why for effect, why in _FRICTION_LOSES.items() if effect in model.effects}
+    if form in ("spring", "loss") and "stribeck" in model.effects:
+        native.lost["stribeck"] = "the fall of friction above standstill: level and damping are its best fit"
+
+
+_PLASTIC = "a spring that yields: where you set qpos by hand or by a keyframe, set data.plastic to the same"
+_FRICTION_LOSES = {
+    "direction_asymmetry": "asymmetry that grows with speed: only its mean is written",
+    "load_dependent_friction": "the load: friction of the recordings' mean load is written",
+    "directional_efficiency": "the load: friction of the recordings' mean load is written",
+    "presliding_hysteresis": "the rounded loop: an elasto-plastic element of the same travel is written",
+    "stiction_breakaway": "the growth with rest",
+    "temperature_drift": "the temperature: friction of a cold joint is written",
+}
+
+
+def _sliding(model: JointModel, speed: Array, use: Use) -> tuple[Array, float]:
+    """(odd part over speed, mean even part) of steady sliding, at the positions of the recordings."""
+    loaded = {"load_dependent_friction", "directional_efficiency"} & set(model.effects)
+    places = np.quantile(use.position_rad, (0.05, 0.25, 0.5, 0.75, 0.95)) if loaded else [0.0]
+    forward = np.mean([steady_friction_nm(model, speed, position_rad=float(q)) for q in places], axis=0)
+    backward = np.mean([steady_friction_nm(model, -speed, position_rad=float(q)) for q in places], axis=0)
+    return 0.5 * (forward - backward), float(np.mean(0.5 * (forward + backward)))
+
+
+def _soft_nm(model: JointModel) -> float:
+    """Torque of the soft presliding element."""
+    values = model.effects.get("presliding_hysteresis")
+    return values["share"] * model.friction.coulomb_nm if values else 0.0
+
+
+def _level_and_damping(speed: Array, torque: Array, fastest: float) -> tuple[float, float, float, float]:
+    """Level and damping polynomial that fit best without falling, all the way beyond the fastest speed."""
+    for powers in ((0, 1, 2, 3), (0, 1, 2), (0, 1), (0,)):
+        weights = np.zeros(4)
+        weights[list(powers)] = np.linalg.lstsq(np.stack([speed**p for p in powers], axis=1), torque, rcond=None)[0]
+        beyond = np.linspace(0.0, _STEEP * fastest, 50)
+        slope = weights[1] + 2.0 * weights[2] * beyond + 3.0 * weights[3] * beyond**2
+        if weights[0] >= 0.0 and np.all(slope >= -1e-12):
+            break
+    return float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3])
+
+
+def _with_stribeck(
+    speed: Array, torque: Array, fastest: float
+) -> tuple[float, float, float, tuple[float, float, float]]:
+    """(Coulomb, rise, Stribeck speed, damping) of the nearest curve of LuGre's form."""
+    best: tuple[float, float, float, float, tuple[float, float, float]] | None = None
+    for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.6 * fastest, 30):
+        bump = np.exp(-((speed / at) ** 2))
+        for powers in ((1, 2, 3), (1, 2), (1,)):
+            table = np.column_stack([np.ones_like(speed), bump, *(speed**p for p in powers)])
+            weights = np.linalg.lstsq(table, torque, rcond=None)[0]
+            poly = [0.0, 0.0, 0.0]
+            for p, w in zip(powers, weights[2:], strict=True):
+                poly[p - 1] = float(w)
+            beyond = np.linspace(0.0, _STEEP * fastest, 50)
+            slope = poly[0] + 2.0 * poly[1] * beyond + 3.0 * poly[2] * beyond**2
+            if weights[0] < 0.0 or weights[1] < 0.0 or np.any(slope < -1e-12):
+                continue
+            rest = float(np.mean((torque - table @ weights) ** 2))
+            if best is None or rest < best[0]:
+                best = (rest, float(weights[0]), float(weights[1]), float(at), (poly[0], poly[1], poly[2]))
+            break
+    if best is None:
+        level, a, b, c = _level_and_damping(speed, torque, fastest)
+        return level, 0.0, 0.1, (a, b, c)
+    return best[1:]
+
+
+# -- inertia, gravity, constant and periodic torques ----------------------------------------------------------------
+
+
+def _write_plant(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
+    effects, name = model.effects, believed.name
+    if "inertia_error" in effects:
+        link = model.inertia_kg_m2 * (1.0 - model.motor_inertia_share)
+        armature = believed.armature_kg_m2 + effects["inertia_error"]["error_share"] * link
+        native.joint["armature"] = _word(max(0.0, armature))
+        native.placed["inertia_error"] = "joint: armature"
+        if armature < 0.0:
+            native.lost["inertia_error"] = "the link is lighter than armature can make it: change its mass"
+    if "gravity_error" in effects:
+        share = effects["gravity_error"]["error_share"] / use.own_gravity_share
+        if share <= -1.0:
+            native.lost["gravity_error"] = "its own body is too light to carry the error: change the masses behind it"
+        else:
+            native.gravity_share = share
+            native.placed["gravity_error"] = "inertial of its own body: mass and centre; inertia about the joint kept"
+            native.lost["gravity_error"] = "which body is wrong: joints towards the base feel the change too"
+    if "torque_bias" in effects:
+        native.more_tendons.append(_constant(f"{name}_bias", name, effects["torque_bias"]["bias_nm"]))
+        native.placed["torque_bias"] = "a far spring on a tendon (constant torque)"
+    if "torque_ripple" in effects:
+        values = effects["torque_ripple"]
+        for prefix in ("", "second_", "third_", "fourth_"):
+            if amplitude := values.get(f"{prefix}amplitude_nm", 0.0):
+                poles = values[f"{prefix}cycles_per_motor_revolution"] * model.gear_ratio
+                phase = values[f"{prefix}phase_rad"] - 0.5 * math.pi
+                native.more_actuators.append(
+                    _passive(name, f"{prefix}ripple", f'cogging="{_words((amplitude, poles, phase))}"')
+                )
+        native.placed["torque_ripple"] = "passive dcmotor: cogging, one for each line"
+    if "encoder_offset" in effects:
+        native.joint["ref"] = _word(effects["encoder_offset"]["offset_rad"])
+        native.placed["encoder_offset"] = "joint: ref"
+        native.lost["encoder_offset"] = "keyframes keep their numbers, which now mean what the encoder reads"
+
+
+_FRESH = "only the command is late: MuJoCo's own loop sees position and velocity at once"
+
+# -- motor ----------------------------------------------------------------------------------------------------------
+
+
+def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
+    effects, motor = model.effects, believed.motor
+    asked = {"torque_constant_error", "torque_saturation", "torque_delay", "electrical_lag", "controller_gain_error"}
+    if motor is None or motor.law == "other":
+        for name in sorted(asked & set(effects)):
+            native.lost[name] = "the file has no actuator of a plain law on this joint"
+        return
+    gain = 1.0 + effects.get("torque_constant_error", {}).get("error_share", 0.0)
+    kp, kv = motor.kp_nm_per_rad / motor.gear**2, motor.kv_nm_s_per_rad / motor.gear**2
+    errors = effects.get("controller_gain_error", {})
+    kp *= gain * (1.0 + errors.get("kp_error_share", 0.0))
+    kv *= gain * (1.0 + errors.get("kd_error_share", 0.0))
+    limit = largest_torque(model) if math.isfinite(model.drive.torque_limit_nm) else math.inf
+    if "torque_constant_error" in effects or "controller_gain_error" in effects:
+        if motor.law == "position":
+            native.actuators |= {"kp": _word(kp), "kv": _word(kv)}
+        else:
+            native.actuators["gear"] = _word(motor.gear * gain)
+        where = "actuator: kp and kv" if motor.law == "position" else "actuator: gear"
+        native.placed |= dict.fromkeys(sorted({"torque_constant_error", "controller_gain_error"} & set(effects)), where)
+        if "torque_constant_error" in effects:
+            native.lost["torque_constant_error"] = "the drive's report: MuJoCo tells the true torque"
+    if math.isfinite(limit) and ("torque_saturation" in effects or (gain != 1.0 and motor.law == "position")):
+        force = limit * gain / abs(motor.gear)
+        native.actuators["forcerange"] = _words((-force, force))
+        if "torque_saturation" in effects:
+            native.placed["torque_saturation"] = "actuator: forcerange"
+    if "torque_delay" in effects:
+        delay = motor.delay_s + effects["torque_delay"]["delay_s"]
+        native.actuators |= {
+            "delay": _word(delay),
+            "nsample": str(math.ceil(delay / use.timestep_s) + 1),
+            "interp": "linear",
+        }
+        native.placed["torque_delay"] = "actuator: delay, nsample, interp (call mj_initCtrlHistory at the start)"
+        if motor.law == "position":
+            native.lost["torque_delay"] = _FRESH
+    if "electrical_lag" in effects:
+        if motor.law == "position":
+            native.actuators["timeconst"] = _word(effects["electrical_lag"]["time_constant_s"])
+            native.placed["electrical_lag"] = "actuator: timeconst"
+            native.lost["electrical_lag"] = _FRESH
+        else:
+            lag = _word(effects["electrical_lag"]["time_constant_s"])
+            native.actuators |= {"dyntype": "filterexact", "dynprm": lag}
+            native.placed["electrical_lag"] = "actuator: dyntype filterexact"
+            native.lost["electrical_lag"] = "one more activation: keyframes get a zero for it"
+
+
+def largest_torque(model: JointModel) -> float:
+    """What the drive gives in the end when everything is asked of it, whatever effect clips it."""
+    parameters, state = packing.parameters(model), packing.state()
+    state[plant.DEMAND] = model.drive.torque_limit_nm
+    current = [kernel().motor_torque(parameters, state, 1e-3) for _ in range(2000)]
+    return float(current[-1])
+
+
+# -- transmission ---------------------------------------------------------------------------------------------------
+
+
+def _write_transmission(native: Native, believed: ModelJoint, model: JointModel) -> None:
+    effects, name = model.effects, believed.name
+    motor = model.motor_inertia_share * model.inertia_kg_m2
+    link = model.inertia_kg_m2 - motor
+    if "backlash" in effects:
+        values = effects["backlash"]
+        half, stiffness = 0.5 * values["gap_rad"], values["contact_stiffness_nm_per_rad"]
+        damping = values["contact_relaxation_s"] * stiffness
+        # With an impedance near 0 a limit is a spring and a damper over the inertia that it sees.
+        reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
+        limits = f'limited="true" range="{_words((-half, half))}" solimplimit="0.001 0.001 0.001"'
+        solver = f'solreflimit="{_words((-stiffness / reduced, -max(damping, 1e-9) / reduced))}"'
+        native.more_joints.append(f"{limits} {solver}")
+        native.placed["backlash"] = f"a joint {name}_play behind it, with limits"
+    elif "joint_elasticity" in effects:
+        values = effects["joint_elasticity"]
+        stiffness = 1.0 / values["compliance_rad_per_nm"]
+        native.more_joints.append(
+            f'stiffness="{_word(stiffness)}" damping="{_word(values["relaxation_s"] * stiffness)}"'
+        )
+        native.placed["joint_elasticity"] = f"a joint {name}_play behind it, with stiffness and damping"
+    else:
+        return
+    effect = "backlash" if "backlash" in effects else "joint_elasticity"
+    native.lost[effect] = "one more coordinate: indices of qpos and keyframes move"
+    if believed.armature_kg_m2 <= 0.0:
+        native.joint.setdefault("armature", _word(motor))
+        native.lost[effect] += f"; armature {_word(motor)} kg m2 was assumed for the motor's side"
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+def _passive(joint: str, what: str, law: str) -> str:
+    return (
+        f'<dcmotor name="{joint}_{what}" joint="{joint}" input="none" motorconst="0" resistance="1" {law}/>'
+        "  <!-- passive: no control -->"
+    )
+
+
+def _slipping(name: str, joint: str, stiffness: float, yields_rad: float) -> str:
+    return (
+        f'<fixed name="{name}" stiffness="{_word(stiffness)}" springyield="{_word(yields_rad)}" springlength="0">'
+        f'<joint joint="{joint}" coef="1"/></fixed>'
+    )
+
+
+def _constant(name: str, joint: str, torque_nm: float) -> str:
+    """A constant torque of the machine against which the drive must hold: the spring pulls the other way."""
+    side = "-1" if torque_nm > 0.0 else "1"
+    return (
+        f'<fixed name="{name}" stiffness="{_word(abs(torque_nm) / FAR_RAD)}" springlength="{_word(FAR_RAD)}">'
+        f'<joint joint="{joint}" coef="{side}"/></fixed>'
+    )
+
+
+def _word(value: float) -> str:
+    return f"{value:.9g}"
+
+
+def _words(values: tuple[float, ...]) -> str:
+    return " ".join(_word(value) for value in values)

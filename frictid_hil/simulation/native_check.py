@@ -1,0 +1,184 @@
+"""How near a native export comes to our own simulation: both driven along the same command, torque against torque.
+
+The user's compiled model moves one joint; the others are held where they stand by an inertia that nothing moves. Our
+own simulation gets the inertia and the gravity that the joint has in that posture.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.joint import JointModel, ServoGains
+from frictid_hil.simulation.replay import Controller, closed_loop
+from frictid_hil.simulation.rigid_bodies import mujoco_library
+from frictid_hil.simulation.robot_model import ModelJoint, RobotModel, inverse_torque, relax
+
+if TYPE_CHECKING:
+    import mujoco
+
+HELD_KG_M2 = 1e9
+"""Armature of the joints that shall stand."""
+SETTLED_S = 0.3
+"""Start of a motion that is not compared."""
+
+
+def in_posture(robot: RobotModel, joint: str, model: JointModel, posture: Array) -> JointModel:
+    """The joint with the inertia and the gravity that the arm gives it while the others stand in ``posture`` (nq,)."""
+    places = np.linspace(-math.pi, math.pi, 24)[:, None]
+    still, unit = np.zeros_like(places), np.ones_like(places)
+    bodies = robot.without_friction()
+    number = [robot.number(joint)]
+    gravity = inverse_torque(bodies, posture, number, places, still, still)[:, 0]
+    inertia = float(np.median(inverse_torque(bodies, posture, number, places, still, unit)[:, 0] - gravity))
+    columns = np.column_stack([np.cos(places[:, 0]), np.sin(places[:, 0])])
+    cos, sin = np.linalg.lstsq(columns, gravity, rcond=None)[0]
+    believed = robot.joint(joint)
+    motor = believed.armature_kg_m2 or model.motor_inertia_share * inertia
+    whole = inertia if believed.armature_kg_m2 or not _soft(model) else inertia + motor
+    return replace(
+        model,
+        inertia_kg_m2=whole,
+        motor_inertia_share=min(0.99, max(0.01, motor / whole)),
+        gravity_cos_nm=float(cos),
+        gravity_sin_nm=float(sin),
+    )
+
+
+def _soft(model: JointModel) -> bool:
+    return bool({"backlash", "joint_elasticity"} & set(model.effects))
+
+
+def torque_difference(
+    robot: RobotModel,
+    exported: mujoco.MjModel,
+    joint: str,
+    model: JointModel,
+    posture: Array,
+    time_s: Array,
+    command_rad: Array,
+) -> float:
+    """RMS of the exported joint's torque less ours, over the RMS of ours.
+
+    Args:
+        robot: the user's model as it was.
+        exported: the edited model, compiled.
+        joint: that was edited.
+        model: our own, with effects, from ``in_posture``.
+        posture: of the user's model, (nq,).
+        time_s: shape (n,).
+        command_rad: where the joint is sent, shape (n,).
+    """
+    step_s = float(exported.opt.timestep)
+    time = np.arange(time_s[0], time_s[-1], step_s)
+    command = np.interp(time, time_s, command_rad)
+    believed = robot.joint(joint)
+    by_position = believed.motor is not None and believed.motor.law == "position"
+    loop = _loop(believed, model, step_s, by_position=by_position)
+    ours = closed_loop(model, loop, time, command).torque_nm[1:]
+    theirs = _in_mujoco(robot, exported, joint, believed, posture, command, loop, ours[0], by_position=by_position)[:-1]
+    # A drive with another torque constant reports what it believes; MuJoCo tells what it gives.
+    theirs = theirs / (1.0 + model.effects.get("torque_constant_error", {}).get("error_share", 0.0))
+    settled = round(SETTLED_S / step_s)
+    return float(np.sqrt(np.mean((theirs - ours)[settled:] ** 2) / np.mean(ours[settled:] ** 2)))
+
+
+def _loop(believed: ModelJoint, model: JointModel, step_s: float, *, by_position: bool) -> Controller:
+    limit = model.drive.torque_limit_nm
+    if by_position and believed.motor is not None:
+        motor = believed.motor
+        return Controller(
+            motor.kp_nm_per_rad, 0.0, motor.kv_nm_s_per_rad, 1.0 / step_s,
+            torque_limit_nm=limit, command_rate="backward", command_rate_weight=0.0,
+        )  # fmt: skip
+    gains = ServoGains.for_inertia(model.inertia_kg_m2, 40.0)
+    return Controller(
+        gains.kp_nm_per_rad, gains.ki_nm_per_rad_s, gains.kd_nm_s_per_rad, 1.0 / step_s, torque_limit_nm=limit
+    )
+
+
+def _in_mujoco(
+    robot: RobotModel,
+    exported: Any,
+    joint: str,
+    believed: ModelJoint,
+    posture: Array,
+    command: Array,
+    loop: Controller,
+    start_nm: float,
+    *,
+    by_position: bool,
+) -> Array:
+    """Torque of the joint's drive in each step, shape (n,)."""
+    library = mujoco_library()
+    m = copy.copy(exported)
+    number = m.joint(joint).id
+    dof, place = int(m.jnt_dofadr[number]), int(m.jnt_qposadr[number])
+    play = next((k for k in range(m.njnt) if m.joint(k).name == f"{joint}_play"), None)
+    free = {dof} if play is None else {dof, int(m.jnt_dofadr[play])}
+    m.dof_armature[[k for k in range(m.nv) if k not in free]] = HELD_KG_M2
+    m.opt.disableflags |= int(library.mjtDisableBit.mjDSBL_CONTACT)
+    data = library.MjData(m)
+    for name in robot.joints:
+        data.qpos[int(m.joint(name).qposadr[0])] = posture[int(robot.compiled.joint(name).qposadr[0])]
+    data.qpos[place] = command[0]
+    driven = [m.actuator(a).id for a in believed.motor.names] if believed.motor is not None else []
+    drive = driven[0] if driven else None
+    gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
+    control = control_of(m, drive)
+    if control is not None:
+        # What the other side begins with: the torque that holds the joint.
+        data.ctrl[control] = gear * (command[0] + start_nm / loop.kp_nm_per_rad) if by_position else start_nm / gear
+        if hasattr(library, "mj_initCtrlHistory"):
+            _fill_history(library, m, data)
+    relax(m, data)
+    library.mj_forward(m, data)
+    torque, rate = np.empty(command.size), np.gradient(command, float(m.opt.timestep))
+    integral, last, step_s = start_nm, command[0], float(m.opt.timestep)
+    for k, wanted in enumerate(command):
+        demand = 0.0
+        if by_position and control is not None:
+            data.ctrl[control] = gear * (wanted + start_nm / loop.kp_nm_per_rad)
+        else:
+            reading = float(data.qpos[place])
+            velocity, last = (reading - last) / step_s, reading
+            error = wanted - reading
+            demand = loop.kp_nm_per_rad * error + integral + loop.kd_nm_s_per_rad * (rate[k] - velocity)
+            if abs(demand) > loop.torque_limit_nm:
+                demand = math.copysign(loop.torque_limit_nm, demand)
+            else:
+                integral += loop.ki_nm_per_rad_s * error * step_s
+            if control is not None:
+                data.ctrl[control] = demand / (believed.motor.gear if believed.motor is not None else 1.0)
+            else:
+                data.qfrc_applied[dof] = demand
+        library.mj_step(m, data)
+        torque[k] = demand if drive is None else gear * float(data.actuator_force[force_of(m, drive)])
+    return torque
+
+
+def control_of(m: Any, actuator: int | None) -> int | None:
+    """Place of an actuator's control; passive actuators have none, so that the two lists are not the same."""
+    if actuator is None:
+        return None
+    return int(m.actuator_ctrladr[actuator]) if hasattr(m, "actuator_ctrladr") else actuator
+
+
+def force_of(m: Any, actuator: int) -> int:
+    """Place of an actuator's force."""
+    return int(m.actuator_outadr[actuator]) if hasattr(m, "actuator_outadr") else actuator
+
+
+def _fill_history(library: Any, m: Any, data: Any) -> None:
+    """The delay line begins with the present control instead of zeros."""
+    for actuator in range(len(m.actuator_trntype)):
+        samples = int(m.actuator_history[actuator][0])
+        if samples > 0:
+            control = float(data.ctrl[int(m.actuator_ctrladr[actuator])])
+            times = float(m.opt.timestep) * np.arange(-samples, 0)
+            library.mj_initCtrlHistory(m, data, actuator, times, np.full(samples, control))
