@@ -91,12 +91,30 @@ def print_arm(output: Output, result: Result) -> None:
         )
     output.out.print(table)
     output.out.print(result["summary"], markup=False, soft_wrap=True)
+    _print_arm_cause(output, result)
     _print_export(output, result)
     for line, names in _same_lines(result["joints"]).items():
         who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
         output.out.print(f"{who}: {line}", markup=False, soft_wrap=True)
     for name, place in result["held"].items():
         output.out.print(f"{name}: held at {place:.4g}", markup=False)
+
+
+def _print_arm_cause(output: Output, result: Result) -> None:
+    """What belongs to no single joint, and how much these motions can tell."""
+    arm = result["arm"]
+    if arm is None:
+        return
+    if cause := arm["cause"]:
+        for name, value in cause["parameters"].items():
+            low, high = value["interval_95"]
+            output.out.print(f"  {name} = {value['value']:.4g} ({low:.4g} .. {high:.4g})", markup=False)
+    base = arm["base_parameters"]
+    output.out.print(
+        f"the motions tell {base['rank']} combinations of {base['of']} inertial parameters apart (condition "
+        f"{base['condition']:.0f})",
+        markup=False,
+    )
 
 
 def _print_export(output: Output, result: Result) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.files import part_of_path, refuse_overwriting
+from frictid_hil.gap.arm import ArmFindings
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -44,8 +45,8 @@ def diagnose_arm(
 
     Returns:
         The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
-        ``asked``; ``held``, ``logs`` and ``summary`` of the arm; ``closed_loop`` of the user's model
-        before and after in MuJoCo; ``export`` of a model that was written.
+        ``asked``; ``held``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop`` of the
+        user's model before and after in MuJoCo; ``export`` of a model that was written.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
@@ -58,7 +59,8 @@ def diagnose_arm(
         "model_in": str(asked.model.resolve()),
         "logs": [{"name": m.name, "validation": m.validation} for m in arm.motions],
         "held": dict(arm.held),
-        "summary": summary(found),
+        "summary": summary(found, arm.found),
+        "arm": _of_the_arm(arm.found),
         "joints": joints,
     }
     made = exports(arm, found, apply=apply)
@@ -101,7 +103,7 @@ def _diagnosed(experiments: ExperimentSet) -> Diagnosis:
     return find_causes(experiments)
 
 
-def summary(found: Mapping[str, Diagnosis]) -> str:
+def summary(found: Mapping[str, Diagnosis], arm: ArmFindings | None = None) -> str:
     """One sentence about the arm."""
     named = [
         f"{name} ({' and '.join(c.effect for c in d.causes)})" for name, d in found.items() if d.verdict == "explained"
@@ -113,7 +115,29 @@ def summary(found: Mapping[str, Diagnosis]) -> str:
         parts.append(f"causes are named on {', '.join(named)}")
     if open_ones:
         parts.append(f"open: {', '.join(open_ones)}")
+    if arm is not None and arm.cause is not None:
+        body = f" on {arm.cause.body}" if arm.cause.body else ""
+        parts.insert(0, f"the arm: {arm.cause.effect}{body} ({arm.cause.confidence:.2f})")
     return "; ".join(parts) + "."
+
+
+def _of_the_arm(found: ArmFindings | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    cause = found.cause
+    told = None
+    if cause is not None:
+        parameters = {
+            name: {"value": value, "interval_95": [low, high]} for name, (value, low, high) in cause.parameters.items()
+        }
+        told = {"effect": cause.effect, "body": cause.body, "confidence": cause.confidence, "parameters": parameters}
+    return {
+        "cause": told,
+        "chances": dict(found.chances),
+        "rms_before": found.rms_before,
+        "rms_after": found.rms_after,
+        "base_parameters": {"of": found.base.columns, "rank": found.base.rank, "condition": found.base.condition},
+    }
 
 
 def _told(joint: JointSet, found: Diagnosis) -> dict[str, Any]:

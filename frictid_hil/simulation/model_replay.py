@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.native_check import control_of, force_of
+from frictid_hil.simulation.native_check import control_of, drive_of, force_of
 from frictid_hil.simulation.rigid_bodies import mujoco_library
 from frictid_hil.simulation.robot_model import RobotModel, relax
 
@@ -42,7 +42,6 @@ def why_not_replayed(robot: RobotModel, joints: Sequence[str], commanded: bool) 
 
 
 def replayed(
-    robot: RobotModel,
     model: mujoco.MjModel,
     joints: Sequence[str],
     held: Mapping[str, float],
@@ -53,7 +52,6 @@ def replayed(
     """Run a model along the commands of a recording, from where the recording begins.
 
     Args:
-        robot: the user's model as it was; tells the actuators.
         model: the one to run, as it was or edited.
         joints: of the recording, k of them, all driven by position.
         held: where the others stand; they are not moved.
@@ -66,8 +64,7 @@ def replayed(
     for name, place in held.items():
         data.qpos[int(m.joint(name).qposadr[0])] = place
     places = [int(m.joint(name).qposadr[0]) for name in joints]
-    motors = [robot.joint(name).motor for name in joints]
-    drives = [m.actuator(motor.names[0]).id for motor in motors if motor is not None]
+    drives = [drive for name in joints if (drive := drive_of(m, m.joint(name).id)) is not None]
     controls = [control_of(m, drive) for drive in drives]
     gears = np.array([float(m.actuator_gear[drive][0]) for drive in drives])
     forces = [force_of(m, drive) for drive in drives]

@@ -159,8 +159,8 @@ class ModelText:
         ]  # fmt: skip
 
     def section(self, tag: str) -> Element | None:
-        """The first section of a name below a root."""
-        for e in self._elements:
+        """The last section of a name below a root: what is added there moves no index of what stands before."""
+        for e in reversed(self._elements):
             if e.tag == tag and e.parent is not None and e.parent.tag in ("mujoco", "mujocoinclude"):
                 return e
         return None

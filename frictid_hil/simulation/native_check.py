@@ -127,8 +127,7 @@ def _in_mujoco(
     for name in robot.joints:
         data.qpos[int(m.joint(name).qposadr[0])] = posture[int(robot.compiled.joint(name).qposadr[0])]
     data.qpos[place] = command[0]
-    driven = [m.actuator(a).id for a in believed.motor.names] if believed.motor is not None else []
-    drive = driven[0] if driven else None
+    drive = drive_of(m, number) if believed.motor is not None else None
     gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
     control = control_of(m, drive)
     if control is not None:
@@ -160,6 +159,16 @@ def _in_mujoco(
         library.mj_step(m, data)
         torque[k] = demand if drive is None else gear * float(data.actuator_force[force_of(m, drive)])
     return torque
+
+
+def drive_of(m: Any, joint: int) -> int | None:
+    """The first actuator that drives a joint; passive ones have no control."""
+    joints = (int(mujoco_library().mjtTrn.mjTRN_JOINT), int(mujoco_library().mjtTrn.mjTRN_JOINTINPARENT))
+    controls = getattr(m, "actuator_ctrlnum", np.ones(len(m.actuator_trntype)))
+    for a in range(len(m.actuator_trntype)):
+        if int(m.actuator_trntype[a]) in joints and int(m.actuator_trnid[a][0]) == joint and controls[a] > 0:
+            return a
+    return None
 
 
 def control_of(m: Any, actuator: int | None) -> int | None:

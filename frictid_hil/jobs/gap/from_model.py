@@ -17,7 +17,9 @@ import numpy as np
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.nominal import ExperimentFile, NominalFile, load_nominal
 from frictid_hil.errors import InputFileError, UsageError
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.arm import ArmFindings, Recorded, find_in_arm
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set
 from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.jobs.gap.logs import name_of, parted, samples_of_all
@@ -109,12 +111,14 @@ class ArmSet:
         motions: the recordings.
         held: where the joints stand that no recording has.
         joints: by name.
+        found: of the arm as a whole; None where no log has torques of all joints, or there is only one joint.
     """
 
     robot: RobotModel
     motions: tuple[Motion, ...]
     held: Mapping[str, float]
     joints: Mapping[str, JointSet]
+    found: ArmFindings | None = None
 
 
 def sets_from_model(asked: ModelLogs) -> ArmSet:
@@ -132,11 +136,42 @@ def sets_from_model(asked: ModelLogs) -> ArmSet:
     _ask_for_places(robot, motions, held)
     _known_tolerances(asked.tolerances or {}, names)
     inertia = _inertia(robot, motions, held)
+    found = _of_the_arm(robot, motions, held)
+    if found is not None and found.torque is not None:
+        # What belongs to the arm is no cause of a joint.
+        rigid = [torque + found.torque(*_motion_of(motion)) for torque, motion in zip(rigid, motions, strict=True)]
     sets = {}
     for k, name in enumerate(names):
         columns = [torque[:, k] for torque in rigid]
         sets[name] = _joint_set(asked, robot, motions, name, columns, float(inertia[k]))
-    return ArmSet(robot, motions, {**_reference(robot, names), **held}, sets)
+    return ArmSet(robot, motions, {**_reference(robot, names), **held}, sets, found)
+
+
+def _of_the_arm(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str, float]) -> ArmFindings | None:
+    """Causes that belong to no single joint."""
+    names = tuple(motions[0].samples)
+    recorded = []
+    for motion in motions:
+        torques = [s.torque_nm for s in motion.samples.values() if s.torque_nm is not None]
+        if len(torques) < len(names):
+            return None
+        time = next(iter(motion.samples.values())).time_s
+        recorded.append(Recorded(motion.validation, time, motion.position_rad, np.stack(torques, axis=1)))
+    if len(names) < 2:
+        return None
+    curves = [_curve_of(robot.joint(name), motions) for name in names]
+    return find_in_arm(robot, names, held, curves, recorded)
+
+
+def _curve_of(believed: ModelJoint, motions: Sequence[Motion]) -> FrictionCurve | None:
+    told = _friction(believed, [motion.samples[believed.name] for motion in motions])
+    if told is None:
+        return None
+    return FrictionCurve.through(np.array(told["velocity_rad_s"]), np.array(told["torque_nm"]))
+
+
+def _motion_of(motion: Motion) -> tuple[Array, Array, Array]:
+    return kinematics(next(iter(motion.samples.values())).time_s, motion.position_rad)
 
 
 def _motions(asked: ModelLogs, robot: RobotModel) -> tuple[Motion, ...]:
@@ -212,8 +247,7 @@ def _one_clock(named: Mapping[str, Samples]) -> dict[str, Samples]:
 
 def _rigid(robot: RobotModel, motion: Motion, held: Mapping[str, float]) -> Array:
     """The bodies' torque along a recording, shape (n, k)."""
-    time = next(iter(motion.samples.values())).time_s
-    return robot.rigid_body_torque(tuple(motion.samples), *kinematics(time, motion.position_rad), held)
+    return robot.rigid_body_torque(tuple(motion.samples), *_motion_of(motion), held)
 
 
 def kinematics(time_s: Array, position_rad: Array) -> tuple[Array, Array, Array]:
@@ -310,7 +344,7 @@ def _joint_set(
             )
         )
     numbers: dict[str, Any] = {}
-    friction = told["joint"].get("friction") or _friction(believed, listed)
+    friction = told["joint"].get("friction") or _friction(believed, [samples for _, samples in listed])
     if friction is None:
         numbers = _drafted_friction(told, listed, robot, name)
     else:
@@ -349,13 +383,13 @@ def _gravity(robot: RobotModel, motions: Sequence[Motion], name: str) -> tuple[f
     return float(cos), float(sin)
 
 
-def _friction(believed: ModelJoint, logs: Sequence[tuple[ExperimentFile, Samples]]) -> dict[str, Any] | None:
+def _friction(believed: ModelJoint, logs: Sequence[Samples]) -> dict[str, Any] | None:
     """The file's friction as pairs over the speeds that were driven; None where the file has no dry friction."""
-    torques = [s.torque_nm for _, s in logs if s.torque_nm is not None]
+    torques = [s.torque_nm for s in logs if s.torque_nm is not None]
     size = float(np.sqrt(np.mean(np.concatenate(torques) ** 2))) if torques else 0.0
     if believed.dry_nm <= LEAST_DRY * size or believed.dry_nm <= 0.0:
         return None
-    fastest = max(float(np.quantile(np.abs(np.gradient(s.position_rad, s.time_s)), 0.99)) for _, s in logs)
+    fastest = max(float(np.quantile(np.abs(np.gradient(s.position_rad, s.time_s)), 0.99)) for s in logs)
     speed = 1.2 * max(fastest, 1e-3) * (np.arange(1, CURVE_POINTS + 1) / CURVE_POINTS) ** 2
     told: dict[str, Any] = {
         "velocity_rad_s": [float(v) for v in speed],

@@ -255,7 +255,7 @@ def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
     samples = list(motion.samples.values())
     time = samples[0].time_s
     command = np.stack([s.position_command_rad for s in samples if s.position_command_rad is not None], axis=1)
-    ran = replayed(arm.robot, model, names, arm.held, time, motion.position_rad, command)
+    ran = replayed(model, names, arm.held, time, motion.position_rad, command)
     begin = int(np.searchsorted(time, time[0] + 1.0))
     position = (motion.position_rad - ran.position_rad)[begin:]
     measured = [s.torque_nm for s in samples]

@@ -1,0 +1,477 @@
+"""Causes that belong to the arm and not to a joint: a payload, the mass of a link, the direction of gravity.
+
+The rigid bodies' torque is linear in masses, first moments and inertias of the bodies, and in the direction of gravity.
+So each such cause is a few columns over all joints at once, made by the user's own engine; friction, a constant, the
+rotor and the torque constant of each joint stand beside them as columns of that joint alone, with priors as wide as a
+joint's own causes may be. One posterior weighs the causes of the arm against each other and against none.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg, signal
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.robot_model import RobotModel, inverse_torque
+
+Motion = tuple[Array, Array, Array]
+"""Position, velocity and acceleration, (n, k) each."""
+
+CUTOFF_HZ = 15.0
+RATE_HZ = 60.0
+"""Rate to which everything is thinned behind the low-pass."""
+MOVING = 0.06
+"""Share of a joint's fastest speed above which its friction is that of sliding."""
+MASS_PRIOR = 0.3
+"""One-sigma of the share by which a link may be heavier or lighter when that is a cause."""
+PAYLOAD_PRIOR = 0.3
+"""One-sigma of a payload's mass, over the mass of all links."""
+REACH_PRIOR_M = 0.15
+"""One-sigma of the place of a payload's centre."""
+TILT_PRIOR_RAD = 0.1
+SURE = 0.9
+"""Chance from which a cause of the arm is named."""
+LEAST_GAIN = 0.02
+"""Fall of the pooled RMS on logs that were not fitted, below which a cause has no practical meaning."""
+_ROTOR_KG_M2 = 100.0
+NEGLIGIBLE = 1e-6
+"""Share of the largest pivot below which a combination of parameters is not seen at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmCause:
+    """A cause of the arm.
+
+    Attributes:
+        effect: ``payload``, ``link_mass_error`` or ``base_orientation_error``.
+        body: that carries it; empty for the base.
+        confidence: chance that it is this one.
+        parameters: value and 95 % interval, by name with unit.
+    """
+
+    effect: str
+    body: str
+    confidence: float
+    parameters: Mapping[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class BaseParameters:
+    """What these motions can tell of the bodies at all.
+
+    Attributes:
+        columns: inertial parameters of all bodies.
+        rank: combinations of them that move any torque (base parameters).
+        condition: of the base parameters' columns, scaled to equal length.
+    """
+
+    columns: int
+    rank: int
+    condition: float
+
+
+@dataclass(frozen=True, slots=True)
+class ArmFindings:
+    """What was found of the arm.
+
+    Attributes:
+        cause: named one, or None.
+        chances: of each candidate, ``none`` among them, by name.
+        rms_before: pooled over joints on logs that were not fitted, torque over each joint's dry friction.
+        rms_after: with the cause.
+        base: identifiability.
+        torque: (position, velocity, acceleration) of the arm, (n, k) each -> torque to add to the model's, (n, k).
+    """
+
+    cause: ArmCause | None
+    chances: Mapping[str, float]
+    rms_before: float
+    rms_after: float
+    base: BaseParameters
+    torque: Callable[[Array, Array, Array], Array] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One recording of the arm; arrays (n, k).
+
+    Attributes:
+        validation: judged on, never fitted.
+        time_s: shape (n,).
+        position_rad: measured.
+        torque_nm: measured.
+    """
+
+    validation: bool
+    time_s: Array
+    position_rad: Array
+    torque_nm: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """One recording thinned: motion (m, k) and what the model leaves of the torque."""
+
+    validation: bool
+    position: Array
+    velocity: Array
+    acceleration: Array
+    left: Array
+    rigid: Array
+    moving: Array
+
+
+class _Bodies:
+    """Columns of the arm, made by the user's engine.
+
+    Args:
+        robot: the model.
+        joints: names, in the order of the recordings.
+        held: where the other joints stand.
+    """
+
+    def __init__(self, robot: RobotModel, joints: Sequence[str], held: Mapping[str, float]) -> None:
+        self._robot = robot
+        self._numbers = [robot.number(name) for name in joints]
+        self._posture = robot.posture(held)
+        self._model: Any = robot.without_friction()
+        m = self._model
+        self._empty: Any = copy.copy(m)
+        self._empty.body_mass[:] = 0.0
+        self._empty.body_inertia[:] = 0.0
+        # A rotor so heavy that MuJoCo can factor the inertia matrix of any body; what it asks is taken off again.
+        self._empty.dof_armature[:] = _ROTOR_KG_M2
+        self._empty.jnt_stiffness[:] = 0.0
+        self._empty.body_sameframe[:] = 0
+        self._empty.body_simple[:] = 0
+        carried = {int(m.jnt_bodyid[number]) for number in self._numbers}
+        self.bodies = [b for b in range(1, m.nbody) if m.body_mass[b] > 0.0 and self._moves(b, carried)]
+        self.last = max(carried)
+
+    def _moves(self, body: int, carried: set[int]) -> bool:
+        while body > 0:
+            if body in carried:
+                return True
+            body = int(self._model.body_parentid[body])
+        return False
+
+    def name(self, body: int) -> str:
+        """Of a body."""
+        return self._model.body(body).name or f"body {body}"
+
+    @property
+    def mass_kg(self) -> float:
+        """Of all that moves."""
+        return float(sum(self._model.body_mass[b] for b in self.bodies))
+
+    def whole(self, t: Motion) -> Array:
+        """Torque of all bodies."""
+        return inverse_torque(self._model, self._posture, self._numbers, *t)
+
+    def of(self, body: int, t: Motion, mass: float, centre: Array, inertia: Array, quat: Array) -> Array:
+        """Torque of one body of this mass, centre and principal inertia alone."""
+        m = copy.copy(self._empty)
+        m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body] = mass, centre, inertia, quat
+        return inverse_torque(m, self._posture, self._numbers, *t) - _ROTOR_KG_M2 * t[2]
+
+    def scaled(self, body: int, t: Motion) -> Array:
+        """Torque of a body as the file has it: what a share of its mass and inertia adds."""
+        m = self._model
+        return self.of(body, t, m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body])
+
+    def payload(self, t: Motion) -> list[Array]:
+        """Mass in the origin of the last body, and three first moments, per kg and kg m."""
+        unit, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        mass = self.of(self.last, t, 1.0, none, none, unit)
+        columns = [mass]
+        for axis in np.eye(3):
+            # Half the difference of opposite places: what is quadratic in the place falls out.
+            there = self.of(self.last, t, 1.0, 0.1 * axis, none, unit)
+            opposite = self.of(self.last, t, 1.0, -0.1 * axis, none, unit)
+            columns.append((there - opposite) / 0.2)
+        return columns
+
+    def tilt(self, t: Motion) -> list[Array]:
+        """Gravity turned about the two axes across it, per rad."""
+        still = (t[0], np.zeros_like(t[0]), np.zeros_like(t[0]))
+        gravity = self._model.opt.gravity.copy()
+        size = float(np.linalg.norm(gravity)) or 1.0
+        across = linalg.null_space(gravity[None, :] / size).T
+        columns = []
+        for axis in across:
+            m = copy.copy(self._model)
+            m.jnt_stiffness[:] = 0.0
+            m.opt.gravity[:] = np.cross(axis, gravity)
+            columns.append(inverse_torque(m, self._posture, self._numbers, *still))
+        return columns
+
+    @property
+    def tilt_axes(self) -> Array:
+        """The two axes of ``tilt``, (2, 3)."""
+        gravity = self._model.opt.gravity
+        axes: Array = linalg.null_space(gravity[None, :] / (np.linalg.norm(gravity) or 1.0)).T
+        return axes
+
+    def regressor(self, t: Motion) -> Array:
+        """Mass, first moments and inertias of every body, (n * k, 10 * bodies)."""
+        columns = []
+        unit, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        # Half a right angle about each axis turns (1, -1, 0) into an off-diagonal inertia.
+        c, s = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
+        turned = [([1.0, -1.0, 0.0], [c, 0, 0, s]), ([1.0, 0.0, -1.0], [c, 0, s, 0]), ([0.0, 1.0, -1.0], [c, s, 0, 0])]
+        for body in self.bodies:
+            columns.append(self.of(body, t, 1.0, none, none, unit))
+            for axis in np.eye(3):
+                there = self.of(body, t, 1.0, 0.1 * axis, none, unit)
+                columns.append((there - self.of(body, t, 1.0, -0.1 * axis, none, unit)) / 0.2)
+            columns += [self.of(body, t, 0.0, none, axis, unit) for axis in np.eye(3)]
+            columns += [self.of(body, t, 0.0, none, np.array(i), np.array(q, dtype=float)) for i, q in turned]
+        return np.stack([column.ravel() for column in columns], axis=1)
+
+
+def find_in_arm(
+    robot: RobotModel,
+    joints: Sequence[str],
+    held: Mapping[str, float],
+    curves: Sequence[FrictionCurve | None],
+    recordings: Sequence[Recorded],
+    mass_tolerance: float = 0.03,
+) -> ArmFindings:
+    """Weigh the causes of the arm; deterministic.
+
+    Args:
+        robot: the user's model.
+        joints: of the recordings, k of them.
+        held: where the others stand.
+        curves: friction that is believed, by joint.
+        recordings: of all joints; at least one is fitted.
+        mass_tolerance: one-sigma of every link's mass within which a difference is no cause.
+    """
+    bodies = _Bodies(robot, joints, held)
+    tables = [_table(bodies, curves, r) for r in recordings]
+    fitted = [t for t in tables if not t.validation] or tables
+    judged = [t for t in tables if t.validation] or tables
+    scale = np.array([_scale(curve, fitted, k) for k, curve in enumerate(curves)])
+    candidates = _candidates(bodies)
+    y, nuisance, prior, rows = _stacked(fitted, scale, _nuisances)
+    columns = {name: _stacked_columns(fitted, scale, make, rows) for name, (make, _) in candidates.items()}
+    masses = [_stacked_columns(fitted, scale, _one(bodies, body), rows) for body in bodies.bodies]
+    within = np.concatenate([nuisance, *masses], axis=1)
+    spread = np.concatenate([prior, np.full(len(masses), mass_tolerance)])
+    noise = _noise(y, np.concatenate([within, *columns.values()], axis=1))
+    scores = {"none": _evidence(y, within, spread, noise)}
+    for name, (_, sigma) in candidates.items():
+        table = np.concatenate([within, columns[name]], axis=1)
+        scores[name] = _evidence(y, table, np.concatenate([spread, sigma]), noise)
+    best = max(scores.values())
+    weights = {name: math.exp(max(-700.0, score - best)) for name, score in scores.items()}
+    chances = {name: weight / sum(weights.values()) for name, weight in weights.items()}
+    base = _base_parameters(bodies, fitted)
+    name = max(chances, key=lambda n: chances[n])
+    before = _judged_rms(judged, scale, None, spread[: prior.size], fitted)
+    nothing = ArmFindings(None, chances, before, before, base)
+    if name == "none":
+        return nothing
+    make, sigma = candidates[name]
+    after = _judged_rms(judged, scale, make, np.concatenate([spread[: prior.size], sigma]), fitted)
+    table = np.concatenate([within, columns[name]], axis=1)
+    values, covariance = _posterior(y, table, np.concatenate([spread, sigma]), noise)
+    found, width = values[-sigma.size :], 1.96 * np.sqrt(np.diag(covariance))[-sigma.size :]
+    sure = chances[name] >= SURE and after < (1.0 - LEAST_GAIN) * before
+    if not sure or not _beyond(name, found, width, mass_tolerance):
+        return ArmFindings(None, chances, before, after, base)
+    cause = _named(bodies, name, chances[name], found, width)
+    return ArmFindings(cause, chances, before, after, base, _torque_of(make, found))
+
+
+def _torque_of(make: Callable[..., list[Array]], values: Array) -> Callable[[Array, Array, Array], Array]:
+    def torque(position: Array, velocity: Array, acceleration: Array) -> Array:
+        columns = make((position, velocity, acceleration))
+        return np.asarray(sum(v * c for v, c in zip(values, columns, strict=True)))
+
+    return torque
+
+
+def _candidates(bodies: _Bodies) -> dict[str, tuple[Callable[..., list[Array]], Array]]:
+    """Columns and priors of every cause, by name."""
+    mass = PAYLOAD_PRIOR * bodies.mass_kg
+    found: dict[str, tuple[Callable[..., list[Array]], Array]] = {
+        "payload": (bodies.payload, np.array([mass, *[REACH_PRIOR_M * mass] * 3])),
+        "base_orientation_error": (bodies.tilt, np.full(2, TILT_PRIOR_RAD)),
+    }
+    for body in bodies.bodies:
+        found[f"link_mass_error {bodies.name(body)}"] = (_one(bodies, body), np.array([MASS_PRIOR]))
+    return found
+
+
+def _one(bodies: _Bodies, body: int) -> Callable[..., list[Array]]:
+    return lambda t: [bodies.scaled(body, t)]
+
+
+def _table(bodies: _Bodies, curves: Sequence[FrictionCurve | None], r: Recorded) -> _Table:
+    """A recording behind the low-pass, thinned."""
+    step_s = float(np.median(np.diff(r.time_s)))
+    rate = 1.0 / step_s
+    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate) / (0.5 * rate))
+    even = np.arange(r.time_s[0], r.time_s[-1], step_s)
+    q = np.stack([np.interp(even, r.time_s, column) for column in r.position_rad.T], axis=1)
+    torque = np.stack([np.interp(even, r.time_s, column) for column in r.torque_nm.T], axis=1)
+    # A torque is the mean since the row before: half a step earlier than its row.
+    torque[:-1] = 0.5 * (torque[:-1] + torque[1:])
+    q, torque = signal.filtfilt(b, a, q, axis=0), signal.filtfilt(b, a, torque, axis=0)
+    v = np.gradient(q, step_s, axis=0)
+    acc = np.gradient(v, step_s, axis=0)
+    every = slice(round(0.3 * rate), -round(0.3 * rate) or None, max(1, int(rate / RATE_HZ)))
+    q, v, acc, torque = q[every], v[every], acc[every], torque[every]
+    rigid = bodies.whole((q, v, acc))
+    friction = np.stack(
+        [c.torque(v[:, k]) if c is not None else np.zeros(len(v)) for k, c in enumerate(curves)], axis=1
+    )
+    fastest = np.quantile(np.abs(v), 0.98, axis=0)
+    slow = np.abs(v) < MOVING * fastest
+    # Also shortly before and after: the low-pass smears a reversal.
+    wide = signal.convolve(slow.astype(float), np.ones((7, 1)), mode="same") > 0.5
+    return _Table(r.validation, q, v, acc, torque - rigid - friction, rigid, ~wide)
+
+
+def _scale(curve: FrictionCurve | None, tables: Sequence[_Table], k: int) -> float:
+    """What a joint's torque is counted in: its dry friction, or a tenth of what the bodies ask."""
+    rigid = float(np.sqrt(np.mean(np.concatenate([t.rigid[:, k] for t in tables]) ** 2)))
+    return max(curve.coulomb_nm if curve is not None else 0.0, 0.02 * rigid, 1e-9)
+
+
+def _nuisances(t: _Table, k: int, scale: float) -> tuple[Array, Array]:
+    """Columns of one joint's own causes and their priors: friction, viscosity, a constant, rotor, torque constant."""
+    v, acc = t.velocity[:, k], t.acceleration[:, k]
+    fastest = max(float(np.max(np.abs(v))), 1e-9)
+    hard = max(float(np.sqrt(np.mean(acc**2))), 1e-9)
+    columns = [np.sign(v), v / fastest, np.abs(v) * v / fastest**2, np.ones_like(v), acc / hard, t.rigid[:, k]]
+    rigid = float(np.sqrt(np.mean(t.rigid[:, k] ** 2)))
+    prior = [0.5 * scale, 0.5 * scale, 0.5 * scale, 0.1 * scale, 0.1 * rigid, 0.03]
+    return np.stack(columns, axis=1), np.array(prior)
+
+
+def _stacked(
+    tables: Sequence[_Table], scale: Array, make: Callable[[_Table, int, float], tuple[Array, Array]]
+) -> tuple[Array, Array, Array, list[list[Array]]]:
+    """(y, columns, priors, rows) of all joints one below the other, each counted in its own scale."""
+    joints = scale.size
+    rows = [[np.flatnonzero(t.moving[:, k]) for k in range(joints)] for t in tables]
+    y = np.concatenate([t.left[r[k], k] / scale[k] for k in range(joints) for t, r in zip(tables, rows, strict=True)])
+    blocks, priors = [], []
+    for k in range(joints):
+        parts = [make(t, k, scale[k]) for t in tables]
+        blocks.append(np.concatenate([p[0][r[k]] for p, r in zip(parts, rows, strict=True)]) / scale[k])
+        priors.append(parts[0][1])
+    return y, linalg.block_diag(*blocks), np.concatenate(priors), rows
+
+
+def _stacked_columns(
+    tables: Sequence[_Table], scale: Array, make: Callable[..., list[Array]], rows: list[list[Array]]
+) -> Array:
+    every = [make((t.position, t.velocity, t.acceleration)) for t in tables]
+    columns = []
+    for c in range(len(every[0])):
+        parts = [
+            columns_of[c][r[k], k] / scale[k]
+            for k in range(scale.size)
+            for columns_of, r in zip(every, rows, strict=True)
+        ]
+        columns.append(np.concatenate(parts))
+    return np.stack(columns, axis=1)
+
+
+def _noise(y: Array, table: Array) -> float:
+    """Variance of a row, in the weight of independent rows: what is left hangs together in time."""
+    left = y - table @ np.linalg.lstsq(table, y, rcond=None)[0]
+    centred = left - left.mean()
+    spectrum = np.abs(np.fft.rfft(centred, 2 * centred.size)) ** 2
+    correlation = np.fft.irfft(spectrum)[: centred.size] / max(float(centred @ centred), 1e-300)
+    end = int(np.argmax(correlation < 0.05)) or 1
+    memory = 1.0 + 2.0 * float(np.sum(correlation[1:end]))
+    return max(float(np.mean(left**2)) * memory, 1e-10)
+
+
+def _posterior(y: Array, table: Array, spread: Array, noise: float) -> tuple[Array, Array]:
+    scaled = table * spread
+    inner = scaled.T @ scaled / noise + np.eye(spread.size)
+    covariance = linalg.inv(inner)
+    values = spread * (covariance @ (scaled.T @ y) / noise)
+    return values, covariance * np.outer(spread, spread)
+
+
+def _evidence(y: Array, table: Array, spread: Array, noise: float) -> float:
+    """Logarithm of the chance of the torques under Gaussian priors, but for what all candidates share."""
+    scaled = table * spread
+    inner = scaled.T @ scaled / noise + np.eye(spread.size)
+    factor = linalg.cholesky(inner, lower=True)
+    towards = linalg.solve_triangular(factor, scaled.T @ y / noise, lower=True)
+    return float(0.5 * towards @ towards - np.sum(np.log(np.diag(factor))))
+
+
+def _judged_rms(
+    judged: Sequence[_Table],
+    scale: Array,
+    make: Callable[..., list[Array]] | None,
+    spread: Array,
+    fitted: Sequence[_Table],
+) -> float:
+    """Pooled RMS on the logs that were not fitted, joints' own causes and the candidate fitted on the others."""
+
+    def stacked(tables: Sequence[_Table]) -> tuple[Array, Array]:
+        y, own, _, rows = _stacked(tables, scale, _nuisances)
+        more = [] if make is None else [_stacked_columns(tables, scale, make, rows)]
+        return y, np.concatenate([own, *more], axis=1)
+
+    y, table = stacked(fitted)
+    values, _ = _posterior(y, table, spread, _noise(y, table))
+    y, table = stacked(judged)
+    return float(np.sqrt(np.mean((y - table @ values) ** 2)))
+
+
+def _beyond(name: str, found: Array, width: Array, mass_tolerance: float) -> bool:
+    """Whether a cause is more than what is held of the file."""
+    if name.startswith("link_mass_error"):
+        return bool(abs(found[0]) - 0.5 * width[0] > 2.0 * mass_tolerance)
+    if name == "payload":
+        return bool(found[0] > width[0])
+    return bool(np.any(np.abs(found) > width))
+
+
+def _named(bodies: _Bodies, name: str, chance: float, found: Array, width: Array) -> ArmCause:
+    effect, _, body = name.partition(" ")
+    if effect == "link_mass_error":
+        return ArmCause(effect, body, chance, {"error_share": _interval(found[0], width[0])})
+    if effect == "payload":
+        mass = float(found[0])
+        values = {"mass_kg": _interval(mass, width[0])}
+        for axis, moment, wide in zip("xyz", found[1:], width[1:], strict=True):
+            values[f"centre_{axis}_m"] = _interval(float(moment) / mass, float(wide) / mass)
+        return ArmCause(effect, bodies.name(bodies.last), chance, values)
+    turn, wide = found @ bodies.tilt_axes, np.abs(width @ np.abs(bodies.tilt_axes))
+    told = {f"about_{axis}_rad": _interval(turn[k], wide[k]) for k, axis in enumerate("xyz") if wide[k] > 1e-12}
+    return ArmCause(effect, "", chance, told)
+
+
+def _interval(value: float, half: float) -> tuple[float, float, float]:
+    return float(value), float(value - half), float(value + half)
+
+
+def _base_parameters(bodies: _Bodies, tables: Sequence[_Table]) -> BaseParameters:
+    """Rank and condition of the regressor along the fitted motions, by QR with pivots."""
+    motion = [np.concatenate([getattr(t, name) for t in tables]) for name in ("position", "velocity", "acceleration")]
+    some = slice(None, None, max(1, motion[0].shape[0] // 400))
+    table = bodies.regressor((motion[0][some], motion[1][some], motion[2][some]))
+    length = np.linalg.norm(table, axis=0)
+    scaled = table / np.where(length > 1e-9 * length.max(), length, np.inf)
+    _, r, pivots = linalg.qr(scaled, mode="economic", pivoting=True)
+    sizes = np.abs(np.diag(r))
+    rank = int(np.sum(sizes > NEGLIGIBLE * sizes[0]))
+    return BaseParameters(table.shape[1], rank, float(np.linalg.cond(scaled[:, pivots[:rank]])))
