@@ -95,7 +95,7 @@ class Machine:
         asymmetry: share by which dry friction is larger forwards and smaller backwards, by joint.
         ripple: (amplitude in N m, periods per turn), by joint.
         stribeck: (share of dry friction, speed in rad/s), by joint.
-        load: share of the torque's size that adds to friction, by joint.
+        load: share of the gravity that the joint carries that adds to friction, by joint.
         constant: share by which the torque given is larger than the torque reported, by joint.
         payload_kg: mass mounted on the last body, with its centre in that body's frame (m).
         payload_at_m: see there.
@@ -163,7 +163,7 @@ def forces(model: Any, machine: Machine) -> Callable[[Any], Array]:
     def applied(data: Any) -> Array:
         v = data.qvel
         level = usual * (1.0 + rise[:, 0] * np.exp(-((v / rise[:, 1]) ** 2)))
-        level = level * (1.0 + skew * np.sign(v)) + load * np.abs(data.qfrc_actuator)
+        level = level * (1.0 + skew * np.sign(v)) + load * np.abs(data.qfrc_bias)
         model.jnt_springyield[:] = level / stiffness
         out: Array = bias + ripple[:, 0] * np.sin(ripple[:, 1] * data.qpos + 0.4) + constant * data.qfrc_actuator
         return out

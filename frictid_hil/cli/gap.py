@@ -112,6 +112,17 @@ def diagnose(
             help="Export the improved joint to MuJoCo, and FILE.py with its callback.",
         ),
     ] = None,
+    export: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--export",
+            metavar="TARGET=FILE",
+            help="Also write the joints of a model as isaaclab (.py), bam (.json), c (.h) or samples (.json).",
+        ),
+    ] = None,
+    randomise: Annotated[
+        int, typer.Option("--randomise", metavar="N", min=0, help="Posterior samples to draw for --export.")
+    ] = 0,
     apply: Annotated[
         bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
     ] = False,
@@ -122,6 +133,7 @@ def diagnose(
 ) -> None:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
     from frictid_hil.cli.model_words import model_logs, print_arm
+    from frictid_hil.jobs.gap.export_targets import Wanted
     from frictid_hil.jobs.gap_diagnose import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
     from frictid_hil.jobs.gap_diagnose_arm import diagnose_arm
@@ -135,14 +147,19 @@ def diagnose(
                 model_logs(model, every, joint, columns, hold, tolerance, validation, nominal, profile, mujoco),
                 write=write_model,
                 apply=apply,
+                wanted=Wanted.of(export or (), randomise),
                 out=out,
                 force=force,
                 executor_name=executor,
             ),
             lambda result: print_arm(output, result),
         )
-    if hold or tolerance or executor or len(joint or ()) > 1 or not every:
-        why = "needs a set or logs" if not every else "--hold, --tolerance, --executor and several joints need --model"
+    if hold or tolerance or executor or export or randomise or len(joint or ()) > 1 or not every:
+        why = (
+            "needs a set or logs"
+            if not every
+            else "--hold, --tolerance, --executor, --export and several joints need --model"
+        )
         output.refuse("gap_diagnose", UsageError(why))
     source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or ())
     output.run(

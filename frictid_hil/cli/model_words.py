@@ -140,6 +140,9 @@ def _print_export(output: Output, result: Result) -> None:
         output.out.print(remark, markup=False, soft_wrap=True)
     if result.get("model"):
         output.out.print(f"model: {result['model']}", soft_wrap=True, markup=False)
+    for target, told in result.get("targets", {}).items():
+        output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True, markup=False)
+        output.out.print(f"  lost: {told['lost']}", soft_wrap=True, markup=False)
     if result.get("model_refused"):
         output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
 

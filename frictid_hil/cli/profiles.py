@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from frictid_hil.cli.options import JsonOption, ProfileArgument, QuietOption, StoreOption
+from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption
 from frictid_hil.cli.output import READING, Output, Result
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
@@ -67,6 +68,30 @@ def _timing(joint: Result) -> str:
         f"{1e3 * skew[f'{name}_s']:.3f} +- {2e3 * skew[f'{name}_deviation_s']:.3f}" for name in ("measured", "declared")
     )
     return f"{used} (+- {2e3 * skew['used_deviation_s']:.3f}): measured {measured} ms, declared {declared} ms"
+
+
+@app.command("export")
+def export(
+    profile: ProfileArgument,
+    to: Annotated[
+        str, typer.Option("--to", metavar="TARGET", help="table (20 points, CSV), ros2 (YAML) or i2rt (YAML).")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write.")],
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Write a profile in the form of the place where it shall act, and say what is lost."""
+    from frictid_hil.jobs.profile_export import export as job
+
+    output = Output(as_json, quiet)
+
+    def told(result: Result) -> None:
+        output.out.print(f"written: {result['written']}", soft_wrap=True, markup=False)
+        output.out.print(f"off the curve by {result['worst_percent']:.1f} % at most, within what was measured")
+        output.out.print(f"lost: {result['lost']}", soft_wrap=True, markup=False)
+
+    output.run("profile_export", lambda: job(profile, to, out, force=force), told)
 
 
 @app.command("diff")

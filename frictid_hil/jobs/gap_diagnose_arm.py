@@ -13,6 +13,7 @@ from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import Export, closed_loop_gap, exports, write_model
 from frictid_hil.jobs.identification.executors import answers, executor
@@ -25,6 +26,7 @@ def diagnose_arm(
     *,
     write: Path | None = None,
     apply: bool = False,
+    wanted: Wanted | None = None,
     out: Path | None = None,
     force: bool = False,
     executor_name: str | None = None,
@@ -35,6 +37,7 @@ def diagnose_arm(
         asked: model and logs.
         write: where to write the user's model with the causes added; the user's own file is edited in place.
         apply: write the likeliest causes of open verdicts too.
+        wanted: files for other simulators.
         out: folder for one page a joint; None writes none.
         force: write over files that are there.
         executor_name: ``processes:N`` or ``dask://host:port``; None chooses.
@@ -50,7 +53,7 @@ def diagnose_arm(
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
-    outputs = [*pages.values(), *([write] if write is not None else [])]
+    outputs = [*pages.values(), *([write] if write is not None else []), *(wanted.files.values() if wanted else ())]
     refuse_overwriting(outputs, force=force)
     found = diagnosed(arm, executor_name)
     joints = {name: _told(arm.joints[name], diagnosis) for name, diagnosis in found.items()}
@@ -67,6 +70,8 @@ def diagnose_arm(
     result["closed_loop"] = closed_loop_gap(arm, made)
     if write is not None:
         result |= _written(arm, made, write, force)
+    if wanted is not None and wanted.files:
+        result["targets"] = write_targets(arm, found, wanted, apply=apply, force=force)
     if out is not None:
         _make_folder(out)
         for name, page in pages.items():

@@ -117,9 +117,27 @@ _NOWHERE = {
 # -- friction -----------------------------------------------------------------------------------------------------
 
 
+def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, tuple[float, float, float]]:
+    """(level, rise at standstill, Stribeck speed, damping polynomial) that stand nearest to the joint's sliding."""
+    fastest = float(np.max(use.speed_rad_s))
+    speed = _speeds(use)
+    odd, _ = _sliding(model, speed, use)
+    if "stribeck" in model.effects:
+        return _with_stribeck(speed, odd, fastest)
+    level, a, b, c = _level_and_damping(speed, odd, fastest)
+    return level, 0.0, 0.0, (a, b, c)
+
+
+def _speeds(use: Use) -> Array:
+    """Speeds as often as they were driven, and one near standstill."""
+    driven = np.quantile(use.speed_rad_s, np.linspace(0.02, 1.0, 150))
+    speeds: Array = np.unique(np.concatenate([driven, [1e-3 * float(np.max(use.speed_rad_s))]]))
+    return speeds
+
+
 def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use: Use, form: str) -> None:
     fastest = float(np.max(use.speed_rad_s))
-    speed = np.unique(np.concatenate([np.quantile(use.speed_rad_s, np.linspace(0.02, 1.0, 150)), [1e-3 * fastest]]))
+    speed = _speeds(use)
     odd, even = _sliding(model, speed, use)
     soft_nm = _soft_nm(model)
     if form == "lugre":
@@ -213,7 +231,7 @@ def _with_stribeck(
 ) -> tuple[float, float, float, tuple[float, float, float]]:
     """(Coulomb, rise, Stribeck speed, damping) of the nearest curve of LuGre's form."""
     best: tuple[float, float, float, float, tuple[float, float, float]] | None = None
-    for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.6 * fastest, 30):
+    for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.6 * fastest, 60):
         bump = np.exp(-((speed / at) ** 2))
         for powers in ((1, 2, 3), (1, 2), (1,)):
             table = np.column_stack([np.ones_like(speed), bump, *(speed**p for p in powers)])

@@ -102,7 +102,7 @@ def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> 
 def _export(arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> Export:
     robot, name = arm.robot, joint.believed.name
     model = joint_model(joint, effects)
-    use = _use(arm, name)
+    use = use_of(arm, name)
     rewritten = bool(joint.drafted or FRICTION & set(effects))
     forms = FORMS if rewritten and not robot.urdf else ("loss",)
     time, command, posture = _withheld(arm, name)
@@ -124,7 +124,8 @@ def _export(arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, flo
     return Export(model, natives[best], best, tried)
 
 
-def _use(arm: ArmSet, name: str) -> Use:
+def use_of(arm: ArmSet, name: str) -> Use:
+    """Speeds and places of a joint in the recordings."""
     samples = [motion.samples[name] for motion in arm.motions]
     speed = np.concatenate([np.abs(np.gradient(s.position_rad, s.time_s)) for s in samples])
     position = np.concatenate([s.position_rad for s in samples])

@@ -1,0 +1,114 @@
+"""The improved joints for other simulators, and posterior samples of their numbers for domain randomisation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.errors import UsageError
+from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.jobs.gap.from_model import ArmSet
+from frictid_hil.jobs.gap.write_model import applied, joint_model, use_of
+from frictid_hil.simulation.effects import all_effects
+from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, written_as
+
+_SIGMAS = 2.0 * 1.96
+"""Standard deviations in a 95 % interval."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to write beside the model.
+
+    Attributes:
+        files: path by target, see ``targets.TARGETS``.
+        samples: of the posterior, how many; 0 draws none.
+        seed: of the draw.
+    """
+
+    files: Mapping[str, Path]
+    samples: int = 0
+    seed: int = 1
+
+    @staticmethod
+    def of(words: Sequence[str], samples: int) -> Wanted:
+        """From ``TARGET=FILE`` words.
+
+        Raises:
+            UsageError: no such target, no file, or samples asked for that nobody writes.
+        """
+        files = {}
+        for word in words:
+            target, equals, file = word.partition("=")
+            if target not in TARGETS or not file or not equals:
+                raise UsageError(
+                    f"--export {word}: no target and file", next_step=f"one of {', '.join(TARGETS)}, as c=friction.h"
+                )
+            files[target] = Path(file)
+        if "samples" in files and not samples:
+            raise UsageError("--export samples=FILE needs --randomise N", next_step="say how many samples to draw")
+        if samples and not files:
+            raise UsageError(
+                "--randomise has nothing to write to", next_step="add --export samples=FILE or isaaclab=FILE"
+            )
+        return Wanted(files, samples)
+
+
+def write_targets(
+    arm: ArmSet, found: Mapping[str, Diagnosis], wanted: Wanted, *, apply: bool, force: bool
+) -> dict[str, Any]:
+    """Write every target that is wanted, of all joints with a friction curve.
+
+    Raises:
+        UsageError: a file is there already.
+
+    Returns:
+        By target: ``files`` (absolute paths) and ``lost``.
+    """
+    joints, samples = {}, {}
+    random = np.random.default_rng(wanted.seed)
+    for name, joint in arm.joints.items():
+        if joint.experiments.nominal.curve is None:
+            continue
+        use = use_of(arm, name)
+        effects = applied(found[name], apply=apply)
+        joints[name] = numbers_of(joint.believed, joint_model(joint, effects), use)
+        drawn: list[Numbers] = []
+        for _ in range(wanted.samples):
+            other = {e: _drawn(e, values, found[name], random) for e, values in effects.items()}
+            drawn.append(numbers_of(joint.believed, joint_model(joint, other), use))
+        if drawn:
+            samples[name] = drawn
+    step_s = float(arm.robot.compiled.opt.timestep)
+    texts = {
+        target: {
+            path.parent / name: text for name, text in written_as(target, path.name, joints, samples, step_s).items()
+        }
+        for target, path in wanted.files.items()
+    }
+    refuse_overwriting([path for files in texts.values() for path in files], force=force)
+    for files in texts.values():
+        for path, text in files.items():
+            write_whole(path, text)
+    return {
+        target: {"files": [str(path.resolve()) for path in files], "lost": LOST[target]}
+        for target, files in texts.items()
+    }
+
+
+def _drawn(effect: str, values: Mapping[str, float], found: Diagnosis, random: np.random.Generator) -> dict[str, float]:
+    """Parameters of one effect within what the diagnosis leaves open; numbers of a sample come from one draw."""
+    cause = next(cause for cause in found.causes if cause.effect == effect)
+    limits = {p.name: p for p in all_effects()[effect].parameters}
+    drawn = dict(values)
+    for name, told in cause.parameters.items():
+        if told.low is not None and told.high is not None and name in drawn:
+            sigma = (told.high - told.low) / _SIGMAS
+            value = drawn[name] + sigma * float(random.standard_normal())
+            drawn[name] = float(np.clip(value, limits[name].lower, limits[name].upper))
+    return drawn
