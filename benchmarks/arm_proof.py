@@ -57,7 +57,7 @@ def drawn(seed: int, number: int) -> Draw:
     if number % 4 == 3:
         return _arm_drawn(random)
     joints = random.choice(JOINTS, 2, replace=False)
-    tables: dict[str, dict[str, Any]] = {}
+    tables: dict[str, Any] = {}
     effects = {}
     for joint in map(str, joints):
         names = [name for name in EFFECTS if name != "load_dependent_friction" or joint in ("lift", "elbow")]
@@ -128,7 +128,7 @@ def judged(seed: int, number: int, seconds: float, executor: str | None = None) 
 def _closed(before: float, after: float, floor: float) -> float:
     """Part of the closed-loop torque gap that is gone, noise taken off both."""
     left, was = max(after**2 - floor**2, 0.0), max(before**2 - floor**2, 1e-12)
-    return 100.0 * (1.0 - (left / was) ** 0.5)
+    return float(100.0 * (1.0 - (left / was) ** 0.5))
 
 
 def summary(results: list[dict[str, Any]]) -> list[str]:

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, signal
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.robot_model import RobotModel, inverse_torque
 
+Rows = list[list[NDArray[np.intp]]]
+"""Rows that count, by recording and joint."""
 Motion = tuple[Array, Array, Array]
 """Position, velocity and acceleration, (n, k) each."""
 
@@ -125,7 +128,7 @@ class _Table:
     acceleration: Array
     left: Array
     rigid: Array
-    moving: Array
+    moving: NDArray[np.bool_]
 
 
 class _Bodies:
@@ -360,7 +363,7 @@ def _nuisances(t: _Table, k: int, scale: float) -> tuple[Array, Array]:
 
 def _stacked(
     tables: Sequence[_Table], scale: Array, make: Callable[[_Table, int, float], tuple[Array, Array]]
-) -> tuple[Array, Array, Array, list[list[Array]]]:
+) -> tuple[Array, Array, Array, Rows]:
     """(y, columns, priors, rows) of all joints one below the other, each counted in its own scale."""
     joints = scale.size
     rows = [[np.flatnonzero(t.moving[:, k]) for k in range(joints)] for t in tables]
@@ -373,9 +376,7 @@ def _stacked(
     return y, linalg.block_diag(*blocks), np.concatenate(priors), rows
 
 
-def _stacked_columns(
-    tables: Sequence[_Table], scale: Array, make: Callable[..., list[Array]], rows: list[list[Array]]
-) -> Array:
+def _stacked_columns(tables: Sequence[_Table], scale: Array, make: Callable[..., list[Array]], rows: Rows) -> Array:
     every = [make((t.position, t.velocity, t.acceleration)) for t in tables]
     columns = []
     for c in range(len(every[0])):

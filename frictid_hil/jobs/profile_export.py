@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,14 +61,15 @@ def _off(curve: FrictionCurve, written: Torque) -> float:
 
 def _table(joints: Joints) -> tuple[str, dict[str, Torque], str]:
     """Speed and torque, ten rows each way, as drives take them that interpolate between rows."""
-    rows, back = ["joint,velocity_rad_s,torque_nm"], {}
+    rows = ["joint,velocity_rad_s,torque_nm"]
+    back: dict[str, Torque] = {}
     for name, (_, curve) in joints.items():
         low, high = curve.measured_range_rad_s
         speed = np.geomspace(low, high, POINTS // 2)
         torque = curve.torque(speed)
         for v, f in zip([*-speed[::-1], *speed], [*-torque[::-1], *torque], strict=True):
             rows.append(f"{name},{v:.6g},{f:.6g}")
-        back[name] = lambda v, s=speed, t=torque: np.interp(v, s, t)
+        back[name] = partial(np.interp, xp=speed, fp=torque)
     return "\n".join([*rows, ""]), back, "presliding, and the curve below the slowest measured speed"
 
 
@@ -106,7 +108,7 @@ def _i2rt(joints: Joints) -> tuple[str, dict[str, Torque], str]:
 
 
 def _straight(lines: Mapping[str, tuple[float, float]]) -> dict[str, Torque]:
-    return {name: (lambda v, c=level, b=slope: c + b * v) for name, (level, slope) in lines.items()}
+    return {name: np.polynomial.Polynomial(line) for name, line in lines.items()}
 
 
 _TARGETS: dict[str, Callable[[Joints], tuple[str, dict[str, Torque], str]]] = {
