@@ -189,7 +189,7 @@ def least_squares_terms(
     first = np.searchsorted(peaks, knots * (1 - 1e-6)).clip(max=peaks.size - 1)
     seen_s = (starts_s[first] + starts_s[-1]) / 2
     return Terms(
-        scatter=np.sqrt(np.diag(solved.covariance)[odd_block])[kept] * stdtrit(8, 0.975) / COVERAGE,
+        scatter=np.sqrt(np.diag(solved.covariance)[odd_block])[kept] * float(stdtrit(8, 0.975)) / COVERAGE,
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
         model=bend[kept],
         drift=(np.abs(odd) * _drift_shares(recording, seen_s, drift))[kept],
@@ -341,7 +341,7 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
             single[n] += (early.mean() - late.mean()) / 4 if late.size else 0.0
     chance, free = _by_chance(recording, single)
     # One degree of freedom each at most: pooled over five neighbours, and widened for those.
-    spread: Array = np.sqrt(_pooled(chance**2)) * stdtrit(5 * free, 0.975) / COVERAGE
+    spread: Array = np.sqrt(_pooled(chance**2)) * float(stdtrit(5 * free, 0.975)) / COVERAGE
     return spread
 
 

@@ -45,9 +45,9 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
     level = [np.ones((b.size, 1)) * (np.arange(len(base)) == k) for k, b in enumerate(base)]
     start = Term("", {}, builder.add(level), np.zeros(len(base)), np.full(len(base), travel))
     scale = _left(commands, logs)
-    for name, columns in _generic(logs, commands).items():
-        numbers = builder.add(columns)
-        candidates += [family(name, size * scale, numbers, columns) for size in SIZES]
+    for name, shapes in _generic(logs, commands).items():
+        numbers = builder.add(shapes)
+        candidates += [family(name, size * scale, numbers, shapes) for size in SIZES]
     low_pass = LowPass.at(1.0 / logs[0].step_s)
     rows = []
     for k, (log, command) in enumerate(zip(logs, commands, strict=True)):
