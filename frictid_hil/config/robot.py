@@ -495,4 +495,12 @@ _NOT_OF_SETUP = {"node", "axis", "id", "continuous", "procedure", "expected", "o
 def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
     values = joint.model_dump(exclude=_NOT_OF_SETUP)
     row = joint.dh.model_dump() if joint.dh else {}
-    return JointSetup(name=name, address=address, options=joint.options, simulated=joint.simulated, dh=row, **values)
+    return JointSetup(
+        name=name,
+        address=address,
+        options=joint.options,
+        simulated=joint.simulated,
+        expected_inertia_kg_m2=joint.expected.inertia_kg_m2 if joint.expected else 0.0,
+        dh=row,
+        **values,
+    )

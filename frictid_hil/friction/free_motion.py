@@ -19,8 +19,8 @@ from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Solved, solve
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian, uniform
+from frictid_hil.friction.gate import Gate
 from frictid_hil.friction.intervals import coulomb_half_width_nm
-from frictid_hil.friction.quality import Gate
 from frictid_hil.friction.regression import hat_functions
 from frictid_hil.friction.rigid_body import COVERAGE, Measured
 from frictid_hil.friction.trajectory import Array

@@ -7,13 +7,14 @@ and forbids its promotion.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from frictid_hil.friction.consistency import consistency
 from frictid_hil.friction.estimate import Estimate
+from frictid_hil.friction.gate import Gate
 from frictid_hil.friction.intervals import Drift
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.skew import MOST_APART, TimeSkew
@@ -36,25 +37,6 @@ _ROUGH_S = 0.008
 _AT_LIMIT = 0.98
 
 
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """One question and its answer.
-
-    Attributes:
-        name: of the gate.
-        passed: the answer.
-        value: what was measured.
-        limit: what was allowed.
-        reason: a sentence for a person, whether passed or not.
-    """
-
-    name: str
-    passed: bool
-    value: float
-    limit: float
-    reason: str
-
-
 def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
     """All gates that this recording allows to ask."""
     motion = synchronised(recording)
@@ -64,6 +46,7 @@ def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
         _samples(result),
         _lateness(recording),
         _kinks(recording, result),
+        *consistency(recording, motion, result),
     ]
     if not recording.coupled:
         asked.append(_asymmetry(result))

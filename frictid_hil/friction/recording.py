@@ -96,6 +96,8 @@ class CycleRecording:
         stops_s: where reports are missing, or the path stood still for missed set-points; shape (k,).
         stopped_s: how long it stood still where ``time_s`` leaves those moments out, shape (j,).
         shaken: the stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
+        expected_inertia: what the robot file expects of the joint, kg m^2; 0 where it does not say.
+        elsewhere: other stretches of the run that go both ways: name, velocity (rad/s) and torque (N m).
         where: what to name in errors (``joint 1``).
     """
 
@@ -118,6 +120,8 @@ class CycleRecording:
     stops_s: Array = field(default_factory=lambda: np.zeros(0))
     stopped_s: Array = field(default_factory=lambda: np.zeros(0))
     shaken: CycleRecording | None = None
+    expected_inertia: float = 0.0
+    elsewhere: tuple[tuple[str, Array, Array], ...] = ()
     where: str = ""
 
 

@@ -29,6 +29,7 @@ class JointSetup:
         locked_position_rad: where it is held while another joint moves.
         options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
         simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
+        expected_inertia_kg_m2: of the whole joint, as the robot file expects it; 0 where it does not say.
         dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
     """
 
@@ -45,6 +46,7 @@ class JointSetup:
     locked_position_rad: float
     options: Mapping[str, Any] = field(default_factory=dict)
     simulated: Mapping[str, Any] = field(default_factory=dict)
+    expected_inertia_kg_m2: float = 0.0
     dh: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -312,8 +312,27 @@ def _recording(
         repeat=_repeat(drift[0], procedure, start_s) if drift else None,
         late_cycles=late_cycles,
         stops_s=gaps_ns(kept) * 1e-9 - start_s,
+        expected_inertia=joint.expected_inertia_kg_m2 if joint else 0.0,
+        elsewhere=_elsewhere(samples),
         where=f"joint {samples.joint}",
     )
+
+
+def _elsewhere(samples: Samples) -> tuple[tuple[str, Array, Array], ...]:
+    """Stretches besides the cycles that go both ways: the rehearsal, and the way there with the way back."""
+    found = []
+    for names in (("rehearsal",), ("move", "return")):
+        parts = [samples.during(mark) for name in names for mark in samples.marked(name)]
+        parts = [part for part in parts if len(part) > 2]
+        if not parts:
+            continue
+        velocity = [
+            np.gradient(part.position_rad, part.time_s) if part.velocity_rad_s is None else part.velocity_rad_s
+            for part in parts
+        ]
+        torque = [part.torque_nm for part in parts if part.torque_nm is not None]
+        found.append((" and ".join(names), np.concatenate(velocity), np.concatenate(torque)))
+    return tuple(found)
 
 
 def _repeat(drift: Mark, procedure: Procedure, start_s: float) -> Repeat:

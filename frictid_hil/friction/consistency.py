@@ -1,0 +1,175 @@
+"""Do the columns of a recording agree with each other? Gates against data that are wrong and look right.
+
+A torque that comes late, is cut off, or changes its scale in the middle gives a smooth curve with narrow intervals.
+What gives it away is another column, another stretch of the run, or what was expected of the joint. What cannot be seen
+in principle: a torque that is wrong by the same factor from the first sample to the last (it is another joint's), and
+a delay of position and torque alike.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from frictid_hil.friction.estimate import Estimate
+from frictid_hil.friction.gate import Gate
+from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.trajectory import Array
+
+MOST_SEEN_S = 0.0015
+"""What the data may ask for beyond the declared delay of the torque, where they are sure of it ..."""
+MOST_SEEN_WITH_LINK_S = 0.003
+SURE = 2.5
+"""... by so many standard deviations, its own and the declared one's."""
+MOST_APART_S = 0.008
+"""Reported velocity against differenced position: a filter that nobody declared does no harm to the curve ..."""
+MOST_UNSTEADY_S = 0.004
+"""... but a delay that comes and goes does."""
+MOST_SCALE = 0.05
+MOST_INERTIA = 2.0
+"""Inertia against what the robot file expects, either way."""
+FLAT_SHARE = 0.003
+FLAT_SPIKE = 6.0
+"""Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
+MOST_CHANGED = 0.15
+"""Friction outside the cycles, against the curve at the same speed."""
+
+_STEPS = 1000.0
+_LEAST_SAMPLES = 50
+
+
+def consistency(recording: CycleRecording, motion: Motion, result: Estimate) -> list[Gate]:
+    """All questions that this recording allows to ask."""
+    asked = [_delay(recording, result), _velocity(recording, motion), _inertia(recording, result), _flat(recording)]
+    return [gate for gate in (*asked, _elsewhere(recording, result)) if gate is not None]
+
+
+def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
+    """The torque's own rate explains what is left of it where the torque is late."""
+    seen_s, deviation_s = (result.figures.get(name) for name in ("seen_delay_s", "seen_delay_deviation_s"))
+    if seen_s is None or deviation_s is None:
+        return None
+    sure_s = SURE * math.hypot(deviation_s, recording.skew.uncertainty_s)
+    # A link that swings drags the figure; a torque that is very late looks like one.
+    allowed_s = max(MOST_SEEN_S if result.link_resonance_hz is None else MOST_SEEN_WITH_LINK_S, sure_s)
+    said = (
+        f"the data ask for {1e3 * seen_s:+.2f} +- {2e3 * deviation_s:.2f} ms of torque delay beyond the declared one "
+        f"(allowed {1e3 * allowed_s:.2f} ms)"
+    )
+    return Gate.about(
+        "seen_delay",
+        abs(seen_s) <= allowed_s,
+        abs(seen_s),
+        allowed_s,
+        said,
+        "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures",
+    )
+
+
+def _velocity(recording: CycleRecording, motion: Motion) -> Gate | None:
+    """The drive's velocity on the position's derivative and its rate: how large, how late, and whether that stays."""
+    if recording.velocity_rad_s is None:
+        return None
+    times = motion.time_s + recording.skew.velocity_delay_s
+    inside = (times >= recording.time_s[0]) & (times <= recording.time_s[-1])
+    reported = motion.smoother.smooth(np.interp(times, recording.time_s, recording.velocity_rad_s))
+    columns = np.column_stack([motion.velocity_rad_s, -motion.acceleration_rad_s2])
+    found = []
+    for begin, end in pairwise(recording.procedure.cycle_starts_s):
+        rows = inside & (motion.time_s >= begin) & (motion.time_s < end)
+        if rows.sum() >= _LEAST_SAMPLES:
+            (scale, late), *_ = np.linalg.lstsq(columns[rows], reported[rows], rcond=None)
+            found.append((float(scale), float(late / scale) if scale else math.inf))
+    if not found:
+        return None
+    scales, late_s = np.array(found).T
+    off, usual_s = float(np.abs(scales - 1.0).max()), float(np.median(late_s))
+    changes_s = float(late_s.max() - late_s.min())
+    said = (
+        f"the reported velocity is {100 * off:.1f} % off the differenced position at worst (allowed "
+        f"{100 * MOST_SCALE:.0f} %), {1e3 * usual_s:+.2f} ms late against it (allowed {1e3 * MOST_APART_S:.0f} ms), "
+        f"and that changes by {1e3 * changes_s:.2f} ms from cycle to cycle (allowed {1e3 * MOST_UNSTEADY_S:.0f} ms)"
+    )
+    passed = off <= MOST_SCALE and abs(usual_s) <= MOST_APART_S and changes_s <= MOST_UNSTEADY_S
+    cause = (
+        "one of the two is of another moment or has another scale: check the gear in the drive (608F, 6091, 6092) and "
+        "its filters"
+    )
+    return Gate.about("velocity", passed, changes_s, MOST_UNSTEADY_S, said, cause)
+
+
+def _inertia(recording: CycleRecording, result: Estimate) -> Gate | None:
+    """Inertia is positive, and about what the robot file expects."""
+    body = result.rigid_body
+    if body is None or body.inertia_kg_m2 is None:
+        return None
+    found, half, expected = body.inertia_kg_m2.value, body.inertia_kg_m2.half_width, recording.expected_inertia
+    if not math.isfinite(half):
+        return None
+    low, high = 0.0, math.inf
+    if expected > 0.0:
+        low, high = expected / MOST_INERTIA, expected * MOST_INERTIA
+    passed = low < found + half and found - half < high and found + half > 0.0
+    told = f", the robot file expects {expected:.4g}" if expected else ""
+    said = f"inertia is {found:.4g} +- {half:.2g} kg m^2{told} (allowed {low:.3g} to {high:.3g})"
+    return Gate.about(
+        "inertia",
+        passed,
+        found,
+        low if found < low or not math.isfinite(high) else high,
+        said,
+        "torque that is late or cut off takes inertia away; or `expected` in the robot file is of another load",
+    )
+
+
+def _flat(recording: CycleRecording) -> Gate:
+    """A torque that is cut off piles up at its extreme."""
+    torque = np.asarray(recording.torque_nm, dtype=np.float64)
+    step = max(recording.torque_quantum_nm, float(np.abs(torque).max()) / _STEPS) or 1.0
+    share = worst = 0.0
+    for signed in (torque, -torque):
+        below = np.floor((signed.max() - signed) / step + 0.5)
+        counts = np.array([float(np.sum(below == n)) for n in range(4)])
+        spike = counts[0] / max(1.0, float(counts[1:].mean()))
+        if spike > FLAT_SPIKE and counts[0] / torque.size > FLAT_SHARE:
+            share, worst = max(share, counts[0] / torque.size), max(worst, spike)
+    said = f"{100 * share:.2f} % of the samples pile up at the extreme of the torque (allowed {100 * FLAT_SHARE:.1f} %)"
+    cause = "the reported torque is cut off: by a limit of the drive, or by its report"
+    return Gate.about("flat_tops", share <= FLAT_SHARE, share, FLAT_SHARE, said, cause)
+
+
+def _elsewhere(recording: CycleRecording, result: Estimate) -> Gate | None:
+    """Half of forward minus backward torque in other stretches of the run, against the curve at the same speeds."""
+    worst = 0.0
+    told = ""
+    for name, velocity, torque in recording.elsewhere:
+        ratio = _friction_against(result, velocity, torque)
+        if ratio is not None and abs(ratio - 1.0) >= worst:
+            worst, told = abs(ratio - 1.0), f"{name}: friction is {100 * ratio:.0f} % of the curve at the same speed"
+    if not told:
+        return None
+    return Gate.about(
+        "other_stretches",
+        worst <= MOST_CHANGED,
+        worst,
+        MOST_CHANGED,
+        f"{told} (allowed {100 * MOST_CHANGED:.0f} % off)",
+        "the torque's scale or the friction changed during the run: a cold joint (`--warm-up`), a drive that switched "
+        "its current range, or wrong reports",
+    )
+
+
+def _friction_against(result: Estimate, velocity: Array, torque: Array) -> float | None:
+    """Measured over identified friction; None where the stretch does not go both ways at speeds of the curve."""
+    slowest, fastest = result.curve.velocity_rad_s[0], result.curve.velocity_rad_s[-1]
+    steady = (np.abs(velocity) >= max(slowest, 0.9 * float(np.abs(velocity).max(initial=0.0)))) & (
+        np.abs(velocity) <= fastest
+    )
+    ways = [steady & (velocity > 0.0), steady & (velocity < 0.0)]
+    if min(int(way.sum()) for way in ways) < _LEAST_SAMPLES:
+        return None
+    there, back = (float(np.mean(torque[way])) for way in ways)
+    expected = np.mean([float(np.mean(result.curve.magnitude(np.abs(velocity[way])))) for way in ways])
+    return (there - back) / 2 / float(expected)

@@ -1,0 +1,71 @@
+"""Data that are wrong and look right: a gate says so, and each would else have been a smooth curve called ok."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.quality import gates
+
+
+def failed(recording) -> set[str]:
+    return {gate.name for gate in gates(recording, estimate(recording)) if not gate.passed}
+
+
+@pytest.fixture(scope="module")
+def sound(plants):
+    return plants.record(plants.arm[2], plants.procedure(20))
+
+
+def late(recording, column: str, by_s: float, since_s: float = -np.inf):
+    values = getattr(recording, column)
+    shifted = np.interp(recording.time_s - by_s, recording.time_s, values)
+    return replace(recording, **{column: np.where(recording.time_s >= since_s, shifted, values)})
+
+
+def test_a_sound_recording_fails_nothing(sound):
+    assert failed(sound) == set()
+
+
+@pytest.mark.parametrize("by_s", [0.006, 0.02])
+def test_a_torque_that_is_late(sound, by_s):
+    assert failed(late(sound, "torque_nm", by_s)) & {"seen_delay", "inertia"}
+
+
+def test_a_position_that_is_late_from_the_middle_on(sound):
+    spoilt = late(sound, "position_rad", 0.01, since_s=0.5 * sound.procedure.duration_s)
+    assert "velocity" in failed(spoilt)
+
+
+def test_a_position_of_another_scale_than_the_velocity(sound):
+    assert "velocity" in failed(replace(sound, velocity_rad_s=1.1 * sound.velocity_rad_s))
+
+
+@pytest.mark.parametrize("share", [0.9, 0.6])
+def test_a_torque_that_is_cut_off(sound, share):
+    most = share * np.abs(sound.torque_nm).max()
+    assert "flat_tops" in failed(replace(sound, torque_nm=np.clip(sound.torque_nm, -most, most)))
+
+
+def test_a_coarse_torque_is_not_cut_off(sound):
+    quantum = 0.02 * float(np.abs(sound.torque_nm).max())
+    coarse = replace(sound, torque_nm=np.round(sound.torque_nm / quantum) * quantum, torque_quantum_nm=quantum)
+    assert "flat_tops" not in failed(coarse)
+
+
+def test_an_inertia_that_nobody_expects(sound):
+    found = estimate(sound).rigid_body.inertia_kg_m2.value
+    assert "inertia" not in failed(replace(sound, expected_inertia=1.5 * found))
+    assert "inertia" in failed(replace(sound, expected_inertia=3.0 * found))
+    assert "inertia" in failed(replace(sound, expected_inertia=found / 3.0))
+
+
+def test_friction_that_was_another_in_the_rehearsal(sound):
+    curve = estimate(sound).curve
+    phase = np.linspace(0.0, 2 * np.pi, 4000)
+    velocity = 0.5 * curve.velocity_rad_s[-1] * np.sin(phase)
+    torque = 12.0 * np.cos(2 * phase) + curve.torque(velocity)
+    assert "other_stretches" not in failed(replace(sound, elsewhere=(("rehearsal", velocity, torque),)))
+    wrong = 12.0 * np.cos(2 * phase) + curve.torque(velocity) / 1.5
+    assert "other_stretches" in failed(replace(sound, elsewhere=(("rehearsal", velocity, wrong),)))
