@@ -9,6 +9,7 @@ import pytest
 
 import frictid_drivers
 import frictid_hil
+from frictid_drivers import stop_paths
 from frictid_hil.config import reference
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.robot import load_robot
@@ -68,3 +69,8 @@ def test_the_page_of_verbs_is_that_of_the_command_line() -> None:
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     page = (ROOT / "docs" / "reference" / "verbs.md").read_text(encoding="utf-8")
     assert page.strip() == shown.strip(), " ".join(command[1:]) + " > docs/reference/verbs.md"
+
+
+def test_the_page_of_stops_is_that_of_the_code() -> None:
+    page = (ROOT / "docs" / "reference" / "stops.md").read_text(encoding="utf-8")
+    assert page == stop_paths.page(), "python -m frictid_drivers.stop_paths docs/reference/stops.md"

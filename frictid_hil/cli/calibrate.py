@@ -32,6 +32,7 @@ from frictid_hil.cli.options import (
     VelocityOption,
     YesOption,
     one_of,
+    quantity,
     robot_files,
 )
 from frictid_hil.cli.output import Output, Result, Told
@@ -52,6 +53,15 @@ def register(app: typer.Typer) -> None:
 def check(
     robot: RobotOption,
     bus: BusOption = None,
+    latency: Annotated[
+        float,
+        typer.Option(
+            "--latency",
+            metavar="TIME",
+            parser=quantity("duration"),
+            help="Also measure for so long, e.g. 60s, which rate this computer can hold.",
+        ),
+    ] = "0s",  # type: ignore[assignment]  # typer parses it
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -70,7 +80,7 @@ def check(
         output.out.print(table)
         output.out.print("ready" if result["ok"] else "not ready: see the errors above")
 
-    output.run("check", lambda: job(robot, bus=bus), show)
+    output.run("check", lambda: job(robot, bus=bus, latency_s=latency), show)
 
 
 def reset(

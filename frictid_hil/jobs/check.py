@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from dataclasses import asdict
 from typing import Any
 
 from frictid_hil.config.robot import load_robot
@@ -9,14 +11,16 @@ from frictid_hil.errors import PlanRefused
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.protocol.driver import Finding, Severity, new_driver
+from frictid_hil.runner.realtime import Latency, measure_latency
 
 
-def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
+def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) -> dict[str, Any]:
     """Reach the hardware, read it, compare it with the robot file and with the standard plan.
 
     Args:
         robot_name: robot file.
         bus: ``interface:channel`` instead of the file's own.
+        latency_s: for so long this computer's punctuality is measured; 0 not at all.
 
     Raises:
         HardwareError: the bus or a drive cannot be reached at all.
@@ -55,6 +59,10 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
         identities = driver.identify()
     finally:
         driver.close()
+    measured = None
+    if latency_s:
+        measured = _measured(latency_s)
+        findings.extend(_told(measured, setup.cycle_hz))
     ok = all(finding.severity is not Severity.ERROR for finding in findings)
     return {
         "outcome": "ok" if ok else "refused",
@@ -63,6 +71,7 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
         "driver": robot.driver(bus),
         "bus": setup.bus,
         "ok": ok,
+        "latency": None if measured is None else asdict(measured),
         "findings": [
             {
                 "severity": finding.severity.value,
@@ -85,3 +94,29 @@ def check(robot_name: str, *, bus: str | None = None) -> dict[str, Any]:
             for name, identity in identities.items()
         },
     }
+
+
+def _measured(latency_s: float) -> Latency:
+    """In a process of its own, as the cyclic loop is: what makes it punctual cannot be taken back."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(measure_latency, (latency_s,))
+
+
+def _told(found: Latency, cycle_hz: float) -> list[Finding]:
+    shares = (
+        ("half of them", found.p50_s),
+        ("99 %", found.p99_s),
+        ("99.9 %", found.p999_s),
+        ("the latest", found.worst_s),
+    )
+    figures = ", ".join(f"{name} {1e3 * value:.2f} ms" for name, value in shares)
+    said = (
+        f"cycles of an empty loop begin late by at most: {figures}, in {found.duration_s:g} s; it holds "
+        f"{found.highest_hz} Hz"
+    )
+    enough = found.highest_hz >= cycle_hz
+    remedy = "close other programs, use a real-time kernel, or lower cycle_hz in the robot file"
+    findings = [
+        Finding(Severity.OK if enough else Severity.WARNING, "this computer", said, "" if enough else remedy),
+    ]
+    return findings + [Finding(Severity.WARNING, "this computer", told) for told in found.told]

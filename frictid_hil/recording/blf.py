@@ -168,10 +168,14 @@ def container(objects: bytes) -> bytes:
     return head + CONTAINER_HEAD.pack(2, len(objects)) + packed + bytes(size % 4)
 
 
-def containers(data: bytes) -> Iterator[tuple[bytes, str]]:
+def containers(data: bytes, most: int) -> Iterator[tuple[bytes, str]]:
     """The content of each container of a file, and what is wrong with it ("" when nothing).
 
-    A container that is cut off gives what can be unpacked of it, and ends the file.
+    A container that is cut off, or unpacks to more than it says, gives what can be unpacked of it, and ends the file.
+
+    Args:
+        data: the whole file.
+        most: bytes that one container may unpack to.
     """
     at = FILE_HEADER.unpack_from(data)[1]
     while at < len(data):
@@ -185,7 +189,7 @@ def containers(data: bytes) -> Iterator[tuple[bytes, str]]:
         body = data[at + OBJECT_HEAD.size : at + size]
         cut = at + size > len(data)
         if kind == CONTAINER and len(body) >= CONTAINER_HEAD.size:
-            content, whole = _unpacked(body)
+            content, whole = _unpacked(body, most)
             if cut or not whole:
                 yield content, f"the file ends in the middle of a container at byte {at}"
                 return
@@ -196,14 +200,33 @@ def containers(data: bytes) -> Iterator[tuple[bytes, str]]:
         at += size + size % 4
 
 
-def _unpacked(body: bytes) -> tuple[bytes, bool]:
+def _unpacked(body: bytes, most: int) -> tuple[bytes, bool]:
     method, size = CONTAINER_HEAD.unpack_from(body)
     packed = body[CONTAINER_HEAD.size :]
     if method == 0:
         return packed, len(packed) >= size
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(packed, max(size, 1))
+        # One byte more than it says: a container that holds more than it says is none of a logger's.
+        content = unpacker.decompress(packed, max(min(size, most), 1) + 1)
     except zlib.error:
         return b"", False
-    return content, len(content) == size
+    return content[:size], len(content) == size
+
+
+def sound_objects(content: bytes) -> bytes:
+    """The content up to the first object that cannot be one (a size of nothing would be read for ever)."""
+    at = 0
+    while (at := content.find(b"LOBJ", at, at + 8)) >= 0 and at + OBJECT_HEAD.size <= len(content):
+        size = OBJECT_HEAD.unpack_from(content, at)[3]
+        if size < OBJECT_HEAD.size:
+            return content[:at]
+        at += size
+    return content
+
+
+def repacked(head: bytes, content: bytes) -> bytes:
+    """A file with this file header and one uncompressed container."""
+    size = OBJECT_HEAD.size + CONTAINER_HEAD.size + len(content)
+    container_head = OBJECT_HEAD.pack(b"LOBJ", OBJECT_HEAD.size, 1, size, CONTAINER)
+    return head + container_head + CONTAINER_HEAD.pack(0, len(content)) + content + bytes(size % 4)

@@ -6,7 +6,12 @@ and a killed file is readable up to its last flush. Read is whatever python-can 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import gzip
+import io
+import zlib
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -17,12 +22,15 @@ from numpy.typing import NDArray
 from frictid_hil.errors import InputFileError
 from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording import blf
+from frictid_hil.recording.bounds import allowed_bytes, check_expansion
 from frictid_hil.recording.growing_file import GrowingFile
 
 EXTENDED = 0x8000_0000
 """Bit of ``can_id`` that says the frame has a 29-bit id."""
 
 LOG_SUFFIXES = (".blf", ".asc", ".log", ".trc", ".db", ".mf4")
+MOST_TEXT_RATIO = 40
+_LEAST_TEXT_BYTES = 1_000_000
 _FRAMES_PER_CONTAINER = 2048
 _EPOCH_S = 1e8
 """Times beyond this (three years) are of a wall clock, not run time."""
@@ -152,33 +160,50 @@ def read_frames(path: Path) -> Frames:
     """
     try:
         if path.suffix.lower() == ".blf":
-            frames = _from_blf(path)
-            if frames is not None:
-                return frames
-        return _from_python_can(path)
-    except OSError as error:
-        raise InputFileError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
+            return _from_blf(path)
+        if path.suffix.lower() == ".gz":
+            _refuse_bombs(path)
+        return _from_python_can(path, lambda: can.LogReader(path))
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputFileError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from None
 
 
-def _from_blf(path: Path) -> Frames | None:
-    """The fast way, for logs of data frames alone (such as ours); None for others."""
+def _refuse_bombs(path: Path) -> None:
+    """Text of a bus log packs to about a tenth; what unpacks to a multiple of that holds no log."""
+    most, unpacked = max(_LEAST_TEXT_BYTES, MOST_TEXT_RATIO * path.stat().st_size), 0
+    with gzip.open(path) as file:
+        while part := file.read(1 << 20):
+            unpacked += len(part)
+            if unpacked > most:
+                raise InputFileError(
+                    f"{path.stat().st_size:,} bytes that unpack to more than {most:,}",
+                    where=str(path),
+                    cause=f"the limit is {MOST_TEXT_RATIO} times the file",
+                    next_step="if the file is sound, unpack it first",
+                )
+
+
+def _from_blf(path: Path) -> Frames:
+    """The fast way for logs of data frames alone (such as ours); others as python-can reads what is sound of them."""
     data = path.read_bytes()
     if len(data) < blf.FILE_HEADER.size or not data.startswith(b"LOGG"):
         raise InputFileError("not a BLF file" if data else "the file is empty", where=f"{path}, byte 0")
-    contents, damage = [], ""
-    for content, wrong in blf.containers(data):
+    contents, damage, unpacked, most = [], "", 0, allowed_bytes(len(data))
+    for content, wrong in blf.containers(data, most):
+        unpacked += len(content)
+        check_expansion(len(data), unpacked, str(path))
         contents.append(content)
         damage = wrong
     content = b"".join(contents)
     found = blf.frames_in(content)
     if found is None:
-        return None
+        return _from_foreign_blf(path, data, content, damage)
     classical, long, places = found
     if not places.size:
         raise InputFileError("holds no frames", where=str(path), cause=damage)
     whole = _in_order(classical, long, places)
     if whole is None:
-        return None
+        return _from_foreign_blf(path, data, content, damage)
     carries_data = (whole["flags"] & blf.REMOTE) == 0
     objects = whole[carries_data]
     if not objects.size:
@@ -194,6 +219,16 @@ def _from_blf(path: Path) -> Frames | None:
         skipped=int(np.count_nonzero(~carries_data)),
         damage=damage,
     )
+
+
+def _from_foreign_blf(path: Path, data: bytes, content: bytes, damage: str) -> Frames:
+    """Objects of other kinds: python-can reads them, of content that was unpacked within bounds and is sound."""
+    sound = blf.sound_objects(content)
+    if len(sound) < len(content):
+        damage = f"no object where one should be, at byte {len(sound)} of what the file holds unpacked"
+    whole = blf.repacked(data[: blf.FILE_HEADER.unpack_from(data)[1]], sound)
+    frames = _from_python_can(path, lambda: can.BLFReader(io.BytesIO(whole)))
+    return replace(frames, damage=frames.damage or damage)
 
 
 def _in_order(classical: NDArray[np.void], long: NDArray[np.void], places: NDArray[np.intp]) -> NDArray[np.void] | None:
@@ -215,11 +250,11 @@ def _in_order(classical: NDArray[np.void], long: NDArray[np.void], places: NDArr
     return whole
 
 
-def _from_python_can(path: Path) -> Frames:
+def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Iterable[can.Message]]]) -> Frames:
     messages: list[can.Message] = []
     skipped, damage, start_s = 0, "", 0.0
     try:
-        with can.LogReader(path) as reader:
+        with opened() as reader:
             start_s = float(getattr(reader, "start_timestamp", 0.0) or 0.0) if path.suffix.lower() == ".blf" else 0.0
             for message in reader:
                 if message.is_error_frame or message.is_remote_frame:

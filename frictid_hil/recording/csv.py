@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import IO
 
@@ -33,6 +34,8 @@ from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped, samples_of
 
 _MAX_HEADER = 65_536
+_MOST_REMARKS = 10_000
+"""Blank lines and remarks before the header, and between it and the first row."""
 
 _ORDER = (
     "position_rad",
@@ -145,9 +148,12 @@ class CsvTable:
             while not header.strip() or header.lstrip().startswith("#"):
                 header = file.readline(_MAX_HEADER)
                 self._header_lines += 1
+                if self._header_lines > _MOST_REMARKS:
+                    raise InputFileError(f"no header within {_MOST_REMARKS:,} lines", where=str(path))
                 if not header:
                     raise InputFileError("the file is empty", where=str(path))
-            first = next((line for line in iter(lambda: file.readline(_MAX_HEADER), "") if not _is_remark(line)), "")
+            following = islice(iter(lambda: file.readline(_MAX_HEADER), ""), _MOST_REMARKS)
+            first = next((line for line in following if not _is_remark(line)), "")
             self.dialect = Dialect.of(header, first)
         self.told = self.dialect.told()
         self.names = [name.strip() for name in _cells(header, self.dialect.separator)]
@@ -265,6 +271,10 @@ class CsvTable:
         """What is wrong with the file that could not be read as numbers: the first bad cell."""
         where = str(self.path)
         for line, row in self._rows():
+            if len(row) <= max(at):
+                return InputFileError(
+                    f"line {line} has {len(row)} values where the header has {len(self.names)}", where=where
+                )
             for k in at:
                 if not row[k].strip():
                     return InputFileError(f"line {line}, column {self.names[k]}: blank", where=where)

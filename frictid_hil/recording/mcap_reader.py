@@ -15,7 +15,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, Metadata, Schema
@@ -292,11 +294,13 @@ def _json(text: str) -> Any:
 
 
 def _unpacked(chunk: Chunk) -> memoryview:
-    """The content of a chunk that another tool has compressed."""
-    from mcap.stream_reader import get_chunk_data_stream
-
+    """The content of a chunk that another tool has compressed; no more is unpacked than it says."""
+    most = chunk.uncompressed_size + 1
     try:
-        stream, _ = get_chunk_data_stream(chunk)
-        return memoryview(stream.read(chunk.uncompressed_size))
+        if chunk.compression == "zstd":
+            return memoryview(zstandard.ZstdDecompressor().stream_reader(chunk.data).read(most))
+        if chunk.compression == "lz4":
+            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
     except Exception as error:  # each compressor has errors of its own; all of them mean that the chunk is spoilt
         raise _Damaged(f"{chunk.compression}: {error}") from None
+    raise _Damaged(f"an unknown compression {chunk.compression[:20]!r}")

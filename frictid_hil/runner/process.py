@@ -35,13 +35,13 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import new_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
+from frictid_hil.runner.realtime import make_punctual
 from frictid_hil.runner.ring import frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
 from frictid_hil.runner.stop_signals import HeardStop, StopSignals
 
 _PR_SET_PDEATHSIG = 1
 _POLL_S = 0.05
-_FIFO_PRIORITY = 60
 _SILENT_S = 30.0
 """Configuring drives may take its time; what lasts longer without a word hangs ..."""
 _SILENT_STOPPING_S = 5.0
@@ -215,13 +215,10 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
         return bool(pipe.recv())
 
     try:
-        warning = _raise_priority()
-        if warning:
+        for warning in make_punctual():
             tell(Warned(warning))
         driver = new_driver(order.driver, order.setup)
-        gc.collect()
         gc.freeze()
-        gc.disable()
         Scheduler(
             driver,
             order.setup,
@@ -243,15 +240,3 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
     with contextlib.suppress(OSError):  # the parent may be gone; the joint is at rest by now
         pipe.send((outcome,))
     pipe.close()
-
-
-def _raise_priority() -> str:
-    """Real-time scheduling where permitted, before any thread exists; "" or what a person should know."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
-    except OSError:
-        return (
-            "no permission for real-time scheduling; cycles may come late. "
-            "Allow it with: sudo setcap cap_sys_nice+ep $(readlink -f $(which python3)), or LimitRTPRIO=99 in systemd"
-        )
-    return ""

@@ -1,0 +1,98 @@
+"""Everything that makes the cyclic loop punctual, as far as this account may; and how punctual this computer is.
+
+Real-time scheduling and locked memory are asked for before any thread exists, and garbage collection is off while the
+loop runs: each alone makes the tail of the lateness many times longer.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+
+FIFO_PRIORITY = 60
+RATES_HZ = (1000, 800, 500, 400, 250, 200, 125, 100, 50)
+_MEASURED_HZ = 1000
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_HOLDS_PERCENTILE = 99.9
+
+
+def make_punctual() -> list[str]:
+    """Real-time scheduling, memory that stays in place, no garbage collection; what was not permitted, and the remedy.
+
+    For a process of its own: nothing of it is taken back.
+    """
+    told = []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except OSError:
+        told.append(
+            "no permission for real-time scheduling; cycles may come late. "
+            "Allow it with: sudo setcap cap_sys_nice,cap_ipc_lock+ep $(readlink -f $(which python3)), "
+            "or LimitRTPRIO=99 and LimitMEMLOCK=infinity in systemd"
+        )
+    if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0 and not told:
+        told.append(
+            "no permission to lock memory; a page that was swapped out makes a cycle late. "
+            "Allow it with: ulimit -l unlimited, or LimitMEMLOCK=infinity in systemd"
+        )
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return told
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """How late an empty loop is on this computer.
+
+    Attributes:
+        duration_s: measured for so long.
+        p50_s: median lateness.
+        p99_s: 99 %.
+        p999_s: 99.9 %.
+        worst_s: the latest cycle.
+        highest_hz: the highest usual rate at which 99.9 % of the cycles begin within half a period; 0 for none.
+        told: what was not permitted, and the remedy.
+    """
+
+    duration_s: float
+    p50_s: float
+    p99_s: float
+    p999_s: float
+    worst_s: float
+    highest_hz: int
+    told: tuple[str, ...]
+
+
+def judged(late_s: Array, duration_s: float, told: list[str]) -> Latency:
+    """The figures of a measurement."""
+    p50, p99, p999 = (float(value) for value in np.percentile(late_s, (50, 99, _HOLDS_PERCENTILE)))
+    held = [rate for rate in RATES_HZ if p999 <= 0.5 / rate]
+    return Latency(duration_s, p50, p99, p999, float(late_s.max()), max(held, default=0), tuple(told))
+
+
+def measure_latency(duration_s: float) -> Latency:
+    """Wait for a deadline every millisecond, as the loop does, and see how late each wait returns.
+
+    Args:
+        duration_s: at least 0.1.
+    """
+    told = make_punctual()
+    period_ns = round(1e9 / _MEASURED_HZ)
+    late_ns = np.zeros(max(100, round(duration_s * _MEASURED_HZ)), np.int64)
+    deadline_ns = time.monotonic_ns() + period_ns
+    for at in range(late_ns.size):
+        remaining_s = (deadline_ns - time.monotonic_ns()) * 1e-9
+        if remaining_s > 0:
+            time.sleep(remaining_s)
+        late = late_ns[at] = time.monotonic_ns() - deadline_ns
+        # A stall is one late cycle, not a burst of them.
+        deadline_ns += period_ns * (1 + int(late) // period_ns)
+    return judged(late_ns * 1e-9, duration_s, told)
