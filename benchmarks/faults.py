@@ -380,7 +380,7 @@ class Bench:
 
     def _calibrated(self) -> Path:
         if self._profile is None:
-            os.environ[ENVIRONMENT], before = "[]", os.environ[ENVIRONMENT]
+            before, os.environ[ENVIRONMENT] = os.environ.get(ENVIRONMENT, "[]"), "[]"
             result = calibrate(
                 CalibrateOptions(str(self.file), joints=(JOINT,), program="quick", out=self.folder / "profile"),
                 Silent(),
