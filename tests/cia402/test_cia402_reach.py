@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
+import can
 import pytest
 from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive, robot
 
-from frictid_drivers.cia402 import Cia402Driver
+from frictid_drivers.cia402 import Cia402Driver, network
 from frictid_drivers.cia402.known_settings import KNOWN_SETTINGS, Effect, timing_of
 from frictid_drivers.cia402.network import BusLock
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
@@ -196,3 +199,23 @@ def test_position_units_with_feed_or_without_gear():
     assert any("does not know the gear" in finding.message for finding in b.driver.check(None))
     b = bench(1, joint_options={"position_units_per_revolution": 360_000}).open()
     assert b.driver.identify()["0"].position_resolution_rad == pytest.approx(2 * math.pi / 360_000)
+
+
+def test_options_of_an_interface_are_passed_on(monkeypatch):
+    seen = {}
+
+    def opened(**settings):
+        seen.update(settings)
+        return real(interface="virtual", channel="passed-on")
+
+    real = can.Bus
+    monkeypatch.setattr(can, "Bus", opened)
+    bus = network.open_bus("socketcand:can0", {"host": "10.0.0.2", "port": 29536, "tcp_tune": True, "watchdog_ms": 100})
+    bus.shutdown()
+    assert seen["tcp_tune"] is True and seen["host"] == "10.0.0.2" and "watchdog_ms" not in seen
+
+
+def test_what_canopen_logs_stays_off_a_persons_screen():
+    code = "import logging, frictid_drivers.cia402; logging.getLogger('canopen.sdo').error('transfer aborted')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

@@ -11,6 +11,7 @@ from mit_bench import FAMILIES, Bench, robot
 
 from frictid_drivers.mit.logs import decoder
 from frictid_drivers.mit.simulated import VirtualMitDriver
+from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, HardwareError, InvalidFields, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import JointState, Severity
@@ -268,3 +269,13 @@ def test_errors_before_their_time_are_ours(tmp_path: Path) -> None:
             call()
     b.driver.quick_stop()
     b.driver.close()
+
+
+def test_the_seven_joint_arm_answers_and_fits_its_bus() -> None:
+    driver = VirtualMitDriver(load_robot("openarm.yaml").to_setup())
+    driver.open()
+    try:
+        findings = driver.check(None)
+        assert [one for one in findings if one.severity is Severity.ERROR] == [] and len(findings) == 8
+    finally:
+        driver.close()
