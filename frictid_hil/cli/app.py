@@ -8,7 +8,19 @@ from typing import Any
 
 import typer
 
-from frictid_hil.cli import calibrate, columns, compensate, emulate, gap, jobs, new, profiles, replay, reports
+from frictid_hil.cli import (
+    calibrate,
+    columns,
+    compensate,
+    dashboard,
+    emulate,
+    gap,
+    jobs,
+    new,
+    profiles,
+    replay,
+    reports,
+)
 from frictid_hil.cli.output import Output
 from frictid_hil.errors import UsageError
 from frictid_hil.version import __version__
@@ -23,6 +35,7 @@ app = typer.Typer(
 calibrate.register(app)
 compensate.register(app)
 reports.register(app)
+dashboard.register(app)
 replay.register(app)
 jobs.register(app)
 columns.register(app)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.index import index_page
-from frictid_hil.report.pages import write_page
+from frictid_hil.report.pages import Page, write_page
+
+NIGHT_PAGE = "recalibration.html"
+"""In the run folder of a recalibration."""
 
 
 def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict[str, Any]:
@@ -62,8 +66,25 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
     }
 
 
-def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) -> Path:
-    """The index page of a robot, in its folder of the store unless told.
+def write_index_page(store: ProfileStore, robot: str) -> Path:
+    """The index page of a robot, in its folder of the store.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    path = store.root / robot / "index.html"
+    folder = path.parent.resolve()
+    page = page_of(store, robot, lambda run: Path(os.path.relpath(run / NIGHT_PAGE, folder)).as_posix())
+    return write_page(page, path)
+
+
+def page_of(store: ProfileStore, robot: str, address: Callable[[Path], str]) -> Page:
+    """The index page of a robot.
+
+    Args:
+        store: where its profiles are.
+        robot: name.
+        address: of the page of a night, by its run folder; "" where it cannot be reached.
 
     Raises:
         UsageError: nothing is known of such a robot.
@@ -71,14 +92,12 @@ def write_index_page(store: ProfileStore, robot: str, path: Path | None = None) 
     trends, nights = store.trends(robot), store.attempts(robot)
     if not trends and not nights:
         raise _unknown(store, robot)
-    path = path or store.root / robot / "index.html"
-    addresses = {
-        one.utc: Path(os.path.relpath(page, path.parent.resolve())).as_posix()
-        for one in nights
-        if one.run and (page := Path(one.run).resolve() / "recalibration.html").exists()
+    with_page = {
+        one.utc: Path(one.run).resolve() for one in nights if one.run and (Path(one.run) / NIGHT_PAGE).exists()
     }
+    addresses = {utc: found for utc, run in with_page.items() if (found := address(run))}
     active, baseline = store.active(robot), store.baseline(robot)
-    return write_page(index_page(robot, trends, store.promotions(robot), nights, active, baseline, addresses), path)
+    return index_page(robot, trends, store.promotions(robot), nights, active, baseline, addresses)
 
 
 def _unknown(store: ProfileStore, robot: str) -> UsageError:

@@ -81,6 +81,29 @@ def write_page(page: Page, path: Path) -> Path:
     Raises:
         FrictidError: disk full, or no permission.
     """
+    write_whole(path, html_of(page))
+    return path
+
+
+def html_of(page: Page) -> str:
+    """The page as one self-contained document."""
+    specs: list[dict[str, Any]] = []
+    numbered: dict[int, int] = {}
+    for section in page.sections:
+        for figure in section.figures:
+            numbered[id(figure)] = len(specs)
+            specs.append(figure.spec())
+    return template("page.html").render(
+        page=page,
+        number=lambda figure: numbered[id(figure)],
+        plotly=plotly() if specs else "",
+        # "</" would end the script element early.
+        specs=json.dumps(specs, separators=(",", ":")).replace("</", "<\\/"),
+    )
+
+
+def template(name: str) -> jinja2.Template:
+    """One of ours; everything put into it is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("frictid_hil.report", "templates"),
         autoescape=True,
@@ -88,21 +111,12 @@ def write_page(page: Page, path: Path) -> Path:
         lstrip_blocks=True,
     )
     environment.filters["prose"] = _prose
-    specs: list[dict[str, Any]] = []
-    numbered: dict[int, int] = {}
-    for section in page.sections:
-        for figure in section.figures:
-            numbered[id(figure)] = len(specs)
-            specs.append(figure.spec())
-    html = environment.get_template("page.html").render(
-        page=page,
-        number=lambda figure: numbered[id(figure)],
-        plotly=files("frictid_hil.report").joinpath("vendor", "plotly-basic.min.js").read_text() if specs else "",
-        # "</" would end the script element early.
-        specs=json.dumps(specs, separators=(",", ":")).replace("</", "<\\/"),
-    )
-    write_whole(path, html)
-    return path
+    return environment.get_template(name)
+
+
+def plotly() -> str:
+    """The plotting library as JavaScript."""
+    return files("frictid_hil.report").joinpath("vendor", "plotly-basic.min.js").read_text()
 
 
 def _prose(words: str) -> Markup:
