@@ -19,6 +19,7 @@ import contextlib
 import json
 import os
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -34,6 +35,7 @@ from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.virtual import VirtualDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
 from frictid_drivers.virtual.rack import Rack
+from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import Defect, FrictidError, UsageError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
@@ -469,13 +471,20 @@ def cases(verbs: Sequence[str], seeds: int, only: str, phases: Callable[[str], M
     return found
 
 
-def page(verdicts: Sequence[Verdict], command: str) -> str:
+def page(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
     """The evidence as a page."""
     failed = [verdict for verdict in verdicts if verdict.failures]
     lines = [
         "# Faults on purpose",
         "",
-        f"`{command}`: {len(verdicts)} injections, {len(failed)} of them failed one of the questions below.",
+        f"`{command}` at {commit}: {len(verdicts)} injections,",
+        f"{len(failed)} of them failed one of these questions, judged by",
+        "the simulated servos' own state and the withheld truth, whatever the host said:",
+        "",
+        "- the joints are at rest and without power in time;",
+        "- every row that the loop recorded is in the recording, and it can be read;",
+        "- no curve more than its interval and 2 % off the truth is called ok;",
+        "- every ending is one of our errors, with a next step.",
         "",
         "| Verb | Injections | Noticed | Longest to rest | Longest to power off | Failed |",
         "|---|---|---|---|---|---|",
@@ -535,7 +544,7 @@ def main() -> None:
                 flush=True,
             )
     if asked.docs:
-        asked.docs.write_text(page(kept, "python benchmarks/faults.py --seeds " + str(asked.seeds)))
+        asked.docs.write_text(page(kept, "python " + " ".join(sys.argv), git_revision() or "?"))
     failed = sum(bool(verdict.failures) for verdict in kept)
     print(f"{len(kept)} injections, {failed} failed")
 

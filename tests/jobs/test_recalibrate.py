@@ -109,7 +109,7 @@ def test_an_interlock_that_opens_in_motion_stops_it(tmp_path: Path) -> None:
 def test_half_a_robot_is_no_point_of_a_trend(tmp_path: Path) -> None:
     joints = {name: load_robot("hp3j").values()["joints"][name] for name in ("4", "5")}
     unattended = {"allowed_by": "Iwatani", "date": "2026-11-21", "interlock_input": INTERLOCK}
-    faults = {"faults": [{"kind": "interlock_open", "joint": "5", "at_s": 20.0}]}
+    faults = {"faults": [{"kind": "interlock_open", "joint": "5", "at_s": 24.0}]}
     values = {"joints": joints, "cycle_hz": 500}
     result = night(tmp_path, 1, policy={"unattended": unattended}, options=faults, values=values)
     assert (result["outcome"], result["stored"], result["promoted"]) == ("aborted", None, False)
