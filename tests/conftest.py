@@ -6,6 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is loaded
 _home = tempfile.mkdtemp(prefix="frictid-tests-")
 for _name in ("FRICTID_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_DATA_HOME"):
     os.environ[_name] = f"{_home}/{_name.lower()}"
