@@ -99,7 +99,16 @@ def actuation_channel(
     report = report_of(nominal.torque_report_filter, logs, low_pass)
     rows = tuple(_rows(r, base[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, nuisances, candidates)
-    return Channel("actuation", logs[0].step_s * stride_of(low_pass), rows, tuple(nuisances), tuple(candidates), scale)
+    return Channel(
+        "actuation",
+        logs[0].step_s * stride_of(low_pass),
+        rows,
+        tuple(nuisances),
+        tuple(candidates),
+        scale,
+        low_pass.cutoff_hz,
+        (0.0, 0.0),
+    )
 
 
 def _view(recording: Recording, controller: Controller | None, limit_nm: float) -> DriveView:

@@ -75,6 +75,9 @@ class Channel:
         nuisances: what the belief may be wrong by within its tolerance; always in.
         candidates: what may be there besides.
         scale: what a cause may well make of y, in its unit.
+        cutoff_hz: of the low-pass that all columns have passed.
+        raw: RMS of the residual before the low-pass on the validation logs, and what noise leaves of it.
+        known_floor: RMS behind the low-pass of what is known to be noise, whatever any model leaves.
     """
 
     name: str
@@ -83,6 +86,9 @@ class Channel:
     nuisances: tuple[Term, ...]
     candidates: tuple[Term, ...]
     scale: float
+    cutoff_hz: float
+    raw: tuple[float, float] = (0.0, 0.0)
+    known_floor: float = math.inf
 
     @property
     def fitted(self) -> tuple[Rows, ...]:

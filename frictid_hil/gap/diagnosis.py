@@ -62,6 +62,21 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True)
+class Raw:
+    """The inverse gap before any filter, on validation logs, N m.
+
+    Attributes:
+        inverse_nm: RMS of the residual.
+        noise_floor_nm: what noise of torque and position leaves of it.
+        cutoff_hz: of the low-pass behind which all other figures are formed.
+    """
+
+    inverse_nm: float
+    noise_floor_nm: float
+    cutoff_hz: float
+
+
+@dataclass(frozen=True, slots=True)
 class NextExperiment:
     """What to record to decide between two causes."""
 
@@ -90,6 +105,7 @@ class Diagnosis:
         model: the joint with its causes added, where the closed loop can be simulated.
         candidate: the joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
         held_out: by effect, change of the held-out squares when it alone is added, percent.
+        raw: the gap before any filter; None where it is not formed.
     """
 
     name: str
@@ -106,6 +122,7 @@ class Diagnosis:
     model: JointModel | None = None
     candidate: JointModel | None = None
     held_out: Mapping[str, float] = field(default_factory=dict)
+    raw: Raw | None = None
 
     def improved_model(self) -> JointModel | None:
         """The joint with the named causes added; the nominal joint where nothing is applied; None without a controller.

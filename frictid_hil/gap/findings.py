@@ -56,12 +56,14 @@ class Sampled:
         draws: samples.
         sizes: by cause, its size over the floor in every draw, shape (draws,); 0 where it is not in.
         generic: the same of all generic functions together.
+        explained: the same of all causes together.
     """
 
     posterior: Posterior
     draws: Sequence[Draw]
     sizes: Mapping[str, Array]
     generic: Array
+    explained: Array
 
 
 def sampled(posterior: Posterior) -> Sampled:
@@ -71,19 +73,23 @@ def sampled(posterior: Posterior) -> Sampled:
     x = x - np.mean(x, axis=0) * (posterior.channel.name == "actuation")
     gram = x.T @ x / x.shape[0]
     sizes: dict[str, Array] = {}
-    generic = np.zeros(len(draws))
+    generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
+
+    def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
+        if not parts:
+            return 0.0
+        columns, values = np.concatenate([c for c, _ in parts]), np.concatenate([v for _, v in parts])
+        square = float(values @ gram[np.ix_(columns, columns)] @ values)
+        return math.sqrt(max(0.0, square)) / posterior.floor
+
     for k, draw in enumerate(draws):
         parts = posterior.contributions(draw)
-        for effect, (columns, values) in parts.items():
-            if effect and not effect.startswith(FAMILY):
-                size = math.sqrt(max(0.0, float(values @ gram[np.ix_(columns, columns)] @ values)))
-                sizes.setdefault(effect, np.zeros(len(draws)))[k] = size / posterior.floor
-        families = [part for name, part in parts.items() if name.startswith(FAMILY)]
-        if families:
-            columns = np.concatenate([c for c, _ in families])
-            values = np.concatenate([v for _, v in families])
-            generic[k] = math.sqrt(max(0.0, float(values @ gram[np.ix_(columns, columns)] @ values))) / posterior.floor
-    return Sampled(posterior, draws, sizes, generic)
+        causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
+        for effect, part in causes.items():
+            sizes.setdefault(effect, np.zeros(len(draws)))[k] = size_of([part])
+        explained[k] = size_of(list(causes.values()))
+        generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
+    return Sampled(posterior, draws, sizes, generic, explained)
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:

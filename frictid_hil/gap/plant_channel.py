@@ -14,7 +14,7 @@ from frictid_hil.gap.channel import FAMILY, Builder, Channel, Rows, Term, effect
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import families
 from frictid_hil.gap.nuisances import nuisances
-from frictid_hil.gap.position_noise import quiet_views
+from frictid_hil.gap.position_noise import quiet_views, white_rms
 from frictid_hil.gap.residuals import (
     LowPass,
     Recording,
@@ -51,6 +51,7 @@ def plant_channel(
     if not logs:
         return None
     views, noises = quiet_views(nominal, logs)
+    measured = [r.view for r in logs if r.view is not None]
     builder = Builder([[] for _ in logs])
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
     scale = min(friction_nm / 3.0, _gap_nm(logs))
@@ -65,7 +66,7 @@ def plant_channel(
             candidates.append(replace(term, deviation=BEYOND * term.deviation))
         if told:
             continue
-        for shape in form.grid_for(views):
+        for shape in form.grid_for(measured):
             columns = form.regressors(views, shape)
             mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
             candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
@@ -79,7 +80,8 @@ def plant_channel(
     rows = tuple(_rows(r, builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, known, candidates)
     step_s = logs[0].step_s * stride_of(low_pass)
-    return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale)
+    raw, known_floor = _raw(logs, noises), _known_floor(logs, rows, low_pass)
+    return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
 
 
 def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[Array]) -> Term:
@@ -89,6 +91,20 @@ def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[A
     count = int(np.count_nonzero(each > 1e-9 * max(float(each.max()), 1e-300)))
     deviation = np.where(each > 1e-9 * each.max(), size / (math.sqrt(max(count, 1)) * np.maximum(each, 1e-300)), 0.0)
     return Term(FAMILY + name, {"size": size}, numbers, np.zeros(each.size), deviation)
+
+
+def _raw(logs: Sequence[Recording], noises: Sequence[Array]) -> tuple[float, float]:
+    """(RMS of the residual of the validation logs before any filter, what noise of torque and position leaves), N m."""
+    chosen = [k for k, r in enumerate(logs) if r.experiment.validation] or list(range(len(logs)))
+    gap = rms(np.concatenate([p for k in chosen if (p := logs[k].plant_nm) is not None]))
+    white = [white_rms(t) for k in chosen if (t := logs[k].experiment.torque_nm) is not None]
+    return gap, math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
+
+
+def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowPass) -> float:
+    """RMS that white noise of the torque and noise of the position leave behind the low-pass, N m."""
+    white = [white_rms(t) * low_pass.white_gain for r in logs if (t := r.experiment.torque_nm) is not None]
+    return math.hypot(rms(np.array(white)), rms(np.concatenate([log.known_noise for log in rows])))
 
 
 def _gap_nm(logs: Sequence[Recording]) -> float:

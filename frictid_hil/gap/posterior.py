@@ -19,7 +19,7 @@ from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
-from frictid_hil.gap.channel import Channel
+from frictid_hil.gap.channel import FAMILY, Channel, Rows
 
 SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Variance of the slow part over that of the noise: half decades."""
@@ -241,7 +241,28 @@ class Posterior:
         return list(best.values())
 
     def search(self) -> list[Model]:
-        """Models worth a look, the likeliest first: grown from the empty one, then every neighbour of the best."""
+        """Models worth a look, the likeliest first.
+
+        What the likeliest leaves of logs that it was not fitted to may be more than what it leaves of the others: then
+        the model is wrong beyond its noise, and every row tells as much less as it is worse predicted.
+        """
+        found = self._search()
+        fitted = [log for log in self.channel.logs if not log.validation]
+        unseen = [log for log in self.channel.logs if log.validation]
+        if not fitted or not unseen:
+            return found
+        theta = self.fitted(found[0].terms)
+        worse = _mean_square(unseen, theta) / max(_mean_square(fitted, theta), self.floor**2)
+        if worse <= 1.0:
+            return found
+        self._grams, self._rights = self._grams / worse, self._rights / worse
+        self._base = self._base / worse
+        self._left = [gram / worse for gram in self._left]
+        self._known = {}
+        return self._search()
+
+    def _search(self) -> list[Model]:
+        """Grown from the empty model, then every neighbour of the best."""
         best = self.model(())
         while len(best.terms) < MOST:
             grown = [self.model((*best.terms, t)) for t in self._extensions(best)[:TRIED]]
@@ -302,6 +323,25 @@ class Posterior:
         root = np.linalg.cholesky(covariance + 1e-14 * np.eye(at.size))
         return at, care * mean, care[:, None] * root
 
+    def fitted(self, terms: Sequence[int]) -> Array:
+        """Mean coefficients of a set, at its likeliest point of the grid, for all columns of the channel's table."""
+        model = self.model(terms)
+        at, mean, _ = self._coefficients(model, int(np.argmax(model.by_setting)))
+        theta = np.zeros(self.channel.logs[0].x.shape[1])
+        np.add.at(theta, self._columns[at], self._scale[at] * mean)
+        return theta
+
+    def singles(self) -> dict[str, int]:
+        """The best shape of every cause, alone."""
+        empty = self.model(())
+        gains = self._extended((), int(np.argmax(empty.by_setting)))
+        best: dict[str, int] = {}
+        for t in np.argsort(-gains):
+            effect = self.channel.candidates[t].effect
+            if not effect.startswith(FAMILY):
+                best.setdefault(effect, int(t))
+        return best
+
     def contributions(self, draw: Draw) -> dict[str, tuple[np.ndarray, Array]]:
         """By cause: (columns of the channel's table, coefficients), nuisances and terms together."""
         result: dict[str, tuple[list[int], list[float]]] = {}
@@ -322,6 +362,12 @@ class Draw:
     setting: int
     at: np.ndarray
     values: Array
+
+
+def _mean_square(logs: Sequence[Rows], theta: Array) -> float:
+    """Of what coefficients leave, each log's own mean taken off."""
+    rests = [log.y - log.x @ theta for log in logs]
+    return float(np.mean(np.concatenate([rest - np.mean(rest) for rest in rests]) ** 2))
 
 
 def _log_between(low: Array, high: Array) -> Array:

@@ -31,7 +31,7 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
     travel = max(float(np.ptp(r.experiment.position_rad)) for r in logs)
     builder = Builder([[] for _ in logs])
     commands: list[Array] = [c for r in logs if (c := r.experiment.position_command_rad) is not None]
-    base: list[Array] = [*commands]
+    base = commands
     candidates: list[Term] = []
     forms = {name: e.tracking for name, e in all_effects().items() if e.tracking is not None and name in library}
     for name, form in sorted(forms.items(), key=lambda item: item[1].order):
@@ -41,8 +41,10 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
             candidates.append(Term(name, values, builder.add(columns), np.ones(1), np.full(1, SPREAD)))
         best = min((_left(changed, logs), k) for k, (_, changed) in enumerate(tried)) if tried else None
         if best is not None and not form.mimics and best[0] < 0.9 * _left(base, logs):
-            base = tried[best[1]][1]
-    level = [np.ones((b.size, 1)) * (np.arange(len(base)) == k) for k, b in enumerate(base)]
+            base = list(tried[best[1]][1])
+    level: list[Array] = [np.zeros((b.size, len(base))) for b in base]
+    for k, one in enumerate(level):
+        one[:, k] = 1.0
     start = Term("", {}, builder.add(level), np.zeros(len(base)), np.full(len(base), travel))
     scale = _left(commands, logs)
     for name, shapes in _generic(logs, commands).items():
@@ -55,7 +57,16 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
         table = thinned(np.concatenate([*builder.parts[k], residual], axis=1), low_pass)[1:-2]
         e = log.experiment
         rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], np.zeros(table.shape[0])))
-    return Channel("tracking", logs[0].step_s * stride_of(low_pass), tuple(rows), (start,), tuple(candidates), scale)
+    return Channel(
+        "tracking",
+        logs[0].step_s * stride_of(low_pass),
+        tuple(rows),
+        (start,),
+        tuple(candidates),
+        scale,
+        low_pass.cutoff_hz,
+        (0.0, 0.0),
+    )
 
 
 def _tried(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gap_sets
 import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
+from frictid_hil.gap.by_posterior import diagnose
 from frictid_hil.gap.findings import Finding, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior
@@ -40,3 +43,13 @@ def test_a_whitened_row_is_white_and_of_unit_size() -> None:
     rest = white[:, 0]
     assert abs(float(np.std(rest)) - 1.0) < 0.03
     assert abs(float(rest[1:] @ rest[:-1]) / rest.size) < 0.03
+
+
+def test_a_healthy_joint_is_none_and_a_payload_in_validation_alone_is_no_cause_of_the_library() -> None:
+    assert diagnose(gap_sets.make()).verdict == "none"
+    made = gap_sets.make(only=("sines_small", "sines_large", "moves_payload"))
+    heavier = [
+        replace(e, torque_nm=e.torque_nm + 3.0 * e.validation * np.cos(e.position_rad)) for e in made.experiments
+    ]
+    found = diagnose(replace(made, experiments=tuple(heavier)))
+    assert found.verdict == "unknown" and "moves_payload" in found.reasons["validation"]

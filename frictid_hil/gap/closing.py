@@ -1,0 +1,142 @@
+"""How far the gap closes on recordings that nothing was fitted to: along the motion, and in closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import FAMILY, Rows
+from frictid_hil.gap.diagnosis import Figures
+from frictid_hil.gap.findings import Sampled
+from frictid_hil.gap.forward import Effects, Replay, Replayed, pooled
+from frictid_hil.gap.posterior import Draw
+from frictid_hil.gap.residuals import rms
+
+COLOUR = 2.0
+"""Noise at most, over what is white in it or comes from the position: a slow part three times as strong in power."""
+FEW = 40
+"""Draws from which the interval of a gap is read: its ends are known to a tenth of its width."""
+APPEARED = 2.5
+"""Rest of a validation log over that of the fitted ones from which something is in it that was not there before."""
+WINDOW_S = 1.0
+"""Time over which such a rest is averaged to tell since when."""
+
+
+@dataclass(frozen=True, slots=True)
+class Closed:
+    """One channel's gap on the validation logs, in its own unit.
+
+    Attributes:
+        channel: its name.
+        before: RMS of the residual.
+        after: RMS with the named causes taken off.
+        low: 95 % interval of ``after``.
+        high: see there.
+        floor: RMS that noise alone leaves.
+        appeared: (log, seconds) where something shows that no identification log holds; None where nothing does.
+    """
+
+    channel: str
+    before: float
+    after: float
+    low: float
+    high: float
+    floor: float
+    appeared: tuple[str, float] | None = None
+
+
+def closed(channel: Sampled, names: Collection[str]) -> Closed:
+    """The gap of one channel without and with the named causes."""
+    posterior = channel.posterior
+    judged = posterior.channel.judged
+    constant = posterior.channel.name != "plant"
+    every = [coefficients(channel, draw, names) for draw in channel.draws]
+    mean = np.mean(every, axis=0)
+    spread = [rms(_left(judged, theta, constant)) for theta in every[:FEW]]
+    low, high = np.quantile(spread, [0.025, 0.975])
+    after = rms(_left(judged, mean, constant))
+    whole = np.mean([coefficients(channel, draw, None) for draw in channel.draws], axis=0)
+    return Closed(
+        posterior.channel.name,
+        rms(_left(judged, np.zeros_like(mean), constant)),
+        after,
+        min(float(low), after),
+        max(float(high), after),
+        min(posterior.floor, COLOUR * posterior.channel.known_floor),
+        _appeared(channel, whole),
+    )
+
+
+def coefficients(channel: Sampled, draw: Draw, names: Collection[str] | None) -> Array:
+    """Of all columns of the channel's table in one draw, those of other causes 0; of everything where names is None."""
+    theta = np.zeros(channel.posterior.channel.logs[0].x.shape[1])
+    for effect, (columns, values) in channel.posterior.contributions(draw).items():
+        if names is None or (effect in names and not effect.startswith(FAMILY)):
+            np.add.at(theta, columns, values)
+    return theta
+
+
+def _left(logs: Sequence[Rows], theta: Array, without_mean: bool) -> Array:
+    parts = [log.y - log.x @ theta for log in logs]
+    return np.concatenate([part - np.mean(part) if without_mean else part for part in parts])
+
+
+def _appeared(channel: Sampled, theta: Array) -> tuple[str, float] | None:
+    """The validation log, and the time in it, from which on the whole model explains much less than elsewhere."""
+    posterior = channel.posterior
+    fitted = [log for log in posterior.channel.logs if not log.validation]
+    if not fitted or channel.posterior.channel.name != "plant":
+        return None
+    usual = max(posterior.floor, rms(_left(fitted, theta, False)))
+    for log in posterior.channel.logs:
+        if not log.validation:
+            continue
+        rest = log.y - log.x @ theta
+        if rms(rest) < APPEARED * usual:
+            continue
+        rows = max(1, round(WINDOW_S / posterior.channel.step_s))
+        local = np.sqrt(np.convolve(rest**2, np.full(rows, 1.0 / rows), mode="same"))
+        return log.name, log.start_s + posterior.channel.step_s * int(np.argmax(local > APPEARED * usual))
+    return None
+
+
+def held_out(channel: Sampled) -> dict[str, float]:
+    """By effect, change of the validation logs' squares when it alone is added to tolerances, percent."""
+    posterior = channel.posterior
+    judged = posterior.channel.judged
+
+    def squares(theta: Array) -> float:
+        return float(np.sum(_left(judged, theta, posterior.channel.name != "plant") ** 2))
+
+    bare = squares(posterior.fitted(()))
+    alone = {name: squares(posterior.fitted((term,))) for name, term in posterior.singles().items()}
+    return {name: round(100.0 * (left / bare - 1.0), 2) for name, left in alone.items() if bare > 0.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """Closed loop on the validation logs, without and with the named causes."""
+
+    before: Mapping[str, Replayed]
+    after: Mapping[str, Replayed]
+
+    def figures(self, when: str, log: str | None = None) -> tuple[float, float]:
+        """(torque in N m, position in rad): RMS of the difference, of one log or of all."""
+        chosen = getattr(self, when)
+        if log is not None:
+            chosen = {log: chosen[log]}
+        return pooled(chosen, "torque_nm"), pooled(chosen, "position_rad")
+
+    def per_log(self) -> dict[str, dict[str, Figures]]:
+        """Figures before and after by log."""
+        return {
+            log: {when: Figures(None, *self.figures(when, log)) for when in ("before", "after")} for log in self.before
+        }
+
+
+def simulated(replay: Replay, before: Mapping[str, Replayed], effects: Effects, validation: bool | None) -> Simulated:
+    """Both replays on the same logs."""
+    return Simulated(before, replay(effects, validation=validation) if effects else before)

@@ -1,0 +1,104 @@
+"""The verdict: what the posterior and the gap together allow to be said."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from frictid_hil.gap.channel import FAMILY
+from frictid_hil.gap.closing import Closed
+from frictid_hil.gap.findings import Finding, Sampled
+
+FLOORS = 2.0
+"""A gap below so many noise floors is none, by promise."""
+STANDS_OUT = 1.0
+"""Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
+HELPS = 0.98
+"""Gap of the validation logs with the causes over that without, above which they explain nothing there."""
+READ_DIRECTLY = "kinematics"
+"""Where a cause is read from positions and velocities themselves."""
+LISTED = 0.25
+"""Chance from which a cause is listed."""
+LEADS = 0.6
+"""Chance of being the largest cause below which a rival makes the answer ambiguous."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is said.
+
+    Attributes:
+        word: ``none``, ``explained``, ``ambiguous`` or ``unknown``.
+        named: causes that are listed, the first one first.
+        place: where an unexplained gap lives.
+    """
+
+    word: str
+    named: tuple[Finding, ...]
+    place: str = ""
+
+
+def verdict(
+    found: Sequence[Finding],
+    channels: Sequence[Sampled],
+    gaps: Sequence[Closed],
+    negligible: float,
+    otherwise_quiet: bool,
+) -> Verdict:
+    """Decide.
+
+    Args:
+        found: causes, the largest first.
+        channels: draws of each channel.
+        gaps: of each channel.
+        negligible: gap that means nothing to the user, in the channels' unit.
+        otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
+    """
+    helpless = [gap.channel for gap in gaps if gap.after > HELPS * gap.before]
+    named = tuple(f for f in found if f.chance >= LISTED and f.where not in helpless)
+    quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
+    explained = _root_sum([channel.explained for channel in channels])
+    generic = _root_sum([channel.generic for channel in channels])
+    place = _place(channels)
+    if any(f.where == READ_DIRECTLY for f in named):
+        return Verdict("explained", named)
+    nothing = not named or float(np.median(explained)) < STANDS_OUT
+    generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
+    # A gap that is small beside the noise and small in practice is none, whatever trace explains it.
+    tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
+    if tiny or (quiet and (nothing or generic_wins)):
+        return Verdict("none", ())
+    new = any(gap.appeared is not None for gap in gaps)
+    if nothing or generic_wins or new or any(_open(gap, negligible) for gap in gaps):
+        return Verdict("unknown", named, place)
+    first = named[0]
+    rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
+    if first.leads < LEADS and rivals:
+        return Verdict("ambiguous", named)
+    return Verdict("explained", named)
+
+
+def _open(gap: Closed, negligible: float) -> bool:
+    """Whether more than half of a channel's visible gap stays."""
+    visible = max(0.0, gap.before**2 - gap.floor**2)
+    return gap.after > max(FLOORS * gap.floor, negligible) and gap.after**2 - gap.floor**2 > 0.5 * visible
+
+
+def _root_sum(sizes: Sequence[np.ndarray]) -> np.ndarray:
+    total: np.ndarray = np.sqrt(np.sum([size**2 for size in sizes], axis=0))
+    return total
+
+
+def _place(channels: Sequence[Sampled]) -> str:
+    """Generic functions that hold most of what no cause explains, in words."""
+    loudest = max(channels, key=lambda channel: float(np.median(channel.generic)))
+    counts: dict[str, int] = {}
+    for draw in loudest.draws:
+        for effect in draw.model.effects:
+            if effect.startswith(FAMILY):
+                counts[effect] = counts.get(effect, 0) + 1
+    names = sorted(counts, key=lambda name: -counts[name])[:2]
+    words = " and ".join(name.removeprefix(FAMILY) for name in names)
+    return f"{loudest.posterior.channel.name}: {words}" if words else loudest.posterior.channel.name
