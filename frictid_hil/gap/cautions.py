@@ -85,17 +85,3 @@ def below_first_pair(causes: Sequence[Cause], curve: FrictionCurve | None) -> st
         f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
         "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds first"
     )
-
-
-def curve_rather_than_stribeck(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """The causes, a Stribeck effect lowered that needs another bend beside it: together they draw a curve."""
-    names = {c.effect for c in causes}
-    if not {"stribeck", "viscous_nonlinearity"} <= names:
-        return tuple(causes)
-    partner = ("viscous_nonlinearity",)
-    return tuple(
-        replace(c, confidence=min(c.confidence, _TIED), confusable_with=(*partner, *c.confusable_with))
-        if c.effect == "stribeck"
-        else c
-        for c in causes
-    )
