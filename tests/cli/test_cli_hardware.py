@@ -74,7 +74,7 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
         until = time.monotonic() + 100
         while not (frames.exists() and frames.stat().st_size > 1000) and time.monotonic() < until:
             time.sleep(0.1)
-        second = run("calibrate", "--robot", "hp3j", *SHORT, cwd=tmp_path)
+        second = run("calibrate", "--robot", "hp3j", *SHORT, "--realtime", cwd=tmp_path)
         assert second.returncode == 3, second.stderr
         assert "in use" in second.stderr
     finally:

@@ -60,13 +60,18 @@ def test_a_run_replays_to_the_identical_profile(run: Path, robot: str, tmp_path:
 def test_set_points_on_the_simulated_joint_move_it_as_recorded(run: Path, robot: str, tmp_path: Path) -> None:
     result = replay(ReplayOptions(run, robot, out=tmp_path))
     step_rad = 2 * np.pi / 131072 / load_robot(robot).file.joints["5"].gear_ratio
-    assert result["position_rms_rad"] < 2 * step_rad
-    # What is left of the torque is the drive's noise: 5 per mille of rated.
-    assert result["torque_rms_nm"] < 0.007 * load_robot(robot).file.joints["5"].rated_torque_nm
+    assert result["position_rms_rad"] < 1e-4
     (csv,) = result["simulated"]
     header, first, *_ = Path(csv).read_text().splitlines()
     assert header.startswith("time_s,position_rad") and header.endswith("simulated_torque_nm")
     assert len(first.split(",")) == len(header.split(","))
+    # The joint proved its units before this recording begins: how its gear was left bent shows at the very first move.
+    rows = np.genfromtxt(csv, delimiter=",", names=True)
+    later = rows[rows["time_s"] > rows["time_s"][0] + 1.5]
+    assert np.abs(later["simulated_position_rad"] - later["position_rad"]).max() < 2 * step_rad
+    # What is left of the torque is the drive's noise: 5 per mille of rated.
+    torque = later["simulated_torque_nm"] - later["torque_nm"]
+    assert np.sqrt(np.mean(torque**2)) < 0.007 * load_robot(robot).file.joints["5"].rated_torque_nm
 
 
 @pytest.mark.parametrize("name", ["profile.yaml", "simulated-5.csv"])
@@ -202,7 +207,7 @@ def test_a_candump_log_and_an_eds_give_the_same_curve(run: Path, robot: str, tmp
     command += ["--eds", str(eds), "--profile", str(run), "--no-simulate", "--json"]
     command += ["--amplitude", "0.2rad", "--velocity", "1.5rad/s", "--cycles", "3", "--ratio", "0.8"]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert answer.returncode == 0, answer.stderr
+    assert answer.returncode == 0, answer.stdout
     result = json.loads(answer.stdout)
     # A data sheet of drives does not tell of the host, whose heartbeat they watch.
     assert result["log"]["unknown"].keys() == {"heartbeat of node 127"} and result["log"]["lost_rows"] == {"5": 0}
@@ -223,6 +228,9 @@ def mapped_eds(frames: dict[str, Any], robot: str, path: Path) -> Path:
                 dcf[f"{mapping + number:04X}sub{sub}"]["ParameterValue"] = f"0x{index}{object_sub}{bits:02X}"
     joint = load_robot(robot).file.joints["5"]
     assert joint.rated_torque_nm is not None
+    dcf["60A9"]["ParameterValue"] = "0xFDB44700"  # 0.001 revolutions per minute, as the host sets it
+    dcf["6091sub1"]["ParameterValue"], dcf["6091sub2"]["ParameterValue"] = "163", "2"
+    dcf["6092sub1"]["ParameterValue"] = str(131072 * 163 // 2)
     dcf["6076"]["ParameterValue"] = str(round(1000 * joint.rated_torque_nm / joint.gear_ratio))
     with path.open("w") as file:
         dcf.write(file, space_around_delimiters=False)

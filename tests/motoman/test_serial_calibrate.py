@@ -21,7 +21,6 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_mcap
 from frictid_hil.runner.events import Event, JobProgress
-from frictid_hil.runs import run as run_module
 from frictid_hil.runs.folder import load_manifest
 
 ROBOT = """\
@@ -52,7 +51,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path
             emulator = build(setup, plan)
             return MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
 
-        monkeypatch.setattr(run_module, "load_driver", lambda name: driver)
+        monkeypatch.setattr("frictid_hil.runs.run.new_driver", lambda name, setup: driver(setup))
         path = tmp_path / "bench.yaml"
         path.write_text(ROBOT.format(layer=layer, averaging_ms=averaging_ms))
         return path

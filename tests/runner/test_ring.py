@@ -95,7 +95,7 @@ def test_a_run_that_ends_before_its_first_cycle_lets_go_of_its_rings(monkeypatch
         raise UsageError("no hand")
 
     wall_clock = SimpleNamespace(clock=SimpleNamespace(lock_step=False))
-    monkeypatch.setattr(run, "load_driver", lambda name: lambda setup: wall_clock)
+    monkeypatch.setattr(run, "new_driver", lambda name, setup: wall_clock)
     monkeypatch.setattr(run, "sample_ring", noted)
     monkeypatch.setattr(run, "frame_ring", noted)
     nothing: Any = None
