@@ -1,8 +1,8 @@
-"""The diagnosis of a set that cannot be replayed: one posterior over sets of causes, whatever channels there are.
+"""The diagnosis: where the gap lies, which effects cause it, how far it closes; one path for every kind of set.
 
-The plant, actuation and tracking channels that a set has are explained together; what that says, and the gap on the
-validation logs, make the verdict. It takes sets with a controller as well. ``gap.diagnose`` does not hand it those yet:
-on joints that it had never seen it named more causes rightly there, but was wrong at 0.9 and more in 2 of 24.
+Whatever channels a set has (plant, actuation, tracking) are explained by one posterior over sets of causes; what it
+says, and the gap on the validation logs, make the verdict. It is not what the product calls yet: on joints that it had
+never seen it names far more causes rightly, but it is wrong at 0.9 and more where ``gap.diagnose`` never was.
 """
 
 from __future__ import annotations

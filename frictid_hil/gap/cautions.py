@@ -11,7 +11,7 @@ import numpy as np
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Cause
-from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, uniform
 from frictid_hil.gap.sanity import LEAST_ROWS
 
@@ -85,3 +85,29 @@ def below_first_pair(causes: Sequence[Cause], curve: FrictionCurve | None) -> st
         f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
         "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds first"
     )
+
+
+def curve_rather_than_stribeck(causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The causes, a Stribeck effect lowered that needs another bend beside it: together they draw a curve."""
+    names = {c.effect for c in causes}
+    if not {"stribeck", "viscous_nonlinearity"} <= names:
+        return tuple(causes)
+    partner = ("viscous_nonlinearity",)
+    return tuple(
+        replace(c, confidence=min(c.confidence, _TIED), confusable_with=(*partner, *c.confusable_with))
+        if c.effect == "stribeck"
+        else c
+        for c in causes
+    )
+
+
+_FLOORS = 2.0
+"""Gap over what noise leaves up to which nothing is said to be there."""
+_NEGLIGIBLE = 0.05
+"""Gap over the friction level that means nothing in practice: friction repeats to about this from day to day."""
+
+
+def all_clear(gap_nm: float, noise_nm: float, nominal: Nominal) -> bool:
+    """Whether ``none`` may be said: the gap is within two floors, or within what friction repeats to."""
+    level = nominal.curve.coulomb_nm if nominal.curve is not None else 0.0
+    return gap_nm <= max(_FLOORS * noise_nm, _NEGLIGIBLE * level)

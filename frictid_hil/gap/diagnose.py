@@ -8,25 +8,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frictid_hil.gap import by_posterior
 from frictid_hil.gap.actuation import ActuationFit, Drive, fit_actuation, structured_share, velocity_lag_s
-from frictid_hil.gap.cautions import ONE_SINUSOID, below_first_pair, one_sinusoid, tied_on_a_sinusoid
+from frictid_hil.gap.cautions import ONE_SINUSOID, all_clear, below_first_pair, one_sinusoid, tied_on_a_sinusoid
 from frictid_hil.gap.confidence import clues_of
 from frictid_hil.gap.credit import credits, sound
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value, Where
 from frictid_hil.gap.echo import echoes_nm
 from frictid_hil.gap.evidence import Evidence, acceleration_gain
-from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, Replayed, bounded, pooled, settled_nm, why_not
 from frictid_hil.gap.held_out import by_stretch, change
 from frictid_hil.gap.how_far import TOLERANCE_SHARE, Hypothesis, Judge, choose, hollow, needed
-from frictid_hil.gap.judgement import FLOORS
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
+from frictid_hil.gap.partial import diagnose_without_replay
 from frictid_hil.gap.residuals import LowPass, Recording, friction_scales, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.spread import Unlike, unlike
-from frictid_hil.gap.tracking import diagnose_tracking
 from frictid_hil.gap.verdict import Features, verdict_of
 from frictid_hil.gap.where import lives, where
 from frictid_hil.gap.which import Model, Ranking, best_family, families_beside, rank, replacements
@@ -56,16 +54,13 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnose one joint; deterministic.
 
-    A set whose controller can be replayed is judged by the replay, one of positions alone by the way from command to
-    position, any other by the posterior over its channels.
-
     Args:
         experiments: nominal joint and recordings.
         library: names of the effects that may be used; all of them unless given.
         least_chance: of the likeliest cause, below which the answer is ``unknown``.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
-    given, reason = experiments, why_not(experiments)
+    reason = why_not(experiments)
     experiments, hints = completed(checked(experiments))
     if (open_question := one_sided(experiments)) is not None:
         hints["motion"] = open_question
@@ -73,12 +68,8 @@ def diagnose(
         hints["sinusoid"] = ONE_SINUSOID
     logs = recordings(experiments)
     usable = [r for r in logs if r.plant_nm is not None]
-    if not usable:
-        missing = {"forward_torque_nm": reason or "no log to replay", "inverse_nm": "no log has a torque"}
-        missing["forward_position_rad"] = missing["forward_torque_nm"]
-        return diagnose_tracking(experiments, logs, allowed, {**hints, **missing})
-    if reason is not None or all(r.experiment.validation for r in usable):
-        return by_posterior.diagnose(given, library=library)
+    if reason is not None or not usable or not any(not r.experiment.validation for r in usable):
+        return diagnose_without_replay(experiments, logs, allowed, reason, hints)
     return _full(experiments, logs, allowed, hints, least_chance)
 
 
@@ -317,7 +308,7 @@ def _conclude(
         min(noise_nm, before.forward_torque_nm or noise_nm),
         min(step / math.sqrt(12.0), before.forward_position_rad or math.inf) if step else None,
     )
-    if verdict == "none" and not _all_clear(inverse_before, math.hypot(noise_nm, encoder), experiments.nominal):
+    if verdict == "none" and not all_clear(inverse_before, math.hypot(noise_nm, encoder), experiments.nominal):
         verdict, place = "unknown", features.family_name or "the torque that inverse dynamics leaves"
     closed = 0.0
     if before.forward_torque_nm and before.forward_torque_nm > noise_nm:
@@ -401,12 +392,6 @@ def _conclude(
         candidate=judge.replay.model(hypothesis.effects),
         held_out={m.effects[0]: round(100.0 * (_ratio(evidence, m) - 1.0), 2) for m in ranking.singles},
     )
-
-
-def _all_clear(gap_nm: float, noise_nm: float, nominal: Nominal) -> bool:
-    """Whether ``none`` may be said: the gap is within two floors, or within what friction repeats to day by day."""
-    level = nominal.curve.coulomb_nm if nominal.curve is not None else 0.0
-    return gap_nm <= max(FLOORS * noise_nm, by_posterior.NEGLIGIBLE * level)
 
 
 def _ratio(evidence: Evidence, model: Model) -> float:

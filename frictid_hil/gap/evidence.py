@@ -59,6 +59,7 @@ NUISANCES = (
     Nuisance("payload gravity", 0.006, 0.0132),
     Nuisance("timing", 1.5e-4, 3.3e-4),
     Nuisance("presliding stiffness", 0.02, 0.044),
+    Nuisance("offset", 1.0, 2.2),
 )
 
 
@@ -102,6 +103,8 @@ class Evidence:
         library: Sequence[str],
         noise_nm: float | None,
         *,
+        tolerance_factor: float = 1.0,
+        offset_nm: float = 0.0,
         late_s: float = 0.0,
         echoes_nm: Mapping[str, Array] | None = None,
     ) -> None:
@@ -110,7 +113,7 @@ class Evidence:
         self.low_pass = LowPass.at(1.0 / self.recordings[0].step_s)
         self.groups: dict[Group, tuple[int, ...]] = {}
         self._grid: dict[str, tuple[Shape, ...]] = {}
-        parts: list[list[Array]] = [self._thin(_nuisance(views))]
+        parts: list[list[Array]] = [self._thin(_nuisance(views, offset_nm / tolerance_factor))]
         width = parts[0][0].shape[1]
         self._nuisances = tuple(range(width))
         for name, form in ((n, e.inverse) for n, e in all_effects().items() if n in library):
@@ -131,8 +134,8 @@ class Evidence:
             count = columns[0].shape[1]
             self.groups[FAMILY + name, 0] = tuple(range(width, width + count))
             width += count
-        self._prior = np.array([1.0 / n.deviation**2 for n in NUISANCES])
-        self._bound = np.array([n.bound for n in NUISANCES])
+        self._prior = np.array([1.0 / (tolerance_factor * n.deviation) ** 2 for n in NUISANCES])
+        self._bound = tolerance_factor * np.array([n.bound for n in NUISANCES])
         if late_s > 0.0:
             # A drive whose torque is late reports it at a time known no better than that, or than half a sample.
             late_s = max(late_s, 0.5 * self.recordings[0].step_s)
@@ -383,7 +386,7 @@ def acceleration_gain(low_pass: LowPass) -> float:
     return float(np.sqrt(np.mean(np.abs(response) ** 4 * differenced)) * low_pass.rate_hz**2)
 
 
-def _nuisance(views: Sequence[View]) -> list[Array]:
+def _nuisance(views: Sequence[View], offset_nm: float) -> list[Array]:
     columns = []
     for v in views:
         stiffer = slip_state(v.position_rad, 1.05 * v.stiffness_nm_per_rad / v.coulomb_nm)
@@ -398,6 +401,7 @@ def _nuisance(views: Sequence[View]) -> list[Array]:
                     v.payload_gravity_nm,
                     np.gradient(v.torque_nm, v.step_s),
                     v.coulomb_nm * (stiffer - v.slip) / 0.05,
+                    np.full(v.slip.size, offset_nm),
                 ],
                 axis=1,
             )

@@ -41,9 +41,12 @@ def test_the_linear_axis_is_asymmetric_whichever_half_is_judged(benchmark: Modul
 
 
 @pytest.mark.parametrize("odd_judged", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_the_second_joint_of_the_pendulum_has_no_gap_that_matters(benchmark: ModuleType, odd_judged: bool) -> None:
+def test_the_second_joint_of_the_pendulum_has_a_gap_that_no_effect_closes(
+    benchmark: ModuleType, odd_judged: bool
+) -> None:
     found = diagnose(benchmark.double_pendulum(REAL, "c1", 2, odd_judged))
-    assert found.verdict == "none" and not found.causes
+    # Beyond two floors and beyond what friction repeats to: nothing is named, and nothing is cleared either.
+    assert found.verdict == "unknown" and not found.causes
     assert min(found.held_out.values()) > -5.0
 
 
