@@ -345,7 +345,8 @@ def test_a_stop_at_any_moment_with_power_on_ends_in_time_and_within_the_plan(see
     assert isinstance(ended, Interrupted) and stop.asked_ns is not None
     mine = rows[rows["joint"] == 3]
     assert TRAVEL[0] - 0.35 * DEG <= mine["position_rad"].min()
-    assert mine["position_rad"].max() <= ROBOT.file.joints["3"].locked_position_rad + 0.35 * DEG
+    # The proof of units takes half a degree to either side of where the joint stands.
+    assert mine["position_rad"].max() <= ROBOT.file.joints["3"].locked_position_rad + (0.5 + 0.35) * DEG
     moving = mine["t_ns"][np.abs(mine["velocity_rad_s"]) > 1 * DEG]
     assert moving.size == 0 or moving[-1] - stop.asked_ns < 500 * MS
     assert np.abs(mine["velocity_rad_s"][-20:]).max() < 0.5 * DEG
