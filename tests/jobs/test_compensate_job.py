@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -515,7 +516,7 @@ def test_a_service_runs_until_interrupted_and_leaves_its_figures(robot: Path, pr
     assert manifest["outcome"] == "interrupted"
     samples = next(one for one in read(tmp_path / "service") if one.joint == JOINT)
     assert len(samples) > 10_000
-    assert "mop" in out and "0.3" in out
+    assert re.search(r"mop .* 0\.[345]\d* N m", out), "the hand still needs a tenth, whatever moment it was ended at"
 
 
 @pytest.mark.slow
