@@ -13,6 +13,7 @@ The controller keeps travel, step and torque within the job's own bounds meanwhi
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -220,7 +221,7 @@ class BatchRunner:
         """Friction must oppose motion."""
         times_ns = columns["time_ns"] + self._offset_ns
         inside = (times_ns >= rehearsal.start_ns) & (times_ns < rehearsal.end_ns)
-        watch, set_point = SignWatch(_Endless(), name), SetPoint()
+        watch, set_point = SignWatch(_Endless(), name, math.inf), SetPoint()
         for velocity, torque in zip(
             columns["velocity_rad_s"][inside].tolist(), columns["torque_nm"][inside].tolist(), strict=True
         ):

@@ -143,7 +143,7 @@ class Motions:
         # The full travel, slowly, with the torque bound at half; the sign of friction must be right.
         slow = replace(self._limits[index], torque_nm=REHEARSAL_TORQUE * joint.max_torque_nm)
         self._supervisor.set_limits(index, slow)
-        return SignWatch(points, joint.name)
+        return SignWatch(points, joint.name, self._loop.period_s)
 
     def _judged(self, index: int, motion: Motion, source: SetPointSource) -> dict[str, Any]:
         """What the mark of a watched motion tells besides.

@@ -27,16 +27,38 @@ _BOTH_WAYS_RAD = math.radians(0.5)
 """A torque has been seen in a direction once the joint moved so far at such a speed."""
 
 
-class SensorWatch:
-    """Judges one joint, report by report."""
+def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, period_s: float) -> tuple[float, float]:
+    """The least and the most that a joint went between two samples, by the velocity of both, in rad.
 
-    def __init__(self) -> None:
+    A drive follows its set-point for one period. When the next set-point is late, it stands or goes on, and nobody has
+    seen which of the two.
+
+    Args:
+        before_rad_s: velocity of the earlier sample.
+        velocity_rad_s: velocity of the later one.
+        step_s: time between them, by their own time stamps.
+        period_s: of the set-points; infinite where the samples leave no moment out.
+    """
+    mean_rad_s = 0.5 * (before_rad_s + velocity_rad_s)
+    seen_rad, whole_rad = mean_rad_s * min(step_s, period_s), mean_rad_s * step_s
+    return min(seen_rad, whole_rad), max(seen_rad, whole_rad)
+
+
+class SensorWatch:
+    """Judges one joint, report by report.
+
+    Args:
+        period_s: of the set-points.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
         self.restart()
 
     def restart(self) -> None:
         """Forget what was reported: the joint stands, or another mode begins."""
-        self._rows: deque[tuple[int, float, float, float]] = deque()
-        self._integral_rad = 0.0
+        self._rows: deque[tuple[int, float, float, float, float]] = deque()
+        self._least_rad = self._most_rad = 0.0
         self._torque_nm = math.nan
         self._seen_rad = [0.0, 0.0]
 
@@ -51,9 +73,9 @@ class SensorWatch:
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
         if not rows:
-            rows.append((t_ns, position, 0.0, velocity))
+            rows.append((t_ns, position, self._least_rad, self._most_rad, velocity))
             return ""
-        last_ns, last_rad, _, last_rad_s = rows[-1]
+        last_ns, last_rad, _, _, last_rad_s = rows[-1]
         step_s = (t_ns - last_ns) * 1e-9
         if step_s <= 0.0:
             return ""
@@ -63,22 +85,31 @@ class SensorWatch:
         jump_rad = position - last_rad
         if not abs(jump_rad) <= _JUMP_SHARE * most_rad_s * step_s + _JUMP_RAD:
             return f"position jumped by {format_angle(jump_rad)} within {step_s * 1e3:.3g} ms"
-        self._integral_rad += 0.5 * (velocity + last_rad_s) * step_s
-        rows.append((t_ns, position, self._integral_rad, velocity))
+        least_rad, most_rad = velocity_says(last_rad_s, velocity, step_s, self._period_s)
+        self._least_rad += least_rad
+        self._most_rad += most_rad
+        rows.append((t_ns, position, self._least_rad, self._most_rad, velocity))
         while rows[1][0] <= t_ns - _WINDOW_S * 1e9:
             rows.popleft()
-        first_ns, first_rad, first_integral_rad, first_rad_s = rows[0]
-        if t_ns - first_ns >= 0.9e9 * _WINDOW_S:
-            went_rad, said_rad = position - first_rad, self._integral_rad - first_integral_rad
-            off_rad = abs(went_rad - said_rad)
-            changed_rad_s = max(abs(velocity - first_rad_s), abs(velocity - rows[len(rows) // 2][3]))
-            allowed_rad = _OFF_SHARE * max(abs(went_rad), abs(said_rad)) + _OFF_S * changed_rad_s + _OFF_RAD
-            if off_rad > allowed_rad:
-                return (
-                    f"position went {format_angle(went_rad)} within {_WINDOW_S:g} s, its reported velocity says "
-                    f"{format_angle(said_rad)} (may differ by {format_angle(allowed_rad)})"
-                )
+        if t_ns - rows[0][0] >= 0.9e9 * _WINDOW_S and (wrong := self._disagreement()):
+            return wrong
         return self._frozen(report.torque_nm, velocity, jump_rad) if held else ""
+
+    def _disagreement(self) -> str:
+        """What position and velocity tell differently of the window; empty where they agree."""
+        rows = self._rows
+        _, first_rad, first_least_rad, first_most_rad, first_rad_s = rows[0]
+        _, position, least_rad, most_rad, velocity = rows[-1]
+        went_rad = position - first_rad
+        said_rad = min(max(went_rad, least_rad - first_least_rad), most_rad - first_most_rad)
+        changed_rad_s = max(abs(velocity - first_rad_s), abs(velocity - rows[len(rows) // 2][4]))
+        allowed_rad = _OFF_SHARE * max(abs(went_rad), abs(said_rad)) + _OFF_S * changed_rad_s + _OFF_RAD
+        if abs(went_rad - said_rad) <= allowed_rad:
+            return ""
+        return (
+            f"position went {format_angle(went_rad)} within {_WINDOW_S:g} s, its reported velocity says "
+            f"{format_angle(said_rad)} (may differ by {format_angle(allowed_rad)})"
+        )
 
     def _frozen(self, torque_nm: float, velocity_rad_s: float, step_rad: float) -> str:
         """The very same torque in both directions: friction changes its sign, a reading that stands does not."""

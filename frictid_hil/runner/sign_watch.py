@@ -16,17 +16,18 @@ class SignWatch:
     Args:
         source: of the set-points.
         joint: name, for the message.
+        period_s: of the set-points.
     """
 
     _MOVING_RAD_S = math.radians(2.0)
 
-    def __init__(self, source: SetPointSource, joint: str) -> None:
+    def __init__(self, source: SetPointSource, joint: str, period_s: float) -> None:
         self._source = source
         self._joint = joint
         self._sum = [0.0, 0.0]
         self._count = [0, 0]
         self._least, self._most = math.inf, -math.inf
-        self._travelled = Travelled()
+        self._travelled = Travelled(period_s)
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Count the report, then pass the next set-point on."""

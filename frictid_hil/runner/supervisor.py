@@ -86,7 +86,7 @@ class Supervisor:
         self._settling_at: dict[int, float] = {}
         self._torque_high = [0] * len(self._names)
         self._max_age = [max(3, math.ceil(limit.silence_s * cycle_hz)) for limit in limits]
-        self._sensors = [SensorWatch() for _ in self._names]
+        self._sensors = [SensorWatch(1.0 / cycle_hz) for _ in self._names]
         self._runaway: RunawayWatch | None = None
         self._interlock = interlock
         self._interlock_armed = False

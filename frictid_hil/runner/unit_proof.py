@@ -16,6 +16,7 @@ from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.plan import Move
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Feedback, SetPoint
+from frictid_hil.runner.sensor_watch import velocity_says
 from frictid_hil.units import format_angle
 
 PROOF = "units"
@@ -37,11 +38,16 @@ _COARSE = 0.25
 
 
 class Travelled:
-    """The way of a joint, there and back, by its position and by its velocity."""
+    """The way of a joint, there and back, by its position and by its velocity.
 
-    def __init__(self) -> None:
+    Args:
+        period_s: of the set-points.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
         self.by_position_rad = 0.0
-        self.by_velocity_rad = 0.0
+        self._least_rad = self._most_rad = 0.0
         self._time_s = 0.0
         self._step_rad_s = math.inf
         self._last: tuple[int, float, float] | None = None
@@ -61,7 +67,16 @@ class Travelled:
             self._step_rad_s = min(self._step_rad_s, change_rad_s)
         self._time_s += elapsed_s
         self.by_position_rad += direction * (now[1] - last[1])
-        self.by_velocity_rad += direction * 0.5 * (velocity + last[2]) * elapsed_s
+        least_rad, most_rad = sorted(
+            direction * way_rad for way_rad in velocity_says(last[2], velocity, elapsed_s, self._period_s)
+        )
+        self._least_rad += least_rad
+        self._most_rad += most_rad
+
+    @property
+    def by_velocity_rad(self) -> float:
+        """The way that the velocity tells; of those that late set-points leave open, the one nearest the position's."""
+        return min(max(self.by_position_rad, self._least_rad), self._most_rad)
 
     def judge(self, joint: str) -> None:
         """Nothing to say of a drive without velocity, or with one too coarse for this motion.
@@ -110,7 +125,7 @@ class UnitProof:
         self._started_rad = math.nan
         self._asked_rad = self._furthest_rad = 0.0
         self._drift_rad = 0.0
-        self._travelled = Travelled()
+        self._travelled = Travelled(period_s)
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Judge the report, then give the next set-point.

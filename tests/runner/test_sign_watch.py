@@ -10,7 +10,7 @@ from frictid_hil.runner.sign_watch import SignWatch
 
 
 def judged(forward_nm, backward_nm):
-    watch = SignWatch(Stream([0.0] * 4, 0.001), "3")
+    watch = SignWatch(Stream([0.0] * 4, 0.001), "3", 0.001)
     for velocity, torque in ((0.5, forward_nm), (-0.5, backward_nm)):
         watch.update(Feedback(velocity_rad_s=velocity, torque_nm=torque), SetPoint())
     watch.judge()

@@ -62,7 +62,7 @@ def test_a_velocity_in_other_units_is_told(factor):
 
 def test_a_velocity_too_coarse_for_half_a_degree_is_judged_by_the_rehearsal():
     assert proven(step_rad_s=0.02)
-    travelled = Travelled()
+    travelled = Travelled(0.004)
     for k in range(1000):
         rate = 2.0 * math.sin(math.pi * k / 1000)
         travelled.add(Feedback(t_ns=k * 4_000_000, position_rad=0.001 * k, velocity_rad_s=round(rate / 0.02) * 0.02), 1)

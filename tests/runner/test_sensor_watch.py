@@ -1,0 +1,83 @@
+"""Position against reported velocity, by the samples' own times; nothing here looks at the wall clock."""
+
+import itertools
+import math
+import random
+
+import pytest
+
+from frictid_hil.protocol.driver import Feedback
+from frictid_hil.runner.sensor_watch import SensorWatch
+from frictid_hil.runner.unit_proof import Travelled
+
+MS = 1_000_000
+DEG = math.pi / 180
+
+
+def reports(cycles, late_ms=lambda n: 0.0, went=1.0, said=1.0, speed=90.0, moves_on=False):
+    """A joint that follows a set-point for one period, and then stands (or moves on) until the next one comes."""
+    t_ns, position = 0, 0.0
+    for n in range(cycles):
+        rate = speed * DEG * math.sin(math.pi * n / cycles)
+        late_ns = round(late_ms(n) * MS)
+        position += rate * 1e-9 * (MS + late_ns * moves_on) * went
+        t_ns += MS + late_ns
+        yield Feedback(t_ns=t_ns, position_rad=position, velocity_rad_s=rate * said, torque_nm=float(n))
+
+
+def verdict(samples):
+    watch = SensorWatch(0.001)
+    return next(filter(None, (watch.verdict(report, 200 * DEG, held=True) for report in samples)), "")
+
+
+def stalls(seed):
+    chance = random.Random(seed)
+    return lambda n: chance.choice((0.0,) * 12 + (0.3, 2.0, 9.0, 30.0, 49.0))
+
+
+@pytest.mark.parametrize("moves_on", [False, True])
+@pytest.mark.parametrize("seed", range(20))
+def test_a_computer_that_stalls_is_no_wrong_encoder(seed, moves_on):
+    assert verdict(reports(1000, stalls(seed), moves_on=moves_on)) == ""
+
+
+def test_a_computer_that_is_late_in_every_cycle_is_no_wrong_encoder_either():
+    assert verdict(reports(1000, lambda n: 2.0)) == ""
+
+
+@pytest.mark.parametrize("lie", [{"went": 0.0}, {"said": 0.0}, {"said": 2.0}, {"said": -1.0}, {"went": 0.5}])
+@pytest.mark.parametrize("late_ms", [lambda n: 0.0, lambda n: 9.0 * (n % 40 == 0)], ids=["on time", "some late"])
+def test_two_ways_that_differ_are_told(lie, late_ms):
+    assert "its reported velocity says" in verdict(reports(1000, late_ms, **lie))
+
+
+def test_a_velocity_that_points_the_other_way_is_told_however_late_the_samples_are():
+    assert "its reported velocity says" in verdict(reports(1000, lambda n: 5.0, said=-1.0))
+
+
+def test_a_report_that_comes_twice_says_nothing_new():
+    samples = list(reports(1000))
+    again = [each for sample in samples for each in (sample, sample)]
+    assert verdict(again) == "" != verdict(reports(1000, said=2.0))
+    # An adapter that shows the last figures once more under a new time, now and then.
+    stale = [Feedback(b.t_ns, a.position_rad, a.velocity_rad_s, b.torque_nm) if n % 3 == 0 else b
+             for n, (a, b) in enumerate(itertools.pairwise(samples))]  # fmt: skip
+    assert verdict(stale) == ""
+
+
+def test_after_a_tenth_of_a_second_without_a_sample_the_comparison_begins_anew():
+    samples = list(reports(1000))
+    assert verdict(samples[:300] + samples[450:]) == "", "the joint was elsewhere when it was seen again"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_first_motion_of_half_a_degree_is_not_judged_by_a_stall(seed):
+    def judged(said):
+        travelled = Travelled(0.001)
+        for report in reports(300, stalls(seed), said=said, speed=3.0):
+            travelled.add(report, 1.0)
+        travelled.judge("3")
+
+    judged(1.0)
+    with pytest.raises(Exception, match="position says"):
+        judged(-1.0)
