@@ -209,6 +209,7 @@ def check(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to keep cases, answers and scores in.")
     ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -236,6 +237,7 @@ def check(
             worlds=[name.strip() for name in world.split(",") if name.strip()],
             processes=processes,
             leave_one_out=leave_one_out,
+            force=force,
             progress=output.err.print,
         ),
         show,

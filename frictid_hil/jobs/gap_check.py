@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
+from frictid_hil.files import refuse_overwriting
 from frictid_hil.gap.blind.check import run_check
 from frictid_hil.gap.blind.worlds import WORLDS
 
@@ -20,6 +21,7 @@ def run_gap_check(
     *,
     worlds: Sequence[str] = ("narrow",),
     leave_one_out: bool = False,
+    force: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Draw joints whose effect is sealed, diagnose them in processes of their own, open the seal, score.
@@ -31,6 +33,7 @@ def run_gap_check(
         worlds: names of the worlds to draw from, ``cases`` joints each.
         processes: at once; one per processor core unless given.
         leave_one_out: also take each joint's own effect out of the library and diagnose again.
+        force: write over the result and the page of an earlier check.
         progress: given a line now and then.
 
     Returns:
@@ -39,19 +42,19 @@ def run_gap_check(
         None), ``out``. Of several: ``outcome``, ``seed``, ``cases``, ``worlds`` (the same by name), ``out``.
 
     Raises:
-        UsageError: no case asked for, no such world, or ``out`` holds the result of a finished check. An interrupted
-            one goes on.
+        UsageError: no case asked for, no such world, or ``out`` holds the result or the page of a finished check. An
+            interrupted one goes on.
     """
     if cases < 1:
         raise UsageError(f"{cases} cases cannot be scored", next_step="ask for at least 20: `gap check --cases 20`")
     strange = [name for name in worlds if name not in WORLDS]
     if strange or not worlds:
         raise UsageError(f"no world is called {', '.join(strange)!r}", next_step=f"name of: {', '.join(WORLDS)}")
+    folders = {name: out if out is None or len(worlds) == 1 else out / name for name in worlds}
+    written = [folder / file for folder in folders.values() if folder for file in ("result.json", "gap-check.md")]
+    refuse_overwriting(written, force=force)
     results = {}
-    for name in worlds:
-        folder = out if out is None or len(worlds) == 1 else out / name
-        if folder is not None and (folder / "result.json").exists():
-            raise UsageError("this folder holds an earlier check", where=str(folder), next_step="name a new folder")
+    for name, folder in folders.items():
         result = run_check(
             cases,
             seed,

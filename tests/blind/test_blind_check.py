@@ -86,8 +86,14 @@ def test_equal_seeds_seal_equal_truth_whatever_the_processes(scripted: tuple[str
 
 
 def test_a_folder_with_an_earlier_check_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "result.json").write_text("{}")
-    with pytest.raises(UsageError, match="earlier check"):
-        run_gap_check(cases=3, out=tmp_path)
+    for world, name in (("narrow", "result.json"), ("wide", "gap-check.md")):
+        (tmp_path / world).mkdir()
+        (tmp_path / world / name).write_text("mine")
+        with pytest.raises(UsageError, match="would be overwritten") as told:
+            run_gap_check(cases=3, out=tmp_path / world)
+        assert name in told.value.where and "--force" in told.value.next_step
+    with pytest.raises(UsageError, match="would be overwritten"):
+        run_gap_check(cases=3, out=tmp_path, worlds=("zoo", "wide"))
+    assert {path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == {"mine"}
     with pytest.raises(UsageError, match="cannot be scored"):
         run_gap_check(cases=0)
