@@ -116,3 +116,15 @@ def test_no_unbiased_curve_scatters_less_than_its_samples_allow(benchmark_named:
     runs = hat_functions(np.linspace(knots[0], knots[-1], 100), knots) @ np.linalg.lstsq(model, noise, rcond=None)[0]
     gaps = np.sqrt(np.mean((runs[:, ::2] - runs[:, 1::2]) ** 2))
     assert gaps == pytest.approx(bound, rel=0.05)
+
+
+def test_a_stop_is_judged_by_what_the_joint_reports(benchmark_named: Callable[[str], Any]) -> None:
+    stops = benchmark_named("stop_on_the_wall_clock")
+    times = np.arange(0.0, 3.0, 0.001)
+    speed = np.interp(times, [0.0, 1.0, 1.2], [1.0, 1.0, 0.0])
+    went = np.cumsum(speed) * 0.001
+    stopped = stops.judged(times.tolist(), went.tolist(), 1.0, (0.0, 1.05), 130)
+    assert stopped.stop_s == pytest.approx(0.2, abs=0.025) and stopped.speed_rad_s == pytest.approx(1.0)
+    assert stopped.beyond_rad == pytest.approx(0.05, abs=0.002)
+    stood = stops.judged(times.tolist(), [0.3] * times.size, 1.0, (0.0, 1.05), 130)
+    assert (stood.stop_s, stood.speed_rad_s, stood.beyond_rad) == (0.0, 0.0, 0.0)
