@@ -143,6 +143,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--docs", type=Path, help="page whose marked part is written anew")
     asked = parser.parse_args()
+    # A shell lets what it starts in the background ignore SIGINT; the runs shall hear it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     dice, travel_rad, runs = random.Random(asked.seed), planned_travel(), []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(asked.runs):
