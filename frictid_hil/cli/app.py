@@ -67,9 +67,9 @@ def main() -> None:
     # Libraries log what we tell better as errors with cause and next step.
     logging.getLogger().addHandler(logging.NullHandler())
     if "--json" not in sys.argv[1:]:
-        app()
+        app(prog_name="frictid-hil")
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(prog_name="frictid-hil", standalone_mode=False))
     except _WRONG_USAGE as error:
         words = error.ctx.command_path.split()[1:] if error.ctx else []
         help_of = " ".join(["frictid-hil", *words, "--help"])

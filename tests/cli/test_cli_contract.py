@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from called import PROGRAM, run
 from rich.console import Console
 
 from frictid_hil.cli.progress import print_plan
@@ -17,19 +17,6 @@ from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
 
 VERBS = ["check", "calibrate", "identify", "compare", "compensate", "replay", "recalibrate", "schedule"]
 VERBS += ["profile", "emulate", "gap", "report"]
-
-
-def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    program = Path(sys.executable).parent / "frictid-hil"
-    return subprocess.run(
-        [str(program), *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        timeout=200,
-        check=False,
-    )
 
 
 def as_json(result: subprocess.CompletedProcess[str]) -> dict[str, Any]:
@@ -44,6 +31,13 @@ def test_every_verb_explains_itself(verb: str) -> None:
     result = run(verb, "--help")
     assert result.returncode == 0
     assert "Usage" in result.stdout
+
+
+def test_the_installed_command_starts_and_tells_its_exit_code() -> None:
+    asked = [PROGRAM, "compare", "no-such.yaml", "--truth", "hp3j", "--json"]
+    result = subprocess.run(asked, capture_output=True, text=True, timeout=200, check=False)
+    assert (result.returncode, as_json(result)["outcome"]) == (2, "refused")
+    assert "no-such.yaml" in result.stderr and "Traceback" not in result.stderr
 
 
 def test_no_arguments_show_the_verbs() -> None:
@@ -194,8 +188,7 @@ def completed(line: str) -> list[str]:
     """What a shell offers after ``line``."""
     words = line.split(" ")
     told = {"_FRICTID_HIL_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
-    program = Path(sys.executable).parent / "frictid-hil"
-    offered = subprocess.run([str(program)], env={**os.environ, **told}, capture_output=True, text=True, check=False)
+    offered = subprocess.run([PROGRAM], env={**os.environ, **told}, capture_output=True, text=True, check=False)
     return offered.stdout.split()
 
 

@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
+from called import PROGRAM, run
 
 SHORT = ("--joint", "5", "--amplitude", "8deg", "--velocity", "60deg/s", "--cycles", "3", "--yes")
-PROGRAM = str(Path(sys.executable).parent / "frictid-hil")
-
-
-def run(*arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [PROGRAM, *arguments],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        stdin=subprocess.DEVNULL,
-        timeout=200,
-        check=False,
-    )
 
 
 @pytest.mark.parametrize("verb", [("check",), ("calibrate", *SHORT)])
