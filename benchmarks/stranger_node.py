@@ -10,8 +10,8 @@ time goes on by one period per SYNC, so that a loaded machine delays frames and 
 
 from __future__ import annotations
 
-import asyncio
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,10 +19,11 @@ from typing import Any
 import can
 from durand import Node
 from durand.datatypes import DatatypeEnum
-from durand.network import CANBusNetwork
+from durand.network import NetworkABC
 from durand.node import MinimalNodeCapabilities
 from durand.object_dictionary import Record, Variable
-from durand.scheduler import AsyncScheduler, set_scheduler
+from durand.scheduler import VirtualScheduler, set_scheduler
+from stranger_wire import DONE
 
 from frictid_drivers.virtual.joint_drive import plant_for, servo_for
 from frictid_drivers.virtual.object_dictionary import encode
@@ -36,6 +37,42 @@ OF_THE_STACK = {0x1001, 0x1005, 0x1014, 0x1015, 0x1017}
 """Objects that the library brings along and reacts to."""
 
 
+class Line(NetworkABC):  # type: ignore[misc]  # the library has no types
+    """The library's way to the bus.
+
+    Args:
+        bus: to the host.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._subscriptions: dict[int, Callable[[int, bytes], None]] = {}
+        self._own: set[int] = set()
+
+    def add_subscription(self, cob_id: int, callback: Callable[[int, bytes], None]) -> None:
+        """Who wants to hear of an identifier."""
+        self._subscriptions[cob_id] = callback
+
+    def remove_subscription(self, cob_id: int) -> None:
+        """No longer."""
+        self._subscriptions.pop(cob_id)
+
+    def send(self, cob_id: int, msg: bytes) -> None:
+        """One frame of the node."""
+        self._own.add(cob_id)
+        self._bus.send(can.Message(arbitration_id=cob_id, data=msg, is_extended_id=False))
+
+    def serve(self) -> None:
+        """Deal with every frame of the host, one after the other, and say so."""
+        for message in self._bus:
+            if message.is_extended_id or message.arbitration_id in self._own:
+                continue  # a multicast group hears itself
+            heard = self._subscriptions.get(message.arbitration_id)
+            if heard is not None:
+                heard(message.arbitration_id, bytes(message.data))
+            self._bus.send(DONE)
+
+
 class Stranger:
     """One node.
 
@@ -43,11 +80,20 @@ class Stranger:
         node: of the library, fresh.
         servo: the motor behind it, with the family's values after power-on.
         entries: of the family, by (index, subindex).
+        scheduler: the library's time.
         period_s: of SYNC.
     """
 
-    def __init__(self, node: Node, servo: Servo, entries: dict[tuple[int, int], Entry], period_s: float) -> None:
+    def __init__(
+        self,
+        node: Node,
+        servo: Servo,
+        entries: dict[tuple[int, int], Entry],
+        scheduler: VirtualScheduler,
+        period_s: float,
+    ) -> None:
         self._node, self._servo, self._entries = node, servo, entries
+        self._scheduler, self._period_s = scheduler, period_s
         self._period_ns = round(period_s * 1e9)
         self._now_ns = 0
         od = node.object_dictionary
@@ -103,6 +149,7 @@ class Stranger:
 
     def _on_sync(self) -> None:
         self._now_ns += self._period_ns
+        self._scheduler.run(self._period_s)
         self._run()
         od, values = self._node.object_dictionary, self._servo.dictionary.values
         for pdo in self._node.tpdo:
@@ -110,14 +157,14 @@ class Stranger:
                 od.write(index, sub, values[index << 8 | sub])
 
 
-def build(robot: str, family: str, network: CANBusNetwork) -> Stranger:
+def build(robot: str, family: str, line: Line) -> Stranger:
     """The only drive of this robot file, as this family."""
     setup = load_robot(robot).to_setup()
     (joint,) = setup.joints
     joint = replace(joint, options={**joint.options, "personality": family})
     personality = personality_of(joint)
     assert personality is not None
-    servo = servo_for(setup, joint, plant_for(setup, joint), network.send)
+    servo = servo_for(setup, joint, plant_for(setup, joint), line.send)
     servo.dictionary.reset()
     servo.power.boot()
     absent = personality.manner.absent
@@ -127,9 +174,10 @@ def build(robot: str, family: str, network: CANBusNetwork) -> Stranger:
         for entry in record.entries
         if entry.key not in absent
     }
-    return Stranger(
-        Node(network, joint.address, capabilities=MinimalNodeCapabilities), servo, entries, 1.0 / setup.cycle_hz
-    )
+    scheduler = VirtualScheduler()
+    set_scheduler(scheduler)
+    node = Node(line, joint.address, capabilities=MinimalNodeCapabilities)
+    return Stranger(node, servo, entries, scheduler, 1.0 / setup.cycle_hz)
 
 
 def main() -> None:
@@ -137,13 +185,11 @@ def main() -> None:
     robot, family = sys.argv[1:]
     file = load_robot(robot).file
     interface, _, channel = file.bus.partition(":")
-    loop = asyncio.new_event_loop()
-    set_scheduler(AsyncScheduler(loop))
-    network = CANBusNetwork(can.Bus(interface=interface, channel=channel, port=file.options["port"]), loop)
-    stranger = build(robot, family, network)
+    line = Line(can.Bus(interface=interface, channel=channel, port=file.options["port"]))
+    stranger = build(robot, family, line)
     print("ready", flush=True)
     assert stranger
-    loop.run_forever()
+    line.serve()
 
 
 if __name__ == "__main__":

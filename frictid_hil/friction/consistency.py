@@ -94,8 +94,11 @@ def _velocity(recording: CycleRecording, motion: Motion) -> Gate | None:
     )
     passed = off <= MOST_SCALE and abs(usual_s) <= MOST_APART_S and changes_s <= MOST_UNSTEADY_S
     cause = (
-        "one of the two is of another moment or has another scale: check the gear in the drive (608F, 6091, 6092) and "
-        "its filters"
+        f"the reported velocity is about {np.median(scales):.3g} times the differenced position: its unit (60A9) or "
+        "the gear (6091, 6092, 608F) is not what was told. With `replay --eds` these are the maker's values, not this "
+        "drive's: give `velocity_unit_rad_s` and `position_units_per_revolution` in the joint's options"
+        if off > MOST_SCALE
+        else "one of the two is of another moment: check the drive's filters"
     )
     return Gate.about("velocity", passed, changes_s, MOST_UNSTEADY_S, said, cause)
 

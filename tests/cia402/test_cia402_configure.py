@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 import pytest
 from cia402_bench import RAD, Bench, bench
@@ -150,6 +151,25 @@ def test_the_interpolation_time_is_written_in_ms_and_only_where_it_differs():
     with pytest.raises(HardwareError, match=r"interpolates over 1 ms \(60C2\), the cycle is 2 ms") as caught:
         b.driver.configure(500.0, ["0"])
     assert "1000 Hz" in caught.value.next_step
+
+
+def test_a_period_that_the_drive_cannot_interpolate_over_is_refused_and_foreseen():
+    drive = ScriptedDrive(1)
+    drive.values[0x1018, 1] = 0x26C  # takes whole milliseconds only
+    b = Bench(drive, setup=replace(bench(1).setup, cycle_hz=400.0)).open()
+    errors = [one.message for one in b.driver.check(None) if one.severity is Severity.ERROR]
+    assert any("interpolates over 2 ms (60C2), the cycle is 2.5 ms" in one for one in errors)
+    with pytest.raises(HardwareError, match="interpolates over 2 ms") as info:
+        b.driver.configure(400.0, ["0"])
+    assert "use 500 Hz" in info.value.next_step
+
+
+@pytest.mark.parametrize("cycle_hz", [77, 125, 300, 333, 400, 700, 1000])
+def test_every_rate_can_be_interpolated_over_where_all_powers_of_ten_are_taken(cycle_hz):
+    b = bench(1).open()
+    b.driver.configure(float(cycle_hz), ["0"])
+    values = b.drives[0].values
+    assert values[0x60C2, 1] * 10.0 ** values[0x60C2, 2] * cycle_hz == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_rate_without_whole_milliseconds_takes_a_finer_unit():

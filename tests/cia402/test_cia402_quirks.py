@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import replace
 
 import pytest
@@ -154,3 +155,29 @@ def test_torque_mode_needs_a_watch_and_something_that_follows_from_it():
     b = Bench(ScriptedDrive(1, without={0x6007})).open()
     assert not b.driver.capabilities().drive_watchdog
     assert "no abort connection option (6007)" in said(b)
+
+
+class OtherLength(ScriptedDrive):
+    """6066 of 32 bits and 6065 of 16, and strict about it."""
+
+    def sdo(self, request):
+        if request[1:4] == bytes.fromhex("666000") and request[0] == 0x40:
+            return bytes.fromhex("43666000") + struct.pack("<I", self.values[0x6066, 0])
+        if request[1:4] == bytes.fromhex("666000") and request[0] != 0x23:
+            return self.abort(0x6066, 0, 0x06070013)
+        if request[1:4] == bytes.fromhex("656000") and request[0] == 0x40:
+            return bytes.fromhex("4B656000") + struct.pack("<HH", self.values[0x6065, 0] & 0xFFFF, 0)
+        if request[1:4] == bytes.fromhex("656000") and request[0] != 0x2B:
+            return self.abort(0x6065, 0, 0x06070012)
+        return super().sdo(request)
+
+
+def test_an_object_of_another_length_is_written_as_the_drive_has_it():
+    drive = OtherLength(1)
+    drive.values[0x6065, 0] = 40_000
+    b = Bench(drive).open()
+    before = said(b)
+    assert not errors(b)
+    b.driver.configure(1000.0, ["0"])
+    assert drive.values[0x6066, 0] == 20
+    assert all(remark.message in before for remark in b.driver.remarks())

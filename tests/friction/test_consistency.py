@@ -39,7 +39,11 @@ def test_a_position_that_is_late_from_the_middle_on(sound):
 
 
 def test_a_position_of_another_scale_than_the_velocity(sound):
-    assert "velocity" in failed(replace(sound, velocity_rad_s=1.1 * sound.velocity_rad_s))
+    spoilt = replace(sound, velocity_rad_s=1.1 * sound.velocity_rad_s)
+    assert "velocity" in failed(spoilt)
+    (told,) = [gate for gate in gates(spoilt, estimate(spoilt)) if gate.name == "velocity"]
+    assert "about 1.1 times the differenced position" in told.reason
+    assert all(word in told.reason for word in ("60A9", "6091", "replay --eds"))
 
 
 @pytest.mark.parametrize("share", [0.9, 0.6])

@@ -1,8 +1,9 @@
-"""Drives whose CANopen another author wrote, over the loopback interface; calibrating ten of them is a benchmark."""
+"""Drives whose CANopen another author wrote, in a process of their own, over the loopback interface."""
 
 from __future__ import annotations
 
 import importlib
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -31,8 +32,38 @@ def multicast() -> bool:
         return False
 
 
+pytestmark = pytest.mark.skipif(not multicast(), reason="no UDP multicast on this machine")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered(tmp_path_factory):
+    """The driver on this wire, as any installed package brings one."""
+    folder = tmp_path_factory.mktemp("installed")
+    strangers.register(folder)
+    yield
+    sys.path.remove(str(folder))
+
+
+@pytest.fixture(scope="module", params=sorted(strangers.known_personalities()))
+def found(request, tmp_path_factory):
+    return strangers.calibrated(tmp_path_factory.mktemp(request.param), request.param)
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not multicast(), reason="no UDP multicast on this machine")
+def test_calibrated_behind_anothers_canopen(found):
+    assert found.check["ok"] and found.run["outcome"] == "ok", found.run
+    assert not found.surprises
+    assert abs(found.off_percent) <= strangers.LIMIT_PERCENT
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_tshark_finds_no_malformed_frame(found):
+    frames, malformed = strangers.dissected(found.log)
+    assert frames > 5000 and malformed == 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["elmo", "nanotec"])
 def test_check_foresees_what_configuring_a_drive_with_anothers_canopen_meets(family, tmp_path):
     met = strangers.configured(tmp_path, family)
@@ -40,7 +71,6 @@ def test_check_foresees_what_configuring_a_drive_with_anothers_canopen_meets(fam
     assert met.remarks <= met.warnings
 
 
-@pytest.mark.skipif(not multicast(), reason="no UDP multicast on this machine")
 def test_what_a_person_must_say_is_foreseen_there_too(tmp_path, monkeypatch):
     monkeypatch.setitem(strangers.NEEDS, "epos4", {})
     met = strangers.configured(tmp_path, "epos4")

@@ -37,7 +37,8 @@ _ACCELERATIONS = (
     od.MAX_ACCELERATION,
     od.MAX_DECELERATION,
 )
-_PERIOD_TOLERANCE = 0.01
+_PERIOD_TOLERANCE, _MOST_PERIOD_OFF = 0.01, 0.02
+"""An interpolation time this close to the cycle is looked for, and one that is further off is refused."""
 
 NEEDED = {
     od.CONTROLWORD: "it cannot be switched on",
@@ -157,7 +158,8 @@ def interpolation_writes(drive: Drive, cycle_hz: float) -> list[Write]:
         return []
     value, index = interpolation_period(drive, cycle_hz)
     said = "the interpolation time stays as it is"
-    return [Write(od.INTERPOLATION_INDEX, index, said), Write(od.INTERPOLATION_VALUE, value, said)]
+    power = [Write(od.INTERPOLATION_INDEX, index, said)] if drive.has(od.INTERPOLATION_INDEX) else []
+    return [*power, Write(od.INTERPOLATION_VALUE, value, said)]
 
 
 def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
@@ -165,14 +167,17 @@ def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
 
     Milliseconds come first where the period is whole in them: some drives take no other power of ten.
     """
-    period_s = 1.0 / cycle_hz
     own = drive.known(od.INTERPOLATION_INDEX)
-    for index in (-3, *(() if own is None else (own,)), -4, -5, -6, -2, -1):
-        value = period_s * 10.0**-index
-        exact = 1 <= round(value) <= 255 and abs(value - round(value)) < _PERIOD_TOLERANCE * value
-        if exact and (index == own or not drive.quirks.refusal(od.INTERPOLATION_INDEX, index)):
-            return round(value), index
-    return min(255, max(1, round(period_s * 1e3))), -3
+    closest = (math.inf, 1, -3)
+    for index in (-3,) if own is None else (-3, own, -4, -5, -6, -2, -1):
+        value = min(255, max(1, round(10.0**-index / cycle_hz)))
+        off = abs(_period_s(value, index) * cycle_hz - 1.0)
+        if index != own and drive.quirks.refusal(od.INTERPOLATION_INDEX, index):
+            continue
+        if off < _PERIOD_TOLERANCE:
+            return value, index
+        closest = min(closest, (off, value, index))
+    return closest[1:]
 
 
 def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> None:
@@ -186,10 +191,13 @@ def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> N
     Raises:
         HardwareError: it interpolates over another time.
     """
-    if not drive.has(od.INTERPOLATION_VALUE) or not any("interpolation time" in one for one in lost):
+    if not drive.has(od.INTERPOLATION_VALUE):
         return
-    found = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
-    if abs(found * cycle_hz - 1.0) > _PERIOD_TOLERANCE:
+    if any("interpolation time" in one for one in lost):
+        found = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
+    else:
+        found = _period_s(*interpolation_period(drive, cycle_hz))
+    if abs(found * cycle_hz - 1.0) > _MOST_PERIOD_OFF:
         raise HardwareError(
             f"the drive interpolates over {found * 1e3:g} ms (60C2), the cycle is {1e3 / cycle_hz:g} ms",
             where=drive.where(od.INTERPOLATION_VALUE.address),
@@ -290,7 +298,7 @@ def limit_writes(
     """
     writes, tighter = [], []
     torque = drive.known(od.MAX_TORQUE)
-    wanted = min(od.MAX_TORQUE.type.high, math.floor(torque_nm / abs(scale.torque_nm)))
+    wanted = min(drive.quirks.typed(od.MAX_TORQUE).type.high, math.floor(torque_nm / abs(scale.torque_nm)))
     if torque is not None and (settings.raise_torque_limit or torque >= wanted):
         writes.append(Write(od.MAX_TORQUE, wanted))
     elif torque is not None:
@@ -302,7 +310,7 @@ def limit_writes(
     if not drive.has(od.POSITION_LIMIT_MIN) or not drive.has(od.POSITION_LIMIT_MAX):
         return writes, tighter
     low, high = sorted(round(limit_rad / scale.position_rad) for limit_rad in (position_min_rad, position_max_rad))
-    kind = od.POSITION_LIMIT_MIN.type
+    kind = drive.quirks.typed(od.POSITION_LIMIT_MIN).type
     if not kind.low <= low < high <= kind.high:
         raise HardwareError(
             f"the limits {format_angle(position_min_rad)}..{format_angle(position_max_rad)} are {low}..{high} in the "

@@ -82,7 +82,7 @@ class Fleet:
             drive = self.drives[joint.name]
             facts = self.facts[joint.name] = read_facts(drive, catalogue.of)
             eds = joint_settings[joint.name].eds
-            drive.learn(merged(quirks_of_eds(eds, joint.address), facts.quirks) if eds else facts.quirks)
+            drive.learn(merged(facts.quirks, quirks_of_eds(eds, joint.address)) if eds else facts.quirks)
 
     @property
     def sync_counter(self) -> bool:

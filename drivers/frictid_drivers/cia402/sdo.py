@@ -8,13 +8,13 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import can
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from frictid_drivers.cia402.network import Node
-from frictid_drivers.cia402.objects import Object
+from frictid_drivers.cia402.objects import IntegerType, Object
 from frictid_drivers.cia402.quirks import NO_QUIRKS, Quirks
 from frictid_hil.errors import HardwareError
 
@@ -22,6 +22,8 @@ _ABSENT = {0x06020000, 0x06090011, 0x08000024, 0x06010000, 0x06010001, 0x0800000
 """Abort codes that say "there is no such object", "no such sub-index", "no data", "unsupported access", "write only" -
 and "general error", by which some drives say any of these."""
 
+_OTHER_LENGTH = {0x06070010, 0x06070012, 0x06070013}
+"""Abort codes that say "another length of this object"."""
 
 _COMMANDS = {0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
 """What a run commands, and nobody wants back."""
@@ -78,6 +80,7 @@ class Drive:
         self._timeout_s = timeout_s
         self._confirmed: dict[tuple[int, int], int | None] = {}
         self._before: list[tuple[Object, int]] = []
+        self._told_bits: dict[tuple[int, int], int] = {}
         self.quirks = NO_QUIRKS
 
     def learn(self, quirks: Quirks) -> None:
@@ -115,11 +118,15 @@ class Drive:
         data = self._upload(item.index, item.sub, item.address)
         if data is None:
             return None
+        bits = self._told_bits[item.index, item.sub] = 8 * len(data)
+        # Four bytes may be a shorter object's, from a drive that leaves the length out of its answer.
+        if bits < self.quirks.typed(item).type.bits and bits in (8, 16):
+            self._learn_bits(item, bits)
         try:
-            return item.type.unpack(data)
+            return self.quirks.typed(item).type.unpack(data)
         except struct.error as error:
             raise HardwareError(
-                f"answered with {len(data)} bytes, expected a {item.type}",
+                f"answered with {len(data)} bytes, expected a {self.quirks.typed(item).type}",
                 where=self.where(item.address),
                 cause="the drive's object has another type than CiA 402 gives it",
             ) from error
@@ -167,7 +174,7 @@ class Drive:
             for value in write.values:
                 if self.known(write.item) == value:
                     break
-                if self.quirks.refusal(write.item, value):
+                if self._refusal(write.item, value):
                     continue
                 try:
                     self.write(write.item, value, write.mask)
@@ -191,8 +198,8 @@ class Drive:
         lost: list[str] = []
         for write in writes:
             found = self.known(write.item)
-            refused = all(self.quirks.refusal(write.item, value) for value in write.values)
-            cannot_map = write.maps is not None and not self.quirks.maps(write.maps)
+            refused = all(self._refusal(write.item, value) for value in write.values)
+            cannot_map = write.maps is not None and not self._maps(write.maps)
             if found is not None and (found in write.values or not (refused or cannot_map)):
                 continue
             why = self._why_not(write)
@@ -204,8 +211,20 @@ class Drive:
             return f"the drive has no {write.item}"
         if write.maps is not None:
             return f"{write.maps} cannot be mapped into a PDO"
-        refusal = self.quirks.refusal(write.item, write.value)
+        refusal = self._refusal(write.item, write.value)
         return f"the drive does not take {write.item} = {_shown(write.item, write.value)}: {refusal}"
+
+    def _maps(self, item: Object) -> bool:
+        return self.quirks.maps(item) and self.quirks.typed(item) == item
+
+    def _refusal(self, item: Object, value: int) -> str:
+        kind = self.quirks.typed(item).type
+        fits = kind.low <= value <= kind.high
+        return self.quirks.refusal(item, value) or ("" if fits else f"it is a {kind} ({kind.low}..{kind.high})")
+
+    def _learn_bits(self, item: Object, bits: int) -> None:
+        kind = IntegerType(item.type.signed, bits)
+        self.quirks = replace(self.quirks, types={**self.quirks.types, (item.index, item.sub): kind})
 
     def restore(self) -> None:
         """Undo every write of this run, the last one first; what a drive does not take back stays.
@@ -256,6 +275,7 @@ class Drive:
             HardwareError: refused.
         """
         self._confirmed.pop((item.index, item.sub), None)
+        item = self.quirks.typed(item)
         if not item.type.low <= value <= item.type.high:
             raise RefusedByDrive(
                 f"{item.name}: {value} does not fit a {item.type} ({item.type.low}..{item.type.high})",
@@ -267,6 +287,11 @@ class Drive:
         try:
             self._sdo.download(item.index, item.sub, item.type.pack(value))
         except SdoAbortedError as error:
+            told_bits = self._told_bits.get((item.index, item.sub), 0)
+            if error.code in _OTHER_LENGTH and told_bits in (16, 32) and told_bits > item.type.bits:
+                self._learn_bits(item, told_bits)
+                self.write_blind(item, value)
+                return
             raise RefusedByDrive(
                 f"the drive refuses {item.name} = {_shown(item, value)}: {error}",
                 item,
