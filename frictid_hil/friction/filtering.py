@@ -53,10 +53,6 @@ class Gaussian:
         """Second derivative of the smoothed values, unit per second squared."""
         return self._apply(values, 2, advance_s)
 
-    def noise_gain(self, order: int) -> float:
-        """Standard deviation of the output of white noise of unit standard deviation, for derivative ``order``."""
-        return float(np.linalg.norm(self._kernel(order, 0.0)))
-
     def _apply(self, values: Array, order: int, advance_s: float) -> Array:
         kernel = self._kernel(order, advance_s)
         half = kernel.size // 2

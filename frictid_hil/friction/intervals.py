@@ -205,17 +205,6 @@ def coulomb_half_width_nm(curve: FrictionCurve, half_width_nm: Array) -> float:
     return float(np.hypot((1 + reach) * half_width_nm[0], reach * half_width_nm[1]))
 
 
-def curve_half_width_nm(curve: FrictionCurve, half_width_nm: Array, speed_rad_s: Array) -> Array:
-    """Half of the interval of phi at any speed: between knots by lines, outside growing with the distance."""
-    v = np.asarray(curve.velocity_rad_s)
-    speed = np.abs(np.asarray(speed_rad_s, dtype=np.float64))
-    inside = np.interp(speed, v, half_width_nm)
-    below = np.clip((v[0] - speed) / v[0], 0, None) * (coulomb_half_width_nm(curve, half_width_nm) - half_width_nm[0])
-    growth = (half_width_nm[-1] + half_width_nm[-2]) / (v[-1] - v[-2])
-    total: Array = inside + below + np.clip(speed - v[-1], 0, None) * growth
-    return total
-
-
 @dataclass(frozen=True, slots=True)
 class Drift:
     """Friction of the same cycle, run twice.

@@ -75,8 +75,3 @@ def rms(time_s: Array, values: Array) -> float:
     square = np.asarray(values, dtype=np.float64) ** 2
     step_s = np.diff(time_s)
     return float(np.sqrt(np.sum(step_s * (square[1:] + square[:-1])) / (2 * np.sum(step_s))))
-
-
-def tracking_rms(time_s: Array, command_rad: Array, position_rad: Array) -> float:
-    """E_s of (28): rms of p_d - p_s, rad."""
-    return rms(time_s, np.asarray(command_rad) - np.asarray(position_rad))

@@ -124,7 +124,6 @@ class UnitProof:
         self._path = _there_and_back(here_rad, (inward * few_rad, inward * _PROOF_RAD), period_s)
         self._started_rad = math.nan
         self._asked_rad = self._furthest_rad = 0.0
-        self._drift_rad = 0.0
         self._travelled = Travelled(period_s)
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:

@@ -51,7 +51,6 @@ class ServoLoop:
         self._random = np.random.default_rng(seed)
         self._noise: list[float] = []
         self._torque_noise_nm = 0.0
-        self._payload = False
         self.period_s = period_s
         self._kernel.place(self._parameters, self._state, float(position_rad))
         self._parameters[plant.POWERED] = 0.0
@@ -112,7 +111,6 @@ class ServoLoop:
 
     def mount_payload(self, on: bool) -> None:
         """Mount or take off the payload, if the joint has one."""
-        self._payload = on
         packing.mount(self._parameters, self.model, on)
 
     def hold_hand(

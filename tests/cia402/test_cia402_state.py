@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from frictid_drivers.cia402.state import DriveState, Target, drive_state, joint_state, next_controlword
+from frictid_drivers.cia402.state import JOINT_STATES, DriveState, Target, drive_state, next_controlword
 from frictid_hil.protocol.driver import JointState
 
 TABLE = {
@@ -26,15 +26,15 @@ def test_all_statuswords():
         assert len(matching) <= 1
         expected = matching[0] if matching else DriveState.UNKNOWN
         assert drive_state(word) is expected
-        assert isinstance(joint_state(word), JointState)
+        assert isinstance(JOINT_STATES[word & 0x6F], JointState)
         seen[expected] += 1
     assert all(seen.values()) and sum(seen.values()) == 1 << 16
 
 
 def test_only_enabled_counts_as_enabled():
     for word in range(1 << 7):
-        assert (joint_state(word) is JointState.ENABLED) == (drive_state(word) is DriveState.ENABLED)
-        assert (joint_state(word) is JointState.FAULT) == (
+        assert (JOINT_STATES[word & 0x6F] is JointState.ENABLED) == (drive_state(word) is DriveState.ENABLED)
+        assert (JOINT_STATES[word & 0x6F] is JointState.FAULT) == (
             drive_state(word) in (DriveState.FAULT, DriveState.FAULT_REACTION)
         )
 

@@ -39,12 +39,6 @@ def test_ramps_survive_at_the_ends():
     assert np.allclose(kernel.rate(2 * time - 1), 2.0)
 
 
-def test_noise_gain_is_what_white_noise_shows():
-    noise = np.random.default_rng(1).normal(size=200_000)
-    kernel = Gaussian(1e-3, 2e-3)
-    assert np.std(kernel.rate(noise)) == pytest.approx(kernel.noise_gain(1), rel=0.02)
-
-
 def test_a_kernel_below_one_sample_is_refused():
     with pytest.raises(ValueError, match="below one step"):
         Gaussian(1e-3, 0.5e-3)

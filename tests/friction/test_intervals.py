@@ -8,7 +8,7 @@ import pytest
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.estimate import estimate
-from frictid_hil.friction.intervals import aligned_pairs, coulomb_half_width_nm, curve_half_width_nm, window_terms
+from frictid_hil.friction.intervals import aligned_pairs, coulomb_half_width_nm, window_terms
 from frictid_hil.friction.recording import Skew, synchronised
 
 UNKNOWN = {
@@ -136,12 +136,3 @@ def test_coulomb_interval_is_that_of_a_line_through_two_uncertain_pairs():
     draws = np.random.default_rng(0).normal(size=(100_000, 2)) * [0.1, 0.05]
     level = (5.0 + draws[:, 0]) * 2 - (5.2 + draws[:, 1])
     assert coulomb_half_width_nm(curve, np.array([0.1, 0.05, 0.05])) == pytest.approx(np.std(level), rel=0.02)
-
-
-def test_intervals_grow_where_the_curve_is_extrapolated():
-    curve = FrictionCurve.through(np.array([0.2, 0.4, 0.6]), np.array([5.0, 5.2, 5.4]))
-    half = np.array([0.1, 0.2, 0.1])
-    at = curve_half_width_nm(curve, half, np.array([0.0, 0.1, 0.2, 0.3, 0.6, 1.2, -0.3]))
-    assert at[0] > at[1] > at[2] == pytest.approx(0.1)
-    assert at[3] == at[6] == pytest.approx(0.15)
-    assert at[5] > at[4] == pytest.approx(0.1)

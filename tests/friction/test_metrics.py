@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.metrics import curve_distance, curve_mean, rms, tracking_rms
+from frictid_hil.friction.metrics import curve_distance, curve_mean, rms
 
 
 def curve_of(levels, top=2.0):
@@ -43,8 +43,3 @@ def test_a_curve_has_no_distance_to_itself():
 def test_rms_of_whole_sine_periods_on_irregular_time():
     time = np.sort(np.random.default_rng(0).uniform(0, 4.0, 40_000))
     assert rms(time, 3.0 * np.sin(np.pi * time)) == pytest.approx(3.0 / np.sqrt(2), rel=1e-3)
-
-
-def test_tracking_error_of_a_constant_lag_is_that_lag():
-    time = np.linspace(0, 1, 101)
-    assert tracking_rms(time, time, time - 0.01) == pytest.approx(0.01)

@@ -245,12 +245,6 @@ class Cia402Driver:
         """The same as plain values (``driver.FrameMapped``)."""
         return self.frame_map().to_mapping()
 
-    def report_interval_cycles(self, joint: str) -> int:
-        """Cycles between two reports of this joint as configured: 1 where active."""
-        if self._layout is None or joint in self._layout.active:
-            return 1
-        return self._layout.interval_cycles
-
     # -- cycling ------------------------------------------------------------------------------------------------
 
     def start_cycling(self) -> None:

@@ -69,11 +69,6 @@ def drive_state(statusword: int) -> DriveState:
     return _STATES[statusword & _RELEVANT]
 
 
-def joint_state(statusword: int) -> JointState:
-    """The same in the words of the driver protocol."""
-    return JOINT_STATES[statusword & _RELEVANT]
-
-
 class Target(Enum):
     """What a joint's power stage shall become."""
 

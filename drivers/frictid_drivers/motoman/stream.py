@@ -61,7 +61,6 @@ class StreamSession:
         report: the one that is to be answered now.
         arrived_s: when the newest came, port time.
         nacks: refused frames by reason.
-        flags_seen: every flag that any report carried since the last look.
         halted: we asked it to stop; a latched controller is no surprise.
     """
 
@@ -92,7 +91,6 @@ class StreamSession:
         self._reports: deque[TickReport] = deque()
         self.arrived_s = 0.0
         self.nacks: Counter[str] = Counter()
-        self.flags_seen = Flag(0)
         self.halted = False
 
     @property
@@ -254,7 +252,6 @@ class StreamSession:
                     self._newest = frame
                     self._reports.append(frame)
                     self.arrived_s = self._port.now_s()
-                    self.flags_seen |= frame.flags
             case Nack():
                 self.nacks[frame.reason] += 1
                 if frame.code not in _RECOVERABLE and self._error is None:
