@@ -82,6 +82,7 @@ def test_robots_of_the_serial_benchmarks_load(
     assert len(joints_of(path)) == 6
 
 
+@pytest.mark.slow
 def test_joints_of_the_diagnosis_end_to_end_load(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
     end_to_end = benchmark_named("gap_end_to_end")
     for effect in end_to_end.SIZES:

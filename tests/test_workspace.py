@@ -127,6 +127,7 @@ class Nothing:
         """Forget."""
 
 
+@pytest.mark.slow
 def test_an_arm_that_leaves_the_box_is_stopped(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     planned = plan_calibration(

@@ -36,6 +36,7 @@ def scripted(tmp_path: Path) -> tuple[str, ...]:
     return (sys.executable, str(script))
 
 
+@pytest.mark.slow
 def test_truth_is_sealed_until_the_last_answer(tmp_path: Path, scripted: tuple[str, ...]) -> None:
     out = tmp_path / "check"
     phases: list[tuple[str, int, int]] = []
@@ -59,6 +60,7 @@ def test_truth_is_sealed_until_the_last_answer(tmp_path: Path, scripted: tuple[s
     assert result["scores"]["cases"] == 4
 
 
+@pytest.mark.slow
 def test_an_interrupted_check_goes_on_where_it_stopped(tmp_path: Path, scripted: tuple[str, ...]) -> None:
     out = tmp_path / "check"
 

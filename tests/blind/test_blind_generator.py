@@ -58,6 +58,7 @@ def joint() -> Joint:
     return without_traces(draw_joint(np.random.default_rng([4, 2])))
 
 
+@pytest.mark.slow
 def test_the_generator_never_loads_the_effect_library() -> None:
     script = (
         "import sys, frictid_hil.gap.blind.generator\n"
@@ -82,6 +83,7 @@ def test_kinds_are_dealt_so_that_every_single_effect_comes_up() -> None:
     assert {entry.effects[0] for entry in dealt if entry.kind == "outside"} == set(OUTSIDERS)
 
 
+@pytest.mark.slow
 def test_a_case_depends_on_seed_and_index_alone() -> None:
     once = draw_case(3, 11, Assignment("single", ("stribeck",)))
     again = draw_case(3, 11, Assignment("single", ("stribeck",)))
@@ -147,6 +149,7 @@ def test_truth_compares_with_the_same_joint_and_noise() -> None:
     assert truth["gap"]["inverse_nm"] == pytest.approx(np.sqrt(weights @ squares / weights.sum()), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["none", "double", "outside"])
 def test_every_kind_is_drawn(kind: str) -> None:
     effects = {"none": (), "double": ("gravity_error", "torque_delay"), "outside": ("friction_patch",)}[kind]
@@ -182,6 +185,7 @@ def test_a_written_case_has_the_layout_of_the_practice_cases(tmp_path: Path) -> 
         assert (len(rest) + 1) * 0.002 == pytest.approx(experiment["duration_s"])
 
 
+@pytest.mark.slow
 def test_truth_speaks_as_the_practice_truth_does() -> None:
     truth_file = PRACTICE / "truth" / "case_000.yaml"
     if not truth_file.exists():

@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from frictid_hil.gap.blind.check import run_check
+
+pytestmark = pytest.mark.slow
 
 CASES, SEED = 5, 28
 

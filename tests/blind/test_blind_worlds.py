@@ -30,6 +30,7 @@ def test_a_case_is_drawn_from_its_numbers_alone(drawn: tuple[Any, Any, dict[str,
     assert wide.draw_wide(1, 7, "single")[2] == drawn[2]
 
 
+@pytest.mark.slow
 def test_a_case_is_a_legal_set(drawn: tuple[Any, Any, dict[str, Any]], tmp_path: Path) -> None:
     nominal, rows, _ = drawn
     write_rows(tmp_path, nominal, rows)
@@ -39,6 +40,7 @@ def test_a_case_is_a_legal_set(drawn: tuple[Any, Any, dict[str, Any]], tmp_path:
     assert read.nominal.tolerances.inertia_kg_m2.source == "stated"
 
 
+@pytest.mark.slow
 def test_what_is_withheld_is_there_and_the_largest(drawn: tuple[Any, Any, dict[str, Any]]) -> None:
     truth = drawn[2]
     sizes = {one["name"]: one["size_alone"] for one in truth["contributors"]}

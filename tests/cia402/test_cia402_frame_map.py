@@ -76,6 +76,7 @@ def frame_maps(draw):
     return FrameMap(tuple(joints), draw(st.one_of(st.none(), st.integers(0, 0x7FF))), draw(st.integers(0, 10**9)))
 
 
+@pytest.mark.slow
 @given(frame_maps())
 def test_round_trip_through_json_and_yaml(frame_map):
     """Factors must survive to the last bit: replay multiplies by them."""
@@ -143,6 +144,7 @@ plain = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.sampled_from(["schema", "sync_cob_id", "window_ns", "joints"]), plain)
 def test_garbage_is_refused_not_fatal(key, value):
     mapping = hand_written()

@@ -81,6 +81,7 @@ def test_reads_only_and_nothing_to_complain_about(session):
     assert capabilities.max_cycle_hz >= 1000
 
 
+@pytest.mark.slow
 def test_one_joint_moves_by_a_cosine_and_five_stand(session):
     session.start("1")
     session.power()

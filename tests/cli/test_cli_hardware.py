@@ -13,6 +13,7 @@ from called import PROGRAM, run
 SHORT = ("--joint", "5", "--amplitude", "8deg", "--velocity", "60deg/s", "--cycles", "3", "--yes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", [("check",), ("calibrate", *SHORT)])
 def test_a_bus_that_is_not_there_is_exit_3(verb: tuple[str, ...], tmp_path: Path) -> None:
     result = run(verb[0], "--robot", "hp3j", "--bus", "socketcan:no-such-can", *verb[1:], cwd=tmp_path)
@@ -23,6 +24,7 @@ def test_a_bus_that_is_not_there_is_exit_3(verb: tuple[str, ...], tmp_path: Path
     assert not list(tmp_path.rglob("samples*"))
 
 
+@pytest.mark.slow
 def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
     faults = json.dumps([{"kind": "mute", "joint": "3"}])
     result = run("calibrate", "--robot", "hp3j", *SHORT, "--json", cwd=tmp_path, FRICTID_VIRTUAL_FAULTS=faults)
@@ -33,6 +35,7 @@ def test_a_drive_that_does_not_answer_is_named(tmp_path: Path) -> None:
     assert "Transfer" not in result.stderr, "libraries do not talk to the user"
 
 
+@pytest.mark.slow
 def test_a_drive_that_falls_silent_while_moving_ends_in_a_safety_stop_and_keeps_the_log(tmp_path: Path) -> None:
     faults = json.dumps([{"kind": "mute", "joint": "5", "at_s": 6.0}])
     out = tmp_path / "run"
@@ -48,6 +51,7 @@ def test_a_drive_that_falls_silent_while_moving_ends_in_a_safety_stop_and_keeps_
     assert "it ended before them: it holds move, rehearsal" in " ".join(again.stderr.split())
 
 
+@pytest.mark.slow
 def test_two_processes_on_one_bus(tmp_path: Path) -> None:
     first = subprocess.Popen(
         [PROGRAM, "calibrate", "--robot", "hp3j", *SHORT, "--realtime", "--out", str(tmp_path / "first")],
@@ -67,6 +71,7 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
         first.communicate()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
     # A limit on file size fails a write just as a full disk does, at a size that we choose.
     limited = subprocess.run(
@@ -82,6 +87,7 @@ def test_a_full_disk_is_told_and_what_was_written_stays(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "samples.mcap").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_that_may_not_be_written_is_told_before_anything_moves(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")

@@ -82,6 +82,7 @@ def test_every_joint_has_its_row_also_where_several_move_together() -> None:
     assert re.search(r"joint 5 .* waiting .* -:--:--", last[2]), last
 
 
+@pytest.mark.slow
 def test_a_whole_run_on_a_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("frictid_hil.cli.joint_view._REDRAW_S", 0.0)
     console = terminal()

@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 
 
+@pytest.mark.slow
 def test_show_tells_quantities_with_their_units(tmp_path: Path) -> None:
     joint = JointProfile(
         method="aligned", velocity_rad_s=(1.0, 2.0), torque_nm=(4.0, 5.0), coulomb_nm=Estimate(value=3.0)

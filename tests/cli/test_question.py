@@ -18,6 +18,8 @@ import pytest
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 
+pytestmark = pytest.mark.slow
+
 QUESTION = "Is the cell clear?"
 
 

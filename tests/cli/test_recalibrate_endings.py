@@ -155,6 +155,7 @@ ENDINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENDINGS)
 def test_every_ending(name: str, first_night: Path, tmp_path: Path) -> None:
     wanted = ENDINGS[name]
@@ -187,6 +188,7 @@ def test_a_robot_file_that_is_wrong_has_its_line_as_well(tmp_path: Path) -> None
     assert "endings.yaml:" in error["where"] + error["what"] and "cycle_hz" in error["what"]
 
 
+@pytest.mark.slow
 def test_a_defect_of_the_program_is_an_ending_too(
     first_night: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +208,7 @@ def test_a_defect_of_the_program_is_an_ending_too(
     assert (last.exit_code, last.promoted) == (1, False) and "ZeroDivisionError" in last.reason and last.next_step
 
 
+@pytest.mark.slow
 def test_a_night_that_could_not_begin_is_notified_too(tmp_path: Path) -> None:
     told = tmp_path / "told.json"
     command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments(tmp_path, robot_file(tmp_path))]
@@ -215,6 +218,7 @@ def test_a_night_that_could_not_begin_is_notified_too(tmp_path: Path) -> None:
     assert json.loads(told.read_text()) == json.loads(ended.stdout)
 
 
+@pytest.mark.slow
 def test_a_signal_during_motion_is_told_like_every_other_ending(first_night: Path, tmp_path: Path) -> None:
     shutil.copytree(first_night, tmp_path / "store")
     command = [sys.executable, "-m", "frictid_hil.cli.app", *arguments(tmp_path, robot_file(tmp_path)), "--realtime"]

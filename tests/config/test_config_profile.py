@@ -81,6 +81,7 @@ def test_what_was_saved_is_loaded_to_the_last_bit(tmp_path: Path) -> None:
 floats = st.floats(min_value=1e-300, max_value=1e300)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.lists(floats, min_size=2, max_size=12, unique=True), st.data())
 def test_any_curve_survives_the_file_bit_for_bit(
@@ -127,6 +128,7 @@ def stored_joints(draw: st.DrawFn) -> JointProfile:
     )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 @given(joints=st.dictionaries(st.sampled_from(["0", "all_joints", "a: b", "- x", "é"]), stored_joints(), min_size=1))
 def test_any_profile_survives_the_file(

@@ -322,6 +322,7 @@ def kill_while_writing(root: Path, kills: int) -> None:
     assert not list((root / "hp3j").glob("*/.*")), "what the killed had staged is tidied away"
 
 
+@pytest.mark.slow
 def test_fifty_kills_never_spoil_the_store(tmp_path: Path) -> None:
     kill_while_writing(tmp_path, 50)
 

@@ -177,6 +177,7 @@ trees = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(st.dictionaries(st.from_regex(r"[a-z0-9_]{1,8}", fullmatch=True), trees))
 def test_what_is_written_is_read_back_bit_for_bit(values: dict[str, object]) -> None:

@@ -24,6 +24,7 @@ def late(recording, column: str, by_s: float, since_s: float = -np.inf):
     return replace(recording, **{column: np.where(recording.time_s >= since_s, shifted, values)})
 
 
+@pytest.mark.slow
 def test_a_sound_recording_fails_nothing(sound):
     assert failed(sound) == set()
 
@@ -33,6 +34,7 @@ def test_a_torque_that_is_late(sound, by_s):
     assert failed(late(sound, "torque_nm", by_s)) & {"seen_delay", "inertia"}
 
 
+@pytest.mark.slow
 def test_a_position_that_is_late_from_the_middle_on(sound):
     spoilt = late(sound, "position_rad", 0.01, since_s=0.5 * sound.procedure.duration_s)
     assert "velocity" in failed(spoilt)
@@ -58,6 +60,7 @@ def test_a_coarse_torque_is_not_cut_off(sound):
     assert "flat_tops" not in failed(coarse)
 
 
+@pytest.mark.slow
 def test_an_inertia_that_nobody_expects(sound):
     found = estimate(sound).rigid_body.inertia_kg_m2.value
     assert "inertia" not in failed(replace(sound, expected_inertia=1.5 * found))
@@ -65,6 +68,7 @@ def test_an_inertia_that_nobody_expects(sound):
     assert "inertia" in failed(replace(sound, expected_inertia=found / 3.0))
 
 
+@pytest.mark.slow
 def test_friction_that_was_another_in_the_rehearsal(sound):
     curve = estimate(sound).curve
     phase = np.linspace(0.0, 2 * np.pi, 4000)

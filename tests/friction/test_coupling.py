@@ -85,6 +85,7 @@ def test_the_matrix_is_found_and_its_deviation_is_honest() -> None:
             assert deviation < 0.03 * math.sqrt(INERTIA[i, i] * INERTIA[j, j])
 
 
+@pytest.mark.slow
 def test_what_unlike_lags_leave_in_the_curve_is_taken_off() -> None:
     moved, lone = cycles(), cycles(np.diag(np.diag(INERTIA)))
     for name in NAMES[:2]:

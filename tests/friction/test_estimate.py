@@ -27,6 +27,7 @@ def heavy(plants):
     return plants.arm[1], plants.record(plants.arm[1], plants.procedure(20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, 1, 4])
 def test_at_20_degrees_each_method_keeps_its_bar(plants, index):
     joint = plants.arm[index]
@@ -50,6 +51,7 @@ def test_small_travel_error_of_the_published_algorithm_is_a_timing_artefact(plan
     assert errors(plants, joint, recording, "function-a")[1] > 3 * errors(plants, joint, recording, "aligned")[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_ms", [0.0, 1.3, 4.0])
 def test_declared_skew_changes_the_aligned_result_by_less_than_half_a_point(plants, heavy, delay_ms):
     joint, recording = heavy
@@ -70,6 +72,7 @@ def low_passed(torque_nm, step_s, lag_s):
     return reported
 
 
+@pytest.mark.slow
 def test_a_declared_low_pass_is_undone_where_a_shift_would_not_do(plants):
     """At A = 5 deg what a low-pass of 4 ms remembers of the turn reaches into the windows."""
     joint = plants.arm[3]
@@ -105,6 +108,7 @@ def test_torque_held_for_a_cycle_is_half_a_sample_late(plants, heavy):
     assert wrong.torque_nm[-1] - right.torque_nm[-1] == pytest.approx(predicted, rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [1, 2, 3])
 def test_rigid_body_lies_in_its_intervals(plants, index):
     joint = plants.arm[index]
@@ -162,6 +166,7 @@ def test_without_a_drive_velocity_only_the_published_algorithm_is_lost(heavy):
         estimate(silent, "function-a")
 
 
+@pytest.mark.slow
 def test_the_published_result_stands_untouched_beside_every_method(heavy):
     _, recording = heavy
     book = function_a(recording.time_s, recording.velocity_rad_s, recording.torque_nm, recording.procedure)
@@ -213,6 +218,7 @@ def test_unknown_methods_are_refused(heavy):
         estimate(heavy[1], "magic")
 
 
+@pytest.mark.slow
 def test_the_same_samples_give_the_same_bits(heavy):
     _, recording = heavy
     for method in ("aligned", "least-squares"):
@@ -221,6 +227,7 @@ def test_the_same_samples_give_the_same_bits(heavy):
         assert np.array_equal(one.half_width_nm, two.half_width_nm)
 
 
+@pytest.mark.slow
 def test_a_recording_that_ends_with_its_last_cycle_is_not_poisoned_by_its_end(plants, heavy):
     """The live run stops with the repeated cycle; what the kernel would have to invent beyond is left out."""
     _, recording = heavy

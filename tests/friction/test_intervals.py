@@ -33,6 +33,7 @@ def outcome(plants, joint, seed, method, amplitude=20):
     return error / level, result.half_width_nm / level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["function-a", "aligned", "least-squares"])
 @pytest.mark.parametrize("indices", [(1, 3), pytest.param((0, 2, 4, 5), marks=pytest.mark.slow)])
 def test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless(plants, method, indices):
@@ -73,6 +74,7 @@ def test_data_narrow_what_the_declaration_leaves_open_but_never_widen_it(plants,
     assert low <= seen_delay(recording, motion, 25.0).open_s(recording.skew.uncertainty_s) <= high
 
 
+@pytest.mark.slow
 def test_the_seen_delay_widens_an_interval_and_moves_no_curve(plants, monkeypatch):
     recording = plants.record(plants.arm[1], plants.procedure(10))
     recording = replace(recording, skew=Skew(torque_delay_s=1e-3, uncertainty_s=1e-3))
@@ -93,6 +95,7 @@ def extended(recording, more_nm):
     return replace(recording, torque_nm=recording.torque_nm + more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [20, 5])
 def test_friction_that_rises_along_the_travel_is_no_scatter_of_its_mean(plants, amplitude):
     recording = plants.record(plants.arm[0], plants.procedure(amplitude))
@@ -103,6 +106,7 @@ def test_friction_that_rises_along_the_travel_is_no_scatter_of_its_mean(plants, 
     assert np.all(np.abs(sloped.terms.scatter - plain.terms.scatter) < 0.003 * level)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["aligned", "least-squares"])
 @pytest.mark.parametrize(
     "more_nm",
@@ -122,6 +126,7 @@ def test_what_place_and_load_do_to_a_curve_is_in_its_interval(plants, method, mo
     assert before < 0.5 * known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [3, 4])
 def test_a_repeated_cycle_that_runs_slower_feigns_no_drift(plants, index):
     """At 5 deg the fast cycle before leaves the repeated one 3 % slower, which is 0.6 % less viscous friction."""

@@ -20,6 +20,7 @@ def error(joint, recording, method):
     return curve_distance(estimate(recording, method).curve, joint.truth(top), top).e_percent_measured_range
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, {"ripple": 0.1}, {"link_hardening": 0.5}, {"load": 0.05}])
 def test_a_soft_joint_at_10_degrees_keeps_the_bar_of_a_rigid_one(plants, effects):
     """Also where the spring hardens by half under rated torque, which no estimator here knows of."""
@@ -56,6 +57,7 @@ def test_frequency_and_inertia_of_the_link_are_found_within_their_intervals(plan
     assert found.damping == pytest.approx(0.02, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [{}, {"ripple": 0.1}, {"load": 0.05}])
 @pytest.mark.parametrize("amplitude", [20, 5])
 def test_a_rigid_joint_has_no_link(plants, effects, amplitude):
@@ -72,6 +74,7 @@ def programme(plants, name):
     return replace(procedure, cycles=len(shares) or 10, shares=shares)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "step_s"),
     [("thorough", 0.004), ("standard", 0.004), ("quick", 0.004), ("standard", 0.001), ("quick", 0.001)],
@@ -86,6 +89,7 @@ def test_a_rigid_joint_has_no_link_in_short_programmes_or_at_250_hz(plants, name
             assert link.soft_link(recording, synchronised(recording), 20.0) is None, (index, effects)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 @pytest.mark.parametrize("step_s", [0.004, 0.001])
 @pytest.mark.parametrize(("index", "frequency_hz"), [(0, 25.0), (1, 30.0), (2, 35.0)])

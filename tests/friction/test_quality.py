@@ -28,6 +28,7 @@ def test_a_sound_recording_passes_every_gate_and_says_why(sound):
     assert all(len(gate.reason) > 20 for gate in found.values())
 
 
+@pytest.mark.slow
 def test_one_jerk_is_no_peak_and_hunting_is(sound):
     """1 mrad that a late set-point costs and gives back within 4 ms, against 1 mrad of swinging at 40 Hz."""
     jerked, swinging = sound.position_rad.copy(), sound.position_rad.copy()
@@ -63,6 +64,7 @@ def test_saturation_is_caught(plants):
     assert "raise the travel" in gate.reason
 
 
+@pytest.mark.slow
 def test_a_resonance_near_the_fastest_cycle_is_caught(plants):
     soft = replace(plants.arm[2], link_share=0.5, link_frequency_hz=24.0)
     assert asked(plants.record(soft, plants.procedure(20)))["link_resonance"].passed
@@ -83,6 +85,7 @@ def test_late_cycles_and_thin_windows_are_counted(sound):
     assert not asked(sparse)["samples_per_window"].passed
 
 
+@pytest.mark.slow
 def test_a_disturbed_cycle_and_a_one_sided_load_are_caught(sound):
     starts = sound.procedure.cycle_starts_s
     v = sound.velocity_rad_s

@@ -37,6 +37,7 @@ def declared(recording, wrong_s, uncertainty_s=2e-4):
     return replace(recording, skew=Skew(torque_delay_s=STEP_S / 2 - wrong_s, uncertainty_s=uncertainty_s))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong_s", [-2e-3, 4e-3])
 @pytest.mark.parametrize(("index", "amplitude"), [(0, 20), (1, 5), (3, 10)])
 def test_a_wrong_declaration_is_found_to_a_twentieth_of_a_millisecond(plants, index, amplitude, wrong_s):
@@ -62,6 +63,7 @@ def test_a_soft_link_is_taken_off_first(plants):
     assert abs(measured_skew(stretch, link).delay_s - PLANT_S) < 5e-5
 
 
+@pytest.mark.slow
 def test_a_link_that_swings_with_the_shaking_leaves_the_declared_timing(plants):
     joint = replace(plants.arm[3], link_share=0.5, link_frequency_hz=24.0)
     recording = declared(plants.record(joint, plants.procedure(20)), 0.0)
@@ -70,6 +72,7 @@ def test_a_link_that_swings_with_the_shaking_leaves_the_declared_timing(plants):
     assert any("would feign a delay" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_a_curve_that_a_wrong_declaration_bends_is_straightened_and_flagged(plants):
     joint, top = plants.arm[1], plants.procedure(10).velocity_rad_s
     recording = declared(plants.record(joint, plants.procedure(10)), 1e-3)

@@ -62,6 +62,7 @@ def _log(arms: Any, robot: RobotModel, model: Any, machine: Any, k: int) -> Reco
     return Recorded(k == 1, time, q, torque)
 
 
+@pytest.mark.slow
 def test_a_payload_is_weighed_where_it_hangs(found: Callable[..., ArmFindings]) -> None:
     told = found(payload_kg=1.5, payload_at_m=(0.02, 0.03, 0.12))
     assert told.cause is not None and (told.cause.effect, told.cause.body) == ("payload", "hand_3")
@@ -77,6 +78,7 @@ def test_a_payload_is_weighed_where_it_hangs(found: Callable[..., ArmFindings]) 
     assert abs(added[1]) == pytest.approx(1.5 * 9.81 * (0.61 + 0.57 + 0.02), rel=0.1) and abs(added[0]) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_link_and_the_base_are_named(found: Callable[..., ArmFindings]) -> None:
     told = found(mass={"fore": 1.3})
     assert told.cause is not None and (told.cause.effect, told.cause.body) == ("link_mass_error", "fore")
@@ -87,6 +89,7 @@ def test_a_link_and_the_base_are_named(found: Callable[..., ArmFindings]) -> Non
     assert told.cause.parameters["about_y_rad"][0] == pytest.approx(0.03, abs=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", [{}, {"friction": {"lift": 1.5}, "bias_nm": {"wrist_1": 0.5}}])
 def test_a_joints_own_cause_is_none_of_the_arm(found: Callable[..., ArmFindings], machine: dict[str, Any]) -> None:
     told = found(**machine)

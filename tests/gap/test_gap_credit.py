@@ -101,6 +101,7 @@ def test_way_and_rest_start_anew_when_a_joint_rests_or_turns() -> None:
     assert way[1900] == pytest.approx(0.15, abs=0.01) and rest[1900] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["torque_delay", "electrical_lag"])
 def test_a_late_torque_is_never_named_for_sure_by_its_partner(name: str) -> None:
     size = {"torque_delay": {"delay_s": 0.004}, "electrical_lag": {"time_constant_s": 0.004}}[name]

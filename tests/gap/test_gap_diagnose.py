@@ -42,12 +42,14 @@ def healthy() -> ExperimentSet:
     return gap_sets.make()
 
 
+@pytest.mark.slow
 def test_healthy_joint_has_no_gap(healthy: ExperimentSet) -> None:
     d = diagnose(healthy)
     assert d.verdict == "none" and not d.causes
     assert d.before.forward_torque_nm == pytest.approx(d.noise_floor.forward_torque_nm, rel=0.1)
 
 
+@pytest.mark.slow
 def test_traces_below_the_floor_are_not_reported() -> None:
     traces = {
         "torque_bias": {"bias_nm": 0.012},
@@ -115,6 +117,7 @@ def test_without_the_right_effect_in_the_library_no_wrong_one_is_sure() -> None:
     assert "torque_ripple" not in {c.effect for c in d.causes}
 
 
+@pytest.mark.slow
 def test_json_is_plain_and_shares_add_up(healthy: ExperimentSet) -> None:
     d = diagnose(gap_sets.make({"direction_asymmetry": SINGLES["direction_asymmetry"]}))
     document = json.loads(json.dumps(d.to_json()))
@@ -142,6 +145,7 @@ def test_improved_model_closes_the_gap_in_the_simulator() -> None:
     assert left == pytest.approx(d.after.forward_torque_nm, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_unknown_applies_nothing_and_never_enlarges_the_gap() -> None:
     experiments = gap_sets.make()
     # A torque over position that no effect has: the recording alone knows it.

@@ -13,6 +13,7 @@ from frictid_hil.gap.experiment_set import Experiment
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
 
 
+@pytest.mark.slow
 def test_a_scale_of_all_parts_is_not_lost_behind_their_tolerances() -> None:
     found = diagnose(gap_sets.make({"torque_constant_error": {"error_share": -0.02}}))
     assert found.causes[0].effect == "torque_constant_error"

@@ -100,6 +100,7 @@ def _forget() -> None:
         cached.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("library")
 @pytest.mark.parametrize(
     ("name", "parameter", "value"), [("cable_pull", "pull_nm", 3.0), ("amplifier_smoothing", "smoothing_s", 0.006)]

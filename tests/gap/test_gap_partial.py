@@ -29,6 +29,7 @@ def _each(experiments: ExperimentSet, change) -> ExperimentSet:
     return replace(experiments, experiments=tuple(change(e) for e in experiments.experiments))
 
 
+@pytest.mark.slow
 def test_without_controller_the_forward_figures_are_null_with_a_reason(asymmetric: ExperimentSet) -> None:
     d = diagnose(replace(asymmetric, nominal=replace(asymmetric.nominal, controller=None)))
     assert d.before.forward_torque_nm is None and "controller" in d.reasons["forward_torque_nm"]
@@ -44,6 +45,7 @@ def test_nominal_with_nothing_but_a_joint(asymmetric: ExperimentSet) -> None:
     assert not any(c.confidence >= 0.9 and c.effect != "direction_asymmetry" for c in d.causes)
 
 
+@pytest.mark.slow
 def test_rigid_body_torque_from_elsewhere(asymmetric: ExperimentSet) -> None:
     def given_rigid(e: Experiment) -> Experiment:
         q, dt = e.position_rad, gap_sets.STEP_S
@@ -58,6 +60,7 @@ def test_rigid_body_torque_from_elsewhere(asymmetric: ExperimentSet) -> None:
     assert d.before.forward_torque_nm is None
 
 
+@pytest.mark.slow
 def test_one_log_alone_is_never_sure(asymmetric: ExperimentSet) -> None:
     one = replace(asymmetric, experiments=asymmetric.experiments[:1])
     d = diagnose(replace(one, nominal=replace(one.nominal, controller=None)))
@@ -101,6 +104,7 @@ def test_position_and_command_alone() -> None:
     assert d.before.inverse_nm is None and "torque" in d.reasons["inverse_nm"]
 
 
+@pytest.mark.slow
 def test_play_on_one_sinusoid_is_ambiguous_with_a_gain() -> None:
     time = 0.02 * np.arange(1500)
     command = 0.4 * np.sin(1.0 * time)

@@ -24,6 +24,7 @@ def _found(effects: dict[str, dict[str, float]]) -> list[Finding]:
     return findings([sampled(Posterior(channel, len(all_effects())))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "parameter", "value"),
     [("direction_asymmetry", "coulomb_share", 0.06), ("gravity_error", "error_share", 0.12)],
@@ -45,6 +46,7 @@ def test_a_whitened_row_is_white_and_of_unit_size() -> None:
     assert abs(float(rest[1:] @ rest[:-1]) / rest.size) < 0.03
 
 
+@pytest.mark.slow
 def test_a_healthy_joint_is_none_and_a_payload_in_validation_alone_is_no_cause_of_the_library() -> None:
     assert diagnose(gap_sets.make()).verdict == "none"
     made = gap_sets.make(only=("sines_small", "sines_large", "moves_payload"))

@@ -31,6 +31,7 @@ def benchmark() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("judge_pulses", [True, False])
 def test_the_linear_axis_is_asymmetric_whichever_half_is_judged(benchmark: ModuleType, judge_pulses: bool) -> None:
     found = diagnose(benchmark.emps(REAL, judge_pulses))
@@ -40,6 +41,7 @@ def test_the_linear_axis_is_asymmetric_whichever_half_is_judged(benchmark: Modul
     assert found.before.forward_torque_nm is None and "controller" in found.reasons["forward_torque_nm"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd_judged", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_second_joint_of_the_pendulum_has_a_gap_that_no_effect_closes(
     benchmark: ModuleType, odd_judged: bool
@@ -50,6 +52,7 @@ def test_the_second_joint_of_the_pendulum_has_a_gap_that_no_effect_closes(
     assert min(found.held_out.values()) > -5.0
 
 
+@pytest.mark.slow
 def test_play_and_gain_are_not_told_apart_on_one_log_of_the_arm(benchmark: ModuleType) -> None:
     found = diagnose(benchmark.so101(REAL, "Elbow", (), ("backlash_detection",)))
     assert found.verdict == "ambiguous" and found.next_experiment is not None

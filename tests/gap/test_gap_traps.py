@@ -34,6 +34,7 @@ def _each(experiments: ExperimentSet, change: Callable[[Experiment], Experiment]
 # -- traces below the floor -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_traces_that_are_real_but_drown_in_noise_are_no_cause(seed: int) -> None:
     traces = {
@@ -71,6 +72,7 @@ def _torque_in_the_logs(experiments: ExperimentSet, model: JointModel) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [
@@ -100,6 +102,7 @@ def test_no_gap_is_reported_that_is_larger_than_the_logs_contain(effects: dict[s
     assert sum(c.gap_closed_percent or 0.0 for c in found.causes) <= 100.5
 
 
+@pytest.mark.slow
 def test_the_inverse_gap_of_a_known_bias_is_that_bias() -> None:
     found = diagnose(gap_sets.make({"torque_bias": {"bias_nm": 0.25}}))
     healthy = diagnose(gap_sets.make())
@@ -118,6 +121,7 @@ def _one_sinusoid(monkeypatch: pytest.MonkeyPatch, effects: dict[str, dict[str, 
     return gap_sets.make(effects)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", WITHOUT_LOOP)
 @pytest.mark.parametrize("logs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_presliding_on_one_sinusoid_is_ambiguous_with_a_delay(
@@ -141,6 +145,7 @@ def test_presliding_on_varied_motion_is_sure() -> None:
     assert "sinusoid" not in found.reasons
 
 
+@pytest.mark.slow
 def test_a_late_position_on_one_sinusoid_is_ambiguous_with_presliding(monkeypatch: pytest.MonkeyPatch) -> None:
     made = _one_sinusoid(monkeypatch, {}, 2)
 
@@ -158,6 +163,7 @@ def test_a_late_position_on_one_sinusoid_is_ambiguous_with_presliding(monkeypatc
 # -- a curve that bends below its first pair --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", WITHOUT_LOOP)
 @pytest.mark.parametrize(
     ("speeds", "torques"),
@@ -205,6 +211,7 @@ def _flipped_ripple(e: Experiment) -> Experiment:
     return replace(e, torque_nm=e.torque_nm + wave)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", WITHOUT_LOOP)
 @pytest.mark.parametrize("change", [_flipped_bias, _bias_of_one_half, _flipped_ripple])
 def test_what_wins_within_its_logs_and_loses_on_others_is_not_reported(

@@ -44,16 +44,19 @@ def shares() -> dict[str, dict[Region, float]]:
     return found
 
 
+@pytest.mark.slow
 def test_every_effect_is_largest_or_second_where_its_own_file_says(shares: dict[str, dict[Region, float]]) -> None:
     for name, found in shares.items():
         assert set(list(found)[:2]) & set(all_effects()[name].signature.regions), (name, found)
 
 
+@pytest.mark.slow
 def test_most_effects_are_largest_where_their_own_file_says(shares: dict[str, dict[Region, float]]) -> None:
     elsewhere = [n for n, found in shares.items() if next(iter(found)) not in all_effects()[n].signature.regions]
     assert len(elsewhere) <= 1, elsewhere
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "region", "least"),
     [

@@ -23,6 +23,8 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.runner.events import Event, PhaseStarted
 from frictid_hil.runs.folder import load_manifest
 
+pytestmark = pytest.mark.slow
+
 
 def run(out: Path, **changes: object) -> dict[str, object]:
     options = CalibrateOptions("hp3j.yaml", bus=f"virtual:{out.name}", out=out, **changes)  # type: ignore[arg-type]

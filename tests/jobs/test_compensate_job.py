@@ -36,6 +36,8 @@ from frictid_hil.runner.events import Event, PhaseStarted
 from frictid_hil.runs.folder import load_manifest
 from frictid_hil.runs.rehearsals import Rehearsals
 
+pytestmark = pytest.mark.slow
+
 JOINT = "3"
 
 

@@ -77,6 +77,7 @@ TIMES = st.tuples(component(0, 23), component(0, 59), st.sampled_from(["", ":00"
 SHORT = st.sampled_from(["daily", "weekly", "monthly", "hourly", "yearly", "quarterly", "minutely", "semi-annually"])
 
 
+@pytest.mark.slow
 @needs_systemd
 @settings(max_examples=100, deadline=None)
 @given(st.one_of(SHORT, st.tuples(WEEKDAYS, DATES, TIMES).map("".join)))

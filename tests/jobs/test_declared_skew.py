@@ -16,6 +16,8 @@ from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.report import whole_profile
 from frictid_hil.jobs.watch import Silent
 
+pytestmark = pytest.mark.slow
+
 
 def test_torque_four_milliseconds_late_changes_nothing_where_the_drive_declares_it(tmp_path: Path) -> None:
     values = load_robot("hp3j").values()

@@ -82,6 +82,7 @@ def asymmetric(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return a_set(tmp_path_factory.mktemp("gap") / "asymmetric", effects)
 
 
+@pytest.mark.slow
 def test_the_missing_effect_is_named_closed_and_written(asymmetric: Path, tmp_path: Path) -> None:
     result = diagnose(asymmetric, write_model=tmp_path / "improved.yaml", out=tmp_path / "page")
     assert result["verdict"] == "explained"
@@ -101,6 +102,7 @@ def test_a_healthy_joint_has_no_cause(tmp_path: Path) -> None:
     assert result["causes"] == []
 
 
+@pytest.mark.slow
 def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     bare.mkdir()

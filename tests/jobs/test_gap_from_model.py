@@ -131,6 +131,7 @@ def test_logs_of_other_joints_do_not_go_together(tmp_path: Path) -> None:
         sets_from_model(ModelLogs(asked.model, [*asked.logs, tmp_path / "alone.csv"], columns=other.columns))
 
 
+@pytest.mark.slow
 def test_the_command_line_tells_every_joint(tmp_path: Path) -> None:
     asked = _case(tmp_path)
     words = [

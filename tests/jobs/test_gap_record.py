@@ -32,6 +32,8 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
 from frictid_hil.runner.events import Event, PhaseStarted, Preflight
 
+pytestmark = pytest.mark.slow
+
 HP3J = find("hp3j.yaml").resolve()
 NOISE_NM = 0.005 * 11.4
 

@@ -70,14 +70,17 @@ def check_as_alone(logs: Path, executor: str, out: Path) -> None:
         assert "torque over velocity" in Path(alone["report"]).read_text(), "the loops, though nothing was marked"
 
 
+@pytest.mark.slow
 def test_over_processes_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, tmp_path: Path) -> None:
     check_as_alone(logs, "processes:2", tmp_path)
 
 
+@pytest.mark.slow
 def test_over_a_cluster_as_alone_and_a_bad_file_spoils_only_itself(logs: Path, cluster: str, tmp_path: Path) -> None:
     check_as_alone(logs, cluster, tmp_path)
 
 
+@pytest.mark.slow
 def test_profiles_of_recordings_with_one_name_do_not_overwrite_each_other(logs: Path, tmp_path: Path) -> None:
     for night in ("night1", "night2"):
         (tmp_path / night / "arm").mkdir(parents=True)
@@ -112,6 +115,7 @@ def test_a_damaged_recording_is_told(tmp_path: Path) -> None:
     assert torn["error"] and "the file is damaged: the file ends in the middle" in told[1]
 
 
+@pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> None:
     # Defined here, so that it travels by value: workers cannot import the tests.
     def die_at_two(task: int) -> int:
@@ -133,6 +137,7 @@ def test_no_cluster_there(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", ["threads:4", "processes:0", "dask:host"])
 def test_no_such_executor(logs: Path, named: str) -> None:
     with pytest.raises(UsageError, match="no executor"):

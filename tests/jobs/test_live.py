@@ -23,6 +23,8 @@ from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_rows
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("foxglove")
 connect = pytest.importorskip("websockets.sync.client").connect
 

@@ -16,6 +16,8 @@ from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import SKEW, Plan
 
+pytestmark = pytest.mark.slow
+
 
 def planned(robot: str = "hp3j", **options: Any) -> Plan:
     return plan_calibration(CalibrateOptions(robot, joints=("1",), **options)).plan

@@ -49,6 +49,7 @@ def stopped(samples: Samples, stops: dict[int, int]) -> Samples:
 STOPS = {40: 5, 2100: 27, 5203: 1, 9000: 12, 13_900: 2, 14_377: 25}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["aligned", "least-squares"])
 def test_missed_set_points_leave_curve_and_inertia_alone(method: str) -> None:
     whole, broken = (identify_joint(samples, None, method=method) for samples in (run(), stopped(run(), STOPS)))
@@ -59,6 +60,7 @@ def test_missed_set_points_leave_curve_and_inertia_alone(method: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_lost_reports_are_no_stops() -> None:
     samples = run()
     kept = np.ones(len(samples), dtype=np.bool_)

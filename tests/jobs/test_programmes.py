@@ -18,6 +18,8 @@ from frictid_hil.jobs.identify import IdentifyOptions, identify
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Cycles
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:

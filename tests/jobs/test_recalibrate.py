@@ -28,6 +28,8 @@ from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.recording.mcap_reader import read_rows
 from frictid_hil.runner.warm_up import WarmUpWatch
 
+pytestmark = pytest.mark.slow
+
 INTERLOCK = {"joint": "5", "bit": 3, "closed_when": 1}
 
 

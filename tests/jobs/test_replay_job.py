@@ -28,6 +28,8 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.recording.bus_log import BusLogWriter, read_frames
 from frictid_hil.recording.playback import LogBus, logged
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> str:

@@ -43,6 +43,7 @@ def store(tmp_path: Path) -> ProfileStore:
     return store
 
 
+@pytest.mark.slow
 def test_the_page_of_a_robot_has_its_history(store: ProfileStore) -> None:
     command = [sys.executable, "-m", "frictid_hil.cli.app", "report", "--robot", "arm", "--store", str(store.root)]
     answer = subprocess.run([*command, "--json"], capture_output=True, text=True, timeout=100, check=True)

@@ -80,6 +80,7 @@ def test_what_cron_cannot_say_is_not_printed_as_a_cron_line(tmp_path: Path) -> N
     assert result["cron"] is None and "cron cannot say" in result["cron_refused"]
 
 
+@pytest.mark.slow
 def test_the_cron_line_runs_a_night_where_there_was_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As cron does it: a bare environment, ``sh``, nobody there, no folder made beforehand."""
     values = load_robot("hp3j").values()

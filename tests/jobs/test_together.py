@@ -22,6 +22,8 @@ from frictid_hil.recording.bus_log import read_frames
 from frictid_hil.simulation.arm_model import ArmModel
 from frictid_hil.simulation.rigid_bodies import RigidBodies
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("mujoco")
 
 JOINTS = ("1", "2", "4")

@@ -49,6 +49,7 @@ def healthy(arm: ArmSet, **others: Diagnosis) -> dict[str, Diagnosis]:
     return {name: found("none") for name in arm.joints} | others
 
 
+@pytest.mark.slow
 def test_the_cause_is_written_into_a_copy_that_is_nearer_to_the_machine(arm: ArmSet, tmp_path: Path) -> None:
     made = exports(arm, healthy(arm, lift=found("explained")))
     assert list(made) == ["lift"] and made["lift"].form in ("spring", "lugre")
@@ -72,6 +73,7 @@ def test_the_cause_is_written_into_a_copy_that_is_nearer_to_the_machine(arm: Arm
     assert gap["after"]["wrist_3"]["torque_nm"] == pytest.approx(gap["before"]["wrist_3"]["torque_nm"], rel=0.05)
 
 
+@pytest.mark.slow
 def test_open_verdicts_change_nothing_unless_told(arm: ArmSet) -> None:
     for verdict in ("ambiguous", "unknown"):
         assert applied(found(verdict), apply=False) == {}

@@ -300,6 +300,7 @@ def controller_sends(pair: Pair, message: Message) -> None:
     assert received(events) or any(isinstance(event, Failed) for event in events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("towards_host", [True, False])
 @pytest.mark.parametrize("sender", [host_sends, controller_sends])
 @pytest.mark.parametrize("message", [Message("01,000", "RSTATS"), Message("90,000", "3070")])
@@ -312,6 +313,7 @@ def test_every_damage_to_every_byte_is_detected_or_retried(
         sender(Pair(position, 0, towards_host, dropped=True), message)
 
 
+@pytest.mark.slow
 def test_every_damage_to_every_answer_to_a_long_message_is_detected_or_retried() -> None:
     for position in range(8):
         for damage in range(1, 256):

@@ -390,6 +390,7 @@ def a_watched_job(way: str = "", at: int = -1) -> list[dict[str, int]]:
     return passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["to the controller", "to the host"])
 def test_a_damaged_byte_while_a_job_runs_costs_less_than_its_watchdog(way: str) -> None:
     passed = a_watched_job()

@@ -95,6 +95,7 @@ def test_one_joint_in_batch_at_19200_is_within_the_bar(robot: Callable[..., Path
     assert names == ["move", "rehearsal", "hold", "cycles", "drift", "hold", "reversal", "return", "hold"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "exit_code", "told"),
     [

@@ -74,6 +74,7 @@ def check_cause(fault: str, error: FrictidError) -> None:
     assert re.search(CAUSES.get(kind, LINK), told), f"{fault}: {type(error).__name__}: {told}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", STREAM_FAULTS)
 def test_streaming(fault: str) -> None:
     bench = make_bench(faults=[fault])
@@ -112,6 +113,7 @@ def batch_plan() -> JointPlan:
     return JointPlan("0", (Hold(START_RAD, 0.04), out, back, Hold(START_RAD, 0.1)), {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", BATCH_FAULTS)
 def test_batch(fault: str) -> None:
     bench = make_bench(faults=[fault], layer="batch")

@@ -69,12 +69,14 @@ def streamed_on(port: str) -> Streamed:
         driver.close()
 
 
+@pytest.mark.slow
 def test_six_joints_stream_over_a_pseudo_terminal(port: str) -> None:
     streamed = streamed_on(port)
     assert len(streamed.rows) > 100
     assert max(row[1] for row in streamed.rows) - streamed.rows[0][1] == pytest.approx(0.02, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_job_runs_at_19200_baud_over_a_pseudo_terminal(port: str) -> None:
     driver = driver_on(port, layer="batch")
     driver.open()
@@ -111,6 +113,7 @@ def test_even_parity_on_a_pseudo_terminal_is_an_error_and_never_a_fallback(port:
             driver_on(port, parity="E").open()
 
 
+@pytest.mark.slow
 def test_the_verb_prints_its_port_and_ends_quietly_when_asked_to() -> None:
     command = [sys.executable, "-m", "frictid_hil.cli.app", "emulate", "motoman", "--pty"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -139,6 +142,7 @@ def test_a_port_on_which_nobody_answers_is_given_up_in_time() -> None:
     os.close(theirs)
 
 
+@pytest.mark.slow
 def test_unplugging_is_noticed_at_once() -> None:
     with controller("unplug@60") as port:
         driver = driver_on(port)
@@ -153,6 +157,7 @@ def test_unplugging_is_noticed_at_once() -> None:
         assert len(streamed.rows) > 20
 
 
+@pytest.mark.slow
 def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     driver = driver_on(port)
     driver.open()
@@ -180,6 +185,7 @@ def test_a_cable_pulled_while_the_arm_moves_stops_it(port: str, monkeypatch: pyt
     assert first == pytest.approx(second, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone_s", [0.4, 3])
 def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_s: float) -> None:
     at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
@@ -201,6 +207,7 @@ def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_
     assert state.position_rad == pytest.approx(kept["position_rad"][-1], abs=1e-2)
 
 
+@pytest.mark.slow
 def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
     with controller("close@130:2", link=str(tmp_path / "port")) as port:
@@ -220,6 +227,7 @@ def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path, monkeypatch: p
     assert len(columns["time_ns"]) == 1 + 3 * 157
 
 
+@pytest.mark.slow
 def test_what_had_come_of_a_running_job_is_on_disk_after_a_kill(tmp_path: Path) -> None:
     robot, out = tmp_path / "robot.yaml", tmp_path / "run"
     robot.write_text(
@@ -252,6 +260,7 @@ def recorded(out: Path, joint: str) -> int:
         return 0
 
 
+@pytest.mark.slow
 def test_a_link_takes_no_other_files_place(tmp_path: Path) -> None:
     taken = tmp_path / "letter"
     taken.write_text("dear")
@@ -260,6 +269,7 @@ def test_a_link_takes_no_other_files_place(tmp_path: Path) -> None:
     assert taken.read_text() == "dear"
 
 
+@pytest.mark.slow
 def test_the_emulator_tells_how_long_it_waited_for_a_late_host() -> None:
     waits = Waits()
     for passed_s in (0.004, 0.004):

@@ -86,6 +86,7 @@ def matrix(path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [blank_lines, rows, chunk_that_lies, matrix])
 def test_recordings_that_unpack_to_too_much_are_refused(made: Callable[[Path], Path], tmp_path: Path) -> None:
     path = made(tmp_path)
@@ -94,6 +95,7 @@ def test_recordings_that_unpack_to_too_much_are_refused(made: Callable[[Path], P
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [text_log, container_that_lies, container_that_is_large, objects_of_no_size])
 def test_bus_logs_that_unpack_to_too_much_are_refused(made: Callable[[Path], Path], tmp_path: Path) -> None:
     path = made(tmp_path)

@@ -448,6 +448,7 @@ def own_mcap_bomb(folder: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [csv_bomb, npz_bomb, hdf5_bomb, mat_bomb, parquet_bomb, mcap_bomb, own_mcap_bomb])
 def test_a_small_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     columns = written_map(

@@ -56,6 +56,7 @@ def test_what_was_written_is_read_to_the_nanosecond(tmp_path: Path) -> None:
     assert (frames.skipped, frames.damage) == (0, "")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(
@@ -222,6 +223,7 @@ def test_a_log_cut_anywhere_gives_back_what_is_whole(tmp_path: Path) -> None:
     assert had[-1] > 250
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from(["a.blf", "a.asc", "a.log", "a.trc"]))
 def test_a_damaged_log_is_read_or_refused_never_worse(

@@ -161,6 +161,7 @@ def whole_file(folder: Path, flushes: int = 5) -> bytes:
     return (folder / "whole.mcap").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_gives_back_every_whole_record_before_the_cut(tmp_path: Path) -> None:
     data = whole_file(tmp_path)
     path = tmp_path / "cut.mcap"

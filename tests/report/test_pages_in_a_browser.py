@@ -211,6 +211,7 @@ def serious(dom: str) -> list[list[object]]:
     return [broken for broken in json.loads(html.unescape(told)) if broken[1] in ("serious", "critical")]
 
 
+@pytest.mark.slow
 @needs_browser
 @pytest.mark.parametrize("name", [*PAGES, "compensation by hand without a force sensor"])
 def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: Path) -> None:
@@ -233,6 +234,7 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
         assert len(re.findall(r'class="[^"]*(?:js-line|js-fill|point)"', svg)) >= len(figure.traces)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_contrast_holds_in_the_dark_too(history: ProfileStore, tmp_path: Path) -> None:
     path = write_page(pages(history)["index"], tmp_path / "index.html")
@@ -259,6 +261,7 @@ def test_a_long_history_shows_its_newest_year() -> None:
     assert len(shown.weeks) == 53 and all(len(week) == 7 for week in shown.weeks)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_broken_page_would_be_noticed(history: ProfileStore, tmp_path: Path) -> None:
     path = write_page(pages(history)["index"], tmp_path / "index.html")

@@ -126,6 +126,7 @@ ring.close()
 """
 
 
+@pytest.mark.slow
 def test_a_reader_in_another_process_gets_every_row_once_and_in_order() -> None:
     """The reader looks as often as it can, also in the midst of a write."""
     rows = 250_000

@@ -91,6 +91,7 @@ def healthy() -> tuple[list[Event], Rows, Driver, FrictidError | None]:
     return run(("3", "4"))
 
 
+@pytest.mark.slow
 def test_joints_run_one_by_one_in_the_planned_order(
     healthy: tuple[list[Event], Rows, Driver, FrictidError | None],
 ) -> None:
@@ -116,6 +117,7 @@ def test_joints_run_one_by_one_in_the_planned_order(
     ]
 
 
+@pytest.mark.slow
 def test_only_the_planned_joint_moves(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
     events, rows, _, _ = healthy
     for run_of in (event for event in events if isinstance(event, JointRun)):
@@ -127,6 +129,7 @@ def test_only_the_planned_joint_moves(healthy: tuple[list[Event], Rows, Driver, 
             assert (travel > 5 * DEG) == (index == moving), f"joint {index} travelled {travel:.5f} rad"
 
 
+@pytest.mark.slow
 def test_run_time_goes_on_from_joint_to_joint(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
     events, rows, _, _ = healthy
     first, second = (event for event in events if isinstance(event, JointRun))
@@ -137,6 +140,7 @@ def test_run_time_goes_on_from_joint_to_joint(healthy: tuple[list[Event], Rows, 
     assert first.late_cycles == first.missed_cycles == 0
 
 
+@pytest.mark.slow
 def test_lock_step_is_bit_identical(healthy: tuple[list[Event], Rows, Driver, FrictidError | None]) -> None:
     _, rows, _, _ = run(("3", "4"))
     assert rows.tobytes() == healthy[1].tobytes()
@@ -181,6 +185,7 @@ def test_a_drive_that_lies_about_its_units_is_refused_before_motion_proper(lie: 
     assert rows.size == 0 or np.ptp(rows["position_rad"][rows["joint"] == 3]) < 1 * DEG
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [1, 2])
 def test_a_request_to_stop_brings_the_joint_to_rest(level: int) -> None:
     _, rows, _, ended = run(stop=Stop(level))
@@ -194,6 +199,7 @@ def test_states_are_what_the_protocol_names() -> None:
     assert {state.value for state in JointState} == {"unknown", "disabled", "enabled", "stopping", "fault"}
 
 
+@pytest.mark.slow
 def test_joints_that_move_together_do_so_in_step() -> None:
     events, rows, _, ended = run(("1", "3", "4"), together=True, cycle_hz=400.0)
     assert ended is None
@@ -227,6 +233,7 @@ def test_no_joint_that_has_warmed_up_ends_the_motion_of_the_others() -> None:
     assert sources(0, 1) == ["Stream", "Stream"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [1, 2])
 def test_a_request_to_stop_brings_all_joints_to_rest(level: int) -> None:
     _, rows, _, ended = run(("3", "4"), stop=Stop(level), together=True, cycle_hz=400.0)
@@ -237,6 +244,7 @@ def test_a_request_to_stop_brings_all_joints_to_rest(level: int) -> None:
         assert np.ptp(last["position_rad"]) < 0.01 * DEG
 
 
+@pytest.mark.slow
 def test_one_joint_out_of_bounds_stops_all() -> None:
     def faulty(setup: RobotSetup) -> RobotSetup:
         return replace(
@@ -281,6 +289,7 @@ MS = 1_000_000
 TRAVEL = (ROBOT.file.joints["3"].start_position_rad, ROBOT.file.joints["3"].start_position_rad + 4 * DEG)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [40, 100, 130, 170, 230, 290, *random.Random(13).sample(range(300), 4)])
 def test_a_stop_on_request_stays_within_the_planned_travel_and_in_time(after: int) -> None:
     """A short, fast travel: the stop has less room than a tenth of a second at full speed would take."""

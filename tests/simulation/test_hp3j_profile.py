@@ -124,6 +124,7 @@ def test_expectations_in_the_file_cover_the_simulated_joint(joint: str) -> None:
     assert expected["friction_nm"] == pytest.approx(steady_friction_nm(model, np.array([V]))[0], rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", "012345")
 @pytest.mark.parametrize(("amplitude_deg", "limit_percent"), [(20, 2.5), (50, 1.5)])
 def test_function_a_reaches_its_level(joint: str, amplitude_deg: float, limit_percent: float) -> None:

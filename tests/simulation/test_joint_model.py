@@ -121,6 +121,7 @@ _VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.dictionaries(st.sampled_from([*FULL, "x"]), _VALUES))
 def test_whatever_a_file_says_is_a_joint_or_a_list_of_problems(changes) -> None:
@@ -149,6 +150,7 @@ def joints(draw) -> JointModel:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(joints())
 def test_no_joint_within_bounds_makes_nan(model: JointModel) -> None:

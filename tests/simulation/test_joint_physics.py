@@ -92,6 +92,7 @@ def reference(torque, start, end, *, compliance=0.0, relaxation=0.0, motor_share
     return times, solve_ivp(rate, (0.0, end), first, t_eval=times, rtol=1e-8, atol=1e-10, max_step=2e-4).y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compliance", [0.0, 2e-4])
 def test_motion_agrees_with_a_runge_kutta_integration(compliance: float) -> None:
     def torque(t: float) -> float:

@@ -122,6 +122,7 @@ def test_sizes_are_given_for_every_effect() -> None:
     assert any("change its gains" in line for line in told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["", *sorted(SIZES)])
 def test_the_exported_joint_moves_as_in_our_own_simulator(effect: str) -> None:
     joint = BARE.with_effects({effect: SIZES[effect]} if effect else {})

@@ -42,6 +42,7 @@ def test_it_is_short_and_imports_public_names_only(package: Path) -> None:
             assert not node.attr.startswith("_"), node.attr
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass(package: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"],
@@ -149,6 +150,7 @@ def failing(package: Path, text: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("importing")
 @pytest.mark.parametrize("defect", DEFECTS)
 def test_every_planted_defect_is_found(package: Path, defect: str) -> None:

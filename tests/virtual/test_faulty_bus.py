@@ -164,6 +164,7 @@ def row_of(kind: str) -> dict:
     return {**fields, "at_s": 0.12} if kind not in ("missing", "left_in_fault", "abort") else fields
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_passes_through_the_driver_without_a_traceback(make_robot, runtime_folder, kind):
     driver = VirtualDriver(make_robot(options={"faults": [row_of(kind)]}))

@@ -144,6 +144,7 @@ def test_stored_parameters_survive_a_reset(desk):
     assert desk.read(0x6065) == 100_000
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(frames=st.lists(st.binary(min_size=0, max_size=8), min_size=1, max_size=12))
 def test_garbage_gets_one_answer_per_whole_frame(make_desk, frames):

@@ -150,6 +150,7 @@ def test_a_driver_can_be_opened_again(make_robot):
     run.driver.close()
 
 
+@pytest.mark.slow
 def test_one_bus_on_the_wall_clock_has_one_owner(make_robot, own_folder):
     code = (
         "import sys; from frictid_drivers.virtual import channel\n"
@@ -239,6 +240,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_killed_host_leaves_a_joint_that_its_drive_stops(make_robot):
     """SIGKILL of the host: nobody is left but the drive's own watchdog, seen by a second member of the bus."""
     host = subprocess.Popen([sys.executable, "-c", HOST], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -271,6 +273,7 @@ def test_killed_host_leaves_a_joint_that_its_drive_stops(make_robot):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_drives_end_with_their_owner_in_good_order(make_robot):
     rack = start_rack(make_robot(realtime=True))
     bus = SocketBus("bench")

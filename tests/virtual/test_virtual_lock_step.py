@@ -191,6 +191,7 @@ def test_host_silence_stops_a_moving_joint(make_host):
     assert abs(servo.axis._plant.velocity_rad_s) < 0.005
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     frames=st.lists(
