@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from mit_bench import FAMILIES, robot_file
 
 from frictid_hil.config.profile import load_profile
@@ -20,16 +18,6 @@ from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.steady import true_curve_nm
 
 COULOMB_NM = 0.24
-
-
-def unit(folder: Path, family: str, *, noise_per_mille: float, scale: float) -> Path:
-    path = robot_file(folder, family)
-    values: dict[str, Any] = yaml.safe_load(path.read_text())
-    simulated = values["joints"]["0"]["simulated"]
-    simulated["friction"] = {"coulomb_nm": COULOMB_NM * scale, "viscous_nm_s_per_rad": 0.035 * scale}
-    simulated["drive"]["torque_noise_per_mille"] = noise_per_mille
-    path.write_text(yaml.safe_dump(values))
-    return path
 
 
 def calibrated(path: Path, out: Path, seed: int) -> None:
@@ -45,14 +33,6 @@ def calibrated(path: Path, out: Path, seed: int) -> None:
     assert np.allclose(joint.torque_nm, truth_nm, rtol=0.03)
     low_nm, high_nm = np.array(joint.torque_interval_nm).T
     assert np.mean((low_nm <= truth_nm) & (truth_nm <= high_nm)) >= 0.8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", sorted(FAMILIES))
-@pytest.mark.parametrize(("seed", "noise_per_mille", "scale"), [(1, 4.0, 1.0), (2, 8.0, 0.9), (3, 15.0, 1.15)])
-def test_three_units_of_a_family(tmp_path: Path, family: str, seed: int, noise_per_mille: float, scale: float) -> None:
-    path = unit(tmp_path, family, noise_per_mille=noise_per_mille, scale=scale)
-    calibrated(path, tmp_path / "run", seed)
 
 
 @pytest.mark.slow

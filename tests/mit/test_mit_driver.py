@@ -93,7 +93,8 @@ def test_the_watchdog_is_set_and_lets_go_without_the_host(tmp_path: Path, family
 
 
 @pytest.mark.parametrize(
-    ("family", "most_hz"), [("damiao", 493), ("robstride", 416), ("cybergear", 416), ("cubemars", 493)]
+    ("family", "most_hz"),
+    [("damiao", 493), ("robstride", 416), ("cybergear", 416), ("robstride-mit", 493), ("cubemars", 493)],
 )
 def test_six_motors_at_one_kilohertz_are_refused_with_the_rate_that_fits(
     tmp_path: Path, family: str, most_hz: int

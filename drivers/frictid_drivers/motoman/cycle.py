@@ -7,6 +7,7 @@ time t moves the arm at run time t, and the marks of a recording agree with its 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
@@ -129,13 +130,11 @@ class StreamCycle:
         self._in_force: tuple[int, ...] | None = None
         order = [axis for axis in range(8) if welcome.axis_mask >> axis & 1]
         self._place = {k: order.index(units.axis) for k, units in enumerate(self._units) if units.axis in order}
-        tick_s = welcome.tick_us * 1e-6
-        self._bounds = []
-        for joint, unit in zip(joints, self._units, strict=True):
+        self._tick_s = welcome.tick_us * 1e-6
+        self._bounds = [(0, 0, 0)] * len(self._joints)
+        for joint in joints:
             low, high, _ = limits[joint.name]
-            lowest, highest = sorted((unit.pulses(low), unit.pulses(high)))
-            step = abs(joint.max_velocity_rad_s * tick_s * unit.pulses_per_rad) * _STEP_MARGIN
-            self._bounds.append((lowest, highest, int(step) + 1))
+            self.limit(joint.name, low, high)
         clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
         # Targets in the order of the axes; axes without a joint stay where they are.
         self._targets = [axis.pulses for axis in first.axes]
@@ -145,6 +144,14 @@ class StreamCycle:
                 report = self._feedback[k]
                 report.position_rad = unit.position_rad(pulses[unit.axis])
                 report.mode, report.valid, report.age_cycles = Mode.POSITION, True, 1
+
+    def limit(self, joint: str, position_min_rad: float, position_max_rad: float) -> None:
+        """No target beyond these from here on."""
+        k = self._index[joint]
+        unit = self._units[k]
+        lowest, highest = sorted((unit.pulses(position_min_rad), unit.pulses(position_max_rad)))
+        step = abs(self._joints[k].max_velocity_rad_s * self._tick_s * unit.pulses_per_rad) * _STEP_MARGIN
+        self._bounds[k] = (lowest, highest, int(step) + 1)
 
     # -- who follows -------------------------------------------------------------------------------------------
 
@@ -190,6 +197,8 @@ class StreamCycle:
             if place is None:
                 continue
             unit, set_point = self._units[k], set_points[k]
+            if not (math.isfinite(set_point.position_rad) and math.isfinite(set_point.torque_offset_nm)):
+                raise SafetyAbort("the set-point is no number", where=f"joint {self._joints[k].name}")
             target = unit.pulses(set_point.position_rad)
             lowest, highest, step = self._bounds[k]
             moved = abs(target - self._targets[place])

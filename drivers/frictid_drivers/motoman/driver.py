@@ -158,6 +158,8 @@ class MotomanDriver:
             HardwareError: the controller's own travel is narrower.
         """
         self._limits[joint] = (position_min_rad, position_max_rad, torque_nm)
+        if self._cycle is not None:
+            self._cycle.limit(joint, position_min_rad, position_max_rad)
         welcome = self._reach.welcome
         if welcome is None:
             return
