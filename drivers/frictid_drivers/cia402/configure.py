@@ -1,4 +1,4 @@
-"""Every setting that a drive gets, as lists of writes: ``configure`` applies them, and `check` foresees what they meet.
+"""Settings of the CiA-402 profile, as lists of writes: ``configure`` applies them, and `check` foresees what they meet.
 
 The lists are formed by reading alone, so that what `check` says of them is what ``configure`` does. A setting that is
 already as it shall be is not written; what was changed is put back when the bus is left. Everything is written in NMT
@@ -9,26 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.facts import Facts
-from frictid_drivers.cia402.frame_map import Frame
-from frictid_drivers.cia402.layout import Layout, Pdo
+from frictid_drivers.cia402.access import Drive, Write
 from frictid_drivers.cia402.scale import Scale, velocity_unit_rad_s
-from frictid_drivers.cia402.sdo import Drive, RefusedByDrive, Write
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, DriveState, drive_state
 from frictid_hil.errors import HardwareError
-from frictid_hil.plan.setup import JointSetup
 from frictid_hil.units import format_angle, format_torque
 
-_NOT_VALID = 1 << 31
-_NO_REMOTE = 1 << 30
-_COB_ID_MASK = _NOT_VALID | 0x1FFFFFFF
-"""Bit 30 (remote frames) is a drive's own business."""
-
-_ALL = tuple((transmit, number) for transmit in (False, True) for number in (1, 2, 3, 4))
 _VELOCITIES = (od.MAX_PROFILE_VELOCITY, od.PROFILE_VELOCITY)
 _ACCELERATIONS = (
     od.PROFILE_ACCELERATION,
@@ -134,21 +123,6 @@ def velocity_dependent(drive: Drive) -> dict[od.Object, int]:
     return {item: value for item in items if (value := drive.known(item))}
 
 
-def timing_writes(drive: Drive, cycle_hz: float, sync_overflow: int) -> list[Write]:
-    """SYNC and interpolation period: 1005, 1006, 1019, 60C2."""
-    writes = []
-    if drive.has(od.SYNC_COB_ID):
-        writes.append(Write(od.SYNC_COB_ID, 0x80, mask=0x7FF))
-    if drive.has(od.SYNC_OVERFLOW) and drive.known(od.SYNC_OVERFLOW) != sync_overflow:
-        # 1019 may only change while 1006 is zero.
-        if drive.has(od.SYNC_PERIOD_US):
-            writes.append(Write(od.SYNC_PERIOD_US, 0))
-        writes.append(Write(od.SYNC_OVERFLOW, sync_overflow))
-    if drive.has(od.SYNC_PERIOD_US):
-        writes.append(Write(od.SYNC_PERIOD_US, round(1e6 / cycle_hz), "the drive does not know the period of SYNC"))
-    return writes + interpolation_writes(drive, cycle_hz)
-
-
 def interpolation_writes(drive: Drive, cycle_hz: float) -> list[Write]:
     """60C2 for a rate, only where it differs: in the drive's own power of ten, else in ms, else as exact as can be."""
     if not drive.has(od.INTERPOLATION_VALUE):
@@ -212,9 +186,9 @@ def _period_s(value: int | None, index: int | None) -> float:
     return 0.0 if value is None else value * 10.0 ** (-3 if index is None else index)
 
 
-def safety_writes(drive: Drive, settings: BusSettings) -> list[Write]:
-    """Watchdogs both ways and what the drive does when ours expires: 1016, 1017, 6007, 605A."""
-    writes = [Write(od.HEARTBEAT_PRODUCER_MS, settings.drive_heartbeat_ms)]
+def reaction_writes(drive: Drive, settings: BusSettings) -> list[Write]:
+    """What the drive does when the host is lost, and how it stops quickly: 6007, 605A."""
+    writes = []
     if drive.has(od.ABORT_CONNECTION):
         other = 5 - settings.abort_option
         writes.append(
@@ -227,42 +201,7 @@ def safety_writes(drive: Drive, settings: BusSettings) -> list[Write]:
         writes.append(
             Write(od.QUICK_STOP_OPTION, settings.quick_stop_option, "how it stops quickly cannot be set", own)
         )
-    if drive.has(od.HEARTBEAT_CONSUMER):
-        consumer = _free_consumer(drive, settings.host_node)
-        said = "the drive does not watch over the host; torque mode is refused"
-        writes.append(Write(consumer, settings.host_node << 16 | settings.watchdog_ms, said))
     return writes
-
-
-def _free_consumer(drive: Drive, host_node: int) -> od.Object:
-    """The entry of 1016 that watches over us already, else the first free one, else the first."""
-    entries = [od.HEARTBEAT_CONSUMER.at(sub) for sub in range(1, (drive.known(od.HEARTBEAT_CONSUMERS) or 1) + 1)]
-    values = {entry: drive.known(entry) for entry in entries}
-    for wanted in (lambda v: v >> 16 & 0x7F == host_node, lambda v: not v & 0xFFFF):
-        for entry, value in values.items():
-            if value is not None and wanted(value):
-                return entry
-    return entries[0]
-
-
-def frame_format_writes(drive: Drive, switch: od.Object | None, *, fd: bool) -> list[Write]:
-    """Classical or CAN FD frames for the PDOs, where the robot file or a known drive has an object that decides it.
-
-    Raises:
-        HardwareError: CAN FD is wanted of a drive that lacks the object.
-    """
-    if switch is None:
-        return []  # the vendor's tool has set it; what comes in other frames is told while cycling
-    if drive.has(switch):
-        return [Write(switch, int(fd))]
-    if fd:
-        raise HardwareError(
-            f"the drive has no {switch.address}: it cannot be told to send its PDOs as CAN FD frames",
-            where=drive.where(switch.address),
-            cause="the drive or its firmware speaks classical CAN only",
-            next_step="leave `fd` out of the robot file's options, or correct this joint's `fd_object`",
-        )
-    return []
 
 
 def window_writes(drive: Drive, settings: JointSettings, position_rad_per_unit: float, *, active: bool) -> list[Write]:
@@ -338,101 +277,3 @@ def set_point_writes(drive: Drive, mode: int) -> list[Write]:
     """A start from which nothing can jump: mode, and all targets but the position zero."""
     targets = (od.TARGET_TORQUE, drive.quirks.typed(od.TORQUE_OFFSET), od.TARGET_VELOCITY)
     return [Write(od.MODE, mode), *(Write(target, 0) for target in targets if drive.has(target))]
-
-
-def pdo_writes(drive: Drive, layout: Layout, joint: str) -> list[Write]:
-    """Mapping and transmission of every PDO; those that are not used are made invalid first."""
-    used = {(pdo.transmit, pdo.number) for pdo in layout.pdos[joint]}
-    writes = []
-    for transmit, number in _ALL:
-        cob_id = od.pdo_cob_id(transmit, number)
-        present = drive.known(cob_id) if (transmit, number) not in used else None
-        if present is not None and not present & _NOT_VALID:
-            writes.append(Write(cob_id, present | _NOT_VALID, mask=_COB_ID_MASK))
-    for pdo in layout.pdos[joint]:
-        writes += _one_pdo(drive, pdo)
-    return writes
-
-
-def _one_pdo(drive: Drive, pdo: Pdo) -> list[Write]:
-    cob_id = od.pdo_cob_id(pdo.transmit, pdo.number)
-    valid = pdo.cob_id | (_NO_REMOTE if pdo.transmit else 0)
-    settings = [Write(od.pdo_type(pdo.transmit, pdo.number), pdo.every)]
-    if pdo.transmit and drive.has(od.pdo_sync_start(pdo.number)):
-        settings.append(Write(od.pdo_sync_start(pdo.number), pdo.start))
-    items = [od.Object(entry.index, entry.sub, entry.type, entry.meaning) for entry in pdo.entries]
-    mapped = mapping(drive, pdo) == [item.mapping for item in items]
-    if mapped and drive.known(cob_id) == valid and all(drive.known(write.item) == write.value for write in settings):
-        return []
-    writes = [Write(cob_id, valid | _NOT_VALID, mask=_COB_ID_MASK), *settings]
-    if not mapped:
-        count = od.pdo_entry_count(pdo.transmit, pdo.number)
-        writes.append(Write(count, 0))
-        for sub, item in enumerate(items, start=1):
-            writes.append(Write(od.pdo_entry(pdo.transmit, pdo.number, sub), item.mapping, maps=item))
-        writes.append(Write(count, len(items)))
-    return [*writes, Write(cob_id, valid, mask=_COB_ID_MASK)]
-
-
-def mapping(drive: Drive, pdo: Pdo) -> list[int]:
-    """The mapping words of a PDO as the drive has them, in order."""
-    count = drive.known(od.pdo_entry_count(pdo.transmit, pdo.number)) or 0
-    words = [drive.known(od.pdo_entry(pdo.transmit, pdo.number, sub)) for sub in range(1, count + 1)]
-    return [word for word in words if word is not None]
-
-
-def frame_of(drive: Drive, pdo: Pdo) -> Frame:
-    """The frame as read back from the drive."""
-    entries = {entry.index << 16 | entry.sub << 8 | entry.type.bits: entry for entry in pdo.entries}
-    return Frame(pdo.cob_id, tuple(entries[word] for word in mapping(drive, pdo)))
-
-
-def joint_writes(
-    drive: Drive,
-    joint: JointSetup,
-    scale: Scale,
-    facts: Facts,
-    settings: JointSettings,
-    bus: BusSettings,
-    layout: Layout,
-) -> list[Write]:
-    """Everything but the limits and the velocity unit, in order.
-
-    Raises:
-        HardwareError: the drive cannot be used so.
-    """
-    return [
-        *timing_writes(drive, layout.cycle_hz, layout.sync_overflow),
-        *safety_writes(drive, bus),
-        *frame_format_writes(drive, settings.fd_object, fd=layout.fd),
-        *window_writes(drive, settings, scale.position_rad, active=joint.name in layout.active),
-        *set_point_writes(drive, facts.position_mode),
-        *pdo_writes(drive, layout, joint.name),
-    ]
-
-
-def lesson(drive: Drive, refused: RefusedByDrive) -> bool:
-    """Learn from this drive's refusal of a nice-to-have: True where the layout can be planned again without it.
-
-    An object that cannot be mapped is left out where it can be; a drive that takes few transmission types reports on
-    every SYNC.
-    """
-    item, quirks = refused.item, drive.quirks
-    if item is None or refused.where != drive.where(item.address):
-        return False
-    if 0x1800 <= item.index < 0x1A00 and item.sub == 2 and quirks.sends_on(10):
-        drive.quirks = replace(quirks, transmission_types=(1, 253, 255))
-        return True
-    mapped = (refused.value >> 16, refused.value >> 8 & 0xFF)
-    if (
-        item.sub
-        and item.index & 0xFA00 in (0x1600, 0x1A00)
-        and mapped in _OPTIONAL
-        and mapped not in quirks.not_mappable
-    ):
-        drive.quirks = replace(quirks, not_mappable=quirks.not_mappable | {mapped})
-        return True
-    return False
-
-
-_OPTIONAL = {(item.index, item.sub) for item in (od.ERROR_CODE, od.TORQUE_OFFSET, od.TARGET_TORQUE, od.TARGET_VELOCITY)}

@@ -8,8 +8,9 @@ from collections.abc import Collection, Mapping, Sequence
 import can
 import canopen
 
-from frictid_drivers.cia402 import configure
+from frictid_drivers.cia402 import communication, configure
 from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.access import Drive, RefusedByDrive, Write
 from frictid_drivers.cia402.bus_load import BusLoad, highest_rate_hz
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE
 from frictid_drivers.cia402.facts import Facts, read_facts
@@ -18,7 +19,7 @@ from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
 from frictid_drivers.cia402.network import Node, Wire
 from frictid_drivers.cia402.quirks import Catalogue, merged, quirks_of_eds
 from frictid_drivers.cia402.scale import Scale, raise_on_error, scale_of
-from frictid_drivers.cia402.sdo import Drive, RefusedByDrive
+from frictid_drivers.cia402.sdo import SdoDrive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_hil.errors import HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
@@ -73,7 +74,7 @@ class Fleet:
         for joint in setup.joints:
             node = Node(joint.address, empty)
             self.wire.add_node(node)
-            self.drives[joint.name] = Drive(node, joint.name, settings.sdo_timeout_s)
+            self.drives[joint.name] = SdoDrive(node, joint.name, settings.sdo_timeout_s)
             self.wire.subscribe(HEARTBEAT_BASE + joint.address, self._on_heartbeat)
         catalogue = Catalogue(setup.folder)
         self.facts: dict[str, Facts] = {}
@@ -191,7 +192,7 @@ class Fleet:
             try:
                 frames = tuple(self._configure_joint(joint, layout) for joint in self._setup.joints)
             except RefusedByDrive as refused:
-                if not any(configure.lesson(drive, refused) for drive in self.drives.values()):
+                if not any(communication.lesson(drive, refused) for drive in self.drives.values()):
                     raise
                 continue
             window_ns = round(self._settings.reply_window * 1e9 / cycle_hz)
@@ -212,12 +213,26 @@ class Fleet:
         limits = (joint.max_torque_nm, joint.position_min_rad, joint.position_max_rad)
         try:
             writes, tighter = configure.limit_writes(drive, settings, scale, *limits)
-            writes += configure.joint_writes(drive, joint, scale, facts, settings, self._settings, layout)
+            writes += self._writes(joint, scale, layout)
             fatal, lost = drive.foresee([*units, *writes])
             configure.refuse_other_period(drive, layout.cycle_hz, lost)
         except HardwareError as error:
             return findings, [error.what], []
         return findings, fatal, [*tighter, *lost]
+
+    def _writes(self, joint: JointSetup, scale: Scale, layout: Layout) -> list[Write]:
+        """Everything but the limits and the velocity unit, in order; `check` and ``configure`` use the same."""
+        drive, settings = self.drives[joint.name], self._joint_settings[joint.name]
+        return [
+            *communication.sync_writes(drive, layout.cycle_hz, layout.sync_overflow),
+            *configure.interpolation_writes(drive, layout.cycle_hz),
+            *configure.reaction_writes(drive, self._settings),
+            *communication.heartbeat_writes(drive, self._settings),
+            *communication.frame_format_writes(drive, settings.fd_object, fd=layout.fd),
+            *configure.window_writes(drive, settings, scale.position_rad, active=joint.name in layout.active),
+            *configure.set_point_writes(drive, self.facts[joint.name].position_mode),
+            *communication.pdo_writes(drive, layout, joint.name),
+        ]
 
     def travel_rad(self, joint: JointSetup) -> tuple[float, float] | None:
         """Between which positions the drive lets this joint move once configured; None where it sets no limits."""
@@ -267,12 +282,12 @@ class Fleet:
             raise_on_error(findings)
             self.scales[joint.name] = scale
         scale = self.scales[joint.name]
-        notes += drive.apply(configure.joint_writes(drive, joint, scale, facts, settings, self._settings, layout))
+        notes += drive.apply(self._writes(joint, scale, layout))
         configure.refuse_other_period(drive, layout.cycle_hz, notes)
         target = od.INTERPOLATED_TARGET if facts.position_mode == od.INTERPOLATED else od.TARGET_POSITION
         drive.write_blind(target, drive.read(od.POSITION_ACTUAL))
         self.notes[joint.name] = notes
-        frames = {(pdo.transmit, pdo.number): configure.frame_of(drive, pdo) for pdo in layout.pdos[joint.name]}
+        frames = {(pdo.transmit, pdo.number): communication.frame_of(drive, pdo) for pdo in layout.pdos[joint.name]}
         return JointFrames(
             name=joint.name,
             node=joint.address,

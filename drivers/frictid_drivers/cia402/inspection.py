@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.access import Drive
 from frictid_drivers.cia402.bus_load import BusLoad
 from frictid_drivers.cia402.configure import NEEDED
 from frictid_drivers.cia402.facts import Facts
@@ -13,7 +14,6 @@ from frictid_drivers.cia402.fleet import Fleet
 from frictid_drivers.cia402.known_settings import Effect, read_settings, timing_of
 from frictid_drivers.cia402.layout import Layout
 from frictid_drivers.cia402.scale import Scale, scale_of, velocity_unit_rad_s
-from frictid_drivers.cia402.sdo import Drive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_drivers.cia402.state import DriveState, drive_state
 from frictid_hil.plan.mode import Mode

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from frictid_drivers.cia402.access import Drive
 from frictid_drivers.cia402.objects import IntegerType, Object
-from frictid_drivers.cia402.sdo import Drive
 from frictid_hil.protocol.driver import Timing
 
 

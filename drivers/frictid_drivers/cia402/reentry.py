@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from frictid_drivers.cia402 import configure
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.sdo import Drive
+from frictid_drivers.cia402.access import Drive
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, FAULT_RESET, DriveState, drive_state
 from frictid_hil.errors import HardwareError
 from frictid_hil.protocol.driver import Finding, Severity
