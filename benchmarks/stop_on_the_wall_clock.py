@@ -82,8 +82,8 @@ def planned_travel() -> tuple[float, float]:
     return min(low, here_rad - UNITS_RAD), max(high, here_rad + UNITS_RAD)
 
 
-def one_run(place: Path, wait_s: float, travel_rad: tuple[float, float]) -> Stopped:
-    """Start, listen, interrupt after ``wait_s``, listen until the bus is gone."""
+def one_run(place: Path, wait_s: float, travel_rad: tuple[float, float]) -> Stopped | None:
+    """Start, listen, interrupt after ``wait_s``, listen until the bus is gone; None where the run ended before that."""
     channel = f"stop-{os.getpid()}-{place.name}"
     command = [_program(), *ASKED, "--realtime", "--yes", "--bus", f"virtual:{channel}", "--out", str(place)]
     run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -106,6 +106,8 @@ def one_run(place: Path, wait_s: float, travel_rad: tuple[float, float]) -> Stop
     finally:
         run.kill()
         bus.shutdown()
+    if asked_s == math.inf:
+        return None
     return judged(times_s, positions_rad, asked_s, travel_rad, exit_code)
 
 
@@ -145,12 +147,14 @@ def main() -> None:
     asked = parser.parse_args()
     # A shell lets what it starts in the background ignore SIGINT; the runs shall hear it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    dice, travel_rad, runs = random.Random(asked.seed), planned_travel(), []
+    dice, travel_rad = random.Random(asked.seed), planned_travel()
+    runs: list[Stopped] = []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(asked.runs):
             wait_s = dice.uniform(0.1, LATEST_S)
-            runs.append(one_run(Path(folder) / str(number), wait_s, travel_rad))
-            print(f"after {wait_s:5.2f} s: {runs[-1]}", file=sys.stderr, flush=True)
+            stopped = one_run(Path(folder) / str(number), wait_s, travel_rad)
+            print(f"after {wait_s:5.2f} s: {stopped or 'had ended by itself'}", file=sys.stderr, flush=True)
+            runs += [stopped] if stopped else []
     text = told(runs, f"python benchmarks/stop_on_the_wall_clock.py --runs {asked.runs} --seed {asked.seed}")
     print(text)
     if asked.docs:
