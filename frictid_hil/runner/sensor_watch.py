@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 from frictid_hil.protocol.driver import Feedback
 from frictid_hil.units import format_angle, format_torque
@@ -44,6 +45,27 @@ def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, per
     return min(seen_rad, whole_rad), max(seen_rad, whole_rad)
 
 
+class _Row(NamedTuple):
+    """One report.
+
+    Attributes:
+        t_ns: run time of the row in which it came.
+        position_rad: as reported.
+        velocity_rad_s: as reported.
+        least_rad: the way since the watch began, by the velocity, where the joint stood whenever nobody saw it.
+        most_rad: the same where it went on whenever nobody saw it.
+        late_s: how much older than its row it may be. A report that comes after a silence may be the first one of
+            those that were missed; for as long as the silence was, the next ones may be old as well.
+    """
+
+    t_ns: int
+    position_rad: float
+    velocity_rad_s: float
+    least_rad: float
+    most_rad: float
+    late_s: float
+
+
 class SensorWatch:
     """Judges one joint, report by report.
 
@@ -57,8 +79,7 @@ class SensorWatch:
 
     def restart(self) -> None:
         """Forget what was reported: the joint stands, or another mode begins."""
-        self._rows: deque[tuple[int, float, float, float, float]] = deque()
-        self._least_rad = self._most_rad = 0.0
+        self._rows: deque[_Row] = deque()
         self._torque_nm = math.nan
         self._seen_rad = [0.0, 0.0]
 
@@ -73,36 +94,36 @@ class SensorWatch:
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
         if not rows:
-            rows.append((t_ns, position, self._least_rad, self._most_rad, velocity))
+            rows.append(_Row(t_ns, position, velocity, 0.0, 0.0, 0.0))
             return ""
-        last_ns, last_rad, _, _, last_rad_s = rows[-1]
-        step_s = (t_ns - last_ns) * 1e-9
+        last = rows[-1]
+        step_s = (t_ns - last.t_ns) * 1e-9
         if step_s <= 0.0:
             return ""
         if step_s > _WINDOW_S:
             self.restart()
             return ""
-        jump_rad = position - last_rad
-        if not abs(jump_rad) <= _JUMP_SHARE * most_rad_s * step_s + _JUMP_RAD:
+        jump_rad = position - last.position_rad
+        if not abs(jump_rad) <= _JUMP_SHARE * most_rad_s * (step_s + last.late_s) + _JUMP_RAD:
             return f"position jumped by {format_angle(jump_rad)} within {step_s * 1e3:.3g} ms"
-        least_rad, most_rad = velocity_says(last_rad_s, velocity, step_s, self._period_s)
-        self._least_rad += least_rad
-        self._most_rad += most_rad
-        rows.append((t_ns, position, self._least_rad, self._most_rad, velocity))
-        while rows[1][0] <= t_ns - _WINDOW_S * 1e9:
+        least_rad, most_rad = velocity_says(last.velocity_rad_s, velocity, step_s, self._period_s)
+        late_s = max(step_s - self._period_s, last.late_s - step_s, 0.0)
+        rows.append(_Row(t_ns, position, velocity, last.least_rad + least_rad, last.most_rad + most_rad, late_s))
+        while rows[1].t_ns <= t_ns - _WINDOW_S * 1e9:
             rows.popleft()
-        if t_ns - rows[0][0] >= 0.9e9 * _WINDOW_S and (wrong := self._disagreement()):
+        if t_ns - rows[0].t_ns >= 0.9e9 * _WINDOW_S and (wrong := self._disagreement()):
             return wrong
         return self._frozen(report.torque_nm, velocity, jump_rad) if held else ""
 
     def _disagreement(self) -> str:
         """What position and velocity tell differently of the window; empty where they agree."""
-        rows = self._rows
-        _, first_rad, first_least_rad, first_most_rad, first_rad_s = rows[0]
-        _, position, least_rad, most_rad, velocity = rows[-1]
-        went_rad = position - first_rad
-        said_rad = min(max(went_rad, least_rad - first_least_rad), most_rad - first_most_rad)
-        changed_rad_s = max(abs(velocity - first_rad_s), abs(velocity - rows[len(rows) // 2][4]))
+        first, middle, last = self._rows[0], self._rows[len(self._rows) // 2], self._rows[-1]
+        went_rad = last.position_rad - first.position_rad
+        before_rad = first.velocity_rad_s * first.late_s  # the first report may be that much older
+        least_rad = last.least_rad - first.least_rad + min(before_rad, 0.0)
+        most_rad = last.most_rad - first.most_rad + max(before_rad, 0.0)
+        said_rad = min(max(went_rad, least_rad), most_rad)
+        changed_rad_s = max(abs(last.velocity_rad_s - one.velocity_rad_s) for one in (first, middle))
         allowed_rad = _OFF_SHARE * max(abs(went_rad), abs(said_rad)) + _OFF_S * changed_rad_s + _OFF_RAD
         if abs(went_rad - said_rad) <= allowed_rad:
             return ""

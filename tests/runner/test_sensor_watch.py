@@ -3,7 +3,9 @@
 import itertools
 import math
 import random
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from frictid_hil.protocol.driver import Feedback
@@ -43,6 +45,29 @@ def test_a_computer_that_stalls_is_no_wrong_encoder(seed, moves_on):
 
 def test_a_computer_that_is_late_in_every_cycle_is_no_wrong_encoder_either():
     assert verdict(reports(1000, lambda n: 2.0)) == ""
+
+
+def burst(silent, speed=110.0, cycles=1000, every=150):
+    """Drives whose answers do not come for some cycles, then all at once: the first row shows the oldest of them."""
+    rates = [speed * DEG * math.sin(math.pi * n / cycles) for n in range(cycles)]
+    positions = np.cumsum(rates) * 0.001
+    for n in range(cycles):
+        since = n % every
+        if since < silent:
+            continue
+        of = n - silent if since == silent and n > silent else n
+        yield Feedback(t_ns=n * MS, position_rad=positions[of], velocity_rad_s=rates[of], torque_nm=float(n))
+
+
+@pytest.mark.parametrize("silent", [2, 9, 20, 30, 60])
+def test_answers_that_come_late_and_all_at_once_are_no_jump(silent):
+    assert verdict(burst(silent)) == ""
+
+
+def test_a_jump_without_a_silence_before_it_is_told():
+    samples = list(reports(1000))
+    samples[500:] = [replace(one, position_rad=one.position_rad + 0.9 * DEG) for one in samples[500:]]
+    assert "position jumped by 0.9" in verdict(samples)
 
 
 @pytest.mark.parametrize("lie", [{"went": 0.0}, {"said": 0.0}, {"said": 2.0}, {"said": -1.0}, {"went": 0.5}])
