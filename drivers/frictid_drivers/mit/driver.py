@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from frictid_drivers.mit import adapters
 from frictid_drivers.mit.actuator import Actuator, Reader
 from frictid_drivers.mit.families import Motor, Parameter, RobStride
 from frictid_drivers.mit.frames import FULL, TWELVE, Motion, step
@@ -425,10 +426,15 @@ class MitDriver:
             can_id, data = settings.family.command(settings.motor, Motion())
             cycle += [(can_id, len(data)), (can_id, 8)]
         most_hz = highest_rate_hz(cycle, self._bus_settings.bitrate)
-        if self._bus_settings.tty_baudrate and self.setup.bus.startswith("slcan:"):
+        interface, baud = self.setup.bus.partition(":")[0], self._bus_settings.tty_baudrate
+        letters = 0.0
+        if interface == "slcan" and baud:
             # A real UART: a letter, identifier, length and data in hex, carriage return; 10 bits each.
             letters = sum(27 if can_id >> 31 else 22 for can_id, _ in cycle) / 2
-            most_hz = min(most_hz, float(int(self._bus_settings.tty_baudrate / 10.0 / letters)))
+        elif interface in adapters.LINE_BYTES:
+            letters, baud = adapters.LINE_BYTES[interface] * len(cycle) / 2, baud or adapters.BAUD
+        if letters:
+            most_hz = min(most_hz, float(int(baud / 10.0 / letters)))
         return most_hz
 
 
