@@ -1,8 +1,8 @@
-"""What commands a joint that is compensated: gravity, a low-gain PD, friction compensation - as plain values.
+"""The control law of a compensated joint as plain values: gravity, a low-gain PD and friction compensation.
 
-Section 5 of the paper in one value, ``ControlLaw``, and the two motions of a plan that need it: ``Probe`` asks whether
-the profile still describes the joint, ``Compensated`` runs the law. They print and cross process borders like the rest
-of the plan; ``runner.compensation`` turns a law into torque, cycle by cycle.
+``ControlLaw`` holds section 5 of the paper. Two motions of a plan need it: ``Probe`` asks whether the profile still
+describes the joint, and ``Compensated`` runs the law. Both can be printed and sent to another process like the rest of
+the plan. ``runner.compensation`` turns a law into torque, cycle by cycle.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class Gravity:
         return self.cos_nm * math.cos(position_rad) + self.sin_nm * math.sin(position_rad) + self.bias_nm
 
     def doubt_nm(self, position_rad: float) -> float:
-        """By how much it may be wrong at one position, half of a 95 % interval.
+        """By how much this torque may be wrong at one position, as half of a 95 % interval.
 
-        Over a short travel a bias and the top of a cosine look alike. What the one got of the other changes nothing
-        there, and is missing elsewhere: ``unsure_nm (cos(spread) - cos(q - centre))``.
+        Over a short travel a bias and the top of a cosine look alike, and part of one may be identified as the other.
+        That changes nothing within the travel and is wrong elsewhere: ``unsure_nm (cos(spread) - cos(q - centre))``.
         """
         away = math.cos(self.spread_rad) - math.cos(position_rad - self.centre_rad)
         return self.unsure_nm * away if away > 0.0 else 0.0
@@ -125,10 +125,10 @@ class ControlLaw:
     slew_nm_per_s: float
 
     def friction_share(self, position_rad: float) -> float:
-        """Of friction compensation that is given at one position, 1 where gravity is as good as known.
+        """The share of friction compensation that is given at one position; 1 where gravity is well known.
 
-        1 - R of F_0 is left to stop a free joint. Where gravity may be wrong, that much less friction is given, so that
-        as much is left in the worst case.
+        A share 1 - R of F_0 is left uncompensated, so that a free joint stops. Where gravity may be wrong, the
+        compensation is lowered by that error, so that as much friction is left in the worst case.
         """
         friction = self.friction
         if friction is None:
@@ -231,7 +231,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Compensated:
-    """A stretch in which a control law commands the joint, closed over its own feedback.
+    """A stretch in which a control law commands the joint from the feedback of the joint.
 
     Attributes:
         name: ``stand``, ``hand``, ``track``, ... with the mode behind it.

@@ -77,9 +77,9 @@ def _outside_workspace(plan: Plan, setup: RobotSetup) -> str:
 
 
 def postures_rad(plan: Plan, setup: RobotSetup) -> Iterator[Array]:
-    """Where all joints are meant to be, stretch by stretch, shape (k, joints in the order of the robot file).
+    """The planned postures, stretch by stretch, shape (k, joints in the order of the robot file).
 
-    Joints that move at the same time are taken at the same time; a joint that moves alone, all along its travel.
+    Joints that move together are taken at the same moments. A joint that moves alone is taken along its whole travel.
     """
     columns = {joint.name: at for at, joint in enumerate(setup.joints)}
     standing = np.array([joint.locked_position_rad for joint in setup.joints])

@@ -1,4 +1,4 @@
-"""The plan: everything that will move, where to, how fast and for how long - frozen before anything does.
+"""The plan says what will move, where to, how fast and for how long. It is frozen before anything moves.
 
 A plan is a list of joints, each with its motions in order. A motion knows its set-points as a function of its own time,
 so that the same object is checked against limits, printed for the person who says yes, streamed to the drive, and read
@@ -19,7 +19,7 @@ from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.plan.setup import JointSetup
 
 COUPLING = "coupling"
-"""Name of the motion that shows how much joints that move together drive each other."""
+"""Name of the motion that shows how strongly joints that move together act on each other."""
 SKEW = "skew"
 """Name of the motions that show by how much the torque is late."""
 REHEARSAL = "rehearsal"
@@ -287,7 +287,7 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class JointPlan:
-    """What one joint will do while others are locked, or do the same in step with it.
+    """What one joint will do while the others are locked or move in step with it.
 
     Attributes:
         joint: name of the joint.
@@ -346,7 +346,7 @@ class Plan:
 
 
 def stretch_name(entries: Sequence[JointPlan]) -> str:
-    """What marks and progress call joints that move at the same time: ``1``, or ``0, 1, 2``."""
+    """The name in marks and progress of joints that move at the same time: ``1``, or ``0, 1, 2``."""
     return ", ".join(entry.joint for entry in entries)
 
 
@@ -402,9 +402,9 @@ class Expected:
 
 
 _ENDLESS_S = 10.0
-"""As much of an endless motion is looked at."""
+"""How much of an endless motion is checked."""
 _CORNER_S = 0.1
-"""A motion of straight lines only is stopped within this, where nothing is known of the joint's torque."""
+"""Time in which a motion of straight lines is stopped, where the inertia of the joint is not known."""
 _STOPPING_TORQUE = 0.8
 """Share of a joint's maximum torque that a stop may ask for."""
 
@@ -445,7 +445,7 @@ def joint_plan(
 
 
 def _torque_deceleration_rad_s2(joint: JointSetup, expected: Expected | None, coupling_nm: float) -> float:
-    """What torque and inertia allow beside the weight; friction, which helps, is not counted on."""
+    """The deceleration that torque and inertia allow against the weight. Friction would help and is left out."""
     if expected is None or expected.inertia_kg_m2 <= 0.0:
         return 0.0
     left_nm = _STOPPING_TORQUE * joint.max_torque_nm - abs(expected.gravity_nm) - coupling_nm

@@ -1,7 +1,7 @@
-"""The box that an arm may not leave: checked point by point along the chain of its joints.
+"""The box that an arm may not leave. Every joint of the chain is checked, and the tool.
 
-Links are taken as lines from joint to joint. A box is convex, so that a line is inside where its ends are; what a link
-is thicker than a line is the box's clearance.
+A link is taken as the line from joint to joint. The box is convex, so that a line is inside if both of its ends are.
+The thickness of the links has to be part of the clearance of the box.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Outside:
     bound_m: float
 
     def described(self, names: Sequence[str]) -> str:
-        """In words: which point, how far beyond which side, at which joint angles.
+        """Say which point is how far beyond which side, and at which joint angles.
 
         Args:
             names: of the joints, in the order of the chain.

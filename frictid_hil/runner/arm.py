@@ -1,4 +1,4 @@
-"""The whole arm around the joints that move: seen where it should be, powered, locked, and brought to rest again."""
+"""The whole arm around the joints that move: it is verified, gets power, is locked, and is brought to rest again."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Arm:
         self._care = care
 
     def verify(self, planned_rad: Mapping[str, float]) -> None:
-        """Before anything gets power: every joint reports and stands where it should, and the interlock is closed.
+        """Check, before anything gets power, that every joint stands where it should and that the interlock is closed.
 
         Raises:
             SafetyAbort: naming the joint.
@@ -57,7 +57,7 @@ class Arm:
         self._verify_interlock()
 
     def enable(self) -> None:
-        """Power on every joint, each held where it stands.
+        """Give power to every joint; each one is held where it stands.
 
         Raises:
             SafetyAbort: a joint does not take it.
@@ -84,7 +84,7 @@ class Arm:
     def prove_units(
         self, moving: Collection[int], planned_rad: Mapping[str, float], resolution_rad: Mapping[str, float]
     ) -> None:
-        """Every joint that is going to move, one by one, by a few encoder steps and by 0.5 deg, the others locked.
+        """Move each joint of the plan by a few encoder steps and by 0.5 deg while all others are locked.
 
         Raises:
             SafetyAbort: command, position and velocity of a joint tell of different motions.
@@ -99,7 +99,7 @@ class Arm:
             loop.run({index: UnitProof(joint, here_rad, resolution, droop, loop.period_s)})
 
     def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
-        """Every other joint at its planned place, locked there; and all of them seen to stand.
+        """Bring every other joint to its planned place, lock it there, and wait until all of them stand.
 
         Raises:
             SafetyAbort: one does not come to rest.
@@ -118,7 +118,7 @@ class Arm:
         self._supervisor.watch(list(moving), Mode.POSITION, locked_at)
 
     def power_off(self) -> None:
-        """Power off on every joint, and seen to be."""
+        """Switch off the power of every joint, and wait until the drives report it."""
         self._settling()
         for joint in self._joints:
             self._driver.unlock(joint.name)
@@ -130,7 +130,7 @@ class Arm:
         )
 
     def stop(self) -> None:
-        """Quick stop, a moment of cycles so that it is seen, power off. Never hides the error that led here."""
+        """Stop quickly, cycle until the drives have followed, switch off. The error that led here is never hidden."""
         loop = self._loop
         self._driver.quick_stop()
         try:
@@ -149,7 +149,7 @@ class Arm:
             set_point.position_rad = report.position_rad
 
     def _verify_interlock(self) -> None:
-        """Closed before anything gets power, watched in every cycle from here on."""
+        """The interlock must be closed now, and is watched in every cycle from here on."""
         interlock = self._care.interlock
         if interlock is None:
             return
@@ -160,12 +160,12 @@ class Arm:
         self._supervisor.arm_interlock(self._loop.feedback)
 
     def _settling(self) -> None:
-        """All joints stand near their set-points, whether or not they have power yet."""
+        """Watch all joints as ones that must stand near their set-points, with or without power."""
         at_rad = {index: set_point.position_rad for index, set_point in enumerate(self._loop.set_points)}
         self._supervisor.watch(None, Mode.POSITION, {}, at_rad)
 
     def _lock(self, moving: Collection[int]) -> dict[int, float]:
-        """Lock the others; where each of them is locked."""
+        """Lock all joints but these; returns where each of them is locked, by index."""
         locked_at: dict[int, float] = {}
         for index, joint in enumerate(self._joints):
             if index in moving:

@@ -1,4 +1,4 @@
-"""One joint on a controller that runs whole motions by itself: job by job, every sample supervised once it is fetched.
+"""One joint on a controller that runs whole motions by itself. Every sample is supervised once it has been fetched.
 
 ::
 
@@ -8,7 +8,7 @@
         once it stands    the rest of its recording is fetched, and all of it passed through the supervisor
     power off
 
-The controller keeps travel, step and torque within the job's own bounds meanwhile, and stops when it hears nothing.
+Meanwhile the controller keeps travel, step and torque within the bounds of the job. It stops when it hears nothing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _COLUMNS = ("position_rad", "velocity_rad_s", "torque_nm", "position_command_rad
 
 
 class BatchDriver(Batched, Driver, Protocol):
-    """What this module needs of a driver."""
+    """The parts of a driver that this module calls."""
 
 
 class BatchRunner:
@@ -87,7 +87,7 @@ class BatchRunner:
         self._count = 0
 
     def run(self, session: int, plan: JointPlan) -> tuple[JointRun, int]:
-        """The whole plan of one joint; also the run time at its end, in ns.
+        """Run the whole plan of one joint; returns its run, and the run time at its end in ns.
 
         Raises:
             SafetyAbort: by the supervisor, or by the controller.
@@ -129,16 +129,16 @@ class BatchRunner:
     # -- one job ------------------------------------------------------------------------------------------------
 
     def _jobs(self, here_rad: float, motions: Sequence[Motion]) -> list[list[Motion]]:
-        """The motions, with an approach where they begin elsewhere, cut behind the rehearsal.
+        """Cut the motions into jobs behind the rehearsal, with an approach where they begin elsewhere.
 
-        What is measured stays in one job: no transfer, and no standing still, comes in between.
+        Everything that is measured stays in one job, so that neither a transfer nor a pause comes in between.
         """
         every = from_here(here_rad, motions, self._care.approach_rad_s)
         cut = max((k + 1 for k, motion in enumerate(every) if motion.name == REHEARSAL), default=0)
         return [job for job in (every[:cut], every[cut:]) if job]
 
     def _job(self, index: int, motions: Sequence[Motion], at_rad: Sequence[float]) -> list[Mark]:
-        """Run it, keep what it recorded, and judge that; the marks of its motions."""
+        """Run a job, keep what it recorded, and judge the samples; returns the marks of its motions."""
         if self._stop.level:
             raise Interrupted("stopped on request before the motion began")
         driver, joint, normal = self._driver, self._joints[index], self._limits[index]
@@ -181,7 +181,7 @@ class BatchRunner:
         return marks
 
     def _keep(self, index: int, samples: Mapping[str, Any]) -> None:
-        """Into the ring, and from there to disk, before anything else is asked of the controller."""
+        """Write the samples to disk before anything else is asked of the controller."""
         times_ns, nan = samples["time_ns"] + self._offset_ns, float("nan")
         for time_ns, position, velocity, torque, command in zip(times_ns.tolist(), *_rows(samples), strict=True):
             self._samples.append(time_ns, position, velocity, torque, command, 0.0, nan, nan, 0, index, 0)
@@ -189,7 +189,7 @@ class BatchRunner:
         self._count += len(times_ns)
 
     def _marks(self, motions: Sequence[Motion], columns: Mapping[str, Any]) -> list[Mark]:
-        """Of the motions that are there as a whole."""
+        """The marks of the motions that were recorded from beginning to end."""
         if not columns:
             return []
         end_of_all_ns = int(columns["time_ns"][-1]) + self._offset_ns
@@ -201,7 +201,7 @@ class BatchRunner:
         ]
 
     def _pass_on(self, index: int, columns: Mapping[str, Any]) -> None:
-        """Every fetched sample through the supervisor."""
+        """Show every fetched sample to the supervisor."""
         self._supervisor.watch(index, Mode.POSITION, {})
         report = Feedback(state=JointState.ENABLED, mode=Mode.POSITION, valid=True)
         reports, set_points = [report for _ in self._names], [SetPoint() for _ in self._names]
@@ -218,7 +218,7 @@ class BatchRunner:
             self._supervisor.check(set_points, reports)
 
     def _judge_signs(self, name: str, columns: Mapping[str, Any], rehearsal: Mark) -> None:
-        """Friction must oppose motion."""
+        """Judge by the rehearsal whether friction opposes motion."""
         times_ns = columns["time_ns"] + self._offset_ns
         inside = (times_ns >= rehearsal.start_ns) & (times_ns < rehearsal.end_ns)
         watch, set_point = SignWatch(_Endless(), name, math.inf), SetPoint()
@@ -229,7 +229,7 @@ class BatchRunner:
         watch.judge()
 
     def _look(self, held: Mapping[int, float], reports: Sequence[Feedback]) -> None:
-        """Every joint but the one that runs stands under power where it is held."""
+        """Check that every joint but the one that runs stands under power where it is held."""
         self._supervisor.watch(None, Mode.POSITION, dict(held))
         self._supervisor.check([SetPoint() for _ in reports], reports)
 
@@ -245,7 +245,7 @@ class BatchRunner:
                 )
 
     def _see_standstill(self) -> list[float]:
-        """Where every joint stands, once two looks in a row agree."""
+        """Wait until two readings in a row agree; returns where every joint stands."""
         before = self._driver.standing()
         for _ in range(_LOOKS_AT_STANDSTILL):
             here = self._driver.standing()

@@ -1,4 +1,4 @@
-"""A control law in force: once per cycle from what the joint reports to the torque it is given.
+"""A control law in force: once per cycle it turns the report of a joint into the torque for that joint.
 
 ``LawInForce`` holds the state of one law (friction spring, last torque); ``LawSource`` feeds it with a path and writes
 the set-point of the drive's mode; ``FadeOut`` ends it: friction compensation fades, gravity and the reference stay.
@@ -48,7 +48,7 @@ class LawInForce:
         self._reported_ns = 0
 
     def update(self, report: Feedback, reference: Reference) -> float:
-        """Torque for the coming cycle, N m: clamped, and near the last one."""
+        """The torque for the coming cycle in N m. It is clamped, and its change since the last cycle is limited."""
         law = self.law
         position = report.position_rad
         increment = position - self._position_rad
@@ -96,7 +96,7 @@ class LawSource:
         self._path = _references(motion, period_s)
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """The coming cycle of the path."""
+        """Write the set-point of the coming cycle; False at the end of the path."""
         reference = next(self._path, None)
         if reference is None:
             return False
@@ -105,7 +105,7 @@ class LawSource:
         return True
 
     def write(self, feedback: Feedback, set_point: SetPoint) -> None:
-        """The law's torque at the present reference, in the way the drive's mode takes it."""
+        """Write the torque of the law at the present reference into the fields that the drive's mode uses."""
         torque_nm = self.in_force.update(feedback, self.reference)
         position_rad, velocity_rad_s = self.reference
         # In torque mode nobody follows it; it is recorded beside the measured position.
@@ -133,7 +133,7 @@ class FadeOut:
         self._done = 0
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """One step less."""
+        """Give one step less of the compensation; False once nothing is left of it."""
         if self._done >= self._cycles:
             return False
         self._done += 1

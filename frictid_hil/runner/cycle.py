@@ -1,8 +1,8 @@
-"""The cyclic loop: one exchange per period on absolute deadlines, every sample supervised and recorded.
+"""The cyclic loop exchanges set-points and reports once per period, and supervises and records every sample.
 
-Nothing here allocates per cycle beyond small floats, waits for a file, or catches up by bursts: a cycle that comes late
-is counted, and cycles that were missed altogether are skipped on the clock while the set-points go on one by one, so
-that the joint never sees a jump.
+Deadlines are absolute. Nothing here allocates more than small floats per cycle, and nothing waits for a file. The loop
+never catches up by bursts: a cycle that comes late is counted, and missed deadlines are skipped on the clock. The
+set-points still go on one by one, so that the joint never sees a jump.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ GO_ON = "continue with `--resume RUN`, or start again"
 
 
 class StopRequest(Protocol):
-    """Who may ask the loop to end: Ctrl-C, SIGTERM, a vanished parent."""
+    """Asks the loop to end, after Ctrl-C, SIGTERM or the loss of the parent process."""
 
     @property
     def level(self) -> int:
@@ -54,7 +54,7 @@ class Stream:
         self._next = iter(zip(positions_rad, speeds, strict=True))
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """The next position of the list; the last one stands."""
+        """Write the next position of the list; the last one stays in force."""
         following = next(self._next, None)
         if following is None:
             set_point.velocity_rad_s = 0.0
@@ -228,10 +228,10 @@ class CyclicLoop:
             self.cycle()
 
     def go_on(self) -> None:
-        """Nothing, unless a stop was asked for.
+        """Return, unless a stop was asked for.
 
         Raises:
-            Interrupted: it was.
+            Interrupted: a stop was asked for.
         """
         if self._stop.level:
             raise Interrupted("stopped on request", next_step=GO_ON)
@@ -278,7 +278,7 @@ class CyclicLoop:
     def _stopping_path(
         self, moving: Sequence[tuple[int, SetPointSource, SetPoint]], previous_rad: Sequence[float]
     ) -> list[list[float]]:
-        """Set-points of the stop; none where only a quick stop is fast enough."""
+        """The set-points of the stop; an empty list where only a quick stop is fast enough."""
         path = [list(previous_rad), [set_point.position_rad for _, _, set_point in moving]]
         if path[0] == path[1]:
             return []

@@ -12,7 +12,7 @@ from frictid_hil.recording.samples import Mark
 
 @dataclass(frozen=True, slots=True)
 class Preflight:
-    """Hardware was reached and read; nothing has moved or been written yet.
+    """The hardware was reached and read. Nothing has moved and nothing was written yet.
 
     Attributes:
         identities: per joint name.

@@ -1,6 +1,6 @@
 """The interlock: a digital input that says that the cell is closed and empty, read from the drive that it is wired to.
 
-It is a check of ours on top of the robot's own safety circuit, and replaces no part of that.
+This check comes on top of the safety circuit of the robot and replaces no part of it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class Interlock:
         joint: whose drive reports it.
         bit: of 60FD.
         closed_when: level of the bit when the cell is closed.
-        silence_s: a report older than this is as good as none.
+        silence_s: oldest report that still counts.
     """
 
     joint: str

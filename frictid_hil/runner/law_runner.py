@@ -1,11 +1,11 @@
-"""One joint between position control and control laws, without a jump either way.
+"""Takes one joint from position control into a control law and back, without a jump.
 
 ::
 
     position control --enter--> law (torque mode, or an offset on top) --leave--> position control, where it stands
 
-A joint goes over standing still, with the torque that holds it; it comes back to the position loop with compensation
-faded out. Consecutive stretches under the same law keep its state.
+The joint stands still when it changes over, and the law begins with the torque that holds it. The compensation is faded
+out before the joint returns to its position loop. Consecutive stretches under the same law keep the state of the law.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class LawRunner:
         self._source: LawSource | None = None
 
     def source(self, motion: Compensated) -> LawSource:
-        """The set-points of one stretch; the joint goes over first where it is not under this law yet.
+        """The set-points of one stretch. A joint that is not under this law yet is taken into it first.
 
         Raises:
             SafetyAbort: by the supervisor, or the drive did not take the mode.
@@ -83,11 +83,11 @@ class LawRunner:
         return source
 
     def fade_out(self, source: LawSource) -> FadeOut:
-        """What ends a law."""
+        """The source of set-points that ends a law."""
         return FadeOut(source, round(_FADE_S / self._loop.period_s))
 
     def leave(self) -> bool:
-        """Back to position control, standing where the joint is; False where it was there already."""
+        """Return to position control where the joint stands; False if the joint was in position control already."""
         source = self._source
         if source is None:
             return False

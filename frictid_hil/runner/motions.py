@@ -1,6 +1,6 @@
-"""The motions of the joints that move, each streamed, supervised and marked; some of them watched more closely.
+"""Streams, supervises and marks the motions of the joints that move, and watches some of them more closely.
 
-Joints that move together do so in step: the same stretches, over at the same cycle, each joint held to its own travel,
+Joints that move together do so in step: their stretches end at the same cycle. Each joint is held to its own travel,
 speed, torque and following error. A rehearsal judges the sign of friction under half the torque, a probe compares
 friction with a profile, a warm-up ends when friction has settled, and control laws take a single joint out of position
 control.
@@ -42,7 +42,7 @@ def from_here(here_rad: float, motions: Sequence[Motion], approach_rad_s: float)
 
 
 def stream(loop: CyclicLoop, index: int, motion: Motion) -> None:
-    """One motion of one joint, from its first set-point to its last."""
+    """Stream one motion of one joint, from its first set-point to its last."""
     loop.run({index: _set_points({index: motion}, loop.period_s)[index]})
 
 
@@ -81,7 +81,7 @@ class Motions:
         }
 
     def run(self, plans: Mapping[int, JointPlan]) -> dict[int, list[Mark]]:
-        """All motions of the plans, in order; the marks of each joint.
+        """Run all motions of the plans, in order; returns the marks of each joint.
 
         Raises:
             SafetyAbort: by the supervisor, or friction is not what it must be.
@@ -117,14 +117,14 @@ class Motions:
         return [{index: replace(move, duration_s=longest_s) for index, move in approach.items()}, *stretches]
 
     def _leave_laws(self, motions: Mapping[int, Motion]) -> None:
-        """Back to position control, and to where the next motion begins."""
+        """Return to position control, and go to where the next motion begins."""
         for index, motion in motions.items():
             if not isinstance(motion, Compensated) and self._laws[index].leave():
                 for back in self._from_here({index: [motion]})[:-1]:
                     stream(self._loop, index, back[index])
 
     def _sources(self, motions: Mapping[int, Motion]) -> tuple[Mapping[int, SetPointSource], SetPointSource | None]:
-        """Set-points of every joint, watched as its motion asks; and what ends a control law."""
+        """The set-points of every joint, watched as its motion asks, and the source that ends a control law."""
         ((index, motion), *others) = motions.items()
         if isinstance(motion, Compensated) and not others:
             law = self._laws[index].source(motion)
@@ -146,7 +146,7 @@ class Motions:
         return SignWatch(points, joint.name, self._loop.period_s)
 
     def _judged(self, index: int, motion: Motion, source: SetPointSource) -> dict[str, Any]:
-        """What the mark of a watched motion tells besides.
+        """Judge a watched motion; returns what its mark tells besides.
 
         Raises:
             SafetyAbort: friction helps motion, or the joint did not move.
@@ -185,7 +185,7 @@ def _approach(here_rad: float, motion: Motion, speed_rad_s: float) -> Move:
 
 
 def _set_points(motions: Mapping[int, Motion], period_s: float) -> dict[int, Stream]:
-    """Of one stretch: as many for every joint."""
+    """The set-points of one stretch, equally many for every joint."""
     steps = max(1, math.ceil(max(motion.duration_s for motion in motions.values()) / period_s - 1e-9))
     times_s = np.arange(steps) * period_s
     return {index: Stream(motion.position_rad(times_s).tolist(), period_s) for index, motion in motions.items()}

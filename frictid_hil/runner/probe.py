@@ -1,4 +1,4 @@
-"""Does a profile still describe this joint? Asked with a slow sine in position control, before compensating with it.
+"""Does a profile still describe this joint? A slow sine in position control tells, before the profile compensates.
 
 Friction is half the difference of the torques of both directions, gravity half their sum; both are compared with what
 the profile says at the very positions and speeds of the samples. Another joint's profile, a doubled or a negated one,

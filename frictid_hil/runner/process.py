@@ -54,7 +54,7 @@ _WITHOUT_POWER = ("configure", "reference")
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """All that the child needs to know; crosses the process border once."""
+    """Everything that the child needs to know; it is sent to the child once."""
 
     driver: str
     setup: RobotSetup
@@ -66,7 +66,7 @@ class _Order:
 
 
 class _Life:
-    """Signs of life of the child: rows and messages. Only the time counts in which this process could have seen one."""
+    """How long the child has been silent. Only time in which this process could have heard the child counts."""
 
     def __init__(self) -> None:
         self._seen_rows = 0
@@ -75,7 +75,7 @@ class _Life:
         self._asked_s = 0.0
 
     def look(self, rows: int, *, heard: bool, stop_asked: bool) -> bool:
-        """Whether it can be hoped for any longer."""
+        """False once the child has been silent for too long."""
         passed_s = min(2 * _POLL_S, time.monotonic() - self._looked_s)
         self._looked_s = time.monotonic()
         self._silent_s = 0.0 if heard or rows != self._seen_rows else self._silent_s + passed_s
@@ -162,7 +162,7 @@ def run_in_own_process(
 
 
 def _end(child: SpawnProcess, *, hangs: bool) -> None:
-    """Bring the child to its end, whatever it does."""
+    """End the child process, whatever it does."""
     if child.is_alive() and not hangs:
         child.terminate()
         child.join(_ENDING_S)

@@ -1,4 +1,4 @@
-"""Everything that makes the cyclic loop punctual, as far as this account may; and how punctual this computer is.
+"""Makes the cyclic loop as punctual as this account may, and measures how punctual this computer is.
 
 Real-time scheduling and locked memory are asked for before any thread exists, and garbage collection is off while the
 loop runs: each alone makes the tail of the lateness many times longer.
@@ -24,9 +24,9 @@ _HOLDS_PERCENTILE = 99.9
 
 
 def make_punctual() -> list[str]:
-    """Real-time scheduling, memory that stays in place, no garbage collection; what was not permitted, and the remedy.
+    """Ask for real-time scheduling and locked memory, and switch garbage collection off.
 
-    For a process of its own: nothing of it is taken back.
+    This is for a process of its own, because nothing of it is undone. Returns what was not permitted, and the remedy.
     """
     told = []
     try:
@@ -72,7 +72,7 @@ class Latency:
 
 
 def judged(late_s: Array, duration_s: float, told: list[str]) -> Latency:
-    """The figures of a measurement."""
+    """Form the figures of a measurement."""
     p50, p99, p999 = (float(value) for value in np.percentile(late_s, (50, 99, _HOLDS_PERCENTILE)))
     held = [rate for rate in RATES_HZ if p999 <= 0.5 / rate]
     return Latency(duration_s, p50, p99, p999, float(late_s.max()), max(held, default=0), tuple(told))

@@ -1,4 +1,4 @@
-"""Is every joint where the plan expects it? Asked before anything gets power."""
+"""Checks, before anything gets power, that every joint is where the plan expects it."""
 
 from __future__ import annotations
 

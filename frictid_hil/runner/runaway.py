@@ -1,4 +1,4 @@
-"""A free joint that gains speed with nobody pushing it is running away: compensation gives more than friction takes.
+"""A free joint that gains speed while nobody pushes it runs away: compensation gives more than friction takes.
 
 With a force sensor this is seen at once: the speed grows while the person's torque does not point along the motion.
 Without one, a person who pushes cannot be told from a compensation that does, so only growth that lasts longer than any
@@ -39,7 +39,7 @@ class RunawayWatch:
         self._growing_s = 0.0
 
     def verdict(self, velocity_rad_s: float, external_torque_nm: float) -> str:
-        """What is wrong, in a sentence; empty while all is well."""
+        """Say in a sentence what is wrong; an empty string while all is well."""
         self._velocity += self._blend * (velocity_rad_s - self._velocity)
         speed = abs(self._velocity)
         if external_torque_nm == external_torque_nm:  # there is a force sensor

@@ -1,8 +1,8 @@
-"""The scheduler: reach the hardware, check, lock every joint except one, move it, lock it again, next joint.
+"""The scheduler checks the hardware and moves one joint after the other while all others are locked.
 
-A plan whose joints move together has one such turn, with all of them moving in step.
+Joints that are planned to move together have one common turn and move in step.
 
-The order is always the same, and nothing in it is optional::
+The order is always the same, and no step of it is optional::
 
     open, identify, check         reads only; an error ends here
     proceed?                      a person (or --yes) has seen plan, identities and findings
@@ -97,7 +97,7 @@ class Scheduler:
         self._resolution_rad: Mapping[str, float] = {}
 
     def run(self) -> None:
-        """The whole plan.
+        """Run the whole plan.
 
         Raises:
             HardwareError: hardware unreachable, or not what the robot file says.
@@ -264,7 +264,7 @@ class Scheduler:
         return self._care.limits(joint, plan, self._command_delay_s)
 
     def _make_ready(self, arm: Arm, moving: Mapping[int, JointPlan], name: str) -> None:
-        """Everything seen, powered, at its planned place and still; only the joints to be moved are not locked."""
+        """Verify and power the arm, prove units where asked, and lock every joint that does not move."""
         planned_rad = next(iter(moving.values())).locked
         self._notify(PhaseStarted(name, "reference", 0.0))
         arm.verify(planned_rad)
@@ -277,7 +277,7 @@ class Scheduler:
 
 
 def _with_power_left(first: FrictidError | None, joints: Sequence[str]) -> FrictidError:
-    """What ended the run, with the word that must come last: which joints were not seen to lose their power."""
+    """Add to the error which joints were not seen to lose their power."""
     last_word = f"joint {', '.join(joints)} may still have power: press the emergency stop before you go near"
     if first is None or isinstance(first, Interrupted):
         return SafetyAbort(

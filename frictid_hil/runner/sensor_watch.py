@@ -78,13 +78,13 @@ class SensorWatch:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what was reported: the joint stands, or another mode begins."""
+        """Forget what was reported, because the joint stands or another mode begins."""
         self._rows: deque[_Row] = deque()
         self._torque_nm = math.nan
         self._seen_rad = [0.0, 0.0]
 
     def verdict(self, report: Feedback, most_rad_s: float, *, held: bool) -> str:
-        """What is wrong, in a sentence; empty while all is well.
+        """Say in a sentence what is wrong; an empty string while all is well.
 
         Args:
             report: new.
@@ -116,7 +116,7 @@ class SensorWatch:
         return self._frozen(report.torque_nm, velocity, jump_rad) if held else ""
 
     def _disagreement(self) -> str:
-        """What position and velocity tell differently of the window; empty where they agree."""
+        """Say how position and velocity contradict each other within the window; an empty string where they agree."""
         first, middle, last = self._rows[0], self._rows[len(self._rows) // 2], self._rows[-1]
         went_rad = last.position_rad - first.position_rad
         before_rad = first.velocity_rad_s * first.late_s  # the first report may be that much older
@@ -133,7 +133,7 @@ class SensorWatch:
         )
 
     def _frozen(self, torque_nm: float, velocity_rad_s: float, step_rad: float) -> str:
-        """The very same torque in both directions: friction changes its sign, a reading that stands does not."""
+        """Say that the torque is frozen: friction changes its sign with the direction, this reading does not change."""
         if torque_nm != self._torque_nm:
             self._torque_nm = torque_nm
             self._seen_rad = [0.0, 0.0]

@@ -1,4 +1,4 @@
-"""What a rehearsal must show before any speed: friction opposes motion, and velocity is the rate of the position."""
+"""A rehearsal must show, before a joint moves fast, that friction opposes motion and that velocity fits position."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class SignWatch:
         return goes_on
 
     def judge(self) -> None:
-        """Of friction there is nothing to say where one direction was never seen.
+        """Judge the rehearsal. Friction is not judged where the joint moved in one direction only.
 
         Raises:
             SafetyAbort: torque helps motion, or position and velocity tell of different motions.

@@ -49,7 +49,7 @@ class StopSignals:
         self._previous.clear()
 
     def while_asking(self, question: Callable[[], Answer]) -> Answer:
-        """The answer to a question; a signal ends it, because nothing moves that would have to be stopped first.
+        """Return the answer to a question. A signal ends the question at once, because nothing moves yet.
 
         Raises:
             Interrupted: by a signal.
@@ -62,7 +62,7 @@ class StopSignals:
 
     @contextlib.contextmanager
     def written_to(self, pipe: int) -> Iterator[None]:
-        """Every signal's number goes into this pipe, too, from the interpreter's own handler."""
+        """Let the handler of the interpreter write the number of every signal into this pipe as well."""
         if not self._previous:
             yield
             return

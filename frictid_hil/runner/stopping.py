@@ -1,8 +1,8 @@
-"""Coming to rest on request: along the planned path, ever slower, so that no stop leaves the planned travel.
+"""A stop on request follows the planned path, ever slower, so that it never leaves the planned travel.
 
-Time along the plan is slowed down to a halt: q(t) = p(s(t)) with ds/dt from 1 to 0. Whatever was checked of the plan's
-places - travel, workspace, the company of other joints - holds for the stop as well; only the deceleration is new, and
-the shortest stop is taken that the joints' torque allows.
+The time along the plan is slowed down to a halt: q(t) = p(s(t)) with ds/dt from 1 to 0. The stop passes through places
+of the plan only, so that the checks of travel, workspace and the other joints hold for it as well. Only its
+deceleration is new: the shortest stop that the torque of the joints allows is taken.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from frictid_hil.friction.trajectory import Array
 DURATIONS_S = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 """Stops to choose from, the shortest first; none lasts longer."""
 _STRIDE_S = 0.005
-"""Accelerations are looked at over so long: set-points are points, and their second differences rough."""
+"""Accelerations are formed over so long, because second differences of neighbouring set-points are rough."""
 _OWN_SHARE = 1.2
-"""Where the plan itself asks for more acceleration than the stop may, a stop may ask for so much of that."""
+"""Where the plan itself exceeds the deceleration of a stop, the stop may reach this multiple of the plan's."""
 
 
 def cycles_ahead(period_s: float) -> int:
-    """How many set-points of the plan the longest stop needs."""
+    """The number of set-points that the longest stop needs of the plan."""
     return int(np.ceil(0.5 * DURATIONS_S[-1] / period_s)) + 2
 
 
@@ -59,14 +59,14 @@ def stopping_path(path_rad: Array, period_s: float, most_rad_s2: Sequence[float]
 
 
 def _accelerations(path_rad: Array, stride: int, period_s: float) -> Array:
-    """Size of the acceleration at every row, over ``stride`` cycles to either side; shape of the path."""
+    """Magnitude of the acceleration at every row, formed over ``stride`` cycles to either side; shape of the path."""
     padded = np.vstack([_before(path_rad, stride), path_rad, np.repeat(path_rad[-1:], stride, axis=0)])
     second: Array = padded[2 * stride :] - 2.0 * padded[stride:-stride] + padded[: -2 * stride]
     return np.abs(second) / (stride * period_s) ** 2
 
 
 def _before(path_rad: Array, stride: int) -> Array:
-    """The path went on before its first row as it does there."""
+    """Continue the path backwards at the speed of its first row, for ``stride`` rows."""
     step = path_rad[1] - path_rad[0]
     rows: Array = path_rad[0] + np.arange(-stride, 0)[:, None] * step
     return rows

@@ -1,8 +1,8 @@
-"""Units proven by motion: a few encoder steps, then 0.5 deg, before anything else moves on a robot's first run.
+"""On its first run a robot proves its units by motion: it moves by a few encoder steps, then by 0.5 deg.
 
-A drive that lies about its units gives a plausible report of a wrong motion. Three figures come by different ways: the
-command, the position and the velocity. They must tell of one and the same motion. What a wrong gear ratio in the robot
-file does to all three alike cannot be seen from the bus: a person watches the first motion.
+A drive with wrong units gives a plausible report of a wrong motion. Command, position and velocity come by different
+ways and must tell of one and the same motion. A wrong gear ratio in the robot file changes all three alike and cannot
+be seen from the bus. Therefore a person watches the first motion.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ _HOLD_S = 0.1
 _RUNAWAY = 3.0
 _SLACK_RAD = math.radians(0.1)
 _FOLLOWED = 0.3
-"""Of a motion, that a position loop may leave undone beyond its declared droop."""
+"""Share of a motion that a position loop may leave undone, beyond its declared droop."""
 _VELOCITY_OFF = 0.2
-"""By which two travels may differ: a lie about units is a factor of 2 at least."""
+"""Share by which two travels may differ. A wrong unit makes at least a factor of 2."""
 _COARSE = 0.25
-"""Of the mean speed: steps of the reported velocity above this tell nothing."""
+"""Share of the mean speed. A velocity that is reported in coarser steps tells nothing."""
 
 
 class Travelled:
-    """The way of a joint, there and back, by its position and by its velocity.
+    """Adds up the way of a joint, there and back, by its position and by its velocity.
 
     Args:
         period_s: of the set-points.
@@ -53,7 +53,7 @@ class Travelled:
         self._last: tuple[int, float, float] | None = None
 
     def add(self, report: Feedback, direction: float) -> None:
-        """One report, in which the joint was commanded forward (+1), backward (-1) or to stand (0)."""
+        """Add one report. The joint was commanded to move forward (+1), backward (-1), or to stand (0)."""
         velocity = report.velocity_rad_s
         if report.age_cycles or not math.isfinite(velocity) or not math.isfinite(report.position_rad):
             return
@@ -75,11 +75,11 @@ class Travelled:
 
     @property
     def by_velocity_rad(self) -> float:
-        """The way that the velocity tells; of those that late set-points leave open, the one nearest the position's."""
+        """The way that the velocity tells. Where late set-points leave it open: what is nearest to the position's."""
         return min(max(self.by_position_rad, self._least_rad), self._most_rad)
 
     def judge(self, joint: str) -> None:
-        """Nothing to say of a drive without velocity, or with one too coarse for this motion.
+        """Compare the two ways. A drive without velocity, or with too coarse a velocity, is not judged.
 
         Raises:
             SafetyAbort: position and velocity tell of different motions.
@@ -173,7 +173,7 @@ class UnitProof:
 def _there_and_back(
     here_rad: float, reaches_rad: tuple[float, ...], period_s: float
 ) -> Iterator[tuple[float, float, float]]:
-    """Position, direction and speed, cycle by cycle; a pause after each stroke still belongs to it."""
+    """Yield position, direction and speed, cycle by cycle. The pause after a stroke counts as part of the stroke."""
     for reach_rad in reaches_rad:
         for start_rad, end_rad in ((here_rad, here_rad + reach_rad), (here_rad + reach_rad, here_rad)):
             move = Move.within(start_rad, end_rad, _PEAK_RAD_S)

@@ -54,7 +54,7 @@ class WarmUpWatch:
         return self._sent // self._per_cycle
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        """Count the report; end at the end of a cycle, where the joint stands, once settled."""
+        """Count the report. Once friction has settled, the stream ends with the cycle, where the joint stands."""
         if abs(feedback.velocity_rad_s) > self._fast_rad_s and math.isfinite(feedback.torque_nm):
             backward = feedback.velocity_rad_s < 0
             self._sum[backward] += feedback.torque_nm
@@ -78,7 +78,7 @@ class WarmUpWatch:
         return self.settled
 
     def _rate(self) -> tuple[float | None, float]:
-        """Rate of change over the window, percent per minute, and its standard error."""
+        """The rate of change over the window and its standard error, both in percent per minute."""
         time_s, friction = np.array(self._time_s), np.array(self._friction_nm)
         if time_s.size < _FEWEST_CYCLES or time_s[-1] - time_s[0] < WINDOW_S:
             return None, math.inf

@@ -1,4 +1,4 @@
-"""The workspace box while the arm moves: where the joints are is looked at every few cycles."""
+"""Watches that the arm stays in its workspace box while it moves, every few cycles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLACK_M = 0.01
 
 
 class WorkspaceWatch:
-    """See the module's first page.
+    """Compares the place of every joint with the box.
 
     Args:
         workspace: the box and the chain.
@@ -34,10 +34,10 @@ class WorkspaceWatch:
         self._cycle = 0
 
     def check(self, feedback: Sequence[Feedback]) -> None:
-        """Pass one cycle's reports.
+        """Judge the reports of one cycle.
 
         Raises:
-            SafetyAbort: some joint, or the tool, is outside.
+            SafetyAbort: a joint or the tool is outside of the box.
         """
         self._cycle += 1
         if self._cycle % self._every:

@@ -146,7 +146,7 @@ class RunFolder:
         self._made += made_folders(path)
 
     def begin(self) -> None:
-        """From here on something may have moved: whatever happens, nothing is removed any more."""
+        """From here on something may have moved. Nothing is removed any more, whatever happens."""
         self.manifest |= {"state": "measuring", "outcome": None, "ended_utc": None}
         self.save()
         self._made.clear()
@@ -214,7 +214,7 @@ class RunFolder:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _claim(self) -> None:
-        """Make the folder, or take one that holds nothing of a run; alone in it from here on."""
+        """Make the folder, or take one that holds nothing of a run, and keep other processes out of it."""
         self.claim_output(self.path)
         taken = sorted(path.name for path in self.path.iterdir() if _OURS.fullmatch(path.name))
         if "manifest.json" in taken:

@@ -69,7 +69,7 @@ class RowKeeper:
             self._samples.metadata(f"joint/{joint}", identity)
 
     def taken(self, joint: str, start_ns: int, end_ns: int) -> Rows:
-        """One joint's rows in a stretch of run time; everything older than its start is forgotten.
+        """Return the rows of one joint in a stretch of run time, and forget everything older than its start.
 
         Joints that moved together are taken one after the other from the same stretch.
         """

@@ -9,7 +9,7 @@
 
 A run that is refused in its preflight removes the files that it made for it and nothing else. From `measuring` on
 nothing is removed, and an error is a way to end: ``move`` returns it, and a result is formed of what was measured.
-What a run will not do: choose what moves (the jobs plan), or move it (the runner does).
+A run neither chooses what moves (a job plans that) nor moves it (the runner does).
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class Run:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        """Whatever ends the job between motion and result, the manifest says so."""
+        """Write into the manifest what ended the job between motion and result."""
         if self.state is State.MEASURING and error is not None:
             interrupted = isinstance(error, KeyboardInterrupt)
             told = Interrupted("interrupted after the motion had ended") if interrupted else _as_ours(error)
@@ -236,7 +236,7 @@ class Run:
         return ended or unwritten
 
     def reopen(self) -> None:
-        """Go on with an earlier run of which nothing is missing but its result; nothing moves."""
+        """Continue an earlier run that lacks nothing but its result; nothing moves."""
         self._in(State.PLANNED)
         assert self._order.resume is not None, "an earlier run"
         self._folder = RunFolder.resume(self._order.resume, self._order.robot)
@@ -244,7 +244,7 @@ class Run:
         self.state = State.MEASURING
 
     def so_far(self, joint: str) -> JointRun | None:
-        """What a joint had finished of its plan when it was ended early; None where nothing."""
+        """The finished part of a joint's plan in a run that ended early; None where nothing was finished."""
         marks = tuple(self._marks.get(joint, ()))
         return JointRun(joint, 0, marks, 0.0, 0, 0, 0, 0.0, 0.0) if marks else None
 
@@ -253,7 +253,7 @@ class Run:
         self._rehearsals.heed(run, plan)
 
     def end(self, error: FrictidError | None = None) -> Ended:
-        """Write down how it ended; what was measured is on the disk already."""
+        """Write into the manifest how the run ended. What was measured is on the disk already."""
         self._in(State.MEASURING)
         self.state = State.ENDED
         ended = Ended(self._order.robot.name, self.folder.path, error)
@@ -300,7 +300,7 @@ class Run:
         self._rehearsals.heed(event, plan)
 
     def _refuse_other_drives(self, preflight: Preflight) -> None:
-        """A run is continued with the drives it began with.
+        """Refuse to continue a run with other drives than it began with.
 
         Raises:
             UsageError: a serial number differs.
@@ -323,7 +323,7 @@ class Run:
             self._folder = None
 
     def _with_next_step(self, error: FrictidError) -> FrictidError:
-        """An interrupted run is gone on with by a command that names it."""
+        """Add to an interruption the command that continues the run."""
         if isinstance(error, Interrupted):
             command = self._order.continued_by
             error.next_step = f"continue with `{command} {shlex.quote(str(self.folder.path))}`" if command else ""
@@ -331,7 +331,7 @@ class Run:
 
 
 def _closed(keeper: RowKeeper | None) -> FrictidError | None:
-    """Close the files; what could not be written at the end is the run's error where it has no other."""
+    """Close the files; returns the error where the last rows could not be written."""
     try:
         if keeper is not None:
             keeper.close()

@@ -1,4 +1,4 @@
-"""What a run was asked for: kept in its manifest, and restored from there when the run is continued."""
+"""The options of a run. They are kept in its manifest, and restored from there when the run is continued."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from frictid_hil.errors import ConfigError, UsageError
 from frictid_hil.runs.folder import load_manifest
 
 _ELSEWHERE = frozenset({"robot", "resume", "out", "store", "verb"})
-"""Not among the kept options: the manifest has them itself, or they change nothing that is measured."""
+"""Options that are not kept, because the manifest has them elsewhere or because they change no measurement."""
 
 
 class Options(Protocol):

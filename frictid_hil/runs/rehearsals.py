@@ -1,8 +1,8 @@
-"""Which travels of a robot were seen slowly, with the torque watched, before they may be driven fast.
+"""Remembers which travels of a robot were rehearsed slowly, with the torque watched, and may be driven fast.
 
 A rehearsal counts for the robot file, the bus and the joints that moved together as they were then, and for the travel
 that was seen. Anything else - another bus, a longer travel, a changed file, an exchanged drive - is rehearsed anew.
-What simulated drives rehearsed proves nothing of a machine, and is not kept.
+A rehearsal of simulated drives proves nothing about a machine and is not kept.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Rehearsals:
         )
 
     def heed(self, event: Event, plan: Plan) -> None:
-        """Keep what a finished run rehearsed; refuse a drive that has never rehearsed, where its joint will not.
+        """Keep what a finished run rehearsed. Refuse an exchanged drive if its joint is not going to rehearse.
 
         Raises:
             UsageError: a drive was exchanged; what its joint rehearsed is forgotten: the next run rehearses.

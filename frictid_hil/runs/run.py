@@ -1,7 +1,7 @@
-"""Run a plan whichever clock its driver lives on, and hand every row to whoever keeps it.
+"""Runs a plan on the clock of its driver, and gives every row to a keeper.
 
-Lock-step drivers run in this process, rings drained between cycles. Wall-clock drivers run in a process of their own
-(``runner.process``). The caller sees no difference.
+A lock-step driver runs in this process, and the rings are drained between its cycles. A wall-clock driver runs in a
+process of its own (``runner.process``). The caller sees no difference.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from frictid_hil.runner.stop_signals import StopSignals
 
 
 class Keeper(Protocol):
-    """Who keeps what was measured."""
+    """Keeps what was measured."""
 
     def samples(self, rows: Rows) -> None:
         """Rows of ``ring.SAMPLE_ROW``, in order."""
