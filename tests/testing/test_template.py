@@ -42,6 +42,17 @@ def test_it_is_short_and_imports_public_names_only(package: Path) -> None:
             assert not node.attr.startswith("_"), node.attr
 
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "write-a-driver.md"
+
+
+@pytest.mark.parametrize("file", ["frictid_acme/driver.py", "frictid_acme/fake.py", "tests/test_driver.py"])
+def test_the_page_names_every_module_that_a_driver_needs(package: Path, file: str) -> None:
+    page = PAGE.read_text()
+    for node in ast.walk(ast.parse((package / file).read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("frictid_hil"):
+            assert f"`{node.module}`" in page or f"from {node.module} import" in page, node.module
+
+
 @pytest.mark.slow
 def test_its_own_tests_pass(package: Path) -> None:
     done = subprocess.run(

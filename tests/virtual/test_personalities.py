@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -22,6 +24,7 @@ from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Severity
+from frictid_hil.recording.mcap_reader import read_rows
 
 FAMILIES = sorted(known_personalities())
 COULOMB_NM = 5.0
@@ -159,6 +162,23 @@ def test_a_family_that_does_not_exist(tmp_path):
     with pytest.raises(InvalidFields, match="known: copley"):
         driver = VirtualDriver(load_robot(robot("acme", tmp_path)).to_setup())
         driver.open()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "factor"), [("position", 10.0), ("position", 0.1), ("velocity", 60.0), ("velocity", 0.1)]
+)
+def test_a_drive_that_lies_about_its_units_is_stopped_within_a_degree(quantity, factor, tmp_path):
+    path = robot("copley", tmp_path)
+    values = yaml.safe_load(path.read_text())
+    values["options"] = {"faults": [{"kind": "scale", "quantity": quantity, "factor": factor, "joint": "0"}]}
+    values["joints"]["0"]["start_position_rad"] = 0.0
+    path.write_text(yaml.safe_dump(values))
+    assert check(str(path))["ok"], "nothing of it stands in an object"
+    result = calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent()).to_json()
+    assert result["outcome"] == "aborted" and "units" in result["error"]["cause"]
+    reported_rad = read_rows(tmp_path / "run" / "samples.mcap")["0"]["position_rad"]
+    moved_rad = np.ptp(reported_rad) / (factor if quantity == "position" else 1.0)
+    assert moved_rad < math.radians(1.2)
 
 
 def tracked(path: Path, profile: Path, modes: tuple[str, ...], drive_mode: Mode, **more: Any) -> Any:
