@@ -247,7 +247,7 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
 
 
 class _Measured:
-    """The joints that are identified; every one is kept before the next one moves."""
+    """Identifies joints; the result of each one is kept before the next one moves."""
 
     def __init__(self, planned: Planned, run: Run, watcher: Watcher) -> None:
         self._planned = planned
@@ -333,7 +333,7 @@ def _nothing(_: Preflight) -> None:
 
 
 def _refuse_without_watchdog(preflight: Preflight) -> None:
-    """With nobody there, a drive must stop by itself where this computer does not.
+    """Refuse, where nobody is present, a drive that does not stop by itself when this computer fails.
 
     Raises:
         UsageError: these drives do not.
@@ -394,7 +394,7 @@ def _tick_note(procedure: Procedure, quantum_s: float) -> str:
 def _unseen(
     rehearsals: Rehearsals, setup: RobotSetup, procedures: Mapping[str, Procedure], *, together: bool
 ) -> list[str]:
-    """Joints whose travel was never seen slowly."""
+    """The joints whose travel has not been rehearsed yet."""
     moving = tuple(procedures) if together else ()
     starts = {name: setup.joint(name).start_position_rad for name in procedures}
     return [

@@ -97,7 +97,7 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
 
 
 def _measured(latency_s: float) -> Latency:
-    """In a process of its own, as the cyclic loop is: what makes it punctual cannot be taken back."""
+    """Measure in a process of its own, as the cyclic loop is, because what makes it punctual cannot be undone."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(measure_latency, (latency_s,))
 

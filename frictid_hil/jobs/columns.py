@@ -60,7 +60,7 @@ def _reads_itself(log: Path) -> bool:
 
 
 def _told(joints: list[Samples]) -> dict[str, Any]:
-    """Each joint in a few figures, for a person to recognise."""
+    """Describe each joint by a few figures that a person can recognise."""
     return {
         samples.joint: {
             "rows": len(samples),

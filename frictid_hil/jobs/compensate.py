@@ -1,8 +1,8 @@
-"""``frictid-hil compensate``: a profile put to work on the bus, mode by mode.
+"""``frictid-hil compensate``: compensates a joint with a profile, in one mode after the other.
 
-The order is that of every run: profile and plan checked, drives read and compared with the profile, a person asked, a
-travel never seen on this robot rehearsed, the joint probed in position control, and only then given its compensation
-(section 5 of the paper). What each mode reached is formed in ``compensation_result``.
+The order is always the same. Profile and plan are checked, the drives are read and compared with the profile, and a
+person is asked. A travel that is new to this robot is rehearsed, and the joint is probed in position control. Only then
+it is given its compensation (section 5 of the paper). ``compensation.result`` forms the figures of each mode.
 """
 
 from __future__ import annotations

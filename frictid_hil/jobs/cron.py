@@ -1,8 +1,8 @@
 """A systemd calendar expression as the five fields of a crontab line, exactly or not at all.
 
-cron knows minutes, hours, days, months and weekdays of the local clock; years, seconds, time zones and days counted
-from the end of a month (``~``) it cannot say. Where both a day and a weekday are given, systemd wants both and cron
-takes either (``man 5 crontab``), so that is not translated.
+cron knows minutes, hours, days, months and weekdays of the local clock. It knows no years, seconds or time zones, and
+no days counted from the end of a month (``~``). Where both a day and a weekday are given, systemd wants both and cron
+takes either (``man 5 crontab``); such an expression is not translated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``frictid-hil dashboard``: store and runs as pages on this computer, a run as it moves. It moves nothing."""
+"""``frictid-hil dashboard``: pages of the store, the runs and a run as it moves, on this computer. It moves nothing."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def runs_in(folder: Path) -> dict[str, Path]:
 
 
 def now(run: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """What the live page asks for: the newest seconds of the joint that moves most, and the joints that are done."""
+    """The answer to the live page: the newest seconds of the joint that moves most, and the joints that are done."""
     told: dict[str, Any] = {
         "ended": manifest["outcome"] is not None,
         "told": "no samples yet",

@@ -1,4 +1,4 @@
-"""``frictid-hil emulate``: a controller that is not there, with the robot's simulated joints behind it."""
+"""``frictid-hil emulate``: emulates a controller, with the robot's simulated joints behind it."""
 
 from __future__ import annotations
 

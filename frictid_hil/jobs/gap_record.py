@@ -1,8 +1,8 @@
-"""``gap record``: the diagnostic experiments on the bus, and the experiment set that comes of them.
+"""``gap record``: runs the diagnostic experiments on the bus and writes their experiment set.
 
-Same scheduler, supervisor and recording as a calibration. Experiments without the payload run first, then the person
-is asked to mount it (a simulated robot mounts its own) and the rest follow. A recording that was interrupted is gone on
-with, or a set is made of what it has, moving nothing.
+Scheduler, supervisor and recording are those of a calibration. Experiments without the payload run first. Then a person
+is asked to mount it (a simulated robot mounts its own), and the rest follow. An interrupted recording can be continued,
+or a set can be made of what it has without moving anything.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class GapRecordOptions:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What a recording came to.
+    """The result of a recording.
 
     Attributes:
         ended: how the run ended.
@@ -246,7 +246,7 @@ def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> d
 
 
 def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> Envelope:
-    """Where the experiments run: around the travel of the joint's procedure, as far as the limits let."""
+    """The place of the experiments: around the travel of the joint's procedure, within the limits."""
     procedure = robot.procedure(joint.name)
     centre = options.centre_rad
     if centre is None:
@@ -495,7 +495,7 @@ def _joined(plans: Sequence[Plan]) -> Plan:
 
 
 def _cut(samples: Samples, experiments: Sequence[Experiment]) -> dict[str, Samples]:
-    """The rows of every experiment that was done whole, time counted from its start."""
+    """The rows of every experiment that was finished, with time counted from its start."""
     spans: dict[str, list[int]] = {}
     for mark in samples.marks:
         name, slash, _ = mark.name.partition("/")

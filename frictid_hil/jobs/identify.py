@@ -83,7 +83,7 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class _Identified:
-    """What came of one recording."""
+    """The result of one recording."""
 
     joints: dict[str, JointProfile]
     failed: dict[str, str]
@@ -91,7 +91,7 @@ class _Identified:
     page: Page | None = None
 
     def told(self) -> str:
-        """One line for whoever waits."""
+        """Form one line of progress."""
         if self.error is not None:
             return f"{self.error} ({self.error.cause})" if self.error.cause else str(self.error)
         good = f"joint {', '.join(self.joints)}"
@@ -162,7 +162,7 @@ def recordings(named: Sequence[Path]) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """The folder itself where it is a run; else every run and every readable file below it."""
+    """The folder itself if it is a run; otherwise every run and every readable file below it."""
     if any(folder.glob("samples*.mcap")) or is_lerobot(folder) or is_bag(folder):
         return [folder]
     inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name.lower().endswith(READABLE)]
@@ -212,7 +212,7 @@ def _identified(task: _Task) -> _Identified:
 
 
 def _with_damage(error: FrictidError, samples: Samples) -> FrictidError:
-    """The error, and that the file is damaged or odd, where that is a likelier cause than any that was looked for."""
+    """The error, and a hint where a damaged or odd file is the likelier cause."""
     damage, doubts = samples.meta.get("damage"), samples.meta.get("doubts", ())
     if not damage and not doubts:
         return error

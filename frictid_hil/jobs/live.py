@@ -138,7 +138,7 @@ def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
 
 
 def _message(row: Any) -> dict[str, float]:
-    """One row, what is not known left out: JSON has no NaN."""
+    """One row without the figures that are not known, because JSON has no NaN."""
     message = {"time_s": int(row["t_ns"]) * 1e-9}
     message |= {name: float(row[name]) for name in _COLUMNS if np.isfinite(row[name])}
     if "position_command_rad" in message and "position_rad" in message:

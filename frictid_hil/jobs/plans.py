@@ -1,4 +1,4 @@
-"""From a robot file to a plan: which motions a calibration makes, and what peak torque is to be expected of them."""
+"""From a robot file to a plan: the motions of a calibration, and the peak torque that is expected of them."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def calibration_motions(
 
 
 def rehearsal_note(joints: Sequence[str]) -> str:
-    """For the plan of joints whose travel was never seen on this robot."""
+    """The note in a plan about joints whose travel is new to this robot."""
     return (
         f"first run of this travel on this robot: joints {', '.join(joints)} prove their units by "
         "a few encoder steps and 0.5 deg, then rehearse it slowly, torque watched"
@@ -161,7 +161,7 @@ def calibration_plan(
 
 
 def _refuse_different_timing(procedures: Mapping[str, Procedure]) -> None:
-    """Joints that move together must reverse together: else the coupling does not cancel between the directions.
+    """Refuse joints that would not reverse together, because their coupling would not cancel between the directions.
 
     Raises:
         UsageError: a joint whose cycles last otherwise than the first one's.
@@ -198,7 +198,7 @@ def _in_step(motions: Mapping[str, Sequence[Motion]]) -> dict[str, list[Motion]]
 
 
 def _lasting(motion: Motion, duration_s: float) -> Motion:
-    """The same motion, slower where it would be over earlier."""
+    """The same motion, slowed down where it would end earlier."""
     if isinstance(motion, Move):
         return replace(motion, duration_s=duration_s)
     if isinstance(motion, Sine) and motion.duration_s < duration_s:
@@ -207,7 +207,7 @@ def _lasting(motion: Motion, duration_s: float) -> Motion:
 
 
 def expected_of(robot: Robot) -> dict[str, Expected]:
-    """What the robot file says is to be expected of its joints; joints it says nothing of are left out."""
+    """What the robot file expects of its joints. Joints without an entry are left out."""
     expected: dict[str, Expected] = {}
     for name, joint in robot.file.joints.items():
         if joint.expected is not None:

@@ -60,7 +60,7 @@ def _off(curve: FrictionCurve, written: Torque) -> float:
 
 
 def _table(joints: Joints) -> tuple[str, dict[str, Torque], str]:
-    """Speed and torque, ten rows each way, as drives take them that interpolate between rows."""
+    """Speed and torque in ten rows for each direction, for drives that interpolate between rows."""
     rows = ["joint,velocity_rad_s,torque_nm"]
     back: dict[str, Torque] = {}
     for name, (_, curve) in joints.items():

@@ -1,4 +1,4 @@
-"""The verbs of ``frictid-hil profile``: look at one, compare two, decide which is in force, see how it came to be."""
+"""The verbs of ``frictid-hil profile``: show a profile, compare two, decide which one is in force, show its history."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def rollback(robot: str, *, store: Path | None = None, reason: str = "") -> dict
 
 
 def named_profile(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, Path]:
-    """The profile a person means, and where it is; a file goes before an id of the store.
+    """Find the profile that a person names, and its file. A file takes precedence over an id of the store.
 
     Args:
         text: a file, a run folder, or (with ``robot``) an id of the store, ``active`` or ``baseline``.

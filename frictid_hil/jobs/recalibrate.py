@@ -1,4 +1,4 @@
-"""``frictid-hil recalibrate``: the unattended job. It asks nobody, and whoever reads its line knows what to do next.
+"""``frictid-hil recalibrate``: the unattended job. It asks nobody, and its last line says what to do next.
 
 ::
 
@@ -146,7 +146,7 @@ def _warm_up(policy: Policy) -> WarmUpPolicy | None:
 
 
 def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, measured: Calibrated) -> dict[str, Any]:
-    """Compare, decide, promote or refuse; the active profile changes here or not at all."""
+    """Compare the profile and promote or refuse it. The active profile changes nowhere else."""
     active, baseline = _active_and_baseline(store, robot.name)
     told = measured.to_json()
     result: dict[str, Any] = {
@@ -203,12 +203,12 @@ def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot:
 
 
 def _promote_by_hand(run: str, store: Path | None) -> str:
-    """The command, ready to be typed next morning."""
+    """The command that a person can type next morning."""
     return shlex.join(["frictid-hil", "profile", "promote", run, *(["--store", str(store.resolve())] if store else [])])
 
 
 def _short(joint: dict[str, Any]) -> dict[str, Any]:
-    """What fits on a line of a journal."""
+    """Shorten a text to one line of a journal."""
     kept = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
     return {key: value for key, value in joint.items() if rotary_name(key) in kept}
 

@@ -1,8 +1,8 @@
-"""``frictid-hil replay``: a bus log through the decoders and the identification of a live run, or set-points simulated.
+"""``frictid-hil replay``: identifies a bus log like a live run, or streams its set-points to the simulated joint.
 
-What a live run identifies from are its decoded frames and their run time, and the log carries both: the same log gives
-the same profile to the last bit. The run's manifest says which frame is what; for logs of other origin a frame map or
-an EDS file does.
+A live run identifies from its decoded frames and their run time. The log carries both, so that it gives the same
+profile to the last bit. The manifest of the run says which frame carries what. For logs of other origin a frame map or
+an EDS file says it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``frictid-hil report``: the HTML page of a run, made from what lies in its folder; or the page of a robot."""
+"""``frictid-hil report``: makes the HTML page of a run from its folder, or the page of a robot."""
 
 from __future__ import annotations
 

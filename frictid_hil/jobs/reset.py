@@ -1,4 +1,4 @@
-"""``frictid-hil reset``: drives that an earlier run left in fault or quick stop are brought back, without power."""
+"""``frictid-hil reset``: resets drives that an earlier run left in fault or quick stop, without giving power."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """``frictid-hil schedule``: the systemd service and timer that run ``recalibrate``, and a cron line for those without.
 
-The service may do what a night needs and nothing else: write below its own state and data folders, schedule in real
-time, reach the bus. It ends with the signal that brings a joint to rest, at the latest after its time limit. A night
-missed on a real bus stays missed: people are there when the computer comes up again.
+The service may only do what a night needs: write below its own state and data folders, schedule in real time, and reach
+the bus. Its time limit ends it with the signal that brings a joint to rest. A night that was missed on a real bus is
+not made up for, because people are present when the computer starts again.
 """
 
 from __future__ import annotations

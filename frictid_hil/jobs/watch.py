@@ -1,4 +1,4 @@
-"""Who watches a job: shows the plan, asks the person, follows its phases. The command line is one watcher."""
+"""A watcher of a job shows the plan, asks the person and follows the phases. The command line is one watcher."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Watcher(Protocol):
         ...
 
     def ask(self, question: str) -> bool:
-        """Whether a person who is there has done what the question says; no where nobody is asked."""
+        """Ask whether a person has done what the question says; False where nobody can be asked."""
         ...
 
     def event(self, event: Event) -> None:

@@ -1,4 +1,4 @@
-"""Who goes along with a compensation: the simulated hand that follows its phases, and the live figures of a service."""
+"""Companions of a compensation: the simulated hand that follows its phases, and the live figures of a service."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Hand:
             self._driver = driver
 
     def follow(self, event: Event) -> None:
-        """Guide, rest or let go as the phases ask."""
+        """Guide the joint, hold it at rest or let it go, as the phase needs it."""
         if self._wanted.task != "hand":
             return
         if isinstance(event, PhaseStarted):
@@ -102,7 +102,7 @@ class LiveFigures:
         return self
 
     def samples(self, rows: Rows) -> None:
-        """Keep rows, count those of the joint, forget them, and tell now and then."""
+        """Keep rows, add those of the joint to the figures, and tell the figures now and then."""
         self._keeper.samples(rows)
         now_ns = int(rows["t_ns"][-1]) + 1
         mine = self._keeper.taken(self._joint, self._seen_ns, now_ns)

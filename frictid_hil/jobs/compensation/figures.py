@@ -1,4 +1,4 @@
-"""What a compensation reached: the paper's criteria (25) and (28), raw and with inertia removed, each mode against nc.
+"""The figures of a compensation: the paper's criteria (25) and (28), raw and without inertia, each mode against nc.
 
 Hand torque obeys tau_hand = I a + (what friction and gravity still take). The first term is work that no friction
 compensation can spare: it sets the ceiling of the raw reduction, and is removed for the second figure.
@@ -50,7 +50,7 @@ class ModeRun:
 
 @dataclass(frozen=True, slots=True)
 class ModeFigures:
-    """One mode in numbers; None where it cannot be formed, and why in ``reasons``.
+    """The figures of one mode. A figure that cannot be formed is None, and ``reasons`` says why.
 
     Attributes:
         velocity_rms_rad_s: V_s of (25).
@@ -112,7 +112,7 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
 def figures(
     runs: Mapping[str, ModeRun], task: str, inertia_kg_m2: float | None, floors_rad: Mapping[str, float] | None = None
 ) -> dict[str, ModeFigures]:
-    """All modes in numbers, each against ``nc`` where that ran.
+    """The figures of all modes, each one compared with ``nc`` where that ran.
 
     Args:
         runs: by mode.

@@ -133,7 +133,7 @@ def _calibrated_travel_rad(entry: JointProfile) -> float:
 
 
 def _unsure_nm(bias: Estimate, coulomb_nm: float) -> float:
-    """Half of its 95 % interval; where a profile has none, of the interval that the identification starts from."""
+    """Half of the 95 % interval; where a profile has none, half of the interval that the identification starts from."""
     if bias.low is None or bias.high is None:
         return COVERAGE * BIAS_PRIOR * coulomb_nm
     return (bias.high - bias.low) / 2

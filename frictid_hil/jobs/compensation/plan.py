@@ -102,7 +102,7 @@ def _ratio(laws: Mapping[str, ControlLaw]) -> float:
 
 
 def _lowest_ratio(joint: JointSetup, wanted: Wanted, centre_rad: float, laws: Mapping[str, ControlLaw]) -> float | None:
-    """Of the whole travel of the task; a service may be guided anywhere."""
+    """The travel of the whole task. A service may be guided anywhere."""
     reach_rad = wanted.amplitude_rad
     low, high = centre_rad - reach_rad, centre_rad + reach_rad
     if wanted.endless:

@@ -1,7 +1,7 @@
 """May this profile be used on this robot now? Every doubt is a ``ProfileMismatch`` that names both values.
 
-What can be read is asked here: robot, drive, rated torque, gear, settings, age, quality. What only shows in motion
-(friction, load, temperature) is asked by the probe before anything is compensated (``runner.probe``).
+This module compares what can be read: robot, drive, rated torque, gear, settings, age and quality. Friction, load and
+temperature show only in motion. The probe compares them before anything is compensated (``runner.probe``).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a compensation came to: its JSON and its page, also where it ended early."""
+"""The result of a compensation: its JSON and its page, also where it ended early."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class CompensationResult:
-    """What a compensation came to.
+    """The result of a compensation.
 
     Attributes:
         ended: how the run ended.
@@ -164,7 +164,7 @@ def _remarks(found: Mapping[str, ModeFigures]) -> list[str]:
 
 
 def _late(wanted: Wanted, runs: Mapping[str, ModeRun], found: Mapping[str, ModeFigures]) -> list[str]:
-    """Where a drive's own loop tracks: how much of the error is its being late, which is nothing of friction's."""
+    """A remark for a drive's own loop: how much of the tracking error is delay, which friction does not cause."""
     base = found.get("nc")
     if wanted.drive_mode is Mode.TORQUE or base is None or not base.tracking_rms_rad or len(runs) < 2:
         return []
@@ -180,7 +180,7 @@ def _late(wanted: Wanted, runs: Mapping[str, ModeRun], found: Mapping[str, ModeF
 
 
 def _inertia(asked: Asked) -> tuple[float | None, str]:
-    """What is removed from the hand torque: on a simulated robot its own inertia, which no law ever sees."""
+    """The inertia that is removed from the hand torque; on a simulated robot the true one, which no law sees."""
     if asked.wanted.simulated:
         value = asked.setup.joint(asked.joint).simulated.get("inertia_kg_m2")
         if isinstance(value, int | float):

@@ -65,7 +65,7 @@ class Wanted:
 
     @property
     def amplitude_rad(self) -> float:
-        """To either side of the centre."""
+        """The travel to either side of the centre."""
         return HAND_AMPLITUDE_RAD if self.task == "hand" else TRACK_AMPLITUDE_RAD
 
     @property
@@ -77,13 +77,13 @@ class Wanted:
 
     @property
     def period_s(self) -> float:
-        """Of one cycle of the task."""
+        """The duration of one cycle of the task."""
         travel_rad = self.amplitude_rad * (2 * math.pi if self.task == "hand" else 4.0)
         return travel_rad / self.peak_rad_s
 
     @property
     def endless(self) -> bool:
-        """It runs until it is interrupted."""
+        """True where the task runs until it is interrupted."""
         return self.duration_s == 0.0
 
     @property

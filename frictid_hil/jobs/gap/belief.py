@@ -34,7 +34,7 @@ class Belief:
 
     @property
     def payload(self) -> bool:
-        """A payload is known, so experiments with it mean something."""
+        """True where a payload is known, so that experiments with it can be judged."""
         return "payload" in self.sections
 
 

@@ -1,4 +1,4 @@
-"""The joint of a diagnosis as a robot file: nominal plus the causes found, ready for `replay` and `calibrate`."""
+"""Writes the joint of a diagnosis as a robot file: the nominal joint with the causes, for `replay` and `calibrate`."""
 
 from __future__ import annotations
 

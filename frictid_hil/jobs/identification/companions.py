@@ -1,4 +1,4 @@
-"""The joints that moved together with one, out of the same run, with what each of them takes of its torque."""
+"""Adds to the recording of a joint the joints that moved together with it, and the torque that they take from it."""
 
 from __future__ import annotations
 

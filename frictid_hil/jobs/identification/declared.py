@@ -1,4 +1,4 @@
-"""What a recording's drive declares of its columns: timing, never fitted."""
+"""The timing of the columns as the drive of a recording declares it. It is never fitted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _KEYS = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s
 
 
 def declared_skew(samples: Samples) -> Skew:
-    """By how much each column is late; the defaults where nothing is declared."""
+    """The delay of each column; the defaults where nothing is declared."""
     timing = samples.meta.get("timing")
     if not isinstance(timing, Mapping):
         return Skew()

@@ -22,7 +22,7 @@ Answer = TypeVar("Answer")
 
 @contextlib.contextmanager
 def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
-    """Where to run; None is here.
+    """Open the executor; None stands for this process.
 
     Args:
         named: ``processes:N``, ``dask://host:port``, or None to choose.
@@ -49,7 +49,7 @@ def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
 def answers(
     pool: Executor | None, function: Callable[[Task], Answer], tasks: Sequence[Task]
 ) -> Iterator[Answer | FrictidError]:
-    """The function's answer to every task, in order, as they come; an error where a worker was lost."""
+    """Yield the answer to every task in order, or an error where a worker was lost."""
     if pool is None:
         yield from map(function, tasks)
         return

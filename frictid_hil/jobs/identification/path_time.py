@@ -1,8 +1,8 @@
-"""Where the clock went on and the path did not.
+"""Converts run time to the time of the path, which stands still in missed cycles.
 
-A set-point that could not be sent in time is not skipped: the path stands still and goes on with the next one, as a
-jump would jerk the joint. The clock has gone on meanwhile, so that the cycles lie later in the recording than (1) says,
-by more with every missed cycle. Reports that were merely lost look alike; the commanded positions tell which it was.
+A set-point that could not be sent in time is not skipped, because a jump would jerk the joint. The path stands still
+and goes on with the next set-point while the clock goes on. So the cycles lie later in the recording than (1) says, by
+more with every missed cycle. Lost reports look alike; the commanded positions tell the two apart.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def path_time(samples: Samples, procedure: Procedure, start_ns: int) -> PathTime
 
 
 def gaps_ns(samples: Samples) -> Nanoseconds:
-    """Times before gaps of more than one report, shape (k,): what lies in them nobody knows."""
+    """Times before gaps of more than one report, shape (k,). Nothing is known of what lies in a gap."""
     steps_ns = np.diff(samples.time_ns)
     gaps: Nanoseconds = samples.time_ns[:-1][steps_ns > _LONG_STEPS * np.median(steps_ns)]
     return gaps

@@ -73,7 +73,7 @@ def wanted_note(terms: Terms, level_nm: float) -> str:
 
 
 def refuse_where_the_bus_is_too_slow(setup: RobotSetup, quantum_s: float, *, together: bool) -> None:
-    """Before anything is planned.
+    """Judge, before anything is planned, whether the stretch can be made.
 
     Raises:
         UsageError: too few set-points a second, a controller that interpolates them, or joints that move at once.

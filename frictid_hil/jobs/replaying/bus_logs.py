@@ -1,4 +1,4 @@
-"""Which bus logs a person means, which frame of them carries what, and what the joints did while they were recorded."""
+"""Finds the bus logs that a person names, what their frames carry, and what the joints did meanwhile."""
 
 from __future__ import annotations
 
