@@ -32,7 +32,7 @@ from frictid_hil.gap.experiments import (
 )
 from frictid_hil.jobs.gap.belief import Belief, belief_of, read_back
 from frictid_hil.jobs.gap.set import existing_set, write_set
-from frictid_hil.jobs.plans import APPROACH_RAD_S, expected_of
+from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, expected_of
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.plan import REHEARSAL, Expected, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
@@ -319,7 +319,7 @@ def _plans(
         if not group:
             continue
         of_group = dict(expected)
-        notes = []
+        notes = care_notes(setup)
         if loaded:
             payload = belief.sections["payload"]
             notes.append(

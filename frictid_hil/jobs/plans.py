@@ -30,6 +30,7 @@ from frictid_hil.plan.plan import (
     joint_plan,
 )
 from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.runner.care import Care
 
 APPROACH_RAD_S = math.radians(20.0)
 """Speed of moves between the locked position and the start, and of the rehearsal."""
@@ -94,6 +95,13 @@ def rehearsal_note(joints: Sequence[str]) -> str:
         f"first run of this travel on this robot: joints {', '.join(joints)} prove their units by "
         "a few encoder steps and 0.5 deg, then rehearse it slowly, torque watched"
     )
+
+
+def care_notes(setup: RobotSetup) -> list[str]:
+    """Bounds of the supervisor that the robot file sets, each beside the usual one; [] where it sets none."""
+    usual = Care()
+    told = [f"{name} {value:.3g} (usually {getattr(usual, name):.3g})" for name, value in setup.care.items()]
+    return [f"bounds of care from the robot file: {', '.join(told)}"] if told else []
 
 
 def inherited_notes(robot: Robot, joints: Sequence[str]) -> list[str]:

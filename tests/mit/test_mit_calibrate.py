@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mit_bench import FAMILIES, robot_file
+from typer.testing import CliRunner
 
+from frictid_hil.cli.app import app
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
@@ -33,6 +35,12 @@ def calibrated(path: Path, out: Path, seed: int) -> None:
     assert np.allclose(joint.torque_nm, truth_nm, rtol=0.03)
     low_nm, high_nm = np.array(joint.torque_interval_nm).T
     assert np.mean((low_nm <= truth_nm) & (truth_nm <= high_nm)) >= 0.8
+
+
+def test_bounds_that_suit_another_arm_are_printed_before_anything_moves() -> None:
+    told = " ".join(CliRunner().invoke(app, ["calibrate", "--robot", "mit-bench.yaml", "--dry-run"]).output.split())
+    assert "bounds of care from the robot file: still_rad_s 0.05 (usually 0.00873)" in told
+    assert "following_error_rad 0.2 (usually 0.0873)" in told
 
 
 @pytest.mark.slow
