@@ -130,6 +130,7 @@ def test_a_port_that_does_not_exist_says_so() -> None:
     assert not isinstance(caught.value, HardwareBusy)
 
 
+@pytest.mark.slow
 def test_a_port_on_which_nobody_answers_is_given_up_in_time() -> None:
     ours, theirs = os.openpty()
     tty.setraw(theirs)

@@ -117,6 +117,7 @@ def nominal(path: Path) -> None:
     path.write_text("schema: frictid.nominal/1\njoint: '1'\ninertia_kg_m2: 0.5\nfriction: {coulomb_nm: 3.0}\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "written", "opened"),
     [

@@ -136,6 +136,7 @@ def spoilt(data: dict[str, Any], at: str, way: str) -> dict[str, Any]:
     return {**data, "absent": absent, "objects": {**data.get("objects", {}), at: given | change}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_every_refusal_of_a_strict_drive_is_foreseen(family, tmp_path):
     # Each family meets each object in one way, and all families together meet each object in every way.

@@ -71,6 +71,7 @@ def test_check_foresees_what_configuring_a_drive_with_anothers_canopen_meets(fam
     assert met.remarks <= met.warnings
 
 
+@pytest.mark.slow
 def test_what_a_person_must_say_is_foreseen_there_too(tmp_path, monkeypatch):
     monkeypatch.setitem(strangers.NEEDS, "epos4", {})
     met = strangers.configured(tmp_path, "epos4")
