@@ -525,6 +525,33 @@ def unknown_options(
     return problems
 
 
+def number_option(
+    given: Mapping[str, Any],
+    name: str,
+    usual: float,
+    low: float,
+    high: float,
+    path: tuple[str, ...],
+    problems: list[FieldProblem],
+) -> float:
+    """A number among the options; where it is none from ``low`` to ``high``, a problem is added.
+
+    Args:
+        given: the options of the robot file, or those of one joint.
+        name: of the option.
+        usual: its value where it is not given.
+        low: smallest value.
+        high: largest value.
+        path: of ``given`` in the robot file.
+        problems: found so far.
+    """
+    value = given.get(name, usual)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        problems.append(FieldProblem((*path, name), f"expected a number from {low:g} to {high:g}, found {value!r}"))
+        return usual
+    return float(value)
+
+
 def planned_quantum_s(name: str, setup: RobotSetup) -> float:
     """What cycle lengths are rounded to multiples of under this driver; 0 where they are not.
 

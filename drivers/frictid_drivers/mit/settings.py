@@ -13,15 +13,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from frictid_drivers.mit.families import FAMILIES, Family, Motor
 from frictid_drivers.mit.models import MODELS
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import unknown_options
+from frictid_hil.protocol.driver import number_option, unknown_options
 
 BUS_OPTIONS = frozenset(
     {"bitrate", "tty_baudrate", "sleep_after_open", "port", "app_name", "serial", "index", "host", "tcp_tune"}
@@ -93,11 +91,11 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
             joints[joint.name] = settings
     options, at = setup.options, ("options",)
     bus = BusSettings(
-        bitrate=int(_number(options, "bitrate", 1_000_000, 10_000, 1_000_000, at, problems)),
-        watchdog_s=_number(options, "watchdog_ms", 100.0, 5.0, 10_000.0, at, problems) / 1000.0,
+        bitrate=int(number_option(options, "bitrate", 1_000_000, 10_000, 1_000_000, at, problems)),
+        watchdog_s=number_option(options, "watchdog_ms", 100.0, 5.0, 10_000.0, at, problems) / 1000.0,
         allow_torque_without_watchdog=options.get("allow_torque_without_watchdog") is True,
-        reply_window=_number(options, "reply_window", 0.8, 0.1, 0.95, at, problems),
-        tty_baudrate=int(_number(options, "tty_baudrate", 0, 0, 10_000_000, at, problems)),
+        reply_window=number_option(options, "reply_window", 0.8, 0.1, 0.95, at, problems),
+        tty_baudrate=int(number_option(options, "tty_baudrate", 0, 0, 10_000_000, at, problems)),
     )
     if problems:
         raise InvalidFields(problems)
@@ -120,7 +118,7 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
         return None
     family, ranges = FAMILIES[protocol], model.ranges
     usual_reply = joint.address + 0x10 if family.reply_id is None else family.reply_id
-    reply_id = int(_number(options, "reply_id", usual_reply, 0, 0x7FF, at, problems))
+    reply_id = int(number_option(options, "reply_id", usual_reply, 0, 0x7FF, at, problems))
     if reply_id == joint.address:
         problems.append(FieldProblem((*at, "reply_id"), "must differ from the motor's own id"))
     if joint.max_torque_nm > ranges.torque_nm:
@@ -129,29 +127,13 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
                 ("joints", joint.name, "max_torque_nm"), f"a {options['model']} tells {ranges.torque_nm:g} N m"
             )
         )
-    kd = _number(options, "kd", min(1.0, ranges.kd_nm_s_per_rad), 0.0, ranges.kd_nm_s_per_rad, at, problems)
+    kd = number_option(options, "kd", min(1.0, ranges.kd_nm_s_per_rad), 0.0, ranges.kd_nm_s_per_rad, at, problems)
     return JointSettings(
         model=str(options["model"]),
         family=family,
         motor=Motor(joint.address, reply_id, ranges),
-        kp=_number(options, "kp", 50.0, 0.0, ranges.kp_nm_per_rad, at, problems) or math.nan,
+        kp=number_option(options, "kp", 50.0, 0.0, ranges.kp_nm_per_rad, at, problems) or math.nan,
         kd=kd,
-        brake_kd=_number(options, "brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad, at, problems),
-        torque_delay_s=_number(options, "torque_delay_s", 0.0, 0.0, 0.1, at, problems),
+        brake_kd=number_option(options, "brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad, at, problems),
+        torque_delay_s=number_option(options, "torque_delay_s", 0.0, 0.0, 0.1, at, problems),
     )
-
-
-def _number(
-    options: Mapping[str, Any],
-    name: str,
-    usual: float,
-    low: float,
-    high: float,
-    at: tuple[str, ...],
-    problems: list[FieldProblem],
-) -> float:
-    value = options.get(name, usual)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        problems.append(FieldProblem((*at, name), f"expected a number from {low:g} to {high:g}, found {value!r}"))
-        return usual
-    return float(value)

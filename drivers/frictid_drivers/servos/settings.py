@@ -13,14 +13,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from frictid_drivers.servos.models import MODELS, Model
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import unknown_options
+from frictid_hil.protocol.driver import number_option, unknown_options
 
 BUS_OPTIONS = frozenset({"baud", "watchdog_ms", "answer_ms"})
 JOINT_OPTIONS = frozenset(
@@ -86,9 +84,9 @@ def read_settings(setup: RobotSetup) -> tuple[LineSettings, list[JointSettings]]
     """
     problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "servos")
     line = LineSettings(
-        baud=int(_number(setup.options, "baud", 1_000_000, 9600, 4_500_000, ("options",), problems)),
-        watchdog_s=_number(setup.options, "watchdog_ms", 200, 20, 2540, ("options",), problems) / 1000.0,
-        answer_s=_number(setup.options, "answer_ms", 20, 1, 1000, ("options",), problems) / 1000.0,
+        baud=int(number_option(setup.options, "baud", 1_000_000, 9600, 4_500_000, ("options",), problems)),
+        watchdog_s=number_option(setup.options, "watchdog_ms", 200, 20, 2540, ("options",), problems) / 1000.0,
+        answer_s=number_option(setup.options, "answer_ms", 20, 1, 1000, ("options",), problems) / 1000.0,
     )
     joints = [settings for joint in setup.joints if (settings := _joint(joint, problems)) is not None]
     if len({settings.model.wire for settings in joints}) > 1:
@@ -112,16 +110,16 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
         name=str(options["model"]),
         model=replace(
             model,
-            torque_constant_nm_per_a=_number(
+            torque_constant_nm_per_a=number_option(
                 options, "torque_constant_nm_per_a", model.torque_constant_nm_per_a, 0, 100, at, problems
             ),
-            stall_nm=_number(options, "stall_nm", model.stall_nm, 0, 100, at, problems),
-            uncertainty_percent=_number(
+            stall_nm=number_option(options, "stall_nm", model.stall_nm, 0, 100, at, problems),
+            uncertainty_percent=number_option(
                 options, "torque_uncertainty_percent", model.uncertainty_percent, 0, 100, at, problems
             ),
         ),
         id=joint.address,
-        zero_counts=int(_number(options, "zero_counts", model.counts_per_turn // 2, 0, most, at, problems)),
+        zero_counts=int(number_option(options, "zero_counts", model.counts_per_turn // 2, 0, most, at, problems)),
         direction=joint.direction,
     )
     for name in ("position_min_rad", "position_max_rad"):
@@ -130,19 +128,3 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
             where = ("joints", joint.name, name)
             problems.append(FieldProblem(where, f"{limit:g} rad is step {settings.counts(limit)}; there are 0..{most}"))
     return settings
-
-
-def _number(
-    options: Mapping[str, Any],
-    name: str,
-    usual: float,
-    low: float,
-    high: float,
-    at: tuple[str, ...],
-    problems: list[FieldProblem],
-) -> float:
-    value = options.get(name, usual)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        problems.append(FieldProblem((*at, name), f"expected a number from {low:g} to {high:g}, found {value!r}"))
-        return usual
-    return float(value)
