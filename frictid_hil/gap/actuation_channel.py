@@ -15,18 +15,19 @@ from frictid_hil.gap.plant_channel import (
     SIZES,
     family,
     report_of,
-    reported,
     stride_of,
     thinned,
     without_nuisances,
 )
-from frictid_hil.gap.residuals import LowPass, Recording, demand_of, demand_parts, held, rms, settled
+from frictid_hil.gap.residuals import LowPass, Recording, demand_of, demand_parts, held, reported, rms, settled
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse_loops import lagged
 
-SAME_RATE = 0.05
-"""Log and control loop may differ by so much of their rate for a replay row by row to be one of the controller."""
+SLOWEST = 10
+"""Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
+FASTEST = 1.05
+"""Rows of the log to a control tick, above which it holds what the controller never saw."""
 
 
 def forms() -> dict[str, ActuationForm]:
@@ -56,8 +57,9 @@ def why_not_replayed(nominal: Nominal, recordings: Sequence[Recording]) -> str |
     controller = nominal.controller
     if controller is None:
         return None
-    if all(abs(controller.rate_hz * r.step_s - 1.0) > SAME_RATE for r in logs):
-        return "the logs hold not every row of the controller, so its demand cannot be replayed"
+    ticks = [controller.rate_hz * r.step_s for r in logs]
+    if max(ticks) > SLOWEST or min(ticks) < 1.0 / FASTEST:
+        return "the logs are much slower than the controller, or faster, so its demand cannot be replayed"
     return None
 
 

@@ -17,6 +17,10 @@ from frictid_hil.simulation.inverse import View
 
 FREE = 10.0
 """One-sigma of a share that was fitted to these very logs: nothing is believed of it."""
+SAME_RATE = 0.05
+"""Rows and control ticks are the same where their rates differ by no more than this share."""
+ANYWHERE = 0.3
+"""One-sigma of a moment that is known to lie in a row, over the row: evenly spread, 1/sqrt(12)."""
 STIFFER = 0.1
 """Step of the presliding stiffness by which its derivative is formed."""
 _ESTIMATED = {
@@ -48,7 +52,7 @@ def nuisances(
             continue
         free = _ESTIMATED.get(name) in estimated
         terms.append(_term("" if free else name, builder.add(columns), FREE if free else deviation))
-    terms.append(_timing(nominal, views, builder))
+    terms += _timing(nominal, views, builder)
     terms += _friction_shape(nominal, views, builder)
     own = [r.experiment.rigid_body_torque_nm for r in logs if r.experiment.rigid_body_torque_nm is not None]
     if len(own) == len(logs):
@@ -80,16 +84,25 @@ def _relative(sigma: Sigma, value: float) -> float:
     return sigma.of(value) / value if value > 0.0 else 0.0
 
 
-def _timing(nominal: Nominal, views: Sequence[View], builder: Builder) -> Term:
-    """When a torque was reported, in s.
+def _timing(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[Term]:
+    """When a torque was reported, in s, and over which time it was averaged, in s^2.
 
-    A declared filter is known by name and number, rarely by its exact form: half of its lag may be missing. A report
-    is taken somewhere within a tenth of its sample.
+    A declared filter is known by name and number, rarely by its exact form: half of its lag may be missing. Where
+    rows and control ticks are the same, a report is taken somewhere within a tenth of a row; where they are not or
+    nobody knows, anywhere in it, and so is the mean that it is of.
     """
+    step_s = views[0].step_s
     report = nominal.torque_report_filter
     filter_s = 0.5 * report.order * report.time_constant_s if report is not None else 0.0
-    deviation_s = math.hypot(nominal.tolerances.torque_delay_s.of(0.0), 0.1 * views[0].step_s, filter_s)
-    return _term("", builder.add([np.gradient(v.torque_nm, v.step_s)[:, None] for v in views]), deviation_s)
+    same = nominal.controller is not None and abs(nominal.controller.rate_hz * step_s - 1.0) < SAME_RATE
+    within_s = (0.1 if same else ANYWHERE) * step_s
+    deviation_s = math.hypot(nominal.tolerances.torque_delay_s.of(0.0), within_s, filter_s)
+    slopes = [np.gradient(v.torque_nm, step_s) for v in views]
+    bends = [np.gradient(slope, step_s) for slope in slopes]
+    return [
+        _term("", builder.add([slope[:, None] for slope in slopes]), deviation_s),
+        _term("", builder.add([bend[:, None] for bend in bends]), within_s**2),
+    ]
 
 
 def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[Term]:

@@ -20,6 +20,7 @@ from frictid_hil.gap.residuals import (
     Recording,
     first_slide,
     impulse_response,
+    reported,
     rms,
 )
 from frictid_hil.simulation.effect import Region
@@ -32,6 +33,10 @@ SIZES = (0.1, 0.3, 1.0)
 """Sizes of a generic function, over what a cause may well make: half decades."""
 BANDS_HZ = (20.0, 40.0, 80.0, 160.0)
 """Cut-offs to choose from."""
+EACH_LOG = "each log"
+"""Family of what differs from log to log, and says nothing of a further one."""
+SEVERAL = 3
+"""Logs from which on what is of one log alone can be told from what is of all."""
 LINE_SHARE = 0.1
 """Part of what a low-pass takes away that a line over position must describe to be let through; noise gives 1e-3."""
 
@@ -70,7 +75,9 @@ def plant_channel(
             columns = form.regressors(views, shape)
             mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
             candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
-    generic = {**families(views), "each log": _by_log(views)}
+    generic = families(views)
+    if sum(not r.experiment.validation for r in logs) >= SEVERAL:
+        generic[EACH_LOG] = _by_log(views)
     for name, columns in generic.items():
         numbers = builder.add(columns)
         for size in SIZES:
@@ -116,7 +123,8 @@ def _gap_nm(logs: Sequence[Recording]) -> float:
 def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> tuple[Rows, ...]:
     """The logs with that part of generic functions taken off which the belief's own tolerances can say."""
     known = [c for term in nuisances for c in term.columns]
-    generic = sorted({c for term in candidates if term.effect.startswith(FAMILY) for c in term.columns})
+    families = [t for t in candidates if t.effect.startswith(FAMILY) and t.effect != FAMILY + EACH_LOG]
+    generic = sorted({c for term in families for c in term.columns})
     x = np.concatenate([log.x for log in logs])
     weights = np.linalg.pinv(x[:, known]) @ x[:, generic]
     result = []
@@ -244,12 +252,3 @@ def report_of(told: ReportFilter | None, logs: Sequence[Recording], low_pass: Lo
             weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
             left[k] += float(np.sum((table[:, -1] - table[:, :-1] @ weights) ** 2))
     return meant[int(np.argmin(left))]
-
-
-def reported(columns: Array, report: ReportFilter, step_s: float) -> Array:
-    """Columns as a drive reports them that low-passes its torque, shape unchanged."""
-    share = 1.0 - math.exp(-step_s / report.time_constant_s)
-    for _ in range(report.order):
-        start = (1.0 - share) * columns[:1]
-        columns, _ = signal.lfilter([share], [1.0, share - 1.0], columns, axis=0, zi=start)
-    return columns

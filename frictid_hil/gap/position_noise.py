@@ -13,8 +13,10 @@ from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.residuals import LowPass, Recording, nominal_torque, view_of
 from frictid_hil.simulation.inverse import View
 
-SMOOTHEST_HZ = 4.0
-"""No position is smoothed below this: a move of a joint takes a quarter of a second."""
+SMOOTHED_HZ = (4.0, 6.0, 9.0, 13.0, 20.0, 30.0, 45.0, 70.0, 100.0)
+"""Cut-offs to choose from. None is lower: a move of a joint takes a quarter of a second."""
+NOISE_SHARE = 0.03
+"""RMS of an acceleration's noise over its own up to which it is left alone: its square is lost of an inertia."""
 
 
 def quiet_views(nominal: Nominal, logs: Sequence[Recording]) -> tuple[list[View], list[Array]]:
@@ -33,10 +35,7 @@ def quiet_views(nominal: Nominal, logs: Sequence[Recording]) -> tuple[list[View]
         assert view is not None and torque is not None
         step = nominal.encoder_resolution_rad or 0.0
         position_noise = max(white_rms(e.position_rad), step / math.sqrt(12.0))
-        inertia = view.motor_inertia_kg_m2 + view.link_inertia_kg_m2 + view.payload_inertia_kg_m2
-        loudest = inertia * position_noise
-        hertz = math.sqrt(white_rms(torque) / loudest) / (2.0 * math.pi) if loudest > 0.0 else math.inf
-        hertz = min(max(hertz, SMOOTHEST_HZ), 0.2 / log.step_s)
+        hertz = _cutoff_hz(e.position_rad, position_noise, log.step_s)
         smooth = replace(e, position_rad=LowPass(1.0 / log.step_s, hertz)(e.position_rad))
         quiet = view_of(nominal, smooth, log.step_s, view.start_s, np.gradient(smooth.position_rad, log.step_s))
         noisy = replace(e, position_rad=smooth.position_rad + position_noise * random.standard_normal(torque.size))
@@ -46,6 +45,21 @@ def quiet_views(nominal: Nominal, logs: Sequence[Recording]) -> tuple[list[View]
         noises[-1][[0, -1]] = 0.0
         views.append(replace(quiet, torque_nm=asked))
     return views, noises
+
+
+def _cutoff_hz(position_rad: Array, noise_rad: float, step_s: float) -> float:
+    """The highest cut-off behind which noise of the position is no more than a trace of the acceleration."""
+    random = np.random.default_rng(1)
+    columns = np.stack([position_rad, noise_rad * random.standard_normal(position_rad.size)], axis=1)
+    acceleration = LowPass.at(1.0 / step_s)(np.diff(columns, 2, axis=0) / step_s**2)
+    top_hz = 0.2 / step_s
+    usable = [top_hz, *(hertz for hertz in reversed(SMOOTHED_HZ) if hertz < top_hz)]
+    for hertz in usable:
+        inside = LowPass(1.0 / step_s, hertz)(acceleration)[len(acceleration) // 20 : -(len(acceleration) // 20) - 1]
+        moved, noise = np.sqrt(np.mean(inside**2, axis=0))
+        if noise <= NOISE_SHARE * moved:
+            return hertz
+    return usable[-1]
 
 
 def white_rms(values: Array) -> float:

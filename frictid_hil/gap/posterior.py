@@ -19,7 +19,7 @@ from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
-from frictid_hil.gap.channel import FAMILY, Channel, Rows
+from frictid_hil.gap.channel import FAMILY, Channel
 
 SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Variance of the slow part over that of the noise: half decades."""
@@ -37,6 +37,10 @@ MOST = 8
 """Terms of a model at most."""
 TRIED = 6
 """Extensions of a model that are scored at every point of the grid."""
+REDRAWN = 20
+"""Times that a draw outside of its bounds is drawn anew before it is put on them."""
+STRETCHES = 6
+"""Parts of the recordings that are left out one by one, at least."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -168,8 +172,8 @@ class Posterior:
         safe = np.where(self._scale > 0.0, self._scale, np.inf)
         self._centre = (self._mean / safe)[self._first :]
         first = [own[0] for own in self._local]
-        self._low = np.array([t.least for t in candidates]) / safe[self._first :][first]
-        self._high = np.array([t.largest for t in candidates]) / safe[self._first :][first]
+        bounds = np.array([[t.least, t.largest] for t in candidates])
+        self._low, self._high = np.where(np.isfinite(bounds), bounds / safe[self._first :][first][:, None], bounds).T
         middle = self._centre[first]
         self._before = _log_between(self._low - middle, self._high - middle)
 
@@ -243,16 +247,11 @@ class Posterior:
     def search(self) -> list[Model]:
         """Models worth a look, the likeliest first.
 
-        What the likeliest leaves of logs that it was not fitted to may be more than what it leaves of the others: then
-        the model is wrong beyond its noise, and every row tells as much less as it is worse predicted.
+        The likeliest may predict stretches that it was not fitted to worse than its own uncertainty allows: then the
+        model is wrong beyond its noise, and every row tells as much less.
         """
         found = self._search()
-        fitted = [log for log in self.channel.logs if not log.validation]
-        unseen = [log for log in self.channel.logs if log.validation]
-        if not fitted or not unseen:
-            return found
-        theta = self.fitted(found[0].terms)
-        worse = _mean_square(unseen, theta) / max(_mean_square(fitted, theta), self.floor**2)
+        worse = self._surprise(found[0])
         if worse <= 1.0:
             return found
         self._grams, self._rights = self._grams / worse, self._rights / worse
@@ -260,6 +259,34 @@ class Posterior:
         self._left = [gram / worse for gram in self._left]
         self._known = {}
         return self._search()
+
+    def _surprise(self, model: Model) -> float:
+        """Mean square of what a model leaves of stretches left out one by one, over what it itself expects of them.
+
+        A stretch is a whole log where there are several, else a part of one that is longer than the noise remembers.
+        """
+        g = int(np.argmax(model.by_setting))
+        at, care = self._of(model, g)
+        setting = self.settings[g]
+        slow = noise.slow(setting.slow * self._covariance[0], setting.memory_s / self.channel.step_s)
+        grams, rows = [], []
+        for table in self._tables:
+            white, _ = noise.whitened(table[:, [*at, -1]] * np.append(care, 1.0), self._covariance + slow)
+            parts = 1 if len(self._tables) >= STRETCHES else STRETCHES // len(self._tables) + 1
+            for part in np.array_split(white, parts):
+                grams.append(part.T @ part)
+                rows.append(part.shape[0])
+        total = np.sum(grams, axis=0)
+        centre = self._centred(at)
+        left = 0.0
+        for gram in grams:
+            known = total - gram
+            inner = known[:-1, :-1] + np.eye(at.size)
+            mean = np.linalg.solve(inner, known[:-1, -1] + centre)
+            rest = gram[:-1, -1] - gram[:-1, :-1] @ mean
+            square = float(np.append(-mean, 1.0) @ gram @ np.append(-mean, 1.0))
+            left += square - float(rest @ np.linalg.solve(inner + gram[:-1, :-1], rest))
+        return left / sum(rows)
 
     def _search(self) -> list[Model]:
         """Grown from the empty model, then every neighbour of the best."""
@@ -304,24 +331,44 @@ class Posterior:
             if (k, g) not in cache:
                 cache[k, g] = self._coefficients(model, g)
             at, mean, root = cache[k, g]
-            values = self._scale[at] * (mean + root @ random.standard_normal(mean.size))
-            result.append(Draw(model, g, at, values))
+            result.append(Draw(model, g, at, self._scale[at] * self._inside(model, mean, root, random)))
         return result
+
+    def _inside(self, model: Model, mean: Array, root: Array, random: np.random.Generator) -> Array:
+        """Scaled coefficients, the first one of every term between its bounds."""
+        first = mean.size - sum(self._local[t].size for t in model.terms)
+        starts = first + np.cumsum([0, *(self._local[t].size for t in model.terms)])[:-1].astype(int)
+        low, high = self._low[list(model.terms)], self._high[list(model.terms)]
+        values = mean
+        for _ in range(REDRAWN):
+            values = mean + root @ random.standard_normal(mean.size)
+            if np.all((values[starts] >= low) & (values[starts] <= high)):
+                return values
+        values[starts] = np.clip(values[starts], low, high)
+        return values
 
     def _coefficients(self, model: Model, g: int) -> tuple[np.ndarray, Array, Array]:
         """(columns, mean, square root of the covariance) of scaled coefficients at one point of the grid."""
-        nuisances = np.arange(self._first)
-        own = [self._own[len(self.channel.nuisances) + t] for t in model.terms]
-        at = np.concatenate([nuisances, *own]).astype(int)
+        at, care = self._of(model, g)
         gram = self._left[g // len(CARE)]
-        care = np.ones(at.size)
-        care[: nuisances.size] = self.settings[g].care
         inner = gram[np.ix_(at, at)] * care[:, None] * care + np.eye(at.size)
-        mean0 = self._mean[at] / np.where(self._scale[at] > 0.0, self._scale[at], 1.0)
         covariance = np.linalg.inv(inner)
-        mean = covariance @ (gram[at, -1] * care + mean0)
+        mean = covariance @ (gram[at, -1] * care + self._centred(at))
         root = np.linalg.cholesky(covariance + 1e-14 * np.eye(at.size))
         return at, care * mean, care[:, None] * root
+
+    def _of(self, model: Model, g: int) -> tuple[np.ndarray, Array]:
+        """(columns of a model and the nuisances, care that multiplies each) at one point of the grid."""
+        own = [self._own[len(self.channel.nuisances) + t] for t in model.terms]
+        at = np.concatenate([np.arange(self._first), *own]).astype(int)
+        care = np.ones(at.size)
+        care[: self._first] = self.settings[g].care
+        return at, care
+
+    def _centred(self, at: np.ndarray) -> Array:
+        """Scaled means of coefficients before anything is recorded."""
+        means: Array = self._mean[at] / np.where(self._scale[at] > 0.0, self._scale[at], 1.0)
+        return means
 
     def fitted(self, terms: Sequence[int]) -> Array:
         """Mean coefficients of a set, at its likeliest point of the grid, for all columns of the channel's table."""
@@ -364,16 +411,13 @@ class Draw:
     values: Array
 
 
-def _mean_square(logs: Sequence[Rows], theta: Array) -> float:
-    """Of what coefficients leave, each log's own mean taken off."""
-    rests = [log.y - log.x @ theta for log in logs]
-    return float(np.mean(np.concatenate([rest - np.mean(rest) for rest in rests]) ** 2))
-
-
 def _log_between(low: Array, high: Array) -> Array:
-    """Logarithm of a standard normal's chance between two bounds."""
-    chance = special.ndtr(high) - special.ndtr(low)
-    return np.log(np.maximum(chance, 1e-12))
+    """Logarithm of a standard normal's chance between two bounds, however far in its tail they lie."""
+    swap = low > 0.0
+    low, high = np.where(swap, -high, low), np.where(swap, -low, high)
+    top, rest = special.log_ndtr(high), special.log_ndtr(low)
+    difference: Array = top + np.log1p(-np.exp(np.minimum(rest - top, -1e-12)))
+    return difference
 
 
 def _integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[Array, float]:

@@ -13,20 +13,23 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
-from scipy import signal
+from scipy import interpolate, signal
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal, ReportFilter
 from frictid_hil.simulation.inverse import View
 from frictid_hil.simulation.inverse_loops import lagged
 
 CUTOFF_HZ = 20.0
 """Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
 
+LATE = (0.5, 0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""How late a row's torque may be, in rows; the mean over the row comes first."""
 SETTLED_S = 0.5
 """The controller's integral is unknown at the start; its level is read from this first stretch."""
 
@@ -134,13 +137,54 @@ def recordings(experiments: ExperimentSet) -> tuple[Recording, ...]:
     """All experiments of a set with their residuals, in run order."""
     result = []
     start_s = 0.0
+    late = _late_of_row(experiments)
     for experiment in experiments.experiments:
-        result.append(_recording(experiments.nominal, experiment, start_s))
+        result.append(_recording(experiments.nominal, experiment, start_s, late))
         start_s += float(experiment.time_s[-1] - experiment.time_s[0])
     return tuple(result)
 
 
-def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
+def _late_of_row(experiments: ExperimentSet) -> float | None:
+    """How late a row's torque is, in rows, where no controller tells: as the motion fits best; None where one does."""
+    nominal = experiments.nominal
+    if nominal.controller is not None:
+        return None
+    left = np.zeros(len(LATE))
+    for raw in experiments.experiments:
+        if raw.torque_nm is None:
+            continue
+        e, step_s, _ = uniform(raw)
+        view = view_of(nominal, e, step_s, 0.0, np.gradient(e.position_rad, step_s), 0.0)
+        low_pass = LowPass.at(1.0 / step_s)
+        parts = [view.acceleration_rad_s2, view.slip, view.velocity_rad_s, np.cos(e.position_rad)]
+        rigid = e.rigid_body_torque_nm
+        model = np.stack([*parts, np.ones_like(view.slip), *([] if rigid is None else [rigid])], axis=1)
+        if nominal.torque_report_filter is not None:
+            model = reported(model, nominal.torque_report_filter, step_s)
+        model = low_pass(model)[5:-5]
+        torque = low_pass(np.stack([aligned(view.torque_nm, late) for late in LATE], axis=1))[5:-5]
+        weights = np.linalg.lstsq(model, torque, rcond=None)[0]
+        left += np.sum((torque - model @ weights) ** 2, axis=0)
+    return LATE[int(np.argmin(left))]
+
+
+def aligned(torque_nm: Array, late: float) -> Array:
+    """Torque at each row where a row's report is late by so many rows, shape unchanged."""
+    torque = torque_nm.copy()
+    torque[:-1] = (1.0 - late) * torque_nm[:-1] + late * torque_nm[1:]
+    return torque
+
+
+def reported(columns: Array, report: ReportFilter, step_s: float) -> Array:
+    """Columns as a drive reports them that low-passes its torque, shape unchanged."""
+    share = 1.0 - math.exp(-step_s / report.time_constant_s)
+    for _ in range(report.order):
+        start = (1.0 - share) * columns[:1]
+        columns, _ = signal.lfilter([share], [1.0, share - 1.0], columns, axis=0, zi=start)
+    return columns
+
+
+def _recording(nominal: Nominal, raw: Experiment, start_s: float, late: float | None) -> Recording:
     experiment, step_s, resampled = uniform(raw)
     q = experiment.position_rad
     velocity = np.gradient(q, step_s)
@@ -151,7 +195,7 @@ def _recording(nominal: Nominal, raw: Experiment, start_s: float) -> Recording:
     elif nominal.controller is not None and experiment.position_command_rad is not None:
         demand = demand_of(nominal.controller, experiment, step_s)
     if experiment.torque_nm is not None:
-        view = view_of(nominal, experiment, step_s, start_s, velocity)
+        view = view_of(nominal, experiment, step_s, start_s, velocity, late)
         plant = view.torque_nm - nominal_torque(nominal, experiment, view)
         # The ends have no second difference.
         plant[0], plant[-1] = plant[1], plant[-2]
@@ -170,8 +214,8 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     if float(np.max(np.abs(steps - step_s))) < 0.02 * step_s:
         return experiment, float(np.mean(steps)), False
     time = np.arange(experiment.time_s[0], experiment.time_s[-1], step_s)
-    columns = {
-        name: np.interp(time, experiment.time_s, column)
+    columns: dict[str, Any] = {
+        name: interpolate.make_interp_spline(experiment.time_s, column, k=3)(time)
         for name in (
             "position_rad",
             "velocity_rad_s",
@@ -186,15 +230,29 @@ def uniform(experiment: Experiment) -> tuple[Experiment, float, bool]:
     return replace(experiment, time_s=time, **columns), step_s, True
 
 
-def view_of(nominal: Nominal, experiment: Experiment, step_s: float, start_s: float, velocity: Array) -> View:
-    """What inverse forms see of one experiment."""
+def view_of(
+    nominal: Nominal,
+    experiment: Experiment,
+    step_s: float,
+    start_s: float,
+    velocity: Array,
+    late: float | None = None,
+) -> View:
+    """What inverse forms see of one experiment.
+
+    Args:
+        nominal: the believed joint.
+        experiment: on a uniform clock.
+        step_s: of that clock.
+        start_s: of the experiment in its session.
+        velocity: rad/s, shape (n,).
+        late: how late a row's torque is, in rows; half of the time that it has been applied unless given.
+    """
     q = experiment.position_rad
     assert experiment.torque_nm is not None
     acceleration = np.zeros_like(q)
     acceleration[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / step_s**2
-    torque = experiment.torque_nm.copy()
-    # Row k carries the torque applied since row k-1: half a step late.
-    torque[:-1] = 0.5 * (experiment.torque_nm[:-1] + experiment.torque_nm[1:])
+    torque = aligned(experiment.torque_nm, 0.5 * applied_s(nominal, step_s) / step_s if late is None else late)
     inertia = nominal.inertia_kg_m2 or 0.0
     motor = inertia * (nominal.motor_inertia_share or 0.0)
     payload = nominal.payload if experiment.payload else None
@@ -230,6 +288,16 @@ def view_of(nominal: Nominal, experiment: Experiment, step_s: float, start_s: fl
         gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
         gravity_sin_nm=nominal.gravity_sin_nm,
     )
+
+
+def applied_s(nominal: Nominal, step_s: float) -> float:
+    """How long a row's torque has been applied: since the row before, or since the control tick before the row.
+
+    A log that keeps every fifth tick of its controller keeps that tick's torque.
+    """
+    if nominal.controller is None:
+        return step_s
+    return min(step_s, 1.0 / nominal.controller.rate_hz)
 
 
 def first_slide(position_rad: Array, travel_rad: float) -> int:
@@ -287,7 +355,9 @@ def controller_demand(
     integral_nm: float = 0.0,
     velocity_lag_s: float = 0.0,
 ) -> Array:
-    """The controller replayed on a measured position; in force from each sample on, shape (n,).
+    """The controller replayed on a measured position; in force when the next sample is taken, shape (n,).
+
+    Where the log keeps every so many ticks of the controller, the motion between its rows is interpolated.
 
     Args:
         controller: gains and limit.
@@ -297,16 +367,30 @@ def controller_demand(
         integral_nm: level of the integral at the start.
         velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
     """
-    difference = np.diff(position_rad, prepend=position_rad[0]) / step_s
-    velocity = lagged(lagged(difference, step_s, velocity_lag_s), step_s, controller.velocity_filter_s)
+    ticks = max(1, round(controller.rate_hz * step_s))
+    position, command = _between(position_rad, ticks), _between(command_rad, ticks)
+    tick_s = step_s / ticks
+    difference = np.diff(position, prepend=position[0]) / tick_s
+    velocity = lagged(lagged(difference, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
     if controller.command_rate == "backward":
-        feed = np.diff(command_rad, prepend=command_rad[0]) / step_s
+        feed = np.diff(command, prepend=command[0]) / tick_s
     else:
-        feed = np.gradient(command_rad, step_s)
-    error = command_rad - position_rad
-    direct = controller.kp_nm_per_rad * error + controller.added_nm(command_rad, step_s)
+        feed = np.gradient(command, tick_s)
+    error = command - position
+    direct = controller.kp_nm_per_rad * error + controller.added_nm(command, tick_s)
     direct += controller.kd_nm_s_per_rad * (controller.command_rate_weight * feed - velocity)
-    return _integrated(direct, controller.ki_nm_per_rad_s * step_s * error, controller.torque_limit_nm, integral_nm)
+    demand = _integrated(direct, controller.ki_nm_per_rad_s * tick_s * error, controller.torque_limit_nm, integral_nm)
+    return demand[ticks - 1 :: ticks]
+
+
+def _between(column: Array, ticks: int) -> Array:
+    """A logged column at every tick of a controller that is so many times faster, shape (n * ticks,)."""
+    if ticks == 1:
+        return column
+    rows = np.arange(column.size)
+    every = np.minimum(np.arange(column.size * ticks) / ticks, column.size - 1.0)
+    finer: Array = interpolate.make_interp_spline(rows, column, k=min(3, column.size - 1))(every)
+    return finer
 
 
 def demand_parts(controller: Controller, position_rad: Array, command_rad: Array, step_s: float) -> Array:
