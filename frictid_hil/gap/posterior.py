@@ -3,8 +3,9 @@
 A *model* of a channel is its nuisances (what the belief may be wrong by), a set of terms (causes), a discrepancy (a
 flexible function of motion and time of unknown size) and coloured noise with a slow part of unknown size. All are
 Gaussian, so the chance of the recordings is a closed form: the product of the chances with which each row is predicted
-from the rows before it, the first from belief alone. Every unknown size is integrated over a grid. A cause wins only
-by what it predicts better than the discrepancy and the slow noise do, and what nobody predicts widens all intervals.
+from the rows before it, the first from belief alone and validation logs from what they had no part in. Every unknown
+size is integrated over a grid. A cause wins only by what it predicts better than the discrepancy and the slow noise
+do, and what nobody predicts widens all intervals. Coefficients are read from identification logs alone.
 """
 
 from __future__ import annotations
@@ -98,9 +99,9 @@ class Posterior:
         self._scale: Array = np.concatenate([term.deviation for term in terms])
         self._mean: Array = np.concatenate([term.mean for term in terms])
         self._tables = [
-            np.concatenate([log.x[:, self._columns] * self._scale, log.y[:, None]], axis=1) for log in channel.fitted
+            np.concatenate([log.x[:, self._columns] * self._scale, log.y[:, None]], axis=1) for log in channel.logs
         ]
-        known = [log.known_noise for log in channel.fitted]
+        known = [log.known_noise for log in channel.logs]
         rests, _ = self._richest()
         total = [np.hypot(rest, sample) for rest, sample in zip(rests, known, strict=True)]
         self.floor = math.sqrt(float(np.mean(np.concatenate(total) ** 2)))
@@ -135,13 +136,16 @@ class Posterior:
         self._left: list[Array] = []
         for slow_share, memory_s in combinations:
             covariance = self._covariance + noise.slow(slow_share * self._covariance[0], memory_s / channel.step_s)
-            gram, rows = np.zeros((terms + 1, terms + 1)), 0
-            for table in self._tables:
+            gram, fitted, rows = np.zeros((terms + 1, terms + 1)), np.zeros((terms + 1, terms + 1)), 0
+            for log, table in zip(channel.logs, self._tables, strict=True):
                 white, deviation = noise.whitened(table, covariance)
-                gram += white.T @ white
+                inner = white.T @ white
+                gram += inner
+                if any(log is one for one in channel.fitted):
+                    fitted += inner
                 rows += white.shape[0]
             log_density = -rows * (math.log(deviation) + 0.5 * math.log(2.0 * math.pi)) - 0.5 * float(gram[-1, -1])
-            self._left.append(gram)
+            self._left.append(fitted)
             for care in CARE:
                 scaled = gram.copy()
                 scaled[:nuisances] *= care
