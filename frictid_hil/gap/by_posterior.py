@@ -20,7 +20,7 @@ from frictid_hil.gap.closing import Closed, Simulated, closed, held_out, simulat
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, findings, sampled
-from frictid_hil.gap.forward import Replay, Replayed, pooled, why_not
+from frictid_hil.gap.forward import Replay, Replayed, settled_nm, why_not
 from frictid_hil.gap.judgement import FLOORS, Verdict, verdict
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
@@ -150,7 +150,7 @@ def _judged_role(logs: Sequence[Recording]) -> bool | None:
 def _loop_quiet(gaps: Sequence[Closed], runs: Mapping[str, Replayed] | None) -> bool:
     """Whether the joint simulated in closed loop shows no more than noise either; noise as the actuation shows it."""
     noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
-    return runs is None or noise is None or pooled(runs, "torque_nm") <= FLOORS * noise
+    return runs is None or noise is None or settled_nm(runs) <= FLOORS * noise
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

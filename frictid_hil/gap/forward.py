@@ -15,10 +15,10 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.actuation import late_s, velocity_lag_s
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.residuals import LowPass, first_slide, friction_scales, rms
+from frictid_hil.gap.residuals import LowPass, between, first_slide, friction_scales, reported, rms, uniform
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
-from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, closed_loop
+from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, Simulated, closed_loop
 
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -106,7 +106,8 @@ class Replay:
     def __init__(self, experiments: ExperimentSet, controller_lags: bool = False, reported_early: bool = False) -> None:
         self._lagging = controller_lags
         self._early = reported_early
-        self._experiments = experiments.experiments
+        self._experiments = tuple(uniform(e)[0] for e in experiments.experiments)
+        self._report = experiments.nominal.torque_report_filter
         self._nominal = nominal_model(experiments.nominal)
         coulomb, stiffness = friction_scales(experiments.nominal)
         self._slide_rad = 3.0 * coulomb / stiffness
@@ -137,17 +138,7 @@ class Replay:
         state: CarryOver | None = None
         result = []
         for e in self._experiments:
-            command = e.position_command_rad
-            assert command is not None
-            rows = closed_loop(
-                model,
-                self._controller,
-                e.time_s,
-                command,
-                payload=e.payload,
-                state=state,
-                substep_s=SEARCH_SUBSTEP_S,
-            )
+            rows = self._rows(model, self._controller, e, state, SEARCH_SUBSTEP_S)
             state = rows.state
             result.append(
                 replace(e, position_rad=rows.position_rad, velocity_rad_s=rows.velocity_rad_s, torque_nm=rows.torque_nm)
@@ -184,6 +175,25 @@ class Replay:
                 result[experiment.name] = difference
         return result
 
+    def _rows(
+        self, model: JointModel, controller: Controller, e: Experiment, state: CarryOver | None, substep_s: float
+    ) -> Simulated:
+        """One recording simulated, its torque reported as the drive does: the controller's last tick, filtered."""
+        assert e.position_command_rad is not None
+        ticks = max(1, round(controller.rate_hz * float(np.median(np.diff(e.time_s)))))
+        last = (e.time_s.size - 1) * ticks + 1
+        time, command = between(e.time_s, ticks)[:last], between(e.position_command_rad, ticks)[:last]
+        rows = closed_loop(model, controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
+        torque = rows.torque_nm
+        if self._report is not None:
+            torque = reported(torque[:, None], self._report, float(np.median(np.diff(time))))[:, 0]
+        return replace(
+            rows,
+            position_rad=rows.position_rad[::ticks],
+            velocity_rad_s=rows.velocity_rad_s[::ticks],
+            torque_nm=torque[::ticks],
+        )
+
     def _one(
         self,
         model: JointModel,
@@ -193,17 +203,7 @@ class Replay:
         substep_s: float,
         early_s: float,
     ) -> tuple[Replayed, CarryOver]:
-        command = experiment.position_command_rad
-        assert command is not None
-        rows = closed_loop(
-            model,
-            controller,
-            experiment.time_s,
-            command,
-            payload=experiment.payload,
-            state=state,
-            substep_s=substep_s,
-        )
+        rows = self._rows(model, controller, experiment, state, substep_s)
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
         reported = rows.torque_nm

@@ -368,7 +368,7 @@ def controller_demand(
         velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
     """
     ticks = max(1, round(controller.rate_hz * step_s))
-    position, command = _between(position_rad, ticks), _between(command_rad, ticks)
+    position, command = between(position_rad, ticks), between(command_rad, ticks)
     tick_s = step_s / ticks
     difference = np.diff(position, prepend=position[0]) / tick_s
     velocity = lagged(lagged(difference, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
@@ -383,7 +383,7 @@ def controller_demand(
     return demand[ticks - 1 :: ticks]
 
 
-def _between(column: Array, ticks: int) -> Array:
+def between(column: Array, ticks: int) -> Array:
     """A logged column at every tick of a controller that is so many times faster, shape (n * ticks,)."""
     if ticks == 1:
         return column
