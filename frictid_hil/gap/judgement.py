@@ -9,12 +9,14 @@ import numpy as np
 
 from frictid_hil.gap.channel import FAMILY
 from frictid_hil.gap.closing import Closed
-from frictid_hil.gap.findings import Finding, Sampled
+from frictid_hil.gap.findings import VISIBLE, Finding, Sampled
 
 FLOORS = 2.0
 """A gap below so many noise floors is none, by promise."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
+UNNAMED = 0.25
+"""Size of what has no name over that of all causes, from which on their names do not tell the gap: 6 % of its power."""
 HELPS = 0.98
 """Gap of the validation logs with the causes over that without, above which they explain nothing there."""
 READ_DIRECTLY = "kinematics"
@@ -66,12 +68,13 @@ def verdict(
         return Verdict("explained", named)
     nothing = not named or float(np.median(explained)) < STANDS_OUT
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
+    unnamed = float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
     # A gap that is small beside the noise and small in practice is none, whatever trace explains it.
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
     if tiny or (quiet and (nothing or generic_wins)):
         return Verdict("none", ())
     new = any(gap.appeared is not None for gap in gaps)
-    if nothing or generic_wins or new or any(_open(gap, negligible) for gap in gaps):
+    if nothing or unnamed or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
