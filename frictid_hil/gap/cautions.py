@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection
 
 import numpy as np
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.diagnosis import Cause
-from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
+from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.residuals import LowPass, uniform
 from frictid_hil.gap.sanity import LEAST_ROWS
 
@@ -19,9 +17,9 @@ ONE_SINUSOID = (
     "one sinusoid only: what follows travel (presliding hysteresis) and what follows time (a delay) look alike on it"
 )
 """What a set leaves open whose motion never changes."""
-_ALIKE_ON_A_SINUSOID = {"presliding_hysteresis": "torque_delay", "torque_delay": "presliding_hysteresis"}
-_TIED = 0.45
-"""Confidence, at most, of a cause that the motion cannot tell from another."""
+
+ALIKE_ON_A_SINUSOID = {"presliding_hysteresis": "torque_delay", "torque_delay": "presliding_hysteresis"}
+"""Causes that such a motion cannot tell from each other."""
 
 
 def one_sinusoid(experiments: ExperimentSet) -> bool:
@@ -62,52 +60,12 @@ def _sinusoid(q: Array, time_s: Array) -> tuple[float, float] | None:
     return best[1], best[2]
 
 
-def tied_on_a_sinusoid(causes: Sequence[Cause], reasons: Mapping[str, str]) -> tuple[Cause, ...]:
-    """The causes, those lowered that one sinusoid cannot tell from each other, with the other one named."""
-    if "sinusoid" not in reasons:
-        return tuple(causes)
-    lowered = []
-    for cause in causes:
-        partner = _ALIKE_ON_A_SINUSOID.get(cause.effect)
-        if partner is not None:
-            others = tuple(name for name in cause.confusable_with if name != partner)
-            cause = replace(cause, confidence=min(cause.confidence, _TIED), confusable_with=(partner, *others))
-        lowered.append(cause)
-    return tuple(lowered)
-
-
-def below_first_pair(causes: Sequence[Cause], curve: FrictionCurve | None) -> str | None:
+def below_first_pair(effects: Collection[str], curve: FrictionCurve | None) -> str | None:
     """The warning that a Stribeck effect deserves whose nominal curve is drawn straight below its first pair."""
-    if curve is None or not any(c.effect == "stribeck" for c in causes):
+    if curve is None or "stribeck" not in effects:
         return None
     first = curve.measured_range_rad_s[0]
     return (
         f"below {first:.3g} rad/s the nominal curve is a straight line through its first pairs; where the true curve "
         "is concave there, the difference looks like a Stribeck effect: measure pairs at lower speeds first"
     )
-
-
-def curve_rather_than_stribeck(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """The causes, a Stribeck effect lowered that needs another bend beside it: together they draw a curve."""
-    names = {c.effect for c in causes}
-    if not {"stribeck", "viscous_nonlinearity"} <= names:
-        return tuple(causes)
-    partner = ("viscous_nonlinearity",)
-    return tuple(
-        replace(c, confidence=min(c.confidence, _TIED), confusable_with=(*partner, *c.confusable_with))
-        if c.effect == "stribeck"
-        else c
-        for c in causes
-    )
-
-
-_FLOORS = 2.0
-"""Gap over what noise leaves up to which nothing is said to be there."""
-_NEGLIGIBLE = 0.05
-"""Gap over the friction level that means nothing in practice: friction repeats to about this from day to day."""
-
-
-def all_clear(gap_nm: float, noise_nm: float, nominal: Nominal) -> bool:
-    """Whether ``none`` may be said: the gap is within two floors, or within what friction repeats to."""
-    level = nominal.curve.coulomb_nm if nominal.curve is not None else 0.0
-    return gap_nm <= max(_FLOORS * noise_nm, _NEGLIGIBLE * level)

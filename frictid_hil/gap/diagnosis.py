@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from frictid_hil.gap.confidence import Clues
 from frictid_hil.simulation.joint import JointModel
 
 SCHEMA = "frictid.gap_diagnosis/1"
@@ -32,7 +31,6 @@ class Cause:
         parameters: by name with unit; empty for an alternative that was not taken.
         confusable_with: effects that this recording can hardly tell from it.
         gap_closed_percent: its own part of what closing the gap achieved, or None.
-        clues: what its confidence rests on; None where another rule set it.
     """
 
     effect: str
@@ -40,7 +38,6 @@ class Cause:
     parameters: Mapping[str, Value] = field(default_factory=dict)
     confusable_with: tuple[str, ...] = ()
     gap_closed_percent: float | None = None
-    clues: Clues | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,12 @@ of the model stays a small difference of torque and does not grow into another m
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.actuation import late_s, velocity_lag_s
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, between, first_slide, friction_scales, reported, rms, uniform
 from frictid_hil.simulation.effects import all_effects
@@ -22,8 +21,6 @@ from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, Simu
 
 Effects = Mapping[str, Mapping[str, float]]
 
-SEARCH_SUBSTEP_S = 5e-4
-"""Sub-step of replays that only compare neighbours; what is reported uses the simulator's own."""
 SETTLING_S = 0.3
 """Time the controller takes after the first slide to forget the start."""
 
@@ -98,14 +95,9 @@ class Replay:
 
     Args:
         experiments: the set.
-        controller_lags: the controller sees a velocity as late as effects say.
-        reported_early: the drive reports the torque of its sampling instant, in which a delay within the sample is
-            over; the simulator reports the mean over the sample, which such a delay makes late.
     """
 
-    def __init__(self, experiments: ExperimentSet, controller_lags: bool = False, reported_early: bool = False) -> None:
-        self._lagging = controller_lags
-        self._early = reported_early
+    def __init__(self, experiments: ExperimentSet) -> None:
         self._experiments = tuple(uniform(e)[0] for e in experiments.experiments)
         self._report = experiments.nominal.torque_report_filter
         self._nominal = nominal_model(experiments.nominal)
@@ -132,19 +124,6 @@ class Replay:
             merged[name] = {**merged.get(name, {}), **bounded(name, values)}
         return self._nominal.with_effects(merged)
 
-    def simulated(self, effects: Effects) -> tuple[Experiment, ...]:
-        """All experiments as the nominal joint with ``effects`` would have recorded them."""
-        model = self.model(effects)
-        state: CarryOver | None = None
-        result = []
-        for e in self._experiments:
-            rows = self._rows(model, self._controller, e, state, SEARCH_SUBSTEP_S)
-            state = rows.state
-            result.append(
-                replace(e, position_rad=rows.position_rad, velocity_rad_s=rows.velocity_rad_s, torque_nm=rows.torque_nm)
-            )
-        return tuple(result)
-
     def __call__(
         self, effects: Effects, *, validation: bool | None = None, substep_s: float = SUBSTEP_S
     ) -> dict[str, Replayed]:
@@ -157,11 +136,6 @@ class Replay:
             substep_s: of the physics.
         """
         model = self.model(effects)
-        lag_s = velocity_lag_s(effects) if self._lagging else 0.0
-        controller = replace(
-            self._controller,
-            velocity_filter_s=lag_in_row(self._controller.velocity_filter_s, lag_s, 1.0 / self._controller.rate_hz),
-        )
         carried = any(all_effects()[name].carried for name in effects)
         state: CarryOver | None = None
         result: dict[str, Replayed] = {}
@@ -169,21 +143,18 @@ class Replay:
             wanted = validation is None or experiment.validation == validation
             if not wanted and not carried:
                 continue
-            early_s = late_s(effects) if self._early else 0.0
-            difference, state = self._one(model, controller, experiment, state, substep_s, early_s)
+            difference, state = self._one(model, experiment, state, substep_s)
             if wanted:
                 result[experiment.name] = difference
         return result
 
-    def _rows(
-        self, model: JointModel, controller: Controller, e: Experiment, state: CarryOver | None, substep_s: float
-    ) -> Simulated:
+    def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None, substep_s: float) -> Simulated:
         """One recording simulated, its torque reported as the drive does: the controller's last tick, filtered."""
         assert e.position_command_rad is not None
-        ticks = max(1, round(controller.rate_hz * float(np.median(np.diff(e.time_s)))))
+        ticks = max(1, round(self._controller.rate_hz * float(np.median(np.diff(e.time_s)))))
         last = (e.time_s.size - 1) * ticks + 1
         time, command = between(e.time_s, ticks)[:last], between(e.position_command_rad, ticks)[:last]
-        rows = closed_loop(model, controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
+        rows = closed_loop(model, self._controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
         torque = rows.torque_nm
         if self._report is not None:
             torque = reported(torque[:, None], self._report, float(np.median(np.diff(time))))[:, 0]
@@ -197,38 +168,20 @@ class Replay:
     def _one(
         self,
         model: JointModel,
-        controller: Controller,
         experiment: Experiment,
         state: CarryOver | None,
         substep_s: float,
-        early_s: float,
     ) -> tuple[Replayed, CarryOver]:
-        rows = self._rows(model, controller, experiment, state, substep_s)
+        rows = self._rows(model, experiment, state, substep_s)
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
-        reported = rows.torque_nm
-        if early_s > 0.0:
-            reported = np.interp(experiment.time_s + early_s, experiment.time_s, reported)
-        torque = np.zeros_like(reported) if measured is None else measured - reported
+        torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm
         held = first_slide(experiment.position_rad, self._slide_rad) + round(SETTLING_S * low_pass.rate_hz)
         return Replayed(
             low_pass(torque),
             low_pass(experiment.position_rad - rows.position_rad),
             min(held, experiment.time_s.size // 3),
         ), rows.state
-
-
-def lag_in_row(first_s: float, second_s: float, period_s: float) -> float:
-    """Time constant of the one sampled first-order lag that is as late, on the mean, as two of them in a row.
-
-    Sampled, a lag of time constant T is late by period / (exp(period / T) - 1), which is less than T.
-    """
-
-    def late(time_constant_s: float) -> float:
-        return 1.0 / math.expm1(period_s / time_constant_s) if time_constant_s > 0.0 else 0.0
-
-    ticks = late(first_s) + late(second_s)
-    return period_s / math.log1p(1.0 / ticks) if ticks > 0.0 else 0.0
 
 
 def pooled(differences: Mapping[str, Replayed], part: str) -> float:
@@ -239,93 +192,3 @@ def pooled(differences: Mapping[str, Replayed], part: str) -> float:
 def settled_nm(differences: Mapping[str, Replayed]) -> float:
     """RMS torque difference from where each recording has settled: what hypotheses are compared by."""
     return rms(np.concatenate([d.torque_nm[d.settled :] for d in differences.values()]))
-
-
-@dataclass(frozen=True, slots=True)
-class Refined:
-    """Effects with parameters refined by replay.
-
-    Attributes:
-        effects: parameters by effect.
-        intervals: half widths of 95 % intervals by (effect, parameter).
-        squares_before: mean square of the torque difference on the identification logs, before refinement.
-        squares: after.
-    """
-
-    effects: dict[str, dict[str, float]]
-    intervals: dict[tuple[str, str], float]
-    squares_before: float
-    squares: float
-
-
-def refine(replay: Replay, effects: Effects, rounds: int = 3) -> Refined:
-    """Refine parameters by damped Gauss-Newton steps on the identification logs' torque, within the effects' bounds.
-
-    Drive effects are left alone: the actuation channel sees them sample by sample, which a replay does not do better.
-    """
-    current = {name: all_effects()[name].complete(bounded(name, values)) for name, values in effects.items()}
-    free: list[tuple[str, str, float, float, float]] = []
-    for name in current:
-        if all_effects()[name].inverse is None:
-            continue
-        for p in all_effects()[name].parameters:
-            if not p.replayed or p.name not in effects[name]:
-                continue
-            if p.name.startswith("second_") and current[name].get("second_amplitude_nm", 0.0) == 0.0:
-                continue
-            free.append((name, p.name, p.lower, p.upper, p.typical))
-
-    def difference(values: Effects) -> Array:
-        logs = replay(values, validation=False, substep_s=SEARCH_SUBSTEP_S)
-        return np.concatenate([d.torque_nm[d.settled :: 8] for d in logs.values()])
-
-    base = difference(current)
-    before = least = float(np.mean(base**2))
-    if not free:
-        return Refined(current, {}, before, least)
-    jacobian = np.zeros((base.size, len(free)))
-    damping = 1e-3
-    for _ in range(rounds):
-        for k, (name, parameter, lower, upper, typical) in enumerate(free):
-            value = current[name][parameter]
-            step = 0.04 * abs(value) if abs(value) > 1e-3 * abs(typical) else 0.02 * max(abs(typical), 1e-4)
-            if value + step > upper:
-                step = -step
-            if value + step < lower:
-                continue
-            jacobian[:, k] = (difference(_changed(current, name, parameter, value + step)) - base) / step
-        inner = jacobian.T @ jacobian
-        scale = np.diag(inner).copy()
-        scale[scale <= 0.0] = 1.0
-        improved = False
-        for _ in range(3):
-            move = -np.linalg.solve(inner + np.diag(damping * scale + 1e-30), jacobian.T @ base)
-            trial = {name: dict(values) for name, values in current.items()}
-            for k, (name, parameter, lower, upper, _typical) in enumerate(free):
-                value = current[name][parameter]
-                # Shapes may double or halve in one step; beyond that the linear picture is not to be trusted.
-                reach = max(0.7 * abs(value), 1e-3 * abs(_typical))
-                trial[name][parameter] = float(np.clip(value + np.clip(move[k], -reach, reach), lower, upper))
-            tried = difference(trial)
-            squares = float(np.mean(tried**2))
-            if squares < least:
-                improved = squares < 0.995 * least
-                current, base, least = trial, tried, squares
-                damping = max(1e-6, 0.3 * damping)
-                break
-            damping *= 10.0
-        if not improved:
-            break
-    return Refined(current, _half_widths(jacobian, least, free), before, least)
-
-
-def _changed(effects: Mapping[str, dict[str, float]], name: str, parameter: str, value: float) -> Effects:
-    return {**effects, name: {**effects[name], parameter: value}}
-
-
-def _half_widths(
-    jacobian: Array, mean_square: float, free: Sequence[tuple[str, str, float, float, float]]
-) -> dict[tuple[str, str], float]:
-    # Thinned rows of a 20 Hz residual are correlated: about two thirds of them count.
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) * mean_square / 0.64
-    return {(name, p): float(1.96 * math.sqrt(max(0.0, covariance[k, k]))) for k, (name, p, *_) in enumerate(free)}

@@ -62,7 +62,7 @@ def joint() -> Joint:
 def test_the_generator_never_loads_the_effect_library() -> None:
     script = (
         "import sys, frictid_hil.gap.blind.generator\n"
-        "print([m for m in sys.modules if m.startswith(('frictid_hil.simulation', 'frictid_hil.gap.which'))])"
+        "print([m for m in sys.modules if m.startswith(('frictid_hil.simulation', 'frictid_hil.gap.posterior'))])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from frictid_hil.errors import ConfigError, FrictidError, InputFileError
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal, read_log
+from frictid_hil.simulation.effects import backlash, torque_delay
 
 ASYMMETRY = {"direction_asymmetry": {"coulomb_share": 0.1, "viscous_share": 0.15}}
 
@@ -108,9 +109,7 @@ def test_position_and_command_alone() -> None:
 def test_play_on_one_sinusoid_is_ambiguous_with_a_gain() -> None:
     time = 0.02 * np.arange(1500)
     command = 0.4 * np.sin(1.0 * time)
-    from frictid_hil.gap.tracking import Chain
-
-    position = Chain({"delay_s": 0.08, "gap_rad": 0.03}).position(command, 0.02)
+    position = backlash.behind_play(torque_delay.delayed(command, 0.08, 0.02), 0.03, 0.02)
     log = Experiment("backlash_detection", False, False, 0, time, position, position_command_rad=command)
     d = diagnose(ExperimentSet("one", Nominal(), (log,)))
     assert d.verdict == "ambiguous" and d.next_experiment is not None and d.next_experiment.duration_s > 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
-from frictid_hil.gap.by_posterior import diagnose
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import Finding, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior
