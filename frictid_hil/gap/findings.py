@@ -159,14 +159,15 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
     posterior = channel.posterior
     terms = [*posterior.channel.nuisances, *(posterior.channel.candidates[t] for t in draw.model.terms)]
-    at, total, shape = 0, None, None
+    at, total, shape, loudest = 0, None, None, 0.0
     for term in terms:
         values = draw.values[at : at + len(term.columns)]
         at += len(term.columns)
         if term.effect != effect or "stiffness" in term.shape:
             continue
         total = values if total is None or total.size != values.size else total + values
-        shape = term
+        if shape is None or float(np.sum(np.abs(values))) > loudest:
+            shape, loudest = term, float(np.sum(np.abs(values)))
     if shape is None or total is None:
         return {}
     return _read(effect, posterior.channel.name, shape, total)

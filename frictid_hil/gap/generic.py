@@ -24,7 +24,8 @@ DESCRIPTIONS = {
     "position": "a torque that depends on position alone",
     "position friction": "friction that depends on position",
     "position viscous": "damping that depends on position",
-    "velocity": "friction that depends on velocity and direction",
+    "velocity": "friction that depends on velocity",
+    "velocity and direction": "friction that differs by direction, as velocity has it",
     "lagged motion": "friction that lags behind the motion",
     "time": "a slow change over the whole session",
     "time in a log": "a change within each recording",
@@ -58,8 +59,8 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         return bumps
 
     def speed(v: View) -> Array:
-        hats = np.stack([np.interp(np.abs(v.velocity_rad_s), knots, row) for row in np.eye(knots.size)], axis=1)
-        return np.concatenate([hats * v.slip[:, None], hats * np.abs(v.slip)[:, None]], axis=1)
+        hats: Array = np.stack([np.interp(np.abs(v.velocity_rad_s), knots, row) for row in np.eye(knots.size)], axis=1)
+        return hats
 
     def late(v: View) -> Array:
         columns = []
@@ -100,7 +101,8 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         "position": [place(v) for v in views],
         "position friction": [place(v) * v.slip[:, None] for v in views],
         "position viscous": [place(v) * v.velocity_rad_s[:, None] for v in views],
-        "velocity": [speed(v) for v in views],
+        "velocity": [speed(v) * v.slip[:, None] for v in views],
+        "velocity and direction": [speed(v) * np.abs(v.slip)[:, None] for v in views],
         "lagged motion": [late(v) for v in views],
         "time": [session(v) for v in views],
         "time in a log": [within(v) for v in views],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -53,9 +54,9 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
     posterior = channel.posterior
     judged = posterior.channel.judged
     constant = posterior.channel.name != "plant"
-    every = [coefficients(channel, draw, names) for draw in channel.draws]
+    every = [coefficients(channel, draw, names) for draw in _without_generic(channel, names)]
     mean = np.mean(every, axis=0)
-    spread = [rms(_left(judged, theta, constant)) for theta in every[:FEW]]
+    spread = [rms(_left(judged, theta, constant)) for theta in every]
     low, high = np.quantile(spread, [0.025, 0.975])
     after = rms(_left(judged, mean, constant))
     whole = np.mean([coefficients(channel, draw, None) for draw in channel.draws], axis=0)
@@ -68,6 +69,14 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
         _appeared(channel, whole),
     )
+
+
+def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
+    """Draws of the commonest model less its generic functions: what a joint gets to which the causes are added."""
+    posterior = channel.posterior
+    terms = Counter(draw.model.terms for draw in channel.draws).most_common(1)[0][0]
+    causes = tuple(t for t in terms if posterior.channel.candidates[t].effect in names)
+    return posterior.draws([posterior.model(causes)], FEW)
 
 
 def coefficients(channel: Sampled, draw: Draw, names: Collection[str] | None) -> Array:

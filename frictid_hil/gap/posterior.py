@@ -200,7 +200,9 @@ class Posterior:
         covariance = np.linalg.inv(inner)
         mean = covariance @ right
         gain = 0.5 * float(right @ mean) - 0.5 * float(self._centre[at] @ self._centre[at])
+        again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
         gain -= 0.5 * float(np.linalg.slogdet(inner)[1]) - float(np.sum(self._log_prior[list(terms)]))
+        gain -= again * self._chance
         start = 0
         for t in terms:
             if math.isfinite(self._low[t]) or math.isfinite(self._high[t]):
@@ -232,8 +234,14 @@ class Posterior:
             bounded = np.isfinite(self._low[block]) | np.isfinite(self._high[block])
             found += np.where(bounded, _log_between(low, high) - self._before[block], 0.0)
             gains[block] = found + self._log_prior[block]
-        names = {self.channel.candidates[t].effect for t in terms}
-        gains[[c.effect in names for c in self.channel.candidates]] = -np.inf
+        held = [self.channel.candidates[t].effect for t in terms]
+        counts = Counter(held)
+        for t, candidate in enumerate(self.channel.candidates):
+            if counts[candidate.effect]:
+                # Two shapes of one cause make one between them; a third adds nothing.
+                between = counts[candidate.effect] == 1 and bool(candidate.shape) and t not in terms
+                between = between and not candidate.effect.startswith(FAMILY)
+                gains[t] = gains[t] - self._chance if between else -np.inf
         return gains
 
     def _extensions(self, model: Model) -> list[int]:
