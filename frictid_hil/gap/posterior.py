@@ -177,7 +177,9 @@ class Posterior:
         self._centre = (self._mean / safe)[self._first :]
         first = [own[0] for own in self._local]
         bounds = np.array([[t.least, t.largest] for t in candidates])
-        self._low, self._high = np.where(np.isfinite(bounds), bounds / safe[self._first :][first][:, None], bounds).T
+        finite = np.isfinite(bounds)
+        scaled = np.where(finite, bounds, 0.0) / safe[self._first :][first][:, None]
+        self._low, self._high = np.where(finite, scaled, bounds).T
         middle = self._centre[first]
         self._before = _log_between(self._low - middle, self._high - middle)
 
