@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -159,18 +159,30 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
     posterior = channel.posterior
     terms = [*posterior.channel.nuisances, *(posterior.channel.candidates[t] for t in draw.model.terms)]
-    at, total, shape, loudest = 0, None, None, 0.0
+    at, found = 0, []
     for term in terms:
         values = draw.values[at : at + len(term.columns)]
         at += len(term.columns)
-        if term.effect != effect or "stiffness" in term.shape:
-            continue
-        total = values if total is None or total.size != values.size else total + values
-        if shape is None or float(np.sum(np.abs(values))) > loudest:
-            shape, loudest = term, float(np.sum(np.abs(values)))
-    if shape is None or total is None:
+        if term.effect == effect and "stiffness" not in term.shape:
+            found.append((term, values))
+    if not found:
         return {}
-    return _read(effect, posterior.channel.name, shape, total)
+    width = found[-1][1].size
+    total = np.sum([values for _, values in found if values.size == width], axis=0)
+    return _read(effect, posterior.channel.name, _between(found), total)
+
+
+def _between(found: Sequence[tuple[Term, Array]]) -> Term:
+    """The shape that several shapes of one cause make together: their mean where they pull the same way."""
+    shaped = [(term, values) for term, values in found if term.shape]
+    if not shaped:
+        return found[-1][0]
+    loudest, _ = max(shaped, key=lambda one: float(np.sum(np.abs(one[1]))))
+    weights = np.array([values[0] for _, values in shaped])
+    if len(shaped) == 1 or np.min(weights) * np.max(weights) <= 0.0:
+        return loudest
+    mean = {name: float(weights @ [term.shape[name] for term, _ in shaped] / np.sum(weights)) for name in loudest.shape}
+    return replace(loudest, shape=mean)
 
 
 def _read(effect: str, channel: str, term: Term, values: Array) -> dict[str, float]:

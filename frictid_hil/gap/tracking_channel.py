@@ -102,10 +102,9 @@ def _left(positions: Sequence[Array], logs: Sequence[Recording]) -> float:
 
 
 def _generic(logs: Sequence[Recording], commands: Sequence[Array]) -> dict[str, list[Array]]:
-    """Functions of the command that no effect names."""
-    place, motion = [], []
+    """Functions of the command that no effect names; those of its place alone would be a gain by another name."""
+    motion = []
     for log, command in zip(logs, commands, strict=True):
         velocity = LowPass.at(1.0 / log.step_s)(np.gradient(command, log.step_s))
-        place.append(np.stack([np.cos(command), np.sin(command), np.cos(2 * command), np.sin(2 * command)], axis=1))
         motion.append(np.stack([np.abs(velocity), np.sign(velocity), np.gradient(velocity, log.step_s)], axis=1))
-    return {"position": place, "motion": motion}
+    return {"motion": motion}
