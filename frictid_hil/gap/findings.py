@@ -54,7 +54,7 @@ class Sampled:
     Attributes:
         posterior: of the channel.
         draws: samples.
-        sizes: by cause, its size over the floor in every draw, shape (draws,); 0 where it is not in.
+        sizes: by cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
         generic: the same of all generic functions together.
         explained: the same of all causes together.
     """
@@ -85,11 +85,28 @@ def sampled(posterior: Posterior) -> Sampled:
     for k, draw in enumerate(draws):
         parts = posterior.contributions(draw)
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
-        for effect, part in causes.items():
-            sizes.setdefault(effect, np.zeros(len(draws)))[k] = size_of([part])
+        for effect, net in zip(causes, _net(list(causes.values()), gram), strict=True):
+            sizes.setdefault(effect, np.zeros(len(draws)))[k] = net / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
     return Sampled(posterior, draws, sizes, generic, explained)
+
+
+def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> Array:
+    """RMS of what each cause makes, less what others take back: a pair that more than half cancels explains nothing."""
+    if not parts:
+        return np.zeros(0)
+    vectors = np.zeros((len(parts), gram.shape[0]))
+    for k, (columns, values) in enumerate(parts):
+        np.add.at(vectors[k], columns, values)
+    inner = vectors @ gram @ vectors.T
+    squares = np.maximum(np.diag(inner), 1e-300)
+    own = np.sqrt(squares)
+    pair = squares[:, None] + squares + 2.0 * inner
+    cancels = pair < 0.25 * np.maximum(squares[:, None], squares)
+    taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
+    net: Array = np.maximum(0.0, own + taken_back)
+    return net
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -173,13 +190,14 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
 
 
 def _between(found: Sequence[tuple[Term, Array]]) -> Term:
-    """The shape that several shapes of one cause make together: their mean where they pull the same way."""
+    """The shape that several shapes of one cause make together: their mean where one column each pulls the same way."""
     shaped = [(term, values) for term, values in found if term.shape]
     if not shaped:
         return found[-1][0]
     loudest, _ = max(shaped, key=lambda one: float(np.sum(np.abs(one[1]))))
     weights = np.array([values[0] for _, values in shaped])
-    if len(shaped) == 1 or np.min(weights) * np.max(weights) <= 0.0:
+    alike = all(values.size == 1 and term.shape.keys() == loudest.shape.keys() for term, values in shaped)
+    if len(shaped) == 1 or not alike or np.min(weights) * np.max(weights) <= 0.0:
         return loudest
     mean = {name: float(weights @ [term.shape[name] for term, _ in shaped] / np.sum(weights)) for name in loudest.shape}
     return replace(loudest, shape=mean)
@@ -190,7 +208,9 @@ def _read(effect: str, channel: str, term: Term, values: Array) -> dict[str, flo
     if channel == "plant" and form.inverse is not None:
         return form.inverse.parameters(term.shape, values)
     if channel == "tracking":
-        return dict(term.shape)
+        # What a late or slack position adds grows with its number; a gain is none of these.
+        neutral = {link.name: link.neutral for link in form.tracking.links} if form.tracking is not None else {}
+        return {n: v if neutral.get(n, 1.0) else v * float(values[0]) for n, v in term.shape.items()}
     if form.demand is not None:
         return dict(zip(form.demand.parameters, (float(v) for v in values), strict=True))
     if form.actuation is None:
