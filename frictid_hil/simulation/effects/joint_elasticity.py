@@ -66,7 +66,7 @@ def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
     if link <= 0.0:
         return SHAPES
     found: list[Shape] = []
-    for frequency_hz in (4.0, 6.0, 8.0, 11.0, 15.0, 21.0, 30.0, 45.0):
+    for frequency_hz in (4.0, 5.0, 6.0, 7.0, 8.0, 9.5, 11.0, 13.0, 15.0, 18.0, 21.0, 25.0, 30.0, 37.0, 45.0):
         pulsation = 2.0 * np.pi * frequency_hz
         for ratio in (0.03, 0.12):
             compliance = float(np.clip(1.0 / (link * pulsation**2), *COMPLIANCE_BOUNDS))
