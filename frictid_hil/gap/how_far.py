@@ -50,16 +50,15 @@ class Closed:
 
 
 def closed(channel: Sampled, names: Collection[str]) -> Closed:
-    """The gap of one channel without and with the named causes."""
+    """The gap of one channel without the named causes, and with them and what tolerances allow."""
     posterior = channel.posterior
     judged = posterior.channel.judged
     constant = posterior.channel.name != "plant"
-    every = [coefficients(channel, draw, names) for draw in _without_generic(channel, names)]
+    every = [coefficients(channel, draw) for draw in _without_generic(channel, names)]
     mean = np.mean(every, axis=0)
     spread = [rms(_left(judged, theta, constant)) for theta in every]
     low, high = np.quantile(spread, [0.025, 0.975])
     after = rms(_left(judged, mean, constant))
-    whole = np.mean([coefficients(channel, draw, None) for draw in channel.draws], axis=0)
     return Closed(
         posterior.channel.name,
         rms(_left(judged, np.zeros_like(mean), constant)),
@@ -67,7 +66,7 @@ def closed(channel: Sampled, names: Collection[str]) -> Closed:
         min(float(low), after),
         max(float(high), after),
         min(posterior.floor, COLOUR * posterior.channel.known_floor),
-        _appeared(channel, whole),
+        _appeared(channel, mean),
     )
 
 
@@ -79,11 +78,11 @@ def _without_generic(channel: Sampled, names: Collection[str]) -> list[Draw]:
     return posterior.draws([posterior.model(causes)], FEW)
 
 
-def coefficients(channel: Sampled, draw: Draw, names: Collection[str] | None) -> Array:
-    """Of all columns of the channel's table in one draw, those of other causes 0; of everything where names is None."""
+def coefficients(channel: Sampled, draw: Draw) -> Array:
+    """Of all columns of the channel's table in one draw, those of functions without a name 0."""
     theta = np.zeros(channel.posterior.channel.logs[0].x.shape[1])
     for effect, (columns, values) in channel.posterior.contributions(draw).items():
-        if names is None or (effect in names and not effect.startswith(FAMILY)):
+        if not effect.startswith(FAMILY):
             np.add.at(theta, columns, values)
     return theta
 
@@ -94,7 +93,7 @@ def _left(logs: Sequence[Rows], theta: Array, without_mean: bool) -> Array:
 
 
 def _appeared(channel: Sampled, theta: Array) -> tuple[str, float] | None:
-    """The validation log, and the time in it, from which on the whole model explains much less than elsewhere."""
+    """The validation log, and the time in it, from which on the causes explain much less than elsewhere."""
     posterior = channel.posterior
     fitted = [log for log in posterior.channel.logs if not log.validation]
     if not fitted or channel.posterior.channel.name != "plant":

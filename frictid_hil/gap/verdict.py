@@ -68,7 +68,7 @@ def verdict(
         return Verdict("explained", named)
     nothing = not named or float(np.median(explained)) < STANDS_OUT
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
-    unnamed = float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
+    unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
     # A gap that is small beside the noise and small in practice is none, whatever trace explains it.
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
     if tiny or (quiet and (nothing or generic_wins)):
@@ -81,6 +81,12 @@ def verdict(
     if first.leads < LEADS and rivals:
         return Verdict("ambiguous", named)
     return Verdict("explained", named)
+
+
+def _unnamed(loud: Sequence[Sampled]) -> bool:
+    """Whether what has no name is a fair part of what channels with a gap hold."""
+    generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
+    return float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
 
 
 def _open(gap: Closed, negligible: float) -> bool:
