@@ -93,6 +93,7 @@ def test_a_case_depends_on_seed_and_index_alone() -> None:
     assert other.nominal["joint"]["inertia_kg_m2"] != once.nominal["joint"]["inertia_kg_m2"]
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_as_believed_leaves_noise_only(joint: Joint) -> None:
     logs = record(joint, joint.physics, [1])
     believed = believed_motion(joint)

@@ -192,6 +192,7 @@ def completed(line: str) -> list[str]:
     return offered.stdout.split()
 
 
+@pytest.mark.slow
 def test_the_shell_completes_verbs_robot_files_and_choices() -> None:
     assert "calibrate" in completed("frictid-hil cal")
     assert "hp3j.yaml" in completed("frictid-hil calibrate --robot hp")

@@ -82,6 +82,7 @@ def test_the_profile_in_force_compensates(promoted: Told, verb: Verb) -> None:
     assert told["modes"]["mop"]["torque_rms_nm"] < 0.5 * told["modes"]["nc"]["torque_rms_nm"]
 
 
+@pytest.mark.slow
 def test_a_night_finds_the_joint_as_it_was(promoted: Told, verb: Verb) -> None:
     night = verb("recalibrate", "--robot", "smoke.yaml", "--store", "store", "--out", "night")
     assert night["outcome"] == "ok" and night["promoted"] is True

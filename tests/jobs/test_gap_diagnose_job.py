@@ -96,6 +96,7 @@ def test_the_missing_effect_is_named_closed_and_written(asymmetric: Path, tmp_pa
     assert Path(result["report"]).stat().st_size > 1_000_000, "the page carries its plots with it"
 
 
+@pytest.mark.slow
 def test_a_healthy_joint_has_no_cause(tmp_path: Path) -> None:
     result = diagnose(a_set(tmp_path / "healthy", {}))
     assert result["verdict"] == "none"

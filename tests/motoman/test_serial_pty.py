@@ -91,6 +91,7 @@ def test_a_job_runs_at_19200_baud_over_a_pseudo_terminal(port: str) -> None:
     assert took_s > rows * 10 * 4 / 3 * 10 / 19200
 
 
+@pytest.mark.slow
 def test_the_port_is_ours_alone(port: str) -> None:
     driver = driver_on(port)
     driver.open()

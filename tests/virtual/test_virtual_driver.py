@@ -191,6 +191,7 @@ def test_faults_of_the_robot_file_reach_the_run(make_robot):
 # -- wall clock --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_wall_clock_run(make_robot):
     """Drives in a process of their own; how exactly they keep time is ``test_virtual_wall_clock``'s business."""
     began_s = time.monotonic()
