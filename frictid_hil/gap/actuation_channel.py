@@ -109,8 +109,13 @@ def actuation_channel(
         tuple(candidates),
         scale,
         low_pass.cutoff_hz,
-        (0.0, 0.0),
+        between_rows=any(r.resampled or _thinned(controller, r) for r in logs),
     )
+
+
+def _thinned(controller: Controller | None, recording: Recording) -> bool:
+    """Whether the controller ran between the rows of a log."""
+    return controller is not None and controller.rate_hz * recording.step_s > FASTEST
 
 
 def _view(recording: Recording, controller: Controller | None, limit_nm: float) -> DriveView:

@@ -78,6 +78,7 @@ class Channel:
         cutoff_hz: of the low-pass that all columns have passed.
         raw: RMS of the residual before the low-pass on the validation logs, and what noise leaves of it.
         known_floor: RMS behind the low-pass of what is known to be noise, whatever any model leaves.
+        between_rows: the controller was replayed between rows of the logs or on an uneven clock, so not exactly.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Channel:
     cutoff_hz: float
     raw: tuple[float, float] = (0.0, 0.0)
     known_floor: float = math.inf
+    between_rows: bool = False
 
     @property
     def fitted(self) -> tuple[Rows, ...]:

@@ -58,7 +58,7 @@ def verdict(
         negligible: gap that means nothing to the user, in the channels' unit.
         otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
     """
-    helpless = [gap.channel for gap in gaps if gap.after > HELPS * gap.before]
+    helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
     named = tuple(f for f in found if f.chance >= LISTED and f.where not in helpless)
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
@@ -87,6 +87,11 @@ def _unnamed(loud: Sequence[Sampled]) -> bool:
     """Whether what has no name is a fair part of what channels with a gap hold."""
     generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
     return float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
+
+
+def _faint(channel: Sampled, gap: Closed) -> bool:
+    """Whether a gap is no more than what a replay between rows of the logs may leave by itself."""
+    return channel.posterior.channel.between_rows and gap.before <= FLOORS * gap.floor
 
 
 def _open(gap: Closed, negligible: float) -> bool:
