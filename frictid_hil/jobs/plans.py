@@ -91,9 +91,11 @@ def calibration_motions(
 
 def rehearsal_note(joints: Sequence[str]) -> str:
     """The note in a plan about joints whose travel is new to this robot."""
+    who = f"joint {joints[0]} proves its" if len(joints) == 1 else f"joints {', '.join(joints)} prove their"
+    then = "rehearses" if len(joints) == 1 else "rehearse"
     return (
-        f"first run of this travel on this robot: joints {', '.join(joints)} prove their units by "
-        "a few encoder steps and 0.5 deg, then rehearse it slowly, torque watched"
+        f"first run of this travel on this robot: {who} units by "
+        f"a few encoder steps and 0.5 deg, then {then} it slowly, torque watched"
     )
 
 
