@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bytes_but_for_provenance(joint_5: Path, tm
 def test_a_run_on_simulated_drives_spares_no_real_joint_its_rehearsal(joint_5: Path) -> None:
     planned = plan_calibration(CalibrateOptions("hp3j.yaml", bus="socketcan:can0", joints=("5",)))
     assert REHEARSAL in [motion.name for motion in planned.plan.joints[0].motions]
-    assert "rehearse it slowly" in " ".join(planned.plan.notes)
+    assert "it slowly, torque watched" in " ".join(planned.plan.notes)
 
 
 def test_the_plan_is_refused_before_anything_is_written(tmp_path: Path) -> None:

@@ -406,7 +406,7 @@ def rehearses(plan: Plan) -> bool:
 
 def test_on_a_bus_that_never_saw_this_travel_it_is_rehearsed_slowly_and_whole(asked: CompensateOptions) -> None:
     planned = plan_compensation(changed(asked, bus="socketcan:can0", task="hand"))
-    assert any("rehearse it slowly" in note for note in planned.plan.notes)
+    assert any("it slowly, torque watched" in note for note in planned.plan.notes)
     motions = planned.plan.joints[0].motions
     names = [motion.name for motion in motions]
     assert names[:2] == ["move", REHEARSAL] and names.index(REHEARSAL) < names.index("probe")
@@ -450,7 +450,7 @@ def test_a_dry_run_tells_of_the_rehearsal_and_opens_nothing(asked: CompensateOpt
     command += ["--profile", str(asked.profile), "--joint", JOINT, "--bus", "socketcan:can0", "--dry-run"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
-    assert "rehearse it slowly" in " ".join(done.stdout.split())
+    assert "it slowly, torque watched" in " ".join(done.stdout.split())
     as_json = subprocess.run([*command, "--json"], capture_output=True, text=True, cwd=tmp_path, check=False)
     told = json.loads(as_json.stdout)
     assert told["dry_run"] and told["outcome"] == "ok" and told["plan"]["joints"][0]["joint"] == JOINT
