@@ -18,7 +18,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -47,6 +47,7 @@ FASTEST_RAD_S = 50.0
 """2865 deg/s: the last axes of fast SCARA arms turn at 2500 deg/s."""
 
 Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class ProcedureFile(Strict):
@@ -166,6 +167,25 @@ class CareFile(Strict):
     silence_s: Positive | None = None
 
 
+class GatesFile(Strict):
+    """What quality gates allow where this robot needs other limits than usual; see ``friction.gate.GateLimits``.
+
+    A plan prints them and a profile remarks them. Gates against wrong columns have no key.
+    """
+
+    tracking_least: float | None = Field(default=None, gt=0, le=1)
+    tracking_most: float | None = Field(default=None, ge=1)
+    high_frequency_torque: Share | None = None
+    samples_per_window: int | None = Field(default=None, ge=1)
+    late_cycles: Share | None = None
+    direction_asymmetry: Share | None = None
+    straightness: Share | None = None
+    saturation: Share | None = None
+    drift: Share | None = None
+    link_resonance: Share | None = None
+    other_stretches: Share | None = None
+
+
 class RobotFile(Strict):
     """The whole file."""
 
@@ -179,6 +199,7 @@ class RobotFile(Strict):
     procedure: ProcedureFile = ProcedureFile()
     policy: Policy = Policy()
     care: CareFile = CareFile()
+    gates: GatesFile = GatesFile()
     workspace: WorkspaceFile | None = None
     simulated_arm: dict[str, Any] = Field(default_factory=dict)
     joints: dict[str, JointFile] = Field(min_length=1)
@@ -320,6 +341,7 @@ class Robot:
             ConfigError: a joint has no address of the kind that the driver of this bus needs.
         """
         driver, kind = self.driver(bus), self.kind(bus)
+        gates = {**kind.gates, **self.file.gates.model_dump(exclude_none=True)}
         key, (lowest, highest) = kind.addressed_by, kind.addresses
         addresses: dict[str, int | None] = {name: getattr(joint, key) for name, joint in self.file.joints.items()}
         missing = [
@@ -332,14 +354,20 @@ class Robot:
             for name, address in addresses.items()
             if address is not None and not lowest <= address <= highest
         ]
-        if missing or beyond:
-            raise self.document.error([*missing, *beyond], at_key=[problem.path for problem in missing])
+        unknown = [
+            FieldProblem(("driver",), f"driver {driver} sets {name} under {key}, which is not among its keys")
+            for key, bounds, model in (("care", kind.care, CareFile), ("gates", kind.gates, GatesFile))
+            for name in bounds
+            if name not in model.model_fields
+        ]
+        if missing or beyond or unknown:
+            raise self.document.error([*missing, *beyond, *unknown], at_key=[problem.path for problem in missing])
         return RobotSetup(
             name=self.name,
             bus=bus or self.file.bus,
             cycle_hz=self.file.cycle_hz,
             joints=tuple(
-                _joint_setup(name, self.file.joints[name], address)
+                _joint_setup(name, self.file.joints[name], address, gates)
                 for name, address in addresses.items()
                 if address is not None
             ),
@@ -347,9 +375,9 @@ class Robot:
             realtime=realtime,
             seed=seed,
             simulated_arm=self.file.simulated_arm,
-            simulated=self.kind(bus).simulated,
+            simulated=kind.simulated,
             workspace=_workspace(self.file),
-            care=self.file.care.model_dump(exclude_none=True),
+            care={**kind.care, **self.file.care.model_dump(exclude_none=True)},
             folder=self.path.resolve().parent,
         )
 
@@ -492,7 +520,7 @@ def _workspace(file: RobotFile) -> Workspace | None:
 _NOT_OF_SETUP = {"node", "axis", "id", "continuous", "procedure", "expected", "options", "simulated", "dh"}
 
 
-def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
+def _joint_setup(name: str, joint: JointFile, address: int, gates: Mapping[str, float]) -> JointSetup:
     values = joint.model_dump(exclude=_NOT_OF_SETUP)
     row = joint.dh.model_dump() if joint.dh else {}
     return JointSetup(
@@ -502,5 +530,6 @@ def _joint_setup(name: str, joint: JointFile, address: int) -> JointSetup:
         simulated=joint.simulated,
         expected_inertia_kg_m2=joint.expected.inertia_kg_m2 if joint.expected else 0.0,
         dh=row,
+        gates=gates,
         **values,
     )

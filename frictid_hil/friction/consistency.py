@@ -33,17 +33,22 @@ MOST_INERTIA = 2.0
 FLAT_SHARE = 0.003
 FLAT_SPIKE = 6.0
 """Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
-MOST_CHANGED = 0.15
-"""Friction outside the cycles, against the curve at the same speed."""
 
 _STEPS = 1000.0
 _LEAST_SAMPLES = 50
 
 
-def consistency(recording: CycleRecording, motion: Motion, result: Estimate) -> list[Gate]:
-    """All questions that this recording allows to ask."""
+def consistency(recording: CycleRecording, motion: Motion, result: Estimate, most_changed: float) -> list[Gate]:
+    """All questions that this recording allows to ask.
+
+    Args:
+        recording: as measured.
+        motion: the same, synchronised.
+        result: what was identified.
+        most_changed: see ``GateLimits.other_stretches``.
+    """
     asked = [_delay(recording, result), _velocity(recording, motion), _inertia(recording, result), _flat(recording)]
-    return [gate for gate in (*asked, _elsewhere(recording, result)) if gate is not None]
+    return [gate for gate in (*asked, _elsewhere(recording, result, most_changed)) if gate is not None]
 
 
 def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
@@ -143,7 +148,7 @@ def _flat(recording: CycleRecording) -> Gate:
     return Gate.about("flat_tops", share <= FLAT_SHARE, share, FLAT_SHARE, said, cause)
 
 
-def _elsewhere(recording: CycleRecording, result: Estimate) -> Gate | None:
+def _elsewhere(recording: CycleRecording, result: Estimate, most: float) -> Gate | None:
     """Half of forward minus backward torque in other stretches of the run, against the curve at the same speeds."""
     worst = 0.0
     told = ""
@@ -155,10 +160,10 @@ def _elsewhere(recording: CycleRecording, result: Estimate) -> Gate | None:
         return None
     return Gate.about(
         "other_stretches",
-        worst <= MOST_CHANGED,
+        worst <= most,
         worst,
-        MOST_CHANGED,
-        f"{told} (allowed {100 * MOST_CHANGED:.0f} % off)",
+        most,
+        f"{told} (allowed {100 * most:.3g} % off)",
         "the torque's scale or the friction changed during the run: a cold joint (`--warm-up`), a drive that switched "
         "its current range, or wrong reports",
     )

@@ -1,7 +1,8 @@
-"""A quality gate's answer."""
+"""A quality gate's answer, and what the gates allow."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 
@@ -27,3 +28,42 @@ class Gate:
     def about(cls, name: str, passed: bool, value: float, limit: float, said: str, cause: str) -> Gate:
         """The same, where only a failure needs a cause."""
         return cls(name, bool(passed), float(value), float(limit), said if passed else f"{said}: {cause}")
+
+
+@dataclass(frozen=True, slots=True)
+class GateLimits:
+    """What the gates allow where it is a matter of the machine; the defaults suit a geared joint with a usual servo.
+
+    The gates that find wrong columns (delays, scales, torque that is cut off) are not among them: their limits are the
+    same for every machine. Shares are fractions of one.
+
+    Attributes:
+        tracking_least: least peak speed of a cycle over the commanded one.
+        tracking_most: the same, at most.
+        high_frequency_torque: jitter of the torque over the friction.
+        samples_per_window: fewest samples that a pair may be the mean of.
+        late_cycles: share of control cycles that were late or missed.
+        direction_asymmetry: how far either direction may lie from the mean of both, over that mean.
+        straightness: how far a pair may leave the line through its neighbours, over the mean friction.
+        saturation: share of the samples with torque at its limit.
+        drift: change of the friction over the run.
+        link_resonance: frequency of the fastest cycle over the link's resonance.
+        other_stretches: change of the friction in other stretches of the run, against the curve.
+    """
+
+    tracking_least: float = 0.95
+    tracking_most: float = 1.3
+    high_frequency_torque: float = 0.25
+    samples_per_window: float = 8
+    late_cycles: float = 0.02
+    direction_asymmetry: float = 0.3
+    straightness: float = 0.1
+    saturation: float = 0.005
+    drift: float = 0.05
+    link_resonance: float = 0.2
+    other_stretches: float = 0.15
+
+
+def beside_usual(given: Mapping[str, float], usual: object) -> str:
+    """Each figure beside the usual one, which is the attribute of that name: ``drift 0.1 (usually 0.05)``."""
+    return ", ".join(f"{name} {value:.3g} (usually {getattr(usual, name):.3g})" for name, value in given.items())

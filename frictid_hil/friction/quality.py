@@ -14,50 +14,40 @@ from scipy.ndimage import uniform_filter1d
 
 from frictid_hil.friction.consistency import consistency
 from frictid_hil.friction.estimate import Estimate
-from frictid_hil.friction.gate import Gate
+from frictid_hil.friction.gate import Gate, GateLimits
 from frictid_hil.friction.intervals import Drift
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.skew import MOST_APART, TimeSkew
 from frictid_hil.friction.trajectory import Array
 
-LEAST_TRACKING = 0.95
-MOST_TRACKING = 1.3
-MOST_SATURATED = 0.005
-MOST_ROUGHNESS = 0.25
-MOST_DRIFT = 0.05
-RESONANCE_SHARE = 0.2
-LEAST_SAMPLES = 8
-MOST_LATE = 0.02
-MOST_ASYMMETRY = 0.3
-MOST_KINK = 0.1
-
+_USUAL = GateLimits()
 _RARE = 0.02
 """Share of a cycle. A cosine of time spends as much of its period above cos(pi times it) of its peak."""
 _ROUGH_S = 0.008
 _AT_LIMIT = 0.98
 
 
-def gates(recording: CycleRecording, result: Estimate) -> tuple[Gate, ...]:
+def gates(recording: CycleRecording, result: Estimate, limits: GateLimits = _USUAL) -> tuple[Gate, ...]:
     """All gates that this recording allows to ask."""
     motion = synchronised(recording)
     asked = [
-        _tracking(recording, motion),
-        _roughness(recording, result),
-        _samples(result),
-        _lateness(recording),
-        _kinks(recording, result),
-        *consistency(recording, motion, result),
+        _tracking(recording, motion, limits.tracking_least, limits.tracking_most),
+        _roughness(recording, result, limits.high_frequency_torque),
+        _samples(result, limits.samples_per_window),
+        _lateness(recording, limits.late_cycles),
+        _kinks(recording, result, limits.straightness),
+        *consistency(recording, motion, result, limits.other_stretches),
     ]
     if not recording.coupled:
-        asked.append(_asymmetry(result))
+        asked.append(_asymmetry(result, limits.direction_asymmetry))
     if math.isfinite(recording.torque_limit_nm) or recording.limited_share:
-        asked.append(_saturation(recording))
+        asked.append(_saturation(recording, limits.saturation))
     if result.time_skew is not None:
         asked.append(_time_skew(result.time_skew))
     if result.drift is not None:
-        asked.append(_drift(recording, result.drift))
+        asked.append(_drift(recording, result.drift, limits.drift))
     if result.link_resonance_hz is not None:
-        asked.append(_resonance(recording, result.link_resonance_hz.value))
+        asked.append(_resonance(recording, result.link_resonance_hz.value, limits.link_resonance))
     return tuple(asked)
 
 
@@ -76,15 +66,15 @@ def achieved_over_commanded(recording: CycleRecording, motion: Motion) -> Array:
     return ratios
 
 
-def _tracking(recording: CycleRecording, motion: Motion) -> Gate:
+def _tracking(recording: CycleRecording, motion: Motion, least: float, most: float) -> Gate:
     ratios = achieved_over_commanded(recording, motion)
     worst = int(np.argmax(np.abs(ratios - 1.0)))
     ratio = float(ratios[worst])
-    passed = LEAST_TRACKING <= ratio <= MOST_TRACKING
+    passed = least <= ratio <= most
     said = f"cycle {worst + 1} reached {100 * ratio:.1f} % of its commanded peak speed"
     if passed:
-        return Gate("tracking", True, ratio, LEAST_TRACKING, f"tracking: {said} at worst")
-    others = [k for k, other in enumerate(ratios) if k != worst and not LEAST_TRACKING <= other <= MOST_TRACKING]
+        return Gate("tracking", True, ratio, least, f"tracking: {said} at worst")
+    others = [k for k, other in enumerate(ratios) if k != worst and not least <= other <= most]
     if others:
         said += ", " + ", ".join(f"cycle {k + 1} {100 * ratios[k]:.1f} %" for k in others)
     cause = (
@@ -96,115 +86,115 @@ def _tracking(recording: CycleRecording, motion: Motion) -> Gate:
         "tracking",
         False,
         ratio,
-        LEAST_TRACKING if ratio < 1 else MOST_TRACKING,
-        f"tracking: {said} (allowed {100 * LEAST_TRACKING:.0f} to {100 * MOST_TRACKING:.0f} %): {cause}",
+        least if ratio < 1 else most,
+        f"tracking: {said} (allowed {100 * least:.3g} to {100 * most:.3g} %): {cause}",
     )
 
 
-def _roughness(recording: CycleRecording, result: Estimate) -> Gate:
+def _roughness(recording: CycleRecording, result: Estimate, most: float) -> Gate:
     step_s = float(np.median(np.diff(recording.time_s)))
     torque = np.asarray(recording.torque_nm, dtype=np.float64)
     fast = torque - uniform_filter1d(torque, max(3, round(_ROUGH_S / step_s) | 1))
     level = float(np.mean(result.curve.torque_nm))
     share = float(np.sqrt(np.mean(fast**2))) / level
-    passed = share <= MOST_ROUGHNESS
-    said = f"torque jitters by {100 * share:.1f} % of the friction (allowed {100 * MOST_ROUGHNESS:.0f} %)"
+    passed = share <= most
+    said = f"torque jitters by {100 * share:.1f} % of the friction (allowed {100 * most:.3g} %)"
     return Gate(
         "high_frequency_torque",
         passed,
         share,
-        MOST_ROUGHNESS,
+        most,
         said if passed else f"{said}: the position loop oscillates, or the torque signal is too noisy",
     )
 
 
-def _samples(result: Estimate) -> Gate:
+def _samples(result: Estimate, least: float) -> Gate:
     fewest = int(min(result.pairs.samples_plus.min(), result.pairs.samples_minus.min()))
-    passed = fewest >= LEAST_SAMPLES
-    said = f"the smallest window averages {fewest} samples (at least {LEAST_SAMPLES} needed)"
+    passed = fewest >= least
+    said = f"the smallest window averages {fewest} samples (at least {least:g} needed)"
     return Gate(
         "samples_per_window",
         passed,
         float(fewest),
-        float(LEAST_SAMPLES),
+        least,
         said if passed else f"{said}: raise the rate or the travel, or lower the peak speed",
     )
 
 
-def _lateness(recording: CycleRecording) -> Gate:
+def _lateness(recording: CycleRecording, most: float) -> Gate:
     share = recording.late_cycles / len(recording.time_s)
-    passed = share <= MOST_LATE
+    passed = share <= most
     late = recording.late_cycles
-    said = f"{late} control cycles were late or missed, {100 * share:.2f} % (allowed {100 * MOST_LATE:.0f} %)"
+    said = f"{late} control cycles were late or missed, {100 * share:.2f} % (allowed {100 * most:.3g} %)"
     return Gate(
         "late_cycles",
         passed,
         share,
-        MOST_LATE,
+        most,
         said if passed else f"{said}: give the process real-time priority, or lower the rate",
     )
 
 
-def _asymmetry(result: Estimate) -> Gate:
+def _asymmetry(result: Estimate, most: float) -> Gate:
     shares = np.abs(result.asymmetry_nm) / np.asarray(result.curve.torque_nm)
     worst = int(np.argmax(shares))
     share = float(shares[worst])
-    passed = share <= MOST_ASYMMETRY
+    passed = share <= most
     said = (
         f"at pair {worst + 1} of {shares.size} the two directions lie {100 * share:.1f} % to either side of their mean "
-        f"(allowed {100 * MOST_ASYMMETRY:.0f} %)"
+        f"(allowed {100 * most:.3g} %)"
     )
     return Gate(
         "direction_asymmetry",
         passed,
         share,
-        MOST_ASYMMETRY,
+        most,
         said if passed else f"{said}: a load that works one way, torque saturating one way, or a damaged gear",
     )
 
 
-def _kinks(recording: CycleRecording, result: Estimate) -> Gate:
+def _kinks(recording: CycleRecording, result: Estimate, most: float) -> Gate:
     """How far a pair leaves the line through its neighbours; below the standard V_1 a Stribeck dip may."""
     v, f = np.array(result.curve.velocity_rad_s), np.array(result.curve.torque_nm)
     slow = int(np.sum(v < 0.09 * recording.procedure.velocity_rad_s))
     pairs = v.size
     v, f = v[slow:], f[slow:]
     if v.size < 3:
-        return Gate("straightness", True, 0.0, MOST_KINK, "too few pairs to see one leave its neighbours' line")
+        return Gate("straightness", True, 0.0, most, "too few pairs to see one leave its neighbours' line")
     line = f[:-2] + (f[2:] - f[:-2]) * (v[1:-1] - v[:-2]) / (v[2:] - v[:-2])
     leaves = np.abs(f[1:-1] - line) / f.mean()
     worst = int(np.argmax(leaves))
     share = float(leaves[worst])
-    passed = share <= MOST_KINK
+    passed = share <= most
     said = (
         f"pair {slow + worst + 2} of {pairs} leaves the line through its neighbours by {100 * share:.1f} % of the "
-        f"friction (allowed {100 * MOST_KINK:.0f} %)"
+        f"friction (allowed {100 * most:.3g} %)"
     )
     return Gate(
         "straightness",
         passed,
         share,
-        MOST_KINK,
+        most,
         said if passed else f"{said}: that cycle was disturbed; run it again",
     )
 
 
-def _saturation(recording: CycleRecording) -> Gate:
+def _saturation(recording: CycleRecording, most: float) -> Gate:
     high = np.abs(recording.torque_nm) >= _AT_LIMIT * recording.torque_limit_nm
     share = float(np.mean(high))
-    said = f"torque stood at its limit in {100 * share:.2f} % of the samples (allowed {100 * MOST_SATURATED:.1f} %)"
+    said = f"torque stood at its limit in {100 * share:.2f} % of the samples (allowed {100 * most:.3g} %)"
     if recording.limited_share > share:
         share = recording.limited_share
         said = (
             f"the drive said in {100 * share:.2f} % of the samples that one of its limits was active "
-            f"(statusword bit 11; allowed {100 * MOST_SATURATED:.1f} %)"
+            f"(statusword bit 11; allowed {100 * most:.3g} %)"
         )
-    passed = share <= MOST_SATURATED
+    passed = share <= most
     return Gate(
         "saturation",
         passed,
         share,
-        MOST_SATURATED,
+        most,
         said if passed else f"{said}: raise the travel (peak torque grows as V^2/A) or lower the peak speed",
     )
 
@@ -222,30 +212,30 @@ def _time_skew(skew: TimeSkew) -> Gate:
     return Gate("time_skew", skew.agree, skew.apart, MOST_APART, said if skew.agree else cause)
 
 
-def _drift(recording: CycleRecording, drift: Drift) -> Gate:
+def _drift(recording: CycleRecording, drift: Drift, most: float) -> Gate:
     duration_s = recording.procedure.duration_s
     change = abs(drift.over(duration_s))
-    passed = change <= MOST_DRIFT + drift.over(duration_s, drift.chance)
+    passed = change <= most + drift.over(duration_s, drift.chance)
     said = (
         f"friction had changed by {100 * drift.change:+.1f} % when cycle {drift.cycle} ran again "
-        f"{drift.apart_s:.1f} s later: {100 * change:.1f} % over the run (allowed {100 * MOST_DRIFT:.0f} %, "
+        f"{drift.apart_s:.1f} s later: {100 * change:.1f} % over the run (allowed {100 * most:.3g} %, "
         f"and the {100 * drift.over(duration_s, drift.chance):.1f} % that torque noise and steps may feign)"
     )
-    return Gate("drift", passed, change, MOST_DRIFT, said if passed else f"{said}: warm the joint up first")
+    return Gate("drift", passed, change, most, said if passed else f"{said}: warm the joint up first")
 
 
-def _resonance(recording: CycleRecording, resonance_hz: float) -> Gate:
+def _resonance(recording: CycleRecording, resonance_hz: float, most: float) -> Gate:
     fastest_hz = float(recording.procedure.angular_frequencies_rad_s[-1]) / (2 * math.pi)
     share = fastest_hz / resonance_hz
-    passed = share <= RESONANCE_SHARE
+    passed = share <= most
     said = (
-        f"the fastest cycle, {fastest_hz:.2f} Hz, is {100 * share:.0f} % (allowed {100 * RESONANCE_SHARE:.0f} %) "
+        f"the fastest cycle, {fastest_hz:.2f} Hz, is {100 * share:.0f} % (allowed {100 * most:.3g} %) "
         f"of the link's resonance at {resonance_hz:.1f} Hz"
     )
     return Gate(
         "link_resonance",
         passed,
         share,
-        RESONANCE_SHARE,
+        most,
         said if passed else f"{said}: raise the travel, or lower the peak speed",
     )

@@ -20,7 +20,14 @@ from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
 from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
 from frictid_hil.jobs.identification.programmes import Programme, programme
 from frictid_hil.jobs.identification.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
-from frictid_hil.jobs.plans import calibration_plan, care_notes, expected_of, inherited_notes, rehearsal_note
+from frictid_hil.jobs.plans import (
+    calibration_plan,
+    care_notes,
+    expected_of,
+    gate_notes,
+    inherited_notes,
+    rehearsal_note,
+)
 from frictid_hil.jobs.report import write_run_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits
@@ -192,7 +199,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     notes = [chosen.note(procedure, setup.cycle_hz, quantum_s) for procedure in first]
     if quantum_s:
         notes += [_tick_note(procedure, quantum_s) for procedure in first]
-    notes += [*_notes(procedures, expected, rehearse), *inherited_notes(robot, list(procedures)), *care_notes(setup)]
+    notes += [*_notes(procedures, expected, rehearse), *inherited_notes(robot, list(procedures))]
+    notes += [*care_notes(robot, setup), *gate_notes(robot, setup)]
     if together:
         notes += _together_notes(setup)
     if measure_skew:

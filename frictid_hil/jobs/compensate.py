@@ -18,7 +18,7 @@ from frictid_hil.jobs.compensation.plan import compensation_plan
 from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of_file, refuse
 from frictid_hil.jobs.compensation.result import Asked, CompensationResult, Progress, result_of
 from frictid_hil.jobs.compensation.wanted import MODES, Wanted
-from frictid_hil.jobs.plans import expected_of, inherited_notes
+from frictid_hil.jobs.plans import care_notes, expected_of, inherited_notes
 from frictid_hil.jobs.profiles import named_profile
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.control import Compensated
@@ -87,7 +87,7 @@ def plan_compensation(options: CompensateOptions) -> Asked:
         robot.name, setup, joint.name, entry, robot.policy, wanted, Rehearsals(robot, options.bus)
     )
     forced = tuple(f"forced in spite of: {doubt}" for doubt in doubts)
-    notes = (*planned.plan.notes, *inherited_notes(robot, [joint.name]), *forced)
+    notes = (*planned.plan.notes, *inherited_notes(robot, [joint.name]), *care_notes(robot, setup), *forced)
     plan = replace(planned.plan, notes=notes)
     planned = replace(planned, plan=plan, warnings=(*planned.warnings, *forced))
     refuse_beyond_limits(planned.plan, setup, expected_of(robot))

@@ -319,7 +319,7 @@ def _plans(
         if not group:
             continue
         of_group = dict(expected)
-        notes = care_notes(setup)
+        notes = care_notes(robot, setup)
         if loaded:
             payload = belief.sections["payload"]
             notes.append(

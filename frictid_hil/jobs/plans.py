@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from frictid_hil.config import policy
 from frictid_hil.config.robot import Robot
 from frictid_hil.errors import UsageError
+from frictid_hil.friction.gate import GateLimits, beside_usual
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.identification.skew_stretch import shaking
 from frictid_hil.plan.plan import (
@@ -99,11 +100,21 @@ def rehearsal_note(joints: Sequence[str]) -> str:
     )
 
 
-def care_notes(setup: RobotSetup) -> list[str]:
-    """Bounds of the supervisor that the robot file sets, each beside the usual one; [] where it sets none."""
-    usual = Care()
-    told = [f"{name} {value:.3g} (usually {getattr(usual, name):.3g})" for name, value in setup.care.items()]
-    return [f"bounds of care from the robot file: {', '.join(told)}"] if told else []
+def care_notes(robot: Robot, setup: RobotSetup) -> list[str]:
+    """Bounds of the supervisor that are not the usual ones, each beside it and with who set it; [] where all are."""
+    return _set_by("bounds of care", setup.care, Care(), robot.file.care.model_fields_set)
+
+
+def gate_notes(robot: Robot, setup: RobotSetup) -> list[str]:
+    """The same of what quality gates allow."""
+    return _set_by("limits of quality gates", setup.joints[0].gates, GateLimits(), robot.file.gates.model_fields_set)
+
+
+def _set_by(called: str, given: Mapping[str, float], usual: object, stated: Collection[str]) -> list[str]:
+    by_file = {name: value for name, value in given.items() if name in stated}
+    by_driver = {name: value for name, value in given.items() if name not in stated}
+    told = {"robot file": by_file, "driver": by_driver}
+    return [f"{called} from the {who}: {beside_usual(some, usual)}" for who, some in told.items() if some]
 
 
 def inherited_notes(robot: Robot, joints: Sequence[str]) -> list[str]:

@@ -30,6 +30,7 @@ class JointSetup:
         options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
         simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
         expected_inertia_kg_m2: of the whole joint, as the robot file expects it; 0 where it does not say.
+        gates: what quality gates allow here, where other than usual; see ``friction.gate.GateLimits``.
         dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
     """
 
@@ -47,6 +48,7 @@ class JointSetup:
     options: Mapping[str, Any] = field(default_factory=dict)
     simulated: Mapping[str, Any] = field(default_factory=dict)
     expected_inertia_kg_m2: float = 0.0
+    gates: Mapping[str, float] = field(default_factory=dict)
     dh: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -65,7 +67,7 @@ class RobotSetup:
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
         simulated: nothing real moves; a setup that says nothing of it is taken for a real robot's.
         workspace: the box that the arm may not leave; None where the robot file names none.
-        care: bounds of the supervisor that the robot file sets, by name; see ``runner.care.Care``.
+        care: bounds of the supervisor that robot file or driver set, by name; see ``runner.care.Care``.
         folder: of the robot file; file names in options count from there.
     """
 

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from frictid_drivers.mit.simulated import VirtualMitDriver
 from frictid_drivers.motoman import MotomanDriver
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
@@ -226,6 +228,27 @@ def test_bounds_of_care_come_with_the_setup(tmp_path: Path) -> None:
     assert robot.to_setup().care == {"following_error_rad": 0.2}
     bad = written(tmp_path, ("procedure:", "care: {velocity_margin: 0.5}\nprocedure:"), name="bad.yaml")
     assert "velocity_margin" in str(refused(bad))
+
+
+def test_limits_of_quality_gates_come_with_every_joint(tmp_path: Path) -> None:
+    robot = load_robot(written(tmp_path, ("procedure:", "gates: {direction_asymmetry: 0.45}\nprocedure:")))
+    assert [joint.gates for joint in robot.to_setup().joints] == [{"direction_asymmetry": 0.45}] * 2
+    bad = written(tmp_path, ("procedure:", "gates: {drift: 5}\nprocedure:"), name="bad.yaml")
+    assert (error := refused(bad)).where == "bad.yaml:6:16" and "gates.drift" in str(error)
+
+
+def test_what_the_driver_says_of_its_devices_gives_way_to_the_robot_file(tmp_path: Path) -> None:
+    usual = load_robot("mit-bench.yaml").to_setup().care
+    site = "schema: frictid.robot/1\nextends: mit-bench.yaml\nname: mine\ncare: {still_rad_s: 0.2}\n"
+    (tmp_path / "mine.yaml").write_text(site)
+    assert usual["still_rad_s"] == 0.05
+    assert load_robot(tmp_path / "mine.yaml").to_setup().care == {**usual, "still_rad_s": 0.2}
+
+
+def test_a_driver_that_sets_bounds_that_there_are_not_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(VirtualMitDriver, "kind", replace(VirtualMitDriver.kind, gates={"drifts": 0.1}))
+    with pytest.raises(ConfigError, match="driver virtual-mit sets drifts under gates"):
+        load_robot("mit-bench.yaml").to_setup()
 
 
 def test_the_address_must_be_of_the_kind_the_driver_uses() -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.estimate import estimate
+from frictid_hil.friction.gate import GateLimits
 from frictid_hil.friction.quality import gates
 
 
@@ -69,6 +70,13 @@ def test_a_resonance_near_the_fastest_cycle_is_caught(plants):
     soft = replace(plants.arm[2], link_share=0.5, link_frequency_hz=24.0)
     assert asked(plants.record(soft, plants.procedure(20)))["link_resonance"].passed
     assert not asked(plants.record(soft, plants.procedure(5)))["link_resonance"].passed
+
+
+def test_a_machine_may_have_limits_of_its_own(sound):
+    late = replace(sound, late_cycles=len(sound.time_s) // 20)
+    found = {gate.name: gate for gate in gates(late, estimate(late), GateLimits(late_cycles=0.1, straightness=1e-4))}
+    assert found["late_cycles"].passed and "allowed 10 %" in found["late_cycles"].reason
+    assert not found["straightness"].passed and found["straightness"].limit == 1e-4
 
 
 def test_late_cycles_and_thin_windows_are_counted(sound):

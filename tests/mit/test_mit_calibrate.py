@@ -39,8 +39,19 @@ def calibrated(path: Path, out: Path, seed: int) -> None:
 
 def test_bounds_that_suit_another_arm_are_printed_before_anything_moves() -> None:
     told = " ".join(CliRunner().invoke(app, ["calibrate", "--robot", "mit-bench.yaml", "--dry-run"]).output.split())
-    assert "bounds of care from the robot file: still_rad_s 0.05 (usually 0.00873)" in told
-    assert "following_error_rad 0.2 (usually 0.0873)" in told
+    assert "bounds of care from the robot file: following_error_rad 0.2 (usually 0.0873)" in told
+    assert "bounds of care from the driver: still_rad_s 0.05 (usually 0.00873)" in told
+
+
+def test_limits_of_quality_gates_are_printed_before_anything_moves_and_kept_beside_the_result(tmp_path: Path) -> None:
+    path = robot_file(tmp_path, "damiao", {"gates": {"direction_asymmetry": 0.001, "drift": 0.1}})
+    told = " ".join(CliRunner().invoke(app, ["calibrate", "--robot", str(path), "--dry-run"]).output.split())
+    said = "direction_asymmetry 0.001 (usually 0.3), drift 0.1 (usually 0.05)"
+    assert f"limits of quality gates from the robot file: {said}" in told
+    result = calibrate(CalibrateOptions(str(path), out=tmp_path / "run", cycles=3), Silent()).to_json()
+    assert result["outcome"] == "gate_failed"
+    joint = result["joints"]["0"]
+    assert "allowed 0.1 %" in joint["remarks"][0] and said in " ".join(joint["notes"])
 
 
 @pytest.mark.slow

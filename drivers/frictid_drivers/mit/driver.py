@@ -58,7 +58,13 @@ class MitDriver:
         InvalidFields: an option of the robot file is wrong.
     """
 
-    kind = DriverKind(line="can", addressed_by="id", addresses=(1, 0x7F), elsewhere={"virtual": "virtual-mit"})
+    kind = DriverKind(
+        line="can",
+        addressed_by="id",
+        addresses=(1, 0x7F),
+        elsewhere={"virtual": "virtual-mit"},
+        care={"still_rad_s": 0.05},  # a 12-bit velocity cannot say zero
+    )
 
     def __init__(self, setup: RobotSetup, *, bus_factory: BusFactory | None = None, clock: Clock | None = None) -> None:
         self.setup = setup

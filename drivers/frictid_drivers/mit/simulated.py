@@ -10,13 +10,14 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Protocol
 
 from frictid_drivers.mit.driver import MitDriver
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings, read_settings
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Clock, DriverKind, WallClock
+from frictid_hil.protocol.driver import Clock, WallClock
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.testing.wire import FakeCanBus, Frame, ManualClock
@@ -29,7 +30,7 @@ _LONG_ID = 1 << 31
 class VirtualMitDriver(MitDriver):
     """The ``mit`` driver with simulated actuators on its bus."""
 
-    kind = DriverKind(simulated=True, line="virtual", addressed_by="id", addresses=(1, 0x7F), elsewhere={"can": "mit"})
+    kind = replace(MitDriver.kind, simulated=True, line="virtual", elsewhere={"can": "mit"})
 
     def __init__(self, setup: RobotSetup) -> None:
         self.rack = Rack(setup)

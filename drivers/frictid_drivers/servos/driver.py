@@ -56,7 +56,14 @@ class ServoDriver:
         ConfigError: the bus is no serial port.
     """
 
-    kind = DriverKind(line="serial", addressed_by="id", addresses=(0, 252), elsewhere={"virtual": "virtual-servos"})
+    kind = DriverKind(
+        line="serial",
+        addressed_by="id",
+        addresses=(0, 252),
+        elsewhere={"virtual": "virtual-servos"},
+        # A servo without integral part stands beside its goal; one step more or less in 40 ms is a speed.
+        care={"still_rad": 0.03, "still_rad_s": 0.1},
+    )
 
     def __init__(
         self, setup: RobotSetup, *, port_factory: PortFactory | None = None, clock: Clock | None = None

@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 
 from frictid_drivers.servos.driver import ServoDriver
 from frictid_drivers.servos.packets import WIRES
 from frictid_drivers.servos.settings import JointSettings, read_settings
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Clock, DriverKind, WallClock
+from frictid_hil.protocol.driver import Clock, WallClock
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.testing.wire import ManualClock
@@ -25,9 +26,7 @@ _TORQUE_MODE = 10
 class VirtualServoDriver(ServoDriver):
     """The ``servos`` driver with simulated servos on its line."""
 
-    kind = DriverKind(
-        simulated=True, line="virtual", addressed_by="id", addresses=(0, 252), elsewhere={"serial": "servos"}
-    )
+    kind = replace(ServoDriver.kind, simulated=True, line="virtual", elsewhere={"serial": "servos"})
 
     def __init__(self, setup: RobotSetup) -> None:
         self.chain = Chain(setup)

@@ -16,7 +16,7 @@ from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import JointProfile
 from frictid_hil.jobs.compensation.laws import TRACK_SLACK_RAD, calibrated_centre_rad, law_of, speed_bound_rad_s
 from frictid_hil.jobs.compensation.wanted import Wanted, refuse_contradictions
-from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, rehearsal_note
+from frictid_hil.jobs.plans import APPROACH_RAD_S, rehearsal_note
 from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Probe, Swing
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import REHEARSAL, Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
@@ -84,7 +84,7 @@ def compensation_plan(
     peak_nm = gravity.largest_nm + float(entry.curve().magnitude(np.array(moved.peak_velocity_rad_s)))
     peak_nm += inertia * wanted.peak_rad_s * 2 * math.pi / wanted.period_s
     moved = replace(moved, predicted_torque_nm=peak_nm)
-    notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}", *care_notes(setup)]
+    notes = [f"friction compensation in modes {', '.join(wanted.modes)}, setting {wanted.setting}"]
     if rehearse:
         notes.append(rehearsal_note([name]))
     lowest_ratio = _lowest_ratio(joint, wanted, centre_rad, laws)

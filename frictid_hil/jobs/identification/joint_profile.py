@@ -26,6 +26,7 @@ from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
+from frictid_hil.friction.gate import GateLimits, beside_usual
 from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
@@ -155,7 +156,10 @@ def _from_cycles(
         except IdentificationError as problem:
             notes.append(problem.what)
     result = estimate(recording, method)
-    gates = quality.gates(recording, result)
+    limits = {} if joint is None else joint.gates
+    if limits:
+        notes.append(f"limits of quality gates of this robot: {beside_usual(limits, GateLimits())}")
+    gates = quality.gates(recording, result, GateLimits(**limits))
     if recording.shaken is None and not recording.coupled and result.terms is not None:
         notes += filter(None, [wanted_note(result.terms, float(np.mean(result.curve.torque_nm)))])
     body = result.rigid_body
