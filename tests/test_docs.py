@@ -46,6 +46,22 @@ def test_a_file_shown_in_a_guide_loads(page: str, block: str, tmp_path: Path) ->
     assert loaders[re.match(r"schema: ([\w.]+)/", block)[1]](path)
 
 
+GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
+READ_ALOUD_IN_FIVE_MINUTES = 750
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+def test_a_guide_is_read_aloud_in_five_minutes(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    prose = re.sub(r"^ {4,}\S.*$", "", prose, flags=re.MULTILINE)
+    words = re.findall(r"\w[\w'./:-]*", re.sub(r"\]\([^)]*\)", "]", prose))
+    assert len(words) <= READ_ALOUD_IN_FIVE_MINUTES
+    assert re.findall(r"\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,40}\b", text) == [], "a commit hash"
+    tables = re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE)
+    assert all(len(table.splitlines()) <= 2 + 10 for table in tables), "a table above ten rows"
+
+
 def test_the_map_of_the_house_names_files_that_exist() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert len(re.findall(r"^\| .*\? \| ", text.split("## Ten everyday questions")[1], flags=re.MULTILINE)) == 10

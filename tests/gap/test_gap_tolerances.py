@@ -174,7 +174,7 @@ def test_a_replay_follows_a_cascade() -> None:
 
 
 def test_the_page_shows_the_defaults_that_hold() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "guides" / "diagnose.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "experiment-set.md").read_text()
     for name, kinds in RELATIVE_BY_KIND.items():
         cells = " | ".join("exact" if share == 0.0 else f"{100 * share:.3g} %" for share in kinds.values())
         assert f"| `{name}` | {cells} |" in page

@@ -17,7 +17,7 @@ from frictid_hil.testing.wire import FakeCanBus, ManualClock
 
 STEP_S, GEAR = 0.0005, 8.0
 INERTIA_KG_M2, COULOMB_NM, VISCOUS_NM_S = 0.02, 0.3, 0.05
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "write-a-driver.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "driver-helpers.md"
 
 
 class FakeAxis:

@@ -42,7 +42,7 @@ def test_it_is_short_and_imports_public_names_only(package: Path) -> None:
             assert not node.attr.startswith("_"), node.attr
 
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "write-a-driver.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "driver-helpers.md"
 
 
 @pytest.mark.parametrize("file", ["frictid_acme/driver.py", "frictid_acme/fake.py", "tests/test_driver.py"])
