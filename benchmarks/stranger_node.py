@@ -4,15 +4,13 @@
 
 The object list, access, ranges and defaults are the family's (`personalities.yaml`). The node is strict beyond what the
 library is: a PDO is mapped only while it is invalid, and only with what is mappable; values are refused as the family
-refuses them. Motor and state machine are the simulated servo's: an independent CiA-402 axis was not found. The joint's
-time goes on by one period per SYNC, so that a loaded machine delays frames and bends no physics.
+refuses them. Motor and state machine are the simulated servo's (``stranger_motor``).
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,13 +21,10 @@ from durand.network import NetworkABC
 from durand.node import MinimalNodeCapabilities
 from durand.object_dictionary import Record, Variable
 from durand.scheduler import VirtualScheduler, set_scheduler
+from stranger_motor import Motor
 from stranger_wire import DONE
 
-from frictid_drivers.virtual.joint_drive import plant_for, servo_for
-from frictid_drivers.virtual.object_dictionary import encode
 from frictid_drivers.virtual.objects import DataType, Entry
-from frictid_drivers.virtual.personality import personality_of
-from frictid_drivers.virtual.servo import Servo
 from frictid_hil.config.robot import load_robot
 
 NOT_VALID = 1 << 31
@@ -78,27 +73,16 @@ class Stranger:
 
     Args:
         node: of the library, fresh.
-        servo: the motor behind it, with the family's values after power-on.
-        entries: of the family, by (index, subindex).
+        motor: behind it, with the family's values after power-on.
         scheduler: the library's time.
-        period_s: of SYNC.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        servo: Servo,
-        entries: dict[tuple[int, int], Entry],
-        scheduler: VirtualScheduler,
-        period_s: float,
-    ) -> None:
-        self._node, self._servo, self._entries = node, servo, entries
-        self._scheduler, self._period_s = scheduler, period_s
-        self._period_ns = round(period_s * 1e9)
-        self._now_ns = 0
+    def __init__(self, node: Node, motor: Motor, scheduler: VirtualScheduler) -> None:
+        self._node, self._motor, self._scheduler = node, motor, scheduler
         od = node.object_dictionary
-        for (index, sub), entry in entries.items():
-            if index not in OF_THE_STACK and not 0x1400 <= index < 0x1C00 and not (sub == 0 and (index, 1) in entries):
+        for (index, sub), entry in motor.entries.items():
+            counts = sub == 0 and (index, 1) in motor.entries
+            if index not in OF_THE_STACK and not 0x1400 <= index < 0x1C00 and not counts:
                 self._add(index, sub, entry)
         for base in (0x1600, 0x1A00):
             for number in range(4):
@@ -109,11 +93,11 @@ class Stranger:
         node.sync.callbacks.add(self._on_sync)
 
     def _add(self, index: int, sub: int, entry: Entry) -> None:
-        od, values = self._node.object_dictionary, self._servo.dictionary.values
+        od, values = self._node.object_dictionary, self._motor.values
         low, high = (None, None) if entry.kind is DataType.STRING else entry.limits
         kind = DatatypeEnum(int(entry.kind))
         variable = Variable(kind, entry.access, minimum=low, maximum=high, name=entry.name)
-        if (index, 1) in self._entries:
+        if (index, 1) in self._motor.entries:
             if index not in od or not isinstance(od[index], Record):
                 od[index] = Record(entry.name)
             od[index][sub] = variable
@@ -121,17 +105,13 @@ class Stranger:
             od[index] = variable
 
         def read() -> Any:
-            self._run()
+            self._motor.settle()
             value = values[entry.key]
             return value.encode() if isinstance(value, str) else value
 
         od.set_read_callback(index, sub, read)
         if entry.access in ("rw", "wo"):
-            od.validate_callbacks[index, sub].add(partial(self._write, entry))
-
-    def _write(self, entry: Entry, value: Any) -> None:
-        self._run()
-        self._servo.dictionary.download(entry.key, encode(entry, value))
+            od.validate_callbacks[index, sub].add(partial(self._motor.write, entry))
 
     def _mapping(self, index: int, sub: int, value: int) -> None:
         """Refuse what a strict drive refuses; the library asks before it stores."""
@@ -139,19 +119,14 @@ class Stranger:
         if not pdo & NOT_VALID:
             raise ValueError("mapped while valid")
         if sub:
-            entry = self._entries[value >> 16, value >> 8 & 0xFF]
+            entry = self._motor.entries[value >> 16, value >> 8 & 0xFF]
             if not (entry.receive if index < 0x1A00 else entry.transmit):
                 raise ValueError("not mappable")
 
-    def _run(self) -> None:
-        self._servo.power.run_to(self._now_ns)
-        self._servo.power.latch(remote=True)
-
     def _on_sync(self) -> None:
-        self._now_ns += self._period_ns
-        self._scheduler.run(self._period_s)
-        self._run()
-        od, values = self._node.object_dictionary, self._servo.dictionary.values
+        self._scheduler.run(self._motor.period_s)
+        self._motor.advance()
+        od, values = self._node.object_dictionary, self._motor.values
         for pdo in self._node.tpdo:
             for index, sub in pdo.mapping if pdo.enable else ():
                 od.write(index, sub, values[index << 8 | sub])
@@ -159,25 +134,10 @@ class Stranger:
 
 def build(robot: str, family: str, line: Line) -> Stranger:
     """The only drive of this robot file, as this family."""
-    setup = load_robot(robot).to_setup()
-    (joint,) = setup.joints
-    joint = replace(joint, options={**joint.options, "personality": family})
-    personality = personality_of(joint)
-    assert personality is not None
-    servo = servo_for(setup, joint, plant_for(setup, joint), line.send)
-    servo.dictionary.reset()
-    servo.power.boot()
-    absent = personality.manner.absent
-    entries = {
-        (record.index, entry.key & 0xFF): entry
-        for record in personality.records
-        for entry in record.entries
-        if entry.key not in absent
-    }
+    motor = Motor(robot, family, line.send)
     scheduler = VirtualScheduler()
     set_scheduler(scheduler)
-    node = Node(line, joint.address, capabilities=MinimalNodeCapabilities)
-    return Stranger(node, servo, entries, scheduler, 1.0 / setup.cycle_hz)
+    return Stranger(Node(line, motor.node, capabilities=MinimalNodeCapabilities), motor, scheduler)
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
-"""Calibrate drives of ten families whose CANopen is another author's (`durand`), over UDP multicast, in two processes.
+"""Calibrate drives of ten families whose CANopen is another author's, over a wire between processes.
 
-    python benchmarks/strangers.py                 all families (2 min)
+    python benchmarks/strangers.py                 all families (2 min), by `durand` on UDP multicast
     python benchmarks/strangers.py elmo nanotec    these
+    python benchmarks/strangers.py --npm           the same by the npm package `canopen`, on slcan (needs node and npm)
 
 Every family: `check` has no error, configuring meets nothing that `check` did not say, F_0 is within 1 % of the
 simulated joint's, and tshark finds no malformed frame in the recording (left out where it is not installed). Each frame
@@ -43,8 +44,50 @@ NEEDS: dict[str, dict[str, Any]] = {
 }
 
 
-def robot_file(folder: Path, family: str) -> Path:
-    """One joint, on a multicast group and a port of this process's own."""
+@dataclass(frozen=True, slots=True)
+class Stack:
+    """Another author's CANopen, and the wire to it.
+
+    Attributes:
+        script: plays the node.
+        arguments: of the script, after robot file and family.
+        usual_hz: cycle rate, where a family has no own.
+    """
+
+    script: str
+    arguments: tuple[str, ...] = ()
+    usual_hz: int = 500
+
+    def wire(self, folder: Path, family: str) -> tuple[str, dict[str, Any]]:
+        """Bus and options of a robot file, of this process's own."""
+        if self.arguments:
+            return f"slcan:{folder / family}.tty", {"sleep_after_open": 0}
+        group = f"udp_multicast:239.74.{os.getpid() >> 8 & 0xFF}.{os.getpid() & 0xFF}"
+        return group, {"port": 20_000 + os.getpid() % 20_000}
+
+
+DURAND = Stack("stranger_node.py")
+PACKAGE = Path(__file__).with_name("npm_canopen")
+
+
+def npm_canopen(folder: Path) -> Stack:
+    """The npm package, installed into this folder by its own client.
+
+    Raises:
+        OSError: there is no node or no npm.
+        subprocess.CalledProcessError: the package cannot be had.
+    """
+    subprocess.run(["node", "--version"], check=True, capture_output=True)
+    shutil.copytree(PACKAGE, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("node_modules"))
+    # Its native module is for block transfer alone, and not built.
+    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline", "--fetch-retries=0"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=60)
+    return Stack("slcan_hub.py", (str(folder),), usual_hz=250)
+
+
+def robot_file(folder: Path, family: str, stack: Stack = DURAND) -> Path:
+    """One joint, on a wire of this process's own."""
+    bus, wire = stack.wire(folder, family)
     joint = {
         "node": 3, "gear_ratio": 100, "max_velocity_rad_s": 3.0, "max_torque_nm": 60.0, "rated_torque_nm": 40.0,
         "position_min_rad": -2.0, "position_max_rad": 2.0, "start_position_rad": 0.0, "locked_position_rad": 0.0,
@@ -53,9 +96,9 @@ def robot_file(folder: Path, family: str) -> Path:
     }  # fmt: skip
     values = {
         "schema": "frictid.robot/1", "name": family, "driver": DRIVER,
-        "bus": f"udp_multicast:239.74.{os.getpid() >> 8 & 0xFF}.{os.getpid() & 0xFF}",
-        "cycle_hz": RATES_HZ.get(family, 500),
-        "options": {"allow_torque_without_watchdog": True, "port": 20_000 + os.getpid() % 20_000},
+        "bus": bus,
+        "cycle_hz": RATES_HZ.get(family, stack.usual_hz),
+        "options": {"allow_torque_without_watchdog": True, **wire},
         "procedure": {"amplitude_rad": 0.2, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8},
         "joints": {"0": joint},
     }  # fmt: skip
@@ -74,11 +117,11 @@ def register(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def stranger(robot: Path, family: str) -> Iterator[None]:
+def stranger(robot: Path, family: str, stack: Stack = DURAND) -> Iterator[None]:
     """The node in a process of its own."""
-    script = Path(__file__).with_name("stranger_node.py")
+    script = Path(__file__).with_name(stack.script)
     node = subprocess.Popen(
-        [sys.executable, str(script), str(robot), family],
+        [sys.executable, str(script), str(robot), family, *stack.arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdout=subprocess.PIPE,
         text=True,
@@ -152,11 +195,11 @@ class Calibrated:
         return fine and abs(self.off_percent) <= LIMIT_PERCENT
 
 
-def calibrated(folder: Path, family: str) -> Calibrated:
+def calibrated(folder: Path, family: str, stack: Stack = DURAND) -> Calibrated:
     """`check` and `calibrate` of one family."""
-    robot = robot_file(folder, family)
+    robot = robot_file(folder, family, stack)
     told, out = Told(), folder / f"{family} run"
-    with stranger(robot, family):
+    with stranger(robot, family, stack):
         checked = check(str(robot))
         result = calibrate(CalibrateOptions(str(robot), out=out), told).to_json()
     foreseen = {finding["message"] for finding in checked["findings"]}
@@ -191,16 +234,18 @@ def _said(note: str, foreseen: set[str]) -> bool:
     return any(message in note for message in foreseen)
 
 
-def main(families: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Print a line per family; 1 where one fails."""
+    families = [one for one in arguments if one != "--npm"]
     os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp())
     failed = 0
     print(f"{'family':12} {'outcome':12} {'F_0 off %':>9} {'frames':>7} {'malformed':>9} surprises")
     with tempfile.TemporaryDirectory() as home:
         register(Path(home))
+        stack = npm_canopen(Path(home) / "npm") if "--npm" in arguments else DURAND
         for family in families or sorted(known_personalities()):
             with tempfile.TemporaryDirectory() as folder:
-                found = calibrated(Path(folder), family)
+                found = calibrated(Path(folder), family, stack)
                 frames, bad = dissected(found.log) or ("-", "-")
             failed += not found.good or bad not in ("-", 0)
             outcome = found.run["outcome"] if found.check["ok"] else "check fails"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import shutil
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def multicast() -> bool:
         return False
 
 
-pytestmark = pytest.mark.skipif(not multicast(), reason="no UDP multicast on this machine")
+on_multicast = pytest.mark.skipif(not multicast(), reason="no UDP multicast on this machine")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,11 +45,33 @@ def registered(tmp_path_factory):
     sys.path.remove(str(folder))
 
 
+@pytest.fixture(scope="module")
+def npm_canopen(tmp_path_factory):
+    """A third author's stack, for node.js; installed by its own client into a folder that goes away."""
+    if missing := [program for program in ("node", "npm") if shutil.which(program) is None]:
+        pytest.skip(f"{' and '.join(missing)} not installed: no CANopen of the npm package `canopen`")
+    try:
+        return strangers.npm_canopen(tmp_path_factory.mktemp("npm"))
+    except subprocess.SubprocessError as error:
+        pytest.skip(f"the npm package `canopen` cannot be had here: {error}")
+
+
+@pytest.mark.slow
+def test_calibrated_behind_a_third_canopen_on_a_serial_adapter(npm_canopen, tmp_path):
+    found = strangers.calibrated(tmp_path, "copley", npm_canopen)
+    assert found.check["ok"] and found.run["outcome"] == "ok", found.run
+    assert not found.surprises
+    assert abs(found.off_percent) <= strangers.LIMIT_PERCENT
+    frames, malformed = strangers.dissected(found.log) or (0, 0)
+    assert malformed == 0 and (frames > 5000 or shutil.which("tshark") is None)
+
+
 @pytest.fixture(scope="module", params=sorted(strangers.known_personalities()))
 def found(request, tmp_path_factory):
     return strangers.calibrated(tmp_path_factory.mktemp(request.param), request.param)
 
 
+@on_multicast
 @pytest.mark.slow
 def test_calibrated_behind_anothers_canopen(found):
     assert found.check["ok"] and found.run["outcome"] == "ok", found.run
@@ -56,6 +79,7 @@ def test_calibrated_behind_anothers_canopen(found):
     assert abs(found.off_percent) <= strangers.LIMIT_PERCENT
 
 
+@on_multicast
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 def test_tshark_finds_no_malformed_frame(found):
@@ -63,6 +87,7 @@ def test_tshark_finds_no_malformed_frame(found):
     assert frames > 5000 and malformed == 0
 
 
+@on_multicast
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["elmo", "nanotec"])
 def test_check_foresees_what_configuring_a_drive_with_anothers_canopen_meets(family, tmp_path):
@@ -71,6 +96,7 @@ def test_check_foresees_what_configuring_a_drive_with_anothers_canopen_meets(fam
     assert met.remarks <= met.warnings
 
 
+@on_multicast
 @pytest.mark.slow
 def test_what_a_person_must_say_is_foreseen_there_too(tmp_path, monkeypatch):
     monkeypatch.setitem(strangers.NEEDS, "epos4", {})

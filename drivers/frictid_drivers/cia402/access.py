@@ -281,14 +281,8 @@ class Drive(ABC):
             self._before.append((item, 0 if ours else before))
         found = self.read(item)
         if (found ^ value) & mask:
-            raise RefusedByDrive(
-                f"{item.name}: wrote {_shown(item, value)}, read back {_shown(item, found)}",
-                item,
-                value,
-                where=self.where(item.address),
-                cause="the drive limits, rounds or locks this setting",
-                next_step="see the drive's manual on this object; nothing has moved",
-            )
+            what = f"{item.name}: wrote {_shown(item, value)}, read back {_shown(item, found)}"
+            raise self._refused(item, value, what, "the drive limits, rounds or locks this setting")
         self._confirmed[item.index, item.sub] = value
 
     def write_blind(self, item: Object, value: int) -> None:
@@ -300,13 +294,8 @@ class Drive(ABC):
         self._confirmed.pop((item.index, item.sub), None)
         item = self.quirks.typed(item)
         if not item.type.low <= value <= item.type.high:
-            raise RefusedByDrive(
-                f"{item.name}: {value} does not fit a {item.type} ({item.type.low}..{item.type.high})",
-                item,
-                value,
-                where=self.where(item.address),
-                cause="a setting of the robot file is beyond what the drive can hold",
-            )
+            what = f"{item.name}: {value} does not fit a {item.type} ({item.type.low}..{item.type.high})"
+            raise self._refused(item, value, what, "a setting of the robot file is beyond what the drive can hold")
         try:
             self.download(item.index, item.sub, item.type.pack(value))
         except Aborted as error:
@@ -315,14 +304,19 @@ class Drive(ABC):
                 self._learn_bits(item, told_bits)
                 self.write_blind(item, value)
                 return
-            raise RefusedByDrive(
-                f"the drive refuses {item.name} = {_shown(item, value)}: {error}",
-                item,
-                value,
-                where=self.where(item.address),
-                cause="an object the drive lacks, a value it does not support, or a state in which it cannot be set",
-                next_step="see the drive's manual on this object; nothing has moved",
-            ) from error
+            what = f"the drive refuses {item.name} = {_shown(item, value)}: {error}"
+            cause = "an object the drive lacks, a value it does not support, or a state in which it cannot be set"
+            raise self._refused(item, value, what, cause) from error
+
+    def _refused(self, item: Object, value: int, what: str, cause: str) -> RefusedByDrive:
+        return RefusedByDrive(
+            what,
+            item,
+            value,
+            where=self.where(item.address),
+            cause=cause,
+            next_step="see the drive's manual on this object; nothing has moved",
+        )
 
     def forget(self, *items: Object) -> None:
         """These were changed by other means than SDO; with none given, all may have been (the drive was reset)."""
