@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Rows, Term
+from frictid_hil.gap.command_timing import FASTEST, between_rows
 from frictid_hil.gap.experiment_set import Controller, Nominal, ReportFilter
 from frictid_hil.gap.plant_channel import (
     BEYOND,
@@ -26,8 +28,8 @@ from frictid_hil.simulation.inverse_loops import lagged
 
 SLOWEST = 10
 """Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
-FASTEST = 1.05
-"""Rows of the log to a control tick, above which it holds what the controller never saw."""
+WITHIN_ROWS = 0.3
+"""One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
 
 
 def forms() -> dict[str, ActuationForm]:
@@ -109,13 +111,8 @@ def actuation_channel(
         tuple(candidates),
         scale,
         low_pass.cutoff_hz,
-        between_rows=any(r.resampled or _thinned(controller, r) for r in logs),
+        between_rows=any(r.resampled or between_rows(controller, r.step_s) for r in logs),
     )
-
-
-def _thinned(controller: Controller | None, recording: Recording) -> bool:
-    """Whether the controller ran between the rows of a log."""
-    return controller is not None and controller.rate_hz * recording.step_s > FASTEST
 
 
 def _view(recording: Recording, controller: Controller | None, limit_nm: float) -> DriveView:
@@ -162,7 +159,24 @@ def _timing(nominal: Nominal, base: Sequence[Array], logs: Sequence[Recording], 
     terms = [start, Term("torque_delay", {}, numbers, np.zeros(1), np.array([tolerances.torque_delay_s.of(0.0)]))]
     if unsure_s > 0.0:
         terms.append(Term("", {}, numbers, np.zeros(1), np.array([unsure_s])))
+    if all(between_rows(nominal.controller, r.step_s) and r.experiment.torque_demand_nm is None for r in logs):
+        for changed in zip(*(_between_rows(nominal, r) for r in logs), strict=True):
+            terms.append(Term("", {}, builder.add(changed), np.zeros(1), np.array([WITHIN_ROWS])))
     return terms
+
+
+def _between_rows(nominal: Nominal, recording: Recording) -> tuple[Array, Array]:
+    """What a row does not tell of a faster controller, as changes of the demand per row, shape (n, 1) each.
+
+    A command may be held until the next one, interpolated, or sent late; a velocity may be of now or of some ticks ago.
+    """
+    e, step_s = recording.experiment, recording.step_s
+    assert nominal.controller is not None and e.position_command_rad is not None
+    assert recording.demand_nm is not None
+    late = replace(e, position_command_rad=held(e.position_command_rad))
+    command = demand_of(nominal.controller, late, step_s) - recording.demand_nm
+    velocity = demand_of(nominal.controller, e, step_s, step_s) - recording.demand_nm
+    return held(command)[:, None], held(velocity)[:, None]
 
 
 def _shapes(

@@ -15,6 +15,7 @@ import numpy as np
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
+from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, findings, sampled
@@ -52,7 +53,7 @@ def diagnose(
         negligible: gap that the user calls none, as a share of the friction level.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
-    experiments, reasons = completed(checked(experiments))
+    experiments, reasons = completed(in_force(checked(experiments)))
     reasons = dict(reasons)
     if (open_question := one_sided(experiments)) is not None:
         reasons["motion"] = open_question

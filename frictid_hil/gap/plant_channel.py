@@ -14,7 +14,7 @@ from frictid_hil.gap.channel import FAMILY, Builder, Channel, Rows, Term, effect
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import families
 from frictid_hil.gap.nuisances import nuisances
-from frictid_hil.gap.position_noise import quiet_views, white_rms
+from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import (
     LowPass,
     Recording,
@@ -105,7 +105,9 @@ def _raw(logs: Sequence[Recording], noises: Sequence[Array]) -> tuple[float, flo
     chosen = [k for k, r in enumerate(logs) if r.experiment.validation] or list(range(len(logs)))
     gap = rms(np.concatenate([p for k in chosen if (p := logs[k].plant_nm) is not None]))
     white = [white_rms(t) for k in chosen if (t := logs[k].experiment.torque_nm) is not None]
-    return gap, math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
+    own = [differenced_rms(t) for k in chosen if (t := logs[k].experiment.rigid_body_torque_nm) is not None]
+    noise = math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
+    return gap, math.hypot(noise, rms(np.array(own))) if own else noise
 
 
 def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowPass) -> float:

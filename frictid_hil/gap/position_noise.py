@@ -67,3 +67,11 @@ def white_rms(values: Array) -> float:
     if values.size < 8:
         return 0.0
     return float(np.median(np.abs(np.diff(values, 6)))) / (0.6745 * math.sqrt(math.comb(12, 6)))
+
+
+def differenced_rms(values: Array) -> float:
+    """RMS of the noise of a column that was made of a position differenced twice, as a rigid-body torque is."""
+    if values.size < 8:
+        return 0.0
+    white = float(np.median(np.abs(np.diff(values, 4)))) / (0.6745 * math.sqrt(math.comb(12, 6)))
+    return math.sqrt(6.0) * white
