@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from frictid_hil.cli.options import ForceOption, JsonOption, QuietOption, quantity
 from frictid_hil.cli.output import Output
-from frictid_hil.errors import UsageError
-from frictid_hil.units import parse_quantity
+from frictid_hil.errors import Interrupted, UsageError
+
+_Value = TypeVar("_Value")
 
 app = typer.Typer(help="Write a file of your own to start from.", no_args_is_help=True)
 
@@ -22,19 +23,71 @@ def _group() -> None:
     """Write a file of your own to start from."""
 
 
+def _named(text: str) -> tuple[str, int]:
+    name, _, address = text.partition("=")
+    if not name or not address.isdecimal():
+        raise typer.BadParameter(f"expected NAME=ADDRESS such as elbow=2, found {text!r}")
+    return name, int(address)
+
+
+def _all_named(text: str) -> list[tuple[str, int]]:
+    return [_named(word) for word in text.replace(",", " ").split()]
+
+
+def _travel(text: str) -> tuple[float, float]:
+    low, dots, high = text.partition("..")
+    if not dots:
+        raise typer.BadParameter(f"expected LOW..HIGH such as -90deg..90deg, found {text!r}")
+    parse = quantity("angle")
+    return parse(low), parse(high)
+
+
+def _bus(text: str) -> str:
+    interface, colon, channel = text.partition(":")
+    if not (interface and colon and channel):
+        raise typer.BadParameter(f"expected interface:channel such as socketcan:can0, found {text!r}")
+    return text
+
+
+def _ratio(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not value > 0.0:
+        raise typer.BadParameter(f"expected a number above 0 such as 100, found {text!r}")
+    return value
+
+
+def _on_a_terminal() -> bool:
+    return sys.stdin.isatty()
+
+
+def _asked(question: str, option: str, parse: Callable[[str], _Value], *, asks: bool) -> _Value:
+    """The answer to a question on the terminal; a mistyped one is asked for again."""
+    if not asks:
+        raise UsageError(f"{question} is not given", next_step=f"add `{option}`, or run it in a terminal")
+    try:
+        answer: _Value = typer.prompt(question, err=True, value_proc=parse)
+    except typer.Abort:
+        raise Interrupted("interrupted; no file was written") from None
+    return answer
+
+
 @app.command("robot")
 def robot(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="Robot file to write; the robot is named after it.")],
     joint: Annotated[
-        list[str] | None,
-        typer.Option("--joint", "-j", metavar="NAME=ADDRESS", help="A joint and its node, axis or id; repeat."),
+        list[Any] | None,
+        typer.Option("--joint", "-j", metavar="NAME=ADDRESS", parser=_named, help="A joint and its address; repeat."),
     ] = None,
     bus: Annotated[
-        str | None, typer.Option("--bus", metavar="BUS", help="interface:channel, e.g. socketcan:can0.")
+        str | None, typer.Option("--bus", metavar="BUS", parser=_bus, help="interface:channel, e.g. socketcan:can0.")
     ] = None,
     driver: Annotated[str, typer.Option("--driver", metavar="DRIVER", help="Driver of the bus.")] = "cia402",
     travel: Annotated[
-        str | None, typer.Option("--travel", metavar="LOW..HIGH", help="Travel of the joints, e.g. -90deg..90deg.")
+        Any,
+        typer.Option("--travel", metavar="LOW..HIGH", parser=_travel, help="Travel of the joints: -90deg..90deg."),
     ] = None,
     max_velocity: Annotated[
         float | None,
@@ -45,7 +98,8 @@ def robot(
         typer.Option("--max-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint, e.g. 60Nm."),
     ] = None,
     gear_ratio: Annotated[
-        float | None, typer.Option("--gear-ratio", min=1e-3, help="Motor revolutions per joint revolution.")
+        float | None,
+        typer.Option("--gear-ratio", metavar="RATIO", parser=_ratio, help="Motor revolutions per joint revolution."),
     ] = None,
     rated_torque: Annotated[
         float | None,
@@ -64,36 +118,32 @@ def robot(
     from frictid_hil.jobs.new_robot import JointAnswers, new_robot
 
     output = Output(as_json, quiet)
-    asks = sys.stdin.isatty() and not as_json
 
-    def answer(given: str | None, question: str, option: str) -> str:
-        if given is not None:
-            return given
-        if not asks:
-            raise UsageError(f"{question} is not given", next_step=f"add `{option}`, or run it in a terminal")
-        return str(typer.prompt(question, err=True))
+    def answer(given: _Value | None, question: str, option: str, parse: Callable[[str], _Value]) -> _Value:
+        return given if given is not None else _asked(question, option, parse, asks=_on_a_terminal() and not as_json)
 
     def written() -> dict[str, Any]:
         refuse_overwriting([path], force=force)
-        names = joint or answer(None, "joints, as NAME=ADDRESS NAME=ADDRESS", "--joint").split()
-        spot = answer(bus, "bus, as interface:channel", "--bus")
-        low, high = _travel(answer(travel, "travel of the joints, as LOW..HIGH (-90deg..90deg)", "--travel"))
-        speed = max_velocity or parse_quantity(
-            answer(None, "highest speed of a joint (115deg/s)", "--max-velocity"), "angular velocity"
+        names = answer(joint or None, "joints and their addresses (shoulder=1 elbow=2)", "--joint", _all_named)
+        spot = answer(bus, "bus (socketcan:can0)", "--bus", _bus)
+        range_rad = answer(travel, "travel of the joints (-90deg..90deg)", "--travel", _travel)
+        speed = answer(
+            max_velocity, "highest speed of a joint (115deg/s)", "--max-velocity", quantity("angular velocity")
         )
-        torque = max_torque or parse_quantity(
-            answer(None, "highest torque at a joint (60Nm)", "--max-torque"), "torque"
-        )
-        joints = [
-            JointAnswers(name, address, (low, high), speed, torque, gear_ratio, rated_torque)
-            for name, address in map(_named, names)
-        ]
+        torque = answer(max_torque, "highest torque at a joint (60Nm)", "--max-torque", quantity("torque"))
+        ratio, rated = gear_ratio, rated_torque
+        if not read:
+            ratio = answer(ratio, "motor revolutions per joint revolution (100)", "--gear-ratio", _ratio)
+            rated = answer(rated, "rated torque at a joint: motor x gear (24Nm)", "--rated-torque", quantity("torque"))
+        joints = [JointAnswers(name, address, range_rad, speed, torque, ratio, rated) for name, address in names]
         return new_robot(
             path, driver=driver, bus=spot, joints=joints, cycle_hz=cycle_hz, read=read, force=force
         ).to_json()
 
     def show(result: Mapping[str, Any]) -> None:
-        output.out.print(f"{path}: look at every line, then `frictid-hil calibrate --robot {path} --dry-run`")
+        output.out.print(
+            f"{path}: look at every line, then `frictid-hil calibrate --robot {path} --dry-run`", soft_wrap=True
+        )
 
     output.run("new-robot", written, show)
 
@@ -119,17 +169,3 @@ def driver(
         output.out.print("now: cd there, `pip install -e .`, `pytest`; then replace the frames by those of your device")
 
     output.run("new-driver", written, show)
-
-
-def _named(text: str) -> tuple[str, int]:
-    name, _, address = text.partition("=")
-    if not name or not address.isdecimal():
-        raise UsageError(f"expected NAME=ADDRESS such as elbow=2, found {text!r}")
-    return name, int(address)
-
-
-def _travel(text: str) -> tuple[float, float]:
-    low, dots, high = text.partition("..")
-    if not dots:
-        raise UsageError(f"expected LOW..HIGH such as -90deg..90deg, found {text!r}")
-    return parse_quantity(low, "angle"), parse_quantity(high, "angle")

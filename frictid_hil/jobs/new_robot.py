@@ -162,6 +162,8 @@ def _text(
     ]
     for joint in joints:
         lines += _joint(joint, driver, found[joint.name], min(travel / 4, math.radians(20)))
+        if kind_of(driver).addressed_by == "node":  # as the simulated drives are
+            lines += _simulated(joint, min(travel / 4, math.radians(20)), 0.5 * speed)
     return "\n".join(lines) + "\n"
 
 
@@ -191,6 +193,18 @@ def _joint(joint: JointAnswers, driver: str, found: Mapping[str, float], amplitu
         "    direction: 1   # -1 where the drive counts the other way",
         "    # A rough guess lets the plan predict the peak torque before the first run:",
         "    # expected: {inertia_kg_m2: 0.5, gravity_nm: 5.0, friction_nm: 5.0}",
+    ]
+
+
+def _simulated(joint: JointAnswers, amplitude_rad: float, velocity_rad_s: float) -> list[str]:
+    """A joint that moves along the plan with a third of its highest torque, for trials without the robot."""
+    share_nm = joint.max_torque_nm / 9
+    inertia_kg_m2 = share_nm * amplitude_rad / (2 * velocity_rad_s**2)
+    return [
+        "    # Trials without the robot (`--bus virtual:NAME`) move this joint instead; its figures are made up:",
+        "    simulated:",
+        f"      inertia_kg_m2: {inertia_kg_m2:.3g}",
+        f"      friction: {{coulomb_nm: {share_nm:.3g}, viscous_nm_s_per_rad: {share_nm / velocity_rad_s:.3g}}}",
     ]
 
 

@@ -65,3 +65,28 @@ def test_the_verb_names_what_is_missing_and_writes_what_is_whole(tmp_path: Path)
     assert load_robot(path).file.joints["b"].max_velocity_rad_s == pytest.approx(math.radians(115))
     dry = CliRunner().invoke(app, ["calibrate", "--robot", str(path), "--dry-run"])
     assert dry.exit_code == 0, dry.output
+    checked = CliRunner().invoke(app, ["check", "--robot", str(path), "--bus", "virtual:new-bench"])
+    assert checked.exit_code == 0, "its simulated drives stand for the real ones"
+
+
+def test_on_a_terminal_a_mistyped_answer_is_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("frictid_hil.cli.new._on_a_terminal", lambda: True)
+    path = tmp_path / "bench.yaml"
+    answers = [
+        "elbow",
+        "elbow=2",
+        "can0",
+        "socketcan:can0",
+        "-90..90",
+        "-90deg..90deg",
+        "115deg/s",
+        "60Nm",
+        "100",
+        "24Nm",
+    ]
+    asked = CliRunner().invoke(app, ["new", "robot", str(path)], input="\n".join(answers) + "\n")
+    assert asked.exit_code == 0, asked.output
+    assert asked.output.count("Error:") == 3 and "'-90' has no unit" in asked.output
+    assert load_robot(path).file.joints["elbow"].rated_torque_nm == 24.0
+    given_up = CliRunner().invoke(app, ["new", "robot", str(tmp_path / "b.yaml")], input="elbow=2\n")
+    assert given_up.exit_code == 130 and "no file was written" in given_up.output
