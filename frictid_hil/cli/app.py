@@ -43,7 +43,6 @@ app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 app.add_typer(emulate.app, name="emulate")
 app.add_typer(new.app, name="new")
-app.command("new-driver", hidden=True)(new.driver)
 
 _WRONG_USAGE: Any = typer.BadParameter.__bases__[0]
 """Typer's error for every option that is missing, unknown or wrong; it has no public name."""
