@@ -87,7 +87,9 @@ function show(line) {
 }
 
 function take(line) {
-    const data = Buffer.from(line.slice(5), 'hex');
+    let data = Buffer.from(line.slice(5), 'hex');
+    // The package looks for the counter of a SYNC in its second byte; CiA 301 has it in the first.
+    if (line.startsWith('t080')) data = Buffer.concat([data, data]);
     device.receive({ id: parseInt(line.slice(1, 4), 16), data, len: data.length });
 }
 

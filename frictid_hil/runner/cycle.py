@@ -247,7 +247,16 @@ class CyclicLoop:
             self.go_on()
             if done(self.cycle()):
                 return
-        raise SafetyAbort(f"{what} not seen within {timeout_s:g} s", next_step="run `frictid-hil check`")
+        last = (
+            f"joint {name} {report.state.value}, mode {report.mode.name.lower() if report.mode else 'not told'}, "
+            f"status {report.status_raw:#06x}"
+            for name, report in zip(self._supervisor.names, self.feedback, strict=True)
+        )
+        raise SafetyAbort(
+            f"{what} not seen within {timeout_s:g} s",
+            cause=f"last reported: {'; '.join(last)}",
+            next_step="run `frictid-hil check`",
+        )
 
     def settle(self, duration_s: float) -> None:
         """Cycle with unchanged set-points, unsupervised and uninterruptible (used while ending)."""

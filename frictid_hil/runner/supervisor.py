@@ -77,16 +77,16 @@ class Supervisor:
         interlock: Interlock | None = None,
         workspace: WorkspaceWatch | None = None,
     ) -> None:
-        self._names = list(names)
+        self.names = tuple(names)
         self._limits = list(limits)
         self._cycle_hz = cycle_hz
         self._moving: tuple[int, ...] = ()
         self._modes: tuple[Mode, ...] = (Mode.POSITION,)
         self._locked_at: dict[int, float] = {}
         self._settling_at: dict[int, float] = {}
-        self._torque_high = [0] * len(self._names)
+        self._torque_high = [0] * len(self.names)
         self._max_age = [max(3, math.ceil(limit.silence_s * cycle_hz)) for limit in limits]
-        self._sensors = [SensorWatch(1.0 / cycle_hz) for _ in self._names]
+        self._sensors = [SensorWatch(1.0 / cycle_hz) for _ in self.names]
         self._runaway: RunawayWatch | None = None
         self._interlock = interlock
         self._interlock_armed = False
@@ -138,7 +138,7 @@ class Supervisor:
             SafetyAbort: the interlock is open, or its input was not reported for too long.
         """
         if self._interlock is not None and self._interlock_armed:
-            self._interlock.check(feedback[self._names.index(self._interlock.joint)], self._cycle_hz)
+            self._interlock.check(feedback[self.names.index(self._interlock.joint)], self._cycle_hz)
 
     def set_limits(self, joint: int, limits: JointLimits) -> None:
         """Replace one joint's bounds (rehearsal is watched more closely)."""
@@ -174,7 +174,7 @@ class Supervisor:
                 raise SafetyAbort(
                     f"moved to {degrees(report.position_rad):.3f} deg while locked at {degrees(held_rad):.3f} deg "
                     f"(bound {degrees(self._limits[index].still_rad):.3g} deg)",
-                    where=f"joint {self._names[index]}",
+                    where=f"joint {self.names[index]}",
                     cause="a locked joint is being dragged, or its brake or position loop does not hold",
                     next_step="check the brake and the locked position, then start again",
                 )
@@ -282,4 +282,4 @@ class Supervisor:
         )
 
     def _abort(self, index: int, what: str, *, cause: str = "", next_step: str = "") -> SafetyAbort:
-        return SafetyAbort(what, where=f"joint {self._names[index]}", cause=cause, next_step=next_step)
+        return SafetyAbort(what, where=f"joint {self.names[index]}", cause=cause, next_step=next_step)

@@ -164,6 +164,15 @@ def test_a_lost_position_reference_is_refused_before_power() -> None:
     assert "enable" not in [event.phase for event in events if isinstance(event, PhaseStarted)]
 
 
+def test_what_was_reported_instead_is_told() -> None:
+    def powerless(driver: Any, phase: str) -> None:
+        driver.enable = lambda joint, mode: None
+
+    *_, ended = run(tamper=powerless, cycle_hz=50)
+    assert "power on every joint not seen within" in str(ended)
+    assert ended is not None and "joint 3 disabled, mode " in ended.cause and "status 0x" in ended.cause
+
+
 @pytest.mark.parametrize(
     ("lie", "said"),
     [
