@@ -60,7 +60,10 @@ def open_bag(path: Path, topic: str | None = None) -> ArrayTable:
 
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = {c.topic: c for c in reader.connections if c.msgtype.endswith(("JointState", "ControllerState"))}
-            if topic is not None:
+            every_state = len(topics)
+            if topic is None:
+                topics = _of_all_groups(topics)
+            else:
                 topics = {c.topic: c for c in reader.connections if c.topic == topic}
             if len(topics) != 1:
                 every = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in reader.connections))
@@ -86,7 +89,16 @@ def open_bag(path: Path, topic: str | None = None) -> ArrayTable:
             table = _Decoder(
                 lambda data: reader.deserialize(data, kind), lambda message: bytes(serialise(message, kind))
             ).table(raw, path)
-    return _table(path, table, np.array(logged, np.int64), chosen[0].topic)
+    told = [f"read from {chosen[0].topic}, which stands above the topics of single groups"] if every_state > 1 else []
+    return _table(path, table, np.array(logged, np.int64), chosen[0].topic, told if topic is None else [])
+
+
+def _of_all_groups(topics: dict[str, Any]) -> dict[str, Any]:
+    """Of ``/joint_states`` and the like of single groups below it (MotoROS2), the first; else as they are."""
+    shortest = min(topics, key=len, default="")
+    above, name = shortest.rpartition("/")[::2]
+    below = all(other.startswith(f"{above}/") and other.endswith(f"/{name}") for other in topics)
+    return {shortest: topics[shortest]} if name == "joint_states" and below else topics
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,9 +244,8 @@ def _with_time(message: Any, path: str) -> Any:
     return _with(message, {path: other})
 
 
-def _table(path: Path, columns: dict[str, Any], logged: NDArray[np.int64], topic: str) -> ArrayTable:
+def _table(path: Path, columns: dict[str, Any], logged: NDArray[np.int64], topic: str, told: list[str]) -> ArrayTable:
     """Rows in the order of their stamps, times since the first one in nanoseconds."""
-    told = []
     stamp = columns.pop("stamp_ns")
     if np.count_nonzero(stamp <= 0) > 1:
         stamp = logged
