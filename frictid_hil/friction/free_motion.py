@@ -29,6 +29,7 @@ _SHARES = np.array([0.02, 0.05, 0.1, 0.18, 0.3, 0.45, 0.65, 0.85, 1.0])
 """Knots as shares of the highest speed."""
 _LEAST_S = 0.2
 """Time that must be spent around a knot in each direction."""
+_LEAST_SAMPLES = 5
 _BUNCH_S = 1.0
 _GAP_STEPS = 5.0
 _LEAST_GRAVITY_TRAVEL_RAD = 0.5
@@ -190,22 +191,26 @@ def _knots(rows: _Rows, where: str) -> Array:
     top = float(np.quantile(np.abs(rows.velocity), 0.99))
     if top <= 0.0:
         raise IdentificationError("the joint does not move", where=where)
-    edges = np.append(_SHARES * top, np.inf)
-    need = max(5, round(_LEAST_S / rows.step_s))
-    kept = []
-    for low, knot, high in zip(np.append(0.0, edges[:-2]), edges[:-1], edges[1:], strict=True):
-        forward = np.count_nonzero((rows.velocity > low) & (rows.velocity < high))
-        backward = np.count_nonzero((rows.velocity < -low) & (rows.velocity > -high))
-        if min(forward, backward) >= need:
-            kept.append(float(knot))
-    if len(kept) < 2:
+    knots = _SHARES * top
+    kept = knots[_seen_s(rows, knots) >= _LEAST_S]
+    if kept.size < 2:
         raise IdentificationError(
             "the joint does not move both ways long enough at two speeds",
             where=where,
             cause="friction of one direction cannot be told from gravity and bias",
             next_step="record motion both ways at several speeds",
         )
-    return np.array(kept)
+    return kept
+
+
+def _seen_s(rows: _Rows, knots: Array) -> Array:
+    """How long the joint moved at speeds around each knot, in the direction where it did so for less time."""
+    edges = np.concatenate([[0.0], knots, [np.inf]])
+    around = [
+        min(np.count_nonzero((sign * rows.velocity > low) & (sign * rows.velocity < high)) for sign in (1.0, -1.0))
+        for low, high in zip(edges[:-2], edges[2:], strict=True)
+    ]
+    return np.where(np.array(around) >= _LEAST_SAMPLES, rows.step_s * np.array(around), 0.0)
 
 
 def _solve(rows: _Rows, knots: Array, where: str) -> Solved:
@@ -259,10 +264,12 @@ def _gates(
             solved = _solve(part, knots, where)
         except IdentificationError:
             return tuple(gates)
-        curves.append((solved.values[: knots.size], COVERAGE * np.sqrt(np.diag(solved.covariance)[: knots.size])))
-    (first, first_half), (second, second_half) = curves
+        half_width = COVERAGE * np.sqrt(np.diag(solved.covariance)[: knots.size])
+        seen = (_seen_s(part, knots) >= 0.5 * _LEAST_S) & (half_width > 0.0)
+        curves.append((solved.values[: knots.size], half_width, seen))
+    (first, first_half, first_seen), (second, second_half, second_seen) = curves
     spread = np.hypot(first_half, second_half)
-    known = (spread < 0.3 * level) & (first_half > 0.0) & (second_half > 0.0)
+    known = (spread < 0.3 * level) & first_seen & second_seen
     beyond = float(np.max((np.abs(first - second) - spread)[known], initial=0.0)) / max(level, 1e-12)
     gates.append(
         Gate(

@@ -2,12 +2,13 @@
 
 Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
 command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
-guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar) and decimal commas are
-found out and told. A file may have up to 10,000,000 rows and 2 GB.
+guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines
+before the header and text in Windows-1252 are found out and told. A file may have up to 10,000,000 rows and 2 GB.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import difflib
 import gzip
@@ -18,7 +19,6 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import IO
 
@@ -36,6 +36,8 @@ from frictid_hil.recording.table import mapped, samples_of
 _MAX_HEADER = 65_536
 _MOST_REMARKS = 10_000
 """Blank lines and remarks before the header, and between it and the first row."""
+_MOST_TITLES = 50
+"""Lines before the header that are neither: who measured, when, with what."""
 
 _ORDER = (
     "position_rad",
@@ -142,20 +144,16 @@ class CsvTable:
         self.standard: ColumnMap | None = None
         self.sparse = False
         self._read: dict[str, Array] = {}
-        self._header_lines = 0
-        with _reading(path), _open(path) as file:
-            header = ""
-            while not header.strip() or header.lstrip().startswith("#"):
-                header = file.readline(_MAX_HEADER)
-                self._header_lines += 1
-                if self._header_lines > _MOST_REMARKS:
-                    raise InputFileError(f"no header within {_MOST_REMARKS:,} lines", where=str(path))
-                if not header:
-                    raise InputFileError("the file is empty", where=str(path))
-            following = islice(iter(lambda: file.readline(_MAX_HEADER), ""), _MOST_REMARKS)
-            first = next((line for line in following if not _is_remark(line)), "")
-            self.dialect = Dialect.of(header, first)
+        with _reading(path):
+            self._encoding = _encoding(path)
+            with _open(path, self._encoding) as file:
+                header, first, self._header_lines, titles = _header(file, str(path))
+        self.dialect = Dialect.of(header, first)
         self.told = self.dialect.told()
+        if titles:
+            self.told += (f"the header is line {self._header_lines}; what stands above it is passed over",)
+        if self._encoding == _WESTERN:
+            self.told += ("the text is not UTF-8 and is read as Windows-1252",)
         self.names = [name.strip() for name in _cells(header, self.dialect.separator)]
         where = f"{path}, line {self._header_lines}"
         if all(_is_number(name) for name in self.names):
@@ -185,7 +183,7 @@ class CsvTable:
                     quotechar='"',
                     max_rows=MAX_ROWS + 1,
                     ndmin=2,
-                    encoding="utf-8",
+                    encoding="utf-8" if self._encoding == _UNICODE else self._encoding,
                 )
             except UnicodeDecodeError:
                 raise
@@ -253,14 +251,14 @@ class CsvTable:
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         """Line number and cells of each row of data."""
-        with _open(self.path) as file:
+        with _open(self.path, self._encoding) as file:
             reader = csv.reader(file, delimiter=self.dialect.separator)
             for row in reader:
                 if reader.line_num > self._header_lines and row and not row[0].lstrip().startswith("#"):
                     yield reader.line_num, row
 
     def _lines_with_points(self) -> Iterator[str]:
-        with _open(self.path) as file:
+        with _open(self.path, self._encoding) as file:
             for line in file:
                 yield line.replace(",", ".")
 
@@ -321,14 +319,63 @@ def _is_number(text: str) -> bool:
     return "_" not in text
 
 
+_UNICODE, _WESTERN = "utf-8-sig", "cp1252"
+
+
+def _encoding(path: Path) -> str:
+    """Windows-1252 where the file begins with text that is not UTF-8; else UTF-8, whose errors name the byte."""
+    with _open_bytes(path) as file:
+        start = file.read(_MAX_HEADER)
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return _UNICODE if re.search(rb"[\x00-\x08\x0e-\x1f\x81\x8d\x8f\x90\x9d]", start) else _WESTERN
+    return _UNICODE
+
+
+def _header(file: IO[str], where: str) -> tuple[str, str, int, int]:
+    """Header, first row, the header's line number, and how many lines of a title stand above it.
+
+    The header is the first line of words whose cells are as many as those of the row of numbers that follows; where
+    there is none, the first line that is no remark.
+    """
+    lines: list[tuple[int, str]] = []
+    for number in range(1, _MOST_REMARKS + 1):
+        line = file.readline(_MAX_HEADER)
+        if not line:
+            break
+        if not _is_remark(line):
+            lines.append((number, line))
+            if len(lines) > _MOST_TITLES:
+                break
+            if len(lines) > 1 and _heads(lines[-2][1], line):
+                return lines[-2][1], line, lines[-2][0], len(lines) - 2
+    else:
+        if not lines:
+            raise InputFileError(f"no header within {_MOST_REMARKS:,} lines", where=where)
+    if not lines:
+        raise InputFileError("the file is empty", where=where)
+    return lines[0][1], lines[1][1] if len(lines) > 1 else "", lines[0][0], 0
+
+
+def _heads(header: str, row: str) -> bool:
+    for separator in ",;\t|":
+        names, cells = _cells(header, separator), _cells(row, separator)
+        if len(names) == len(cells) > 1 and not any(map(_is_number, names)):
+            numbers = [cell.replace(",", ".") if separator != "," else cell for cell in cells]
+            if all(_is_number(cell) for cell in numbers):
+                return True
+    return False
+
+
 def _open_bytes(path: Path) -> io.BufferedReader:
     return io.BufferedReader(gzip.GzipFile(path)) if path.suffix == ".gz" else path.open("rb")
 
 
-def _open(path: Path) -> IO[str]:
+def _open(path: Path, encoding: str) -> IO[str]:
     if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")
+        return gzip.open(path, "rt", encoding=encoding, newline="")
+    return path.open(encoding=encoding, newline="")
 
 
 @contextmanager

@@ -18,14 +18,15 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.table import Table, unwrapped
 
 _WORDS: dict[str, str] = {
-    "position_command": r"(pos|position|angle|q|joint)?_?(cmd|command|commanded|des|desired|target|ref|reference|goal|"
+    "position_command": r"soll(wert|winkel|lage|position)?|"
+    r"(pos|position|angle|q|joint)?_?(cmd|command|commanded|des|desired|target|ref|reference|goal|"
     r"goal_position|setpoint|action|con)_?(pos|position|positions|dof_pos|q|angle)?",
-    "velocity": r"(joint_?)?(actual_?|meas_?|measured_?)?(vel|velocity|velocities|qd|dq|speed|omega|qdot|dof_vel)"
-    r"_?(meas|measured|act|actual)?",
+    "velocity": r"(joint_?)?(actual_?|meas_?|measured_?)?(vel|velocity|velocities|qd|dq|speed|omega|qdot|dof_vel|"
+    r"drehzahl|geschwindigkeit)_?(meas|measured|act|actual)?",
     "torque": r"(joint_?|motor_?)?(actual_?|meas_?|measured_?)?(tau|torque|torques|trq|effort|efforts|current|currents|"
-    r"force|i|iq|dof_tor)_?(meas|measured|act|actual)?",
+    r"force|i|iq|dof_tor|moment|drehmoment|strom|kraft)_?(meas|measured|act|actual)?",
     "position": r"(joint_?)?(actual_?|meas_?|measured_?)?(pos|position|positions|q|angle|theta|encoder|dof_pos|state|"
-    r"observation\.state|phi)_?(meas|measured|act|actual)?",
+    r"observation\.state|phi|winkel|lage)_?(meas|measured|act|actual)?",
     "time": r"(time|t|stamp|timestamp|times|zeit)",
     "temperature": r"(temp|temperature)",
 }
@@ -34,6 +35,7 @@ _UNITS = {
     "n m": "N m", "mnm": "mNm", "ms": "ms", "us": "us", "ns": "ns", "s": "s", "a": "A", "ma": "mA", "grad": "deg",
     "degree": "deg", "degrees": "deg", "deg_s": "deg/s", "rad_s": "rad/s", "dps": "deg/s", "sec": "s", "msec": "ms",
     "mm": "mm", "m": "m", "n": "N", "mm/s": "mm/s", "m/s": "m/s",
+    "1/min": "rpm", "u/min": "rpm", "min-1": "rpm", "min^-1": "rpm", "r/min": "rpm",
     "°": "deg", "°/s": "deg/s", "degps": "deg/s", "radps": "rad/s",
 }  # fmt: skip
 _FITTING = {
@@ -125,7 +127,7 @@ def draft(table: Table, name: str) -> Draft:
         raise InputFileError(
             f"no column that is named like a position; the file has {', '.join(table.names)[:300]}",
             where=str(table.path),
-            next_step="write the column map by hand: docs/logs.md shows one",
+            next_step="write the column map by hand: docs/guides/your-own-log.md shows one",
         )
     findings = list(table.told)
     time_s, time_document = _time(table, times, findings)
@@ -178,7 +180,9 @@ def _joint(
         if found:
             document["velocity"] = {"column": velocity.column, "unit": found}
     if torque := columns.get("torque"):
-        is_current = torque.unit in ("A", "mA") or re.search(r"current|^i(q)?_?\d*$", torque.column, re.IGNORECASE)
+        is_current = torque.unit in ("A", "mA") or re.search(
+            r"current|strom|^i(q)?_?\d*$", torque.column, re.IGNORECASE
+        )
         document["torque"] = {"column": torque.column, "unit": torque.unit or ("A" if is_current else "N m")}
         if is_current:
             document["torque"] |= {"torque_constant_nm_per_a": 1.0, "gear_ratio": 1.0}  # type: ignore[operator]

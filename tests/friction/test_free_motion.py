@@ -84,3 +84,22 @@ def test_what_cannot_be_told_is_refused_or_gated() -> None:
     with pytest.raises(IdentificationError, match="F_0"):
         free_motion(time, q, -torque)
     assert not gate(free_motion(*joint(1, noise=30.0, seconds=8.0)), "friction_interval")
+
+
+def test_halves_of_rising_speeds_are_compared_where_both_stayed() -> None:
+    step, travel, fastest, cycles, yields = 0.005, 0.35, 2.0, 10, 0.004
+    parts = []
+    for speed in fastest * np.arange(1, cycles + 1) / cycles:
+        time = np.arange(0.0, np.pi * travel / speed, step)
+        parts.append(0.5 * travel * (1.0 - np.cos(2.0 * speed / travel * time)))
+    q = np.concatenate(parts)
+    v = np.gradient(q, step)
+    slip = [0.0]  # friction begins as a spring that yields
+    for moved in np.diff(q):
+        slip.append(float(np.clip(slip[-1] + moved, -yields, yields)))
+    torque = 0.1 * np.gradient(v, step) + friction(np.abs(v)) * np.array(slip) / yields
+    torque += 0.05 * np.random.default_rng(1).standard_normal(q.size)
+    time = step * np.arange(q.size)
+    assert gate(free_motion(time, q, torque), "halves_agree")
+    warmer = np.where(time > time[-1] / 2, 1.0, 1.6) * torque
+    assert not gate(free_motion(time, q, warmer), "halves_agree")

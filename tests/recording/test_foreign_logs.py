@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from frictid_hil.columns import ColumnMap
 from frictid_hil.config.columns import load_columns
 from frictid_hil.errors import FrictidError, InputFileError
+from frictid_hil.jobs.columns import columns
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
@@ -330,6 +331,20 @@ def test_csv_dialects_are_found_out_and_told(tmp_path: Path, separator: str, com
     told = " ".join(joint.meta.get("told", ()))
     assert ("decimal commas" in told) == comma
     assert ("separated by" in told) == (separator != ",")
+
+
+def test_a_logger_that_speaks_german_is_drafted(tmp_path: Path) -> None:
+    time = np.arange(0.0, 4.0, 0.01)
+    angle = 40.0 * np.sin(1.5 * time)
+    rows = zip(1e3 * time, angle, np.gradient(angle, 0.01) / 6.0, np.sign(np.gradient(angle)), strict=True)
+    text = "Zeit [ms];Winkel [°];Drehzahl [1/min];Moment [Nm]\r\n"
+    text += "".join(";".join(f"{value:.4f}".replace(".", ",") for value in row) + "\r\n" for row in rows)
+    log = tmp_path / "messung.csv"
+    log.write_bytes(f"Prüfstand 2\r\n{text}".encode("cp1252"))
+    told = columns(log, out=tmp_path / "map.yaml")
+    assert told["joints"]["0"]["columns"] == ["position_rad", "velocity_rad_s", "torque_nm"]
+    assert told["joints"]["0"]["travel"] == pytest.approx(np.deg2rad(80.0), rel=1e-3)
+    assert told["joints"]["0"]["doubts"] == []
 
 
 def test_a_wrapped_angle_is_unwrapped_and_one_in_a_second_file_held(tmp_path: Path) -> None:

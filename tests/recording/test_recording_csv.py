@@ -119,7 +119,24 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "no.csv.gz").write_bytes(b"not gzip at all")
     assert "cannot be read" in refused(tmp_path / "no.csv.gz")
     (tmp_path / "latin.csv").write_bytes((HEADER + ROWS).encode() + b"0.006,\xb0,1,1,1\n")
-    assert "not UTF-8" in refused(tmp_path / "latin.csv")
+    assert "line 5, column position_rad: '°' is not a number" in refused(tmp_path / "latin.csv")
+    (tmp_path / "binary.csv").write_bytes(b"\x00\xff\xfe" + (HEADER + ROWS).encode())
+    assert "not UTF-8" in refused(tmp_path / "binary.csv")
+
+
+def test_a_title_above_the_header_and_a_western_text_are_passed_over_and_told(tmp_path: Path) -> None:
+    path = tmp_path / "bench.csv"
+    path.write_bytes(
+        f"Messung, Prüfstand 2\n# 3. Mai\nPrüfer;M. Muster\n{(HEADER + ROWS).replace(',', ';')}".encode("cp1252")
+    )
+    (samples,) = read_csv(path)
+    plain = tmp_path / "plain.csv"
+    plain.write_text(HEADER + ROWS)
+    assert samples.columns()["torque_nm"].tolist() == read_csv(plain)[0].columns()["torque_nm"].tolist()
+    told = " ".join(samples.meta["told"])
+    assert "the header is line 4" in told and "Windows-1252" in told and "semicolons" in told
+    path.write_text(path.read_text(encoding="cp1252").replace("8.6", "fast"), encoding="cp1252")
+    assert "line 6, column torque_nm: 'fast' is not a number" in refused(path)
 
 
 def test_too_many_rows_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
