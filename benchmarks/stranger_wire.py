@@ -12,8 +12,8 @@ from typing import Any
 import can
 
 from frictid_drivers.cia402 import Cia402Driver
-from frictid_drivers.cia402.network import open_bus
 from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.can_bus import open_bus
 from frictid_hil.protocol.driver import DriverKind
 
 DONE = can.Message(arbitration_id=0x1FFF_FFFF, is_extended_id=True)

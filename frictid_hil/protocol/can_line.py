@@ -6,46 +6,16 @@ Identifiers carry the flags of ``FrameSink``: bit 31 for 29-bit identifiers, bit
 from __future__ import annotations
 
 import contextlib
-import re
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import can
-from filelock import FileLock, Timeout
 
-from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
-from frictid_hil.protocol.driver import FD_FRAME, Clock, FrameSink
+from frictid_hil.errors import HardwareError
+from frictid_hil.protocol.can_bus import BusFactory, BusLock, open_bus
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock, FrameSink
 
-EXTENDED = 1 << 31
-"""Bit of an identifier, here and in bus logs, that says: 29 bits."""
-BUSIEST = 0.8
-"""Share of a bus that frames of the cycle may take; above, one repeated frame makes the next cycle late."""
-
-BusFactory = Callable[[], can.BusABC]
-
-_FORWARDED = ("bitrate", "tty_baudrate", "sleep_after_open", "port", "app_name", "serial", "index", "host", "tcp_tune")
-_BITRATE = 1_000_000
 _WIRE_FAILURES = 3
-
-
-def worst_frame_bits(can_id: int, data_bytes: int) -> int:
-    """Length of a classical data frame with the most stuffing there can be and the inter-frame space, bits.
-
-    An 11-bit frame has 44 + 8n bits of which 34 + 8n are stuffed, a 29-bit one 64 + 8n and 54 + 8n; at worst every
-    fourth bit after the first of these is followed by a stuff bit; 3 bits lie between frames (ISO 11898-1).
-    """
-    if not 0 <= data_bytes <= 8:
-        raise ValueError(f"a classical CAN frame carries 0..8 bytes, not {data_bytes}")
-    more = 20 if can_id & EXTENDED else 0
-    return 44 + more + 8 * data_bytes + (34 + more + 8 * data_bytes - 1) // 4 + 3
-
-
-def highest_rate_hz(cycle_frames: Iterable[tuple[int, int]], bitrate: int) -> float:
-    """The highest whole rate at which these frames, each an identifier and its bytes, leave a fifth of the bus."""
-    bits = sum(worst_frame_bits(can_id, data_bytes) for can_id, data_bytes in cycle_frames)
-    return float(int(BUSIEST * bitrate / bits)) if bits else float("inf")
 
 
 class CanLine:
@@ -53,7 +23,7 @@ class CanLine:
 
     Args:
         bus: ``interface:channel`` as typed.
-        options: of the robot file; ``bitrate`` and a few others go to python-can.
+        options: of the robot file; ``bitrate``, ``fd``, ``data_bitrate`` and a few others go to python-can.
         sink: told of every frame.
         clock: run time to stamp frames with.
         bus_factory: opens the bus instead of python-can (a simulated one); it is then not locked.
@@ -76,13 +46,14 @@ class CanLine:
         self._sink = sink
         self._clock = clock
         self._failures = 0
-        self._lock: FileLock | None = None
+        self._lock: BusLock | None = None
         if bus_factory is not None:
             self._bus = bus_factory()
             return
-        self._lock = _taken(bus)
+        self._lock = BusLock(bus)
+        self._lock.acquire()
         try:
-            self._bus = _opened(bus, options)
+            self._bus = open_bus(bus, options)
         except BaseException:
             self._lock.release()
             raise
@@ -95,8 +66,10 @@ class CanLine:
         """
         t_ns = self._clock.now_ns()
         message = can.Message(
-            arbitration_id=can_id & 0x1FFF_FFFF,
+            arbitration_id=can_id & (0x1FFF_FFFF if can_id & EXTENDED else 0x7FF),
             is_extended_id=bool(can_id & EXTENDED),
+            is_fd=bool(can_id & FD_FRAME),
+            bitrate_switch=bool(can_id & FD_FRAME),
             # Bytes of its own: some interfaces pad the message that they are given.
             data=bytearray(data),
         )
@@ -152,37 +125,3 @@ class CanLine:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-
-def _taken(bus: str) -> FileLock:
-    path = Path(tempfile.gettempdir()) / f"frictid-hil-{re.sub(r'[^A-Za-z0-9.]+', '-', bus)}.lock"
-    lock = FileLock(path, mode=0o666)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise HardwareBusy(
-            "held by another process", where=bus, next_step=f"wait for it to end, or see who holds it: fuser {path}"
-        ) from None
-    except OSError as error:
-        raise HardwareError(f"cannot lock the bus: {error}", where=str(path)) from error
-    return lock
-
-
-def _opened(bus: str, options: Mapping[str, Any]) -> can.BusABC:
-    interface, colon, channel = bus.partition(":")
-    if not (interface and colon and channel):
-        raise UsageError(f"bus {bus!r} is not of the form interface:channel", next_step="e.g. socketcan:can0")
-    settings = {key: options[key] for key in _FORWARDED if key in options}
-    if interface not in ("socketcan", "virtual"):
-        # A SocketCAN link carries its bitrate already; everybody else must be told.
-        settings.setdefault("bitrate", _BITRATE)
-    try:
-        return can.Bus(interface=interface, channel=channel, **settings)
-    except Exception as error:  # interfaces raise whatever their vendor library does; none of it is the user's to debug
-        link = f"sudo ip link set {channel} up type can bitrate {options.get('bitrate', _BITRATE)}"
-        raise HardwareError(
-            f"cannot open the bus: {error}",
-            where=bus,
-            cause="the adapter is absent, the link is down, or the interface is misspelt",
-            next_step=link if interface == "socketcan" else "check the adapter, its driver and the channel's name",
-        ) from error

@@ -248,6 +248,8 @@ class Finding:
     topic: str = ""
 
 
+EXTENDED = 1 << 31
+"""Bit of an identifier, here and in bus logs, that says: 29 bits."""
 FD_FRAME = 1 << 29
 """Bit of an identifier, here and in bus logs, that says: a CAN FD frame, its data at the higher bit rate."""
 

@@ -9,11 +9,10 @@ from typing import Any, Protocol
 
 import can
 
-from frictid_hil.protocol.can_line import EXTENDED
-from frictid_hil.protocol.driver import Clock
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock
 
 Frame = tuple[int, bytes]
-"""Identifier (bit 31: 29 bits) and data."""
+"""Identifier (bit 31: 29 bits, bit 29: CAN FD) and data."""
 
 
 class Devices(Protocol):
@@ -79,14 +78,16 @@ class FakeCanBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Let every device hear the frame."""
         self._go_on()
-        frame = (msg.arbitration_id | (EXTENDED if msg.is_extended_id else 0), bytes(msg.data))
+        flags = (EXTENDED if msg.is_extended_id else 0) | (FD_FRAME if msg.is_fd else 0)
+        frame = (msg.arbitration_id | flags, bytes(msg.data))
         for can_id, data in self._through(frame, False):
             for answer in self._devices.receive(can_id, data):
                 for answered_id, answered in self._through(answer, True):
                     self._queue.append(
                         can.Message(
-                            arbitration_id=answered_id & 0x1FFF_FFFF,
+                            arbitration_id=answered_id & (0x1FFF_FFFF if answered_id & EXTENDED else 0x7FF),
                             is_extended_id=bool(answered_id & EXTENDED),
+                            is_fd=bool(answered_id & FD_FRAME),
                             data=answered,
                         )
                     )

@@ -10,11 +10,11 @@ import pytest
 from cia402_bench import Bench, bench, hp3j
 from cia402_wire import OBJECTS, ScriptedDrive
 
-from frictid_drivers.cia402 import network
 from frictid_drivers.cia402.replay import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused
 from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol import can_bus
 from frictid_hil.protocol.driver import FD_FRAME, SetPoint
 
 FD = {"fd": True, "data_bitrate": 4_000_000}
@@ -74,8 +74,8 @@ def interfaces(monkeypatch):
 @pytest.mark.parametrize("interface", ["socketcan", "udp_multicast", "ixxat", "neovi", "pcan", "kvaser", "vector"])
 def test_every_family_of_interfaces_is_told_in_its_own_way(interfaces, interface):
     calls = interfaces(can.CanProtocol.CAN_FD)
-    network.open_bus(f"{interface}:absent", {"bitrate": 1_000_000, **FD})
-    network.open_bus(f"{interface}:absent", {"bitrate": 1_000_000})
+    can_bus.open_bus(f"{interface}:absent", {"bitrate": 1_000_000, **FD})
+    can_bus.open_bus(f"{interface}:absent", {"bitrate": 1_000_000})
     told, classical = calls
     timing = told.get("timing")
     if timing is not None:
@@ -90,26 +90,26 @@ def test_every_family_of_interfaces_is_told_in_its_own_way(interfaces, interface
 def test_an_interface_without_can_fd_is_refused(interfaces):
     interfaces(can.CanProtocol.CAN_FD)
     with pytest.raises(HardwareError, match=r"robotell.*not known to speak CAN FD"):
-        network.open_bus("robotell:absent", FD)
+        can_bus.open_bus("robotell:absent", FD)
     interfaces(can.CanProtocol.CAN_20)
     with pytest.raises(HardwareError, match="classical CAN frames only") as caught:
-        network.open_bus("socketcan:can7", FD)
+        can_bus.open_bus("socketcan:can7", FD)
     assert "dbitrate 4000000 fd on" in caught.value.next_step
 
 
 def test_a_link_that_holds_8_bytes_is_refused(interfaces, monkeypatch, tmp_path):
     interfaces(can.CanProtocol.CAN_FD)
-    monkeypatch.setattr(network, "_LINKS", tmp_path)
+    monkeypatch.setattr(can_bus, "_LINKS", tmp_path)
     (tmp_path / "can7").mkdir()
     (tmp_path / "can7/mtu").write_text("16\n")
     with pytest.raises(HardwareError, match="classical CAN frames only"):
-        network.open_bus("socketcan:can7", FD)
+        can_bus.open_bus("socketcan:can7", FD)
     (tmp_path / "can7/mtu").write_text("72\n")
-    network.open_bus("socketcan:can7", FD)
+    can_bus.open_bus("socketcan:can7", FD)
 
 
 def test_python_cans_own_bus_carries_fd_frames():
-    with network.open_bus("virtual:fd-test", FD) as first, network.open_bus("virtual:fd-test", FD) as second:
+    with can_bus.open_bus("virtual:fd-test", FD) as first, can_bus.open_bus("virtual:fd-test", FD) as second:
         first.send(can.Message(arbitration_id=0x181, data=bytes(12), is_fd=True, is_extended_id=False))
         assert second.recv(1).is_fd
 

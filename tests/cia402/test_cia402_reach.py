@@ -11,10 +11,11 @@ import pytest
 from cia402_bench import RAD, Bench, bench
 from cia402_wire import ScriptedDrive, robot
 
-from frictid_drivers.cia402 import Cia402Driver, network
+from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.cia402.known_settings import KNOWN_SETTINGS, Effect, timing_of
-from frictid_drivers.cia402.network import BusLock
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
+from frictid_hil.protocol import can_bus
+from frictid_hil.protocol.can_bus import BusLock
 from frictid_hil.protocol.driver import Driver, Severity
 
 
@@ -210,7 +211,7 @@ def test_options_of_an_interface_are_passed_on(monkeypatch):
 
     real = can.Bus
     monkeypatch.setattr(can, "Bus", opened)
-    bus = network.open_bus("socketcand:can0", {"host": "10.0.0.2", "port": 29536, "tcp_tune": True, "watchdog_ms": 100})
+    bus = can_bus.open_bus("socketcand:can0", {"host": "10.0.0.2", "port": 29536, "tcp_tune": True, "watchdog_ms": 100})
     bus.shutdown()
     assert seen["tcp_tune"] is True and seen["host"] == "10.0.0.2" and "watchdog_ms" not in seen
 

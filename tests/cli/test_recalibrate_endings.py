@@ -19,11 +19,11 @@ import pytest
 from typer.testing import CliRunner
 
 from frictid_drivers.cia402.fleet import Fleet
-from frictid_drivers.cia402.network import BusLock
 from frictid_hil.cli.app import app
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.profiles.store import ProfileStore
+from frictid_hil.protocol.can_bus import BusLock
 
 ROBOT = "endings"
 UNATTENDED = {

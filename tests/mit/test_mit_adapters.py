@@ -13,7 +13,7 @@ from mit_bench import Bench, robot
 from frictid_drivers.mit.adapters import DamiaoAdapter, RobStrideAdapter, SerialAdapter
 from frictid_drivers.mit.driver import MitDriver
 from frictid_hil.plan.mode import Mode
-from frictid_hil.protocol.can_line import EXTENDED
+from frictid_hil.protocol.driver import EXTENDED
 
 
 class FakePort:

@@ -15,8 +15,8 @@ from frictid_drivers.mit.frames import FULL, TWELVE, Motion, pack_motion, pack_r
 from frictid_drivers.mit.logs import decoder
 from frictid_drivers.mit.models import MODELS
 from frictid_hil.errors import InvalidFields
-from frictid_hil.protocol.can_line import EXTENDED, highest_rate_hz, worst_frame_bits
-from frictid_hil.protocol.driver import JointState
+from frictid_hil.protocol.can_load import frame_bits, highest_rate_hz
+from frictid_hil.protocol.driver import EXTENDED, JointState
 
 SHARE = st.floats(-1.0, 1.0)
 MODEL = st.sampled_from(sorted(MODELS))
@@ -108,7 +108,7 @@ def test_states_and_faults_of_answers() -> None:
     ("extended", "data_bytes", "bits"), [(False, 8, 135), (False, 4, 95), (True, 8, 160), (True, 4, 120)]
 )
 def test_the_longest_frame_with_stuffing(extended: bool, data_bytes: int, bits: int) -> None:
-    assert worst_frame_bits(EXTENDED if extended else 0, data_bytes) == bits
+    assert frame_bits(data_bytes, extended=extended).worst == bits
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,13 @@ import frictid_hil.protocol.driver as api
 from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.can_cycle import CanCycle
-from frictid_hil.protocol.can_line import CanLine, highest_rate_hz
+from frictid_hil.protocol.can_line import CanLine
+from frictid_hil.protocol.can_load import highest_rate_hz
 from frictid_hil.protocol.rows import Command, Report, RowDecoder, RowLog
 from frictid_hil.protocol.wishes import Do, Wish
 
 schema = "odrive-frames/1"
-IDLE, CLOSED_LOOP = 1, 8
-CONTROL = {Mode.TORQUE: 1, Mode.VELOCITY: 2, Mode.POSITION: 3}
+IDLE, CLOSED_LOOP, CONTROL = 1, 8, {Mode.TORQUE: 1, Mode.VELOCITY: 2, Mode.POSITION: 3}
 
 
 class Reader:

@@ -24,13 +24,14 @@ from frictid_drivers.cia402.cycle import BUS_ERRORS, Cycle
 from frictid_drivers.cia402.fleet import NMT_PRE_OPERATIONAL, NMT_START, Fleet
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
 from frictid_drivers.cia402.layout import Layout
-from frictid_drivers.cia402.network import BusFactory, BusLock, HeartbeatTimer, open_bus
+from frictid_drivers.cia402.network import HeartbeatTimer
 from frictid_drivers.cia402.settings import read_settings
 from frictid_drivers.cia402.state import DriveState, drive_state
 from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.can_bus import BusFactory, BusLock, open_bus
 from frictid_hil.protocol.driver import (
     Capabilities,
     Clock,

@@ -52,12 +52,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from frictid_drivers.cia402.bus_load import BitRates
 from frictid_drivers.cia402.frame_map import Entry
-from frictid_drivers.cia402.network import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, FORWARDED
 from frictid_drivers.cia402.objects import Object
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, FORWARDED
+from frictid_hil.protocol.can_load import BitRates
 from frictid_hil.protocol.driver import Timing, unknown_options
 
 BUS_OPTIONS = frozenset(

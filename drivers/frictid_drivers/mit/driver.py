@@ -24,8 +24,10 @@ from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.protocol.can_bus import BusFactory
 from frictid_hil.protocol.can_cycle import CanCycle
-from frictid_hil.protocol.can_line import BUSIEST, BusFactory, CanLine, highest_rate_hz
+from frictid_hil.protocol.can_line import CanLine
+from frictid_hil.protocol.can_load import BUSIEST, highest_rate_hz
 from frictid_hil.protocol.driver import (
     Capabilities,
     Clock,

@@ -20,8 +20,7 @@ from typing import ClassVar, Protocol
 
 from frictid_drivers.mit import frames
 from frictid_drivers.mit.frames import FULL, Motion, Ranges
-from frictid_hil.protocol.can_line import EXTENDED
-from frictid_hil.protocol.driver import JointState
+from frictid_hil.protocol.driver import EXTENDED, JointState
 
 Frame = tuple[int, bytes]
 """Identifier with its flags, and data."""
