@@ -6,13 +6,14 @@ Identifiers carry the flags of ``FrameSink``: bit 31 for 29-bit identifiers, bit
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import can
 
 from frictid_hil.errors import HardwareError
-from frictid_hil.protocol.can_bus import BusFactory, BusLock, open_bus
+from frictid_hil.protocol.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, BusFactory, BusLock, open_bus
+from frictid_hil.protocol.can_load import BitRates, highest_rate_hz
 from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock, FrameSink
 
 _WIRE_FAILURES = 3
@@ -43,6 +44,10 @@ class CanLine:
         bus_factory: BusFactory | None = None,
     ) -> None:
         self._name = bus
+        self._rates = BitRates(
+            int(options.get("bitrate", DEFAULT_BITRATE)),
+            int(options.get("data_bitrate", DEFAULT_DATA_BITRATE)) if options.get("fd") else None,
+        )
         self._sink = sink
         self._clock = clock
         self._failures = 0
@@ -57,6 +62,14 @@ class CanLine:
         except BaseException:
             self._lock.release()
             raise
+
+    def highest_rate_hz(self, cycle_frames: Iterable[tuple[int, int]]) -> float:
+        """The highest whole rate at which these frames of one cycle leave a fifth of this bus.
+
+        Args:
+            cycle_frames: identifiers with their flags, each with its number of data bytes.
+        """
+        return highest_rate_hz(cycle_frames, self._rates)
 
     def send(self, can_id: int, data: bytes) -> int:
         """Send one frame; the run time it was stamped with.

@@ -122,19 +122,18 @@ def fd_frame_bits(data_bytes: int, rates: BitRates, *, extended: bool = False) -
     return FrameBits(least, least + slow_stuff + (stuff - slow_stuff) * share)
 
 
-def highest_rate_hz(cycle_frames: Iterable[tuple[int, int]], bitrate: int, data_bitrate: int | None = None) -> float:
+def highest_rate_hz(cycle_frames: Iterable[tuple[int, int]], rates: BitRates) -> float:
     """The highest whole rate at which these frames leave a fifth of the bus.
 
     Args:
         cycle_frames: of one cycle, each an identifier with its flags and its data bytes.
-        bitrate: bit/s; of arbitration where frames are CAN FD.
-        data_bitrate: bit/s of the data of CAN FD frames.
+        rates: of the bus.
     """
-    rates, bits = BitRates(bitrate, data_bitrate), 0.0
+    bits = 0.0
     for can_id, data_bytes in cycle_frames:
         extended = bool(can_id & EXTENDED)
         if can_id & FD_FRAME:
             bits += fd_frame_bits(data_bytes, rates, extended=extended).worst
         else:
             bits += frame_bits(data_bytes, extended=extended).worst
-    return float(int(BUSIEST * bitrate / bits)) if bits else float("inf")
+    return float(int(BUSIEST * rates.nominal / bits)) if bits else float("inf")

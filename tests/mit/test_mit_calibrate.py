@@ -55,6 +55,16 @@ def test_limits_of_quality_gates_are_printed_before_anything_moves_and_kept_besi
 
 
 @pytest.mark.slow
+def test_can_fd_changes_no_figure(tmp_path: Path) -> None:
+    classical, fast = tmp_path / "classical", tmp_path / "fast"
+    for folder, options in ((classical, {}), (fast, {"fd": True})):
+        folder.mkdir()
+        calibrated(robot_file(folder, "damiao", {"options": options}), folder / "run", 4)
+    first, second = (load_profile(folder / "run" / "profile.yaml").joint("0") for folder in (classical, fast))
+    assert first.torque_nm == second.torque_nm
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("family", sorted(FAMILIES))
 def test_compensation_follows_better_than_none(tmp_path: Path, family: str) -> None:
     options = {"allow_torque_without_watchdog": True}  # nothing here can be hurt

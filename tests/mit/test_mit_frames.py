@@ -15,7 +15,7 @@ from frictid_drivers.mit.frames import FULL, TWELVE, Motion, pack_motion, pack_r
 from frictid_drivers.mit.logs import decoder
 from frictid_drivers.mit.models import MODELS
 from frictid_hil.errors import InvalidFields
-from frictid_hil.protocol.can_load import frame_bits, highest_rate_hz
+from frictid_hil.protocol.can_load import BitRates, frame_bits, highest_rate_hz
 from frictid_hil.protocol.driver import EXTENDED, JointState
 
 SHARE = st.floats(-1.0, 1.0)
@@ -115,7 +115,7 @@ def test_the_longest_frame_with_stuffing(extended: bool, data_bytes: int, bits: 
     ("extended", "motors", "most_hz"), [(0, 1, 2962), (0, 6, 493), (0, 7, 423), (EXTENDED, 6, 416), (EXTENDED, 7, 357)]
 )
 def test_the_feasible_rate(extended: int, motors: int, most_hz: float) -> None:
-    assert highest_rate_hz([(extended, 8)] * 2 * motors, 1_000_000) == most_hz
+    assert highest_rate_hz([(extended, 8)] * 2 * motors, BitRates(1_000_000)) == most_hz
 
 
 @pytest.mark.parametrize("values", [{}, {"joints": {"0": {"family": "x"}}}, {"joints": 3}])

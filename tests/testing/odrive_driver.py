@@ -13,12 +13,12 @@ from frictid_hil.errors import FrictidError, HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.can_cycle import CanCycle
 from frictid_hil.protocol.can_line import CanLine
-from frictid_hil.protocol.can_load import highest_rate_hz
 from frictid_hil.protocol.rows import Command, Report, RowDecoder, RowLog
 from frictid_hil.protocol.wishes import Do, Wish
 
 schema = "odrive-frames/1"
-IDLE, CLOSED_LOOP, CONTROL = 1, 8, {Mode.TORQUE: 1, Mode.VELOCITY: 2, Mode.POSITION: 3}
+IDLE, CLOSED_LOOP = 1, 8
+CONTROL = {Mode.TORQUE: 1, Mode.VELOCITY: 2, Mode.POSITION: 3}
 
 
 class Reader:
@@ -80,7 +80,7 @@ class Driver:
         return {joint.name: api.JointIdentity(joint.name, **worth) for joint in self.setup.joints}
 
     def capabilities(self):
-        most_hz = highest_rate_hz([(0, 8)] * 4 * len(self.joints), self.setup.options.get("bitrate", 1_000_000))
+        most_hz = self.line.highest_rate_hz([(0, 8)] * 4 * len(self.joints))
         torque = [Mode.TORQUE] if self.setup.options.get("allow_torque_without_watchdog") else []
         return api.Capabilities(most_hz, frozenset([Mode.POSITION, *torque]), lock_step=self.clock.lock_step)
 

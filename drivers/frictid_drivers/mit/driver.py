@@ -15,7 +15,7 @@ from typing import Any
 
 from frictid_drivers.mit import adapters
 from frictid_drivers.mit.actuator import Actuator, Reader
-from frictid_drivers.mit.families import Motor, Parameter, RobStride
+from frictid_drivers.mit.families import Damiao, Motor, Parameter, RobStride
 from frictid_drivers.mit.frames import FULL, TWELVE, Motion, step
 from frictid_drivers.mit.logs import frame_map_values, row_decoder
 from frictid_drivers.mit.models import MODELS
@@ -131,7 +131,7 @@ class MitDriver:
                 severity,
                 "bus load",
                 f"{count} motors, one frame out and one back each: at most {most_hz:g} Hz within {BUSIEST:.0%} of "
-                f"{self._bus_settings.bitrate / 1000:g} kbit/s, {cycle_hz:g} Hz asked",
+                f"{self._bus_settings.rates}, {cycle_hz:g} Hz asked",
                 "" if severity is Severity.OK else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz`)",
             )
         ]
@@ -357,7 +357,8 @@ class MitDriver:
         raise HardwareError(
             f"does not answer: {what} not seen",
             where=_where(joint),
-            cause="no supply, a wrong id or reply id, another bit rate, or a motor that speaks another protocol",
+            cause="no supply, a wrong id or reply id, another bit rate, CAN FD on one side alone, or a motor that "
+            "speaks another protocol",
             next_step="compare id and protocol with the maker's tool; check supply and termination",
         )
 
@@ -416,6 +417,13 @@ class MitDriver:
                 f"it says {ranges.velocity_rad_s:g} rad/s and {ranges.torque_nm:g} N m where a {settings.model} "
                 f"usually has {table.velocity_rad_s:g} and {table.torque_nm:g}; its own figures are used",
             )
+        code, wanted = figures.get("bit rate", math.nan), self._bus_settings.data_bitrate
+        if code in range(len(Damiao.RATES)) and (rate := Damiao.RATES[int(code)]) != (wanted or 1_000_000):
+            say(
+                Severity.ERROR if wanted or rate > 1_000_000 else Severity.WARNING,
+                f"its register 35 says {rate / 1e6:g} Mbit/s, the robot file {(wanted or 1_000_000) / 1e6:g} Mbit/s",
+                "set the motor's rate with the maker's tool, or `fd` and `data_bitrate` in options",
+            )
         if settings.family.watchdog is None:
             say(
                 Severity.WARNING,
@@ -433,7 +441,7 @@ class MitDriver:
         for settings in self._settings.values():
             can_id, data = settings.family.command(settings.motor, Motion())
             cycle += [(can_id, len(data)), (can_id, 8)]
-        most_hz = highest_rate_hz(cycle, self._bus_settings.bitrate)
+        most_hz = highest_rate_hz(cycle, self._bus_settings.rates)
         interface, baud = self.setup.bus.partition(":")[0], self._bus_settings.tty_baudrate
         letters = 0.0
         if interface == "slcan" and baud:

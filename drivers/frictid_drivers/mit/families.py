@@ -36,11 +36,13 @@ class Motor:
         id: its own.
         reply_id: identifier (11 bit) or host id (29 bit) that its answers carry.
         ranges: of its frames.
+        flags: of all its identifiers: ``FD_FRAME`` where it speaks CAN FD.
     """
 
     id: int
     reply_id: int
     ranges: Ranges
+    flags: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +143,11 @@ class _ElevenBit:
 
     def command(self, motor: Motor, motion: Motion) -> Frame:
         """As ``Family.command``."""
-        return motor.id, frames.pack_motion(motion, motor.ranges)
+        return motor.id | motor.flags, frames.pack_motion(motion, motor.ranges)
 
     def special(self, motor: Motor, what: bytes) -> Frame:
         """As ``Family.special``."""
-        return motor.id, what
+        return motor.id | motor.flags, what
 
     def poll(self, motor: Motor) -> Frame:
         """As ``Family.poll``."""
@@ -153,7 +155,7 @@ class _ElevenBit:
 
     def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
         """As ``Family.commanded``."""
-        if can_id != motor.id or len(data) != 8:
+        if can_id != motor.id | motor.flags or len(data) != 8:
             return None
         return data if data in (ON, OFF, CLEAR) else frames.unpack_motion(data, motor.ranges)
 
@@ -174,7 +176,16 @@ _DAMIAO_PORT = 0x7FF
 
 
 class Damiao(_ElevenBit):
-    """DM-J motors. Register answers share the identifier of the cyclic ones: they are read before and after only."""
+    """DM-J motors. Register answers share the identifier of the cyclic ones: they are read before and after only.
+
+    CAN FD changes the frames' kind and nothing in them. Above 1 Mbit/s (register 35, ``RATES``) a motor answers in FD
+    frames alone, and raises errors where nobody hears them (one source).
+    """
+
+    RATES: ClassVar[tuple[int, ...]] = (
+        125_000, 200_000, 250_000, 500_000, 1_000_000, 2_000_000, 2_500_000, 3_200_000, 4_000_000, 5_000_000,
+    )  # fmt: skip
+    """What the codes of register 35 say, bit/s; above 1 Mbit/s, of the data of FD frames."""
 
     name = "damiao"
     reply_id: ClassVar[int | None] = None
@@ -187,15 +198,16 @@ class Damiao(_ElevenBit):
         "torque range": Parameter(23, "f"),
         "serial": Parameter(15),
         "firmware": Parameter(14),
+        "bit rate": Parameter(35),
     }
 
     def poll(self, motor: Motor) -> Frame:
         """As ``Family.poll``."""
-        return _DAMIAO_PORT, motor.id.to_bytes(2, "little") + bytes([0xCC, 0, 0, 0, 0, 0])
+        return _DAMIAO_PORT | motor.flags, motor.id.to_bytes(2, "little") + bytes([0xCC, 0, 0, 0, 0, 0])
 
     def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
         """Status in the high nibble of byte 0: 0 off, 1 on, 8 and more are faults."""
-        if can_id != motor.reply_id or len(data) != 8 or data[0] & 0x0F != motor.id & 0x0F:
+        if can_id != motor.reply_id | motor.flags or len(data) != 8 or data[0] & 0x0F != motor.id & 0x0F:
             return None
         status = data[0] >> 4
         state = JointState.FAULT if status >= 8 else JointState.ENABLED if status else JointState.DISABLED
@@ -204,16 +216,16 @@ class Damiao(_ElevenBit):
 
     def read(self, motor: Motor, parameter: Parameter) -> Frame:
         """As ``Family.read``."""
-        return _DAMIAO_PORT, motor.id.to_bytes(2, "little") + bytes([0x33, parameter.index, 0, 0, 0, 0])
+        return _DAMIAO_PORT | motor.flags, motor.id.to_bytes(2, "little") + bytes([0x33, parameter.index, 0, 0, 0, 0])
 
     def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
         """As ``Family.write``."""
         head = motor.id.to_bytes(2, "little") + bytes([0x55, parameter.index])
-        return _DAMIAO_PORT, head + _packed(parameter, value)
+        return _DAMIAO_PORT | motor.flags, head + _packed(parameter, value)
 
     def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
         """As ``Family.told``."""
-        ours = can_id == motor.reply_id and len(data) == 8 and data[:2] == motor.id.to_bytes(2, "little")
+        ours = can_id == motor.reply_id | motor.flags and len(data) == 8 and data[:2] == motor.id.to_bytes(2, "little")
         if not ours or data[2] not in (0x33, 0x55) or data[3] != parameter.index:
             return None
         return _unpacked(parameter, data[4:])

@@ -56,7 +56,9 @@ def decoder(frame_map: Mapping[str, Any]) -> RowLog:
         readers = []
         for at, joint in enumerate(frame_map["joints"].values()):
             motor = joint["motor"]
-            where = Motor(int(motor["id"]), int(motor["reply_id"]), Ranges(**motor["ranges"]))
+            where = Motor(
+                int(motor["id"]), int(motor["reply_id"]), Ranges(**motor["ranges"]), int(motor.get("flags", 0))
+            )
             settings = JointSettings("", FAMILIES[joint["family"]], where, 0.0, 0.0, 0.0, 0.0)
             readers.append(Reader(at, int(joint["direction"]), settings))
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -3,7 +3,7 @@
 ::
 
     driver: mit
-    options: {watchdog_ms: 100}        # of the whole bus; also bitrate and what else python-can takes
+    options: {watchdog_ms: 100}        # of the whole bus; also bitrate, fd, data_bitrate and what else python-can takes
     joints:
       "0":
         id: 1                          # the motor's own (Damiao: ESC_ID)
@@ -13,17 +13,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from frictid_drivers.mit.families import FAMILIES, Family, Motor
+from frictid_drivers.mit.families import FAMILIES, Damiao, Family, Motor
 from frictid_drivers.mit.models import MODELS
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import number_option, unknown_options
+from frictid_hil.protocol.can_bus import DEFAULT_DATA_BITRATE
+from frictid_hil.protocol.can_load import BitRates
+from frictid_hil.protocol.driver import FD_FRAME, number_option, unknown_options
 
 BUS_OPTIONS = frozenset(
     {"bitrate", "tty_baudrate", "sleep_after_open", "port", "app_name", "serial", "index", "host", "tcp_tune"}
-    | {"watchdog_ms", "allow_torque_without_watchdog", "reply_window"}
+    | {"watchdog_ms", "allow_torque_without_watchdog", "reply_window", "fd", "data_bitrate"}
 )
 JOINT_OPTIONS = frozenset({"model", "protocol", "kp", "kd", "brake_kd", "reply_id", "torque_delay_s"})
 
@@ -40,6 +44,7 @@ class BusSettings:
 
     Attributes:
         bitrate: bit/s.
+        data_bitrate: bit/s of the data of CAN FD frames; None on a classical bus.
         watchdog_s: without a command for so long, a motor that has a watchdog lets go.
         allow_torque_without_watchdog: torque mode also where nothing stops the motor when the host dies.
         reply_window: share of a cycle that answers are waited for.
@@ -47,10 +52,16 @@ class BusSettings:
     """
 
     bitrate: int
+    data_bitrate: int | None
     watchdog_s: float
     allow_torque_without_watchdog: bool
     reply_window: float
     tty_baudrate: int
+
+    @property
+    def rates(self) -> BitRates:
+        """What the wire does."""
+        return BitRates(self.bitrate, self.data_bitrate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +94,17 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
         InvalidFields: every option that is unknown or impossible.
     """
     problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "mit")
+    data_bitrate = _data_bitrate(setup.options, problems)
     joints: dict[str, JointSettings] = {}
     for joint in setup.joints:
         problems += unknown_options(joint.options, JOINT_OPTIONS, ("joints", joint.name, "options"), "mit")
-        settings = _joint(joint, problems)
+        settings = _joint(joint, problems, fd=data_bitrate is not None)
         if settings is not None:
             joints[joint.name] = settings
     options, at = setup.options, ("options",)
     bus = BusSettings(
         bitrate=int(number_option(options, "bitrate", 1_000_000, 10_000, 1_000_000, at, problems)),
+        data_bitrate=data_bitrate,
         watchdog_s=number_option(options, "watchdog_ms", 100.0, 5.0, 10_000.0, at, problems) / 1000.0,
         allow_torque_without_watchdog=options.get("allow_torque_without_watchdog") is True,
         reply_window=number_option(options, "reply_window", 0.8, 0.1, 0.95, at, problems),
@@ -102,7 +115,22 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
     return bus, joints
 
 
-def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | None:
+def _data_bitrate(options: Mapping[str, Any], problems: list[FieldProblem]) -> int | None:
+    """Of CAN FD frames, where the robot file wants them."""
+    wanted = options.get("data_bitrate", DEFAULT_DATA_BITRATE)
+    if options.get("fd") is True:
+        if wanted not in (fast := [rate for rate in Damiao.RATES if rate > 1_000_000]):
+            known = ", ".join(map(str, fast))
+            problems.append(FieldProblem(("options", "data_bitrate"), f"expected one of {known}, found {wanted!r}"))
+        return int(wanted) if isinstance(wanted, int) else DEFAULT_DATA_BITRATE
+    if options.get("fd", False) is not False:
+        problems.append(FieldProblem(("options", "fd"), f"expected true or false, found {options['fd']!r}"))
+    elif "data_bitrate" in options:
+        problems.append(FieldProblem(("options", "data_bitrate"), "means nothing without `fd: true`"))
+    return None
+
+
+def _joint(joint: JointSetup, problems: list[FieldProblem], *, fd: bool) -> JointSettings | None:
     at = ("joints", joint.name, "options")
     options = joint.options
     model = MODELS.get(str(options.get("model")))
@@ -117,6 +145,8 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
         problems.append(FieldProblem((*at, "protocol"), f"a {options['model']} speaks {known}, found {protocol!r}"))
         return None
     family, ranges = FAMILIES[protocol], model.ranges
+    if fd and not isinstance(family, Damiao):
+        problems.append(FieldProblem(("options", "fd"), f"a {options['model']} speaks classical CAN ({protocol})"))
     usual_reply = joint.address + 0x10 if family.reply_id is None else family.reply_id
     reply_id = int(number_option(options, "reply_id", usual_reply, 0, 0x7FF, at, problems))
     if reply_id == joint.address:
@@ -131,7 +161,7 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
     return JointSettings(
         model=str(options["model"]),
         family=family,
-        motor=Motor(joint.address, reply_id, ranges),
+        motor=Motor(joint.address, reply_id, ranges, FD_FRAME if fd else 0),
         kp=number_option(options, "kp", 50.0, 0.0, ranges.kp_nm_per_rad, at, problems) or math.nan,
         kd=kd,
         brake_kd=number_option(options, "brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad, at, problems),

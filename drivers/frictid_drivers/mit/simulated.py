@@ -17,7 +17,7 @@ from frictid_drivers.mit.driver import MitDriver
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings, read_settings
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import Clock, WallClock
+from frictid_hil.protocol.driver import FD_FRAME, Clock, WallClock
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.testing.wire import FakeCanBus, Frame, ManualClock
@@ -128,13 +128,14 @@ class Rack:
     def __init__(self, setup: RobotSetup) -> None:
         self.actuators: dict[str, Actuator] = {}
         self._wires: list[tuple[Actuator, Wire]] = []
-        settings = read_settings(setup)[1]
+        bus, settings = read_settings(setup)
         for joint in setup.joints:
             mine = settings[joint.name]
             seed = zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode())
             actuator = Actuator(joint, seed, mine.motor.ranges, joint.address)
             self.actuators[joint.name] = actuator
-            self._wires.append((actuator, _wire_of(mine, zlib.crc32(f"{setup.name}/{joint.name}".encode()))))
+            serial = zlib.crc32(f"{setup.name}/{joint.name}".encode())
+            self._wires.append((actuator, _wire_of(mine, serial, bus.data_bitrate)))
 
     def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
         """A frame of the host; the answer of the motor that it is meant for."""
@@ -151,10 +152,11 @@ class Rack:
             actuator.advance(to_ns)
 
 
-def _wire_of(settings: JointSettings, serial: int) -> Wire:
+def _wire_of(settings: JointSettings, serial: int, data_bitrate: int | None) -> Wire:
     name, reply_id = settings.family.name, settings.motor.reply_id
     if name == "damiao":
-        return _DamiaoWire(settings.motor.ranges, reply_id, serial)
+        rate = {None: 4, 2_000_000: 5, 2_500_000: 6, 3_200_000: 7, 4_000_000: 8, 5_000_000: 9}[data_bitrate]
+        return _DamiaoWire(settings.motor.ranges, reply_id, serial, rate)
     if name in ("robstride", "cybergear"):
         return _RobStrideWire(reply_id, 0x200C if name == "cybergear" else 0x7028)
     return _PlainWire(reply_id, 8 if name == "robstride-mit" else 6, deci=name == "robstride-mit")
@@ -196,14 +198,25 @@ def _mit_report(motor: Actuator, first: int) -> bytes:
 
 
 class _DamiaoWire:
-    """Register numbers and status nibble as in the J4310 manual."""
+    """Register numbers and status nibble as in the J4310 manual.
 
-    def __init__(self, ranges: Ranges, reply_id: int, serial: int) -> None:
+    Where register 35 says more than 1 Mbit/s (codes 5 to 9) it answers in CAN FD frames and hears both kinds; below, an
+    FD frame is an error on its wire.
+    """
+
+    def __init__(self, ranges: Ranges, reply_id: int, serial: int, rate: int) -> None:
         self._reply_id = reply_id
         self._floats = {21: ranges.position_rad, 22: ranges.velocity_rad_s, 23: ranges.torque_nm}
-        self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: serial}
+        self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: serial, 35: rate}
 
     def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
+        fast = self._words[35] > 4
+        if can_id & FD_FRAME and not fast:
+            return None
+        answers = self._hear(motor, can_id & ~FD_FRAME, data)
+        return answers and [(answered | (FD_FRAME if fast else 0), said) for answered, said in answers]
+
+    def _hear(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
         if can_id == 0x7FF and len(data) == 8 and data[0] | data[1] << 8 == motor.id:
             return self._service(motor, data)
         if can_id != motor.id or len(data) != 8:
