@@ -92,7 +92,7 @@ class Machine:
         friction: factor on dry friction, by joint.
         viscous: factor on damping, by joint.
         bias_nm: constant torque, by joint.
-        asymmetry: share by which dry friction is larger forwards and smaller backwards, by joint.
+        asymmetry: share by which friction is larger forwards and smaller backwards, by joint.
         ripple: (amplitude in N m, periods per turn), by joint.
         stribeck: (share of dry friction, speed in rad/s), by joint.
         load: share of the gravity that the joint carries that adds to friction, by joint.
@@ -163,9 +163,11 @@ def forces(model: Any, machine: Machine) -> Callable[[Any], Array]:
     def applied(data: Any) -> Array:
         v = data.qvel
         level = usual * (1.0 + rise[:, 0] * np.exp(-((v / rise[:, 1]) ** 2)))
-        level = level * (1.0 + skew * np.sign(v)) + load * np.abs(data.qfrc_bias)
+        level = level + load * np.abs(data.qfrc_bias)
         model.jnt_springyield[:] = level / stiffness
         out: Array = bias + ripple[:, 0] * np.sin(ripple[:, 1] * data.qpos + 0.4) + constant * data.qfrc_actuator
+        # All of friction differs by direction, its spring too: a level alone would jump at reversals or be a constant.
+        out -= skew * (np.abs(stiffness * (data.qpos - data.plastic)) + np.abs(model.dof_damping * v))
         return out
 
     return applied

@@ -87,7 +87,7 @@ def print_arm(output: Output, result: Result) -> None:
             joint["verdict"],
             ", ".join(cause["effect"] for cause in causes),
             ", ".join(f"{cause['confidence']:.2f}" for cause in causes),
-            *("-" if value is None else f"{value:.3g} N m" for value in gap),
+            *("-" if value is None else f"{value:.3g} {_units(joint)[0]}" for value in gap),
         )
     output.out.print(table)
     output.out.print(result["summary"], markup=False, soft_wrap=True)
@@ -96,6 +96,8 @@ def print_arm(output: Output, result: Result) -> None:
     for line, names in _same_lines(result["joints"]).items():
         who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
         output.out.print(f"{who}: {line}", markup=False, soft_wrap=True)
+    for name in result["still"]:
+        output.out.print(f"{name}: stands still in every log, so nothing can be said of it", markup=False)
     for name, place in result["held"].items():
         output.out.print(f"{name}: held at {place:.4g}", markup=False)
 
@@ -125,13 +127,19 @@ def _print_export(output: Output, result: Result) -> None:
     else:
         table = Table("your model in MuJoCo", "torque before", "after", "position before", "after")
         for name, before in loop["before"].items():
-            after = loop["after"][name]
-            torques = [f"{state['torque_nm']:.3g} N m" for state in (before, after)]
-            table.add_row(name, *torques, *(f"{1e3 * state['position_rad']:.3g} mrad" for state in (before, after)))
+            states = (before, loop["after"][name])
+            torque, length = _units(result["joints"].get(name, {}))
+            torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
+            table.add_row(name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states))
         output.out.print(table)
     for name, joint in result.get("export", {}).get("joints", {}).items():
         off = joint["torque_difference_percent"]
-        output.out.print(f"{name}: the export is {off:.2f} % of torque from our simulation on withheld motion")
+        how = (
+            "chosen by the positions that were fitted"
+            if off is None
+            else f"{off:.2f} % of torque from our simulation on withheld motion"
+        )
+        output.out.print(f"{name}: the export is {how}", markup=False)
         for effect, where in joint["placed"].items():
             output.out.print(f"  {effect}: {where}", markup=False, soft_wrap=True)
         for effect, why in joint["lost"].items():
@@ -145,6 +153,11 @@ def _print_export(output: Output, result: Result) -> None:
         output.out.print(f"  lost: {told['lost']}", soft_wrap=True, markup=False)
     if result.get("model_refused"):
         output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
+
+
+def _units(joint: Mapping[str, Any]) -> tuple[str, str]:
+    """(of torque or force, of position)."""
+    return ("N", "m") if joint.get("prismatic") else ("N m", "rad")
 
 
 def _same_lines(joints: Mapping[str, Any]) -> dict[str, list[str]]:

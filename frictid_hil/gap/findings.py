@@ -85,7 +85,9 @@ def sampled(posterior: Posterior) -> Sampled:
     for k, draw in enumerate(draws):
         parts = posterior.contributions(draw)
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
-        for effect, net in zip(causes, _net(list(causes.values()), gram), strict=True):
+        # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
+        unnamed = [parts[""]] if "" in parts else []
+        for effect, net in zip(causes, _net([*causes.values(), *unnamed], gram), strict=False):
             sizes.setdefault(effect, np.zeros(len(draws)))[k] = net / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])

@@ -17,8 +17,9 @@ from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.jobs.gap.export_mujoco import export_mujoco
-from frictid_hil.jobs.gap.improved_robot import improved_robot
+from frictid_hil.jobs.gap.improved_robot import improved_belief, improved_robot
 from frictid_hil.jobs.gap.logs import set_from_logs
+from frictid_hil.jobs.gap.write_model import applied
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.simulation.joint import JointModel
@@ -102,7 +103,8 @@ def diagnose(
 
     Args:
         source: what is diagnosed; a path stands for the folder of an experiment set.
-        write_model: robot file to write the improved joint to.
+        write_model: file to write the improved joint to: a robot file, or a belief with effects where its loop cannot
+            be simulated.
         mujoco: MJCF file to export the improved joint to; its callback script is written beside it.
         apply: write it even where the verdict does not recommend it.
         out: folder for the report page; None writes none.
@@ -127,10 +129,12 @@ def diagnose(
     if experiments.at_rest:
         result["at_rest"] = list(experiments.at_rest)
     if write_model is not None:
-        refused = _why_no_model(found, apply)
-        result["model"] = None if refused else str(_write_model(write_model, experiments, found, apply).resolve())
-        if refused:
-            result["model_refused"] = refused
+        written = _improved(experiments, found, apply)
+        result["model"] = None if written is None else str(write_model.resolve())
+        if written is None:
+            result["model_refused"] = _OPEN.format(found.verdict)
+        else:
+            write_whole(write_model, dump(written))
     if mujoco is not None:
         refused = _why_no_model(found, apply)
         model = _chosen(found, apply)
@@ -174,13 +178,32 @@ def _side_by_side(experiments: ExperimentSet, found: Diagnosis) -> tuple[SideByS
     return tuple(logs)
 
 
+_OPEN = (
+    "the verdict is {}: no cause is sure enough to change the simulator; record the next experiment, or add --apply to "
+    "write the best candidate all the same"
+)
+
+
+def _improved(experiments: ExperimentSet, found: Diagnosis, apply: bool) -> dict[str, Any] | None:
+    """The file to write: a robot where its loop can be simulated, else a belief with effects; None where it is open.
+
+    Where no friction was believed, its draft is an improvement whatever the verdict.
+    """
+    nothing_believed = experiments.nominal.curve is None and any(
+        e.torque_nm is not None for e in experiments.experiments
+    )
+    if found.verdict in ("unknown", "ambiguous") and not apply and not nothing_believed:
+        return None
+    model = _chosen(found, apply)
+    if model is not None:
+        return improved_robot(experiments, model)
+    return improved_belief(experiments, applied(found, apply=apply))
+
+
 def _why_no_model(found: Diagnosis, apply: bool) -> str:
-    """Why the simulator shall stay as it is; "" where a model may be written."""
+    """Why there is no joint to export to an engine; "" where there is one."""
     if found.verdict in ("unknown", "ambiguous") and not apply:
-        return (
-            f"the verdict is {found.verdict}: no cause is sure enough to change the simulator; record the next "
-            "experiment, or add --apply to write the best candidate all the same"
-        )
+        return _OPEN.format(found.verdict)
     if _chosen(found, apply) is None:
         reasons = "; ".join(f"{name}: {why}" for name, why in found.reasons.items())
         return f"the closed loop of this joint cannot be simulated, so there is no joint to write ({reasons})"
@@ -189,10 +212,3 @@ def _why_no_model(found: Diagnosis, apply: bool) -> str:
 
 def _chosen(found: Diagnosis, apply: bool) -> JointModel | None:
     return found.candidate if apply else found.improved_model()
-
-
-def _write_model(path: Path, experiments: ExperimentSet, found: Diagnosis, apply: bool) -> Path:
-    model = _chosen(found, apply)
-    assert model is not None  # by _why_no_model
-    write_whole(path, dump(improved_robot(experiments, model)))
-    return path

@@ -48,8 +48,8 @@ def diagnose_arm(
 
     Returns:
         The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
-        ``asked``; ``held``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop`` of the
-        user's model before and after in MuJoCo; ``export`` of a model that was written.
+        ``asked``; ``held``, ``still``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop``
+        of the user's model before and after in MuJoCo; ``export`` of a model that was written.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
@@ -59,9 +59,10 @@ def diagnose_arm(
     joints = {name: _told(arm.joints[name], diagnosis) for name, diagnosis in found.items()}
     result: dict[str, Any] = {
         "outcome": "ok",
-        "model_in": str(asked.model.resolve()),
+        "model_in": str(arm.robot.path.resolve()),
         "logs": [{"name": m.name, "validation": m.validation} for m in arm.motions],
         "held": dict(arm.held),
+        "still": list(arm.still),
         "summary": summary(found, arm.found),
         "arm": _of_the_arm(arm.found),
         "joints": joints,
@@ -151,6 +152,7 @@ def _told(joint: JointSet, found: Diagnosis) -> dict[str, Any]:
     belief = {key: value for key, value in joint.document.items() if key not in ("case", "robot_joint", "tolerance")}
     return {
         **told,
+        "prismatic": joint.believed.prismatic,
         "believed": belief,
         "tolerances": list(joint.experiments.nominal.tolerances.lines()),
         "drafted": dict(joint.drafted),

@@ -70,7 +70,8 @@ def replayed(
     forces = [force_of(m, drive) for drive in drives]
     data.qpos[places] = position_rad[0]
     frozen = _frozen(m, held)
-    steps = np.maximum(1, np.round(np.diff(time_s) / float(m.opt.timestep)).astype(int))
+    ticks = np.round((time_s - time_s[0]) / float(m.opt.timestep)).astype(int)
+    steps = np.maximum(1, np.diff(ticks))
     positions, torques = np.empty_like(position_rad), np.empty_like(position_rad)
     data.ctrl[controls] = gears * command_rad[0]
     relax(m, data)

@@ -223,6 +223,8 @@ def _level_and_damping(speed: Array, torque: Array, fastest: float) -> tuple[flo
         slope = weights[1] + 2.0 * weights[2] * beyond + 3.0 * weights[3] * beyond**2
         if weights[0] >= 0.0 and np.all(slope >= -1e-12):
             break
+    # What makes a billionth of the torque is rounding.
+    weights[np.abs(weights) * fastest ** np.arange(4) < 1e-9 * np.max(np.abs(torque))] = 0.0
     return float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3])
 
 

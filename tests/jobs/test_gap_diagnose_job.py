@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from frictid_hil.config.nominal import load_nominal
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
+from frictid_hil.config.yaml import read
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.simulation.joint import JointModel
@@ -104,7 +106,7 @@ def test_a_healthy_joint_has_no_cause(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_path: Path) -> None:
+def test_without_a_closed_loop_the_belief_is_written_with_its_effects(asymmetric: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     bare.mkdir()
     for path in asymmetric.glob("*.csv"):
@@ -117,8 +119,11 @@ def test_nothing_is_written_where_there_is_no_closed_loop(asymmetric: Path, tmp_
     assert result["reasons"]
     asked = diagnose(bare, write_model=tmp_path / "improved.yaml")
     assert asked["verdict"] == result["verdict"], "the diagnosis is told all the same"
-    assert asked["model"] is None and "closed loop" in asked["model_refused"]
-    assert not (tmp_path / "improved.yaml").exists()
+    assert asked["verdict"] == "explained"
+    written = read(tmp_path / "improved.yaml").data
+    assert "direction_asymmetry" in written["effects"] and "experiments" not in written
+    assert written["joint"] == read(bare / "nominal.yaml").data["joint"]
+    assert load_nominal(tmp_path / "improved.yaml", logs=False).file.joint.friction is not None
 
 
 @pytest.mark.parametrize(

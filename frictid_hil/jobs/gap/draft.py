@@ -21,6 +21,8 @@ SLIP_RAD = 2e-4
 """Travel in which the slip spring yields, where nobody measured it."""
 SPEEDS = 8
 """Points of the drafted friction curve."""
+SHORT_RAD = 0.3
+"""Travel below which gravity's shape over the position is not told from a constant; so too of a linear axis."""
 LEAST_TOLERANCE = 0.005
 """No number of a least-squares draft is worth more than this share."""
 LARGEST_TOLERANCE = 0.5
@@ -44,7 +46,9 @@ def drafted(logs: ExperimentSet) -> dict[str, Any]:
     rigid = all(log.rigid_body_torque_nm is not None for log in known)
     table = np.concatenate(tables)
     columns, torque = table[:, :-1], table[:, -1]
-    fitted = [k for k in range(columns.shape[1]) if np.any(columns[:, k]) and not (rigid and k in _RIGID)]
+    short = max(log.travel_rad for log in known) < SHORT_RAD
+    left_out = _RIGID if rigid else (_COS, _SIN) if short else ()
+    fitted = [k for k in range(columns.shape[1]) if np.any(columns[:, k]) and k not in left_out]
     weights = np.zeros(columns.shape[1])
     weights[fitted] = np.linalg.lstsq(columns[:, fitted], torque, rcond=None)[0]
     sigma = np.full(columns.shape[1], np.inf)
@@ -101,7 +105,7 @@ def _document(
     speeds = fastest * np.arange(1, SPEEDS + 1) / SPEEDS
     typical = level + slope * float(np.median(speed[speed > 0.05 * fastest]))
     joint: dict[str, Any] = {"inertia_kg_m2": 0 if rigid else max(0.0, _rounded(weights[_INERTIA]))}
-    if not rigid:
+    if not rigid and np.isfinite(sigma[_COS]):
         joint |= {"gravity_cos_nm": _rounded(weights[_COS]), "gravity_sin_nm": _rounded(weights[_SIN])}
     joint["friction"] = {
         "velocity_rad_s": [_rounded(v) for v in speeds],
@@ -114,7 +118,8 @@ def _document(
     }
     if not rigid:
         tolerance["inertia_kg_m2"] = _share(sigma[_INERTIA], weights[_INERTIA])
-        tolerance["absolute"] = {"gravity_torque_nm": _rounded(float(np.hypot(sigma[_COS], sigma[_SIN])))}
+        if np.isfinite(sigma[_COS]):
+            tolerance["absolute"] = {"gravity_torque_nm": _rounded(float(np.hypot(sigma[_COS], sigma[_SIN])))}
     left = float(np.sqrt(np.mean((torque - columns @ weights) ** 2)))
     return {
         "joint": joint,

@@ -16,13 +16,14 @@ import numpy as np
 
 from frictid_hil.config.columns import load_columns
 from frictid_hil.config.nominal import ExperimentFile, NominalFile, load_nominal
+from frictid_hil.config.search import find
 from frictid_hil.errors import InputFileError, UsageError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.arm import ArmFindings, Recorded, find_in_arm
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set
 from frictid_hil.jobs.gap.draft import drafted
-from frictid_hil.jobs.gap.logs import name_of, parted, samples_of_all
+from frictid_hil.jobs.gap.logs import names_of, parted, samples_of_all
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.robot_model import ModelJoint, RobotModel
 
@@ -42,7 +43,7 @@ class ModelLogs:
     """What is asked: a model, recordings, and what the model does not say.
 
     Attributes:
-        model: MJCF or URDF.
+        model: MJCF or URDF, by path or the name of one that is shipped.
         logs: recordings, each of any number of joints.
         joints: to diagnose; ``NAME`` or ``NAME=NAME_IN_LOG``; all that model and logs share unless told.
         columns: column map of foreign logs.
@@ -110,8 +111,9 @@ class ArmSet:
         robot: the model.
         motions: the recordings.
         held: where the joints stand that no recording has.
-        joints: by name.
+        joints: by name; only those that move.
         found: of the arm as a whole; None where no log has torques of all joints, or there is only one joint.
+        still: joints of the logs that stand in all of them.
     """
 
     robot: RobotModel
@@ -119,6 +121,12 @@ class ArmSet:
     held: Mapping[str, float]
     joints: Mapping[str, JointSet]
     found: ArmFindings | None = None
+    still: tuple[str, ...] = ()
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The joints of the recordings, in the order of their columns."""
+        return tuple(self.motions[0].samples)
 
 
 def sets_from_model(asked: ModelLogs) -> ArmSet:
@@ -128,7 +136,7 @@ def sets_from_model(asked: ModelLogs) -> ArmSet:
         UsageError: a joint, log or number that is not there; the place of a joint that matters is not told.
         InputFileError, ConfigError: an unusable model, recording or map.
     """
-    robot = RobotModel.load(asked.model)
+    robot = RobotModel.load(find(asked.model, folder="models", what="robot model"))
     motions = _motions(asked, robot)
     names = tuple(motions[0].samples)
     held = {name: value for name, value in (asked.held or {}).items() if name not in names}
@@ -142,9 +150,20 @@ def sets_from_model(asked: ModelLogs) -> ArmSet:
         rigid = [torque + found.torque(*_motion_of(motion)) for torque, motion in zip(rigid, motions, strict=True)]
     sets = {}
     for k, name in enumerate(names):
-        columns = [torque[:, k] for torque in rigid]
-        sets[name] = _joint_set(asked, robot, motions, name, columns, float(inertia[k]))
-    return ArmSet(robot, motions, {**_reference(robot, names), **held}, sets, found)
+        moved = [n for n, motion in enumerate(motions) if _moves(motion.samples[name])]
+        if moved:
+            columns = [rigid[n][:, k] for n in moved]
+            sets[name] = _joint_set(asked, robot, [motions[n] for n in moved], name, columns, float(inertia[k]))
+    if not sets:
+        raise InputFileError("no joint moves in these logs", where=str(asked.logs[0]))
+    still = tuple(name for name in names if name not in sets)
+    return ArmSet(robot, motions, {**_reference(robot, names), **held}, sets, found, still)
+
+
+def _moves(samples: Samples) -> bool:
+    """Whether a joint is moved in a log: its command changes, or without one its position does."""
+    command = samples.position_command_rad
+    return float(np.ptp(samples.position_rad if command is None else command)) > 0.0
 
 
 def _of_the_arm(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str, float]) -> ArmFindings | None:
@@ -181,7 +200,8 @@ def _motions(asked: ModelLogs, robot: RobotModel) -> tuple[Motion, ...]:
     wanted = dict(_pair(word) for word in asked.joints)
     for name in wanted:
         robot.number(name)
-    read = [(name_of(path), samples_of_all(path, columns), path) for path in asked.logs]
+    named_logs = zip(names_of(asked.logs), asked.logs, strict=True)
+    read = [(name, samples_of_all(path, columns), path) for name, path in named_logs]
     first = None
     on_one_clock = []
     for log, found, path in read:

@@ -1,15 +1,17 @@
-"""Writes the joint of a diagnosis as a robot file: the nominal joint with the causes, for `replay` and `calibrate`."""
+"""Writes the joint of a diagnosis: as a robot file for `replay` and `calibrate`, or as a belief with its effects."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.config.robot import FASTEST_RAD_S, MOST_TRAVEL_RAD
 from frictid_hil.gap.experiment_set import ExperimentSet
+from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.simulation.joint import JointModel
 
 _SLACK_RAD = math.radians(15.0)
@@ -63,6 +65,24 @@ def improved_robot(experiments: ExperimentSet, model: JointModel) -> dict[str, A
             }
         },
     }
+
+
+def improved_belief(experiments: ExperimentSet, effects: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """A ``nominal.yaml`` with what was found, where the joint's loop cannot be simulated and so makes no robot.
+
+    Inertia, gravity and friction are drafted where nothing was believed of friction. ``effects`` are those of a robot
+    file's ``simulated``.
+
+    Args:
+        experiments: the set that was diagnosed.
+        effects: parameters by effect.
+    """
+    document = {k: v for k, v in (experiments.nominal.document or {}).items() if k != "experiments"}
+    fitted = tuple(log for log in experiments.experiments if not log.validation) or experiments.experiments
+    if experiments.nominal.curve is None and any(log.torque_nm is not None for log in fitted):
+        draft = drafted(replace(experiments, experiments=fitted))
+        document = {**draft, **document, "joint": {**draft["joint"], **(document.get("joint") or {})}}
+    return {**document, "effects": {name: dict(values) for name, values in effects.items()}}
 
 
 def _fastest_rad_s(time_s: np.ndarray[Any, Any], position_rad: np.ndarray[Any, Any]) -> float:

@@ -51,7 +51,7 @@ def set_from_logs(
         UsageError: several joints and none named, or a validation log that is not there.
         InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
     """
-    read_logs = [(name_of(path), _samples(path, columns, joint)) for path in logs]
+    read_logs = [(n, _samples(path, columns, joint)) for n, path in zip(names_of(logs), logs, strict=True)]
     data, told, where = _belief(nominal, profile, joint)
     entries = {entry.name: entry for entry in told.experiments}
     if not validation:
@@ -169,8 +169,14 @@ def samples_of_all(path: Path, columns: ColumnMap | None) -> list[Samples]:
     return found
 
 
-def name_of(path: Path) -> str:
-    """What a recording is called: its file's name without ending."""
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """What recordings are called: the file's name without ending, after its folder's where two files have one name."""
+    names = [_name_of(path) for path in paths]
+    folders = [path.resolve().parent.name for path in paths]
+    return [f"{f}/{n}" if names.count(n) > 1 else n for f, n in zip(folders, names, strict=True)]
+
+
+def _name_of(path: Path) -> str:
     name = path.name
     for ending in (".gz", ".csv", ".txt", ".mat", ".mcap", ".npz", ".parquet", ".h5", ".hdf5", ".bag", ".db3"):
         name = name.removesuffix(ending)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from scipy import signal
 from frictid_hil.config.write import dump
 from frictid_hil.errors import FrictidError
 from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, Motion
@@ -29,6 +30,7 @@ PRESLIDING_RAD = 2e-4
 """Travel in which friction builds up, where nobody says it."""
 CUTOFF_HZ = 20.0
 """Low-pass of torques that are compared with measured ones."""
+_FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,31 +58,86 @@ def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False)
         found: diagnosis of every joint.
         apply: take the likeliest causes where the verdict is open, too.
     """
+    wanted = {name: applied(found[name], apply=apply) for name in arm.joints}
+    if not any(s.torque_nm is not None for motion in arm.motions for s in motion.samples.values()):
+        return _exports_by_position(arm, {name: effects for name, effects in wanted.items() if effects})
     made = {}
-    for name, joint in arm.joints.items():
-        effects = applied(found[name], apply=apply)
+    for name, effects in wanted.items():
+        joint = arm.joints[name]
         if (effects or joint.drafted) and joint.experiments.nominal.curve is not None:
             made[name] = _export(arm, joint, effects)
     return made
+
+
+def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, Export]:
+    """Where no torque is known: what is late, on joints where the user's engine comes nearer to the fitted positions.
+
+    A chain from command to position holds the lag of the servo's loop, which the model has too: it is taken off.
+    """
+    fitted = [motion for motion in arm.motions if not motion.validation] or arm.motions
+    names = arm.recorded
+    if not wanted or why_not_replayed(arm.robot, names, _commanded(fitted, names)) is not None:
+        return {}
+    made = {}
+    for name, effects in wanted.items():
+        joint = arm.joints[name]
+        late = {e: v for e, v in _beyond_own_lag(joint, effects).items() if e in _TIMING}
+        model = joint_model(joint, late)
+        native = native_elements(joint.believed, model, use_of(arm, name), "", friction=False)
+        native.lost |= {e: _NEEDS_TORQUE for e in effects if e not in _TIMING}
+        made[name] = Export(model, native, "", {})
+    before = _gap_of(arm, arm.robot.compiled, fitted)[1]
+    after = _gap_of(arm, compiled_with(arm.robot, {n: export.native for n, export in made.items()}), fitted)[1]
+    nearer = {name for name, off, was in zip(names, after, before, strict=True) if off < was}
+    return {name: export for name, export in made.items() if name in nearer}
+
+
+_NEEDS_TORQUE = "not written: without a torque it may as well be the dead band or the gain of the servo's own loop"
+_TIMING = {"torque_delay", "electrical_lag"}
+
+
+def _beyond_own_lag(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Effects with the lag of the model's own position loop taken off what is late."""
+    left = {name: dict(values) for name, values in effects.items()}
+    motor = joint.believed.motor
+    own_s = (motor.kv_nm_s_per_rad + joint.believed.damping[0]) / motor.kp_nm_per_rad if motor is not None else 0.0
+    for effect, number in (("electrical_lag", "time_constant_s"), ("torque_delay", "delay_s")):
+        if effect in left:
+            taken = min(own_s, left[effect][number])
+            left[effect][number] -= taken
+            own_s -= taken
+            if left[effect][number] <= 0.0:
+                del left[effect]
+    return left
 
 
 def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
     """The effects that the verdict allows to be written, with parameters within their bounds."""
     if found.verdict != "explained" and not (apply and found.verdict in ("ambiguous", "unknown")):
         return {}
-    effects = {}
+    effects: dict[str, dict[str, float]] = {}
     for cause in found.causes:
-        limits = {p.name: p for p in all_effects()[cause.effect].parameters}
-        values = {n: float(np.clip(v.value, limits[n].lower, limits[n].upper)) for n, v in cause.parameters.items()}
-        if values:
+        told = {name: value.value for name, value in cause.parameters.items()}
+        if "lag_s" in told:
+            # A chain from command to position: what lags is an effect of its own, and what no delay holds lags too.
+            late = told["delay_s"] - _within("torque_delay", told)["delay_s"]
+            effects["electrical_lag"] = _within("electrical_lag", {"time_constant_s": told["lag_s"] + late})
+        if values := _within(cause.effect, told):
             effects[cause.effect] = all_effects()[cause.effect].complete(values)
     return effects
 
 
+def _within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
+    """An effect's own parameters, within their bounds."""
+    limits = {p.name: p for p in all_effects()[effect].parameters}
+    return {n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in told.items() if n in limits}
+
+
 def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
-    """The believed joint with effects, as we simulate it; only for a joint with a friction curve."""
+    """The believed joint with effects, as we simulate it."""
     nominal = joint.experiments.nominal
-    assert nominal.curve is not None and nominal.inertia_kg_m2 is not None
+    assert nominal.inertia_kg_m2 is not None
+    curve = nominal.curve or _FRICTIONLESS
     motor = joint.believed.motor
     limit = motor.torque_limit_nm if motor is not None else float("inf")
     rated = nominal.rated_torque_nm or (limit if np.isfinite(limit) else 1.0)
@@ -90,9 +147,8 @@ def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> 
         gravity_cos_nm=nominal.gravity_cos_nm,
         gravity_sin_nm=nominal.gravity_sin_nm,
         gear_ratio=nominal.gear_ratio or 1.0,
-        friction=nominal.curve,
-        presliding_stiffness_nm_per_rad=nominal.presliding_stiffness_nm_per_rad
-        or nominal.curve.coulomb_nm / PRESLIDING_RAD,
+        friction=curve,
+        presliding_stiffness_nm_per_rad=nominal.presliding_stiffness_nm_per_rad or curve.coulomb_nm / PRESLIDING_RAD,
         encoder=Encoder("motor", 0.0),
         drive=Drive(rated, limit, 0.0, 0.0, 0.0),
         servo=ServoGains(0.0, 0.0, 0.0),
@@ -138,7 +194,7 @@ def use_of(arm: ArmSet, name: str) -> Use:
 def _own_gravity_share(arm: ArmSet, name: str) -> float:
     """Gravity torque of the joint's own body over that of all that it carries, along the recordings."""
     robot = arm.robot
-    names = tuple(arm.joints)
+    names = arm.recorded
     every = np.concatenate([motion.position_rad for motion in arm.motions])
     some = every[:: max(1, every.shape[0] // 200)]
     still, column = np.zeros_like(some), names.index(name)
@@ -211,7 +267,7 @@ def _account(export: Export, *, urdf: bool) -> dict[str, Any]:
         "lost": lost,
         "remarks": list(export.native.remarks),
         "friction_form": export.form,
-        "torque_difference_percent": 100.0 * export.off[export.form],
+        "torque_difference_percent": 100.0 * export.off[export.form] if export.off else None,
         "tried_percent": {form: 100.0 * off for form, off in export.off.items()},
     }
 
@@ -228,26 +284,34 @@ def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
         ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
         torque behind a low-pass), or ``reason``.
     """
-    judged = [motion for motion in arm.motions if motion.validation]
-    commanded = all(s.position_command_rad is not None for m in judged for s in m.samples.values())
-    names = tuple(arm.joints)
-    if reason := why_not_replayed(arm.robot, names, commanded):
+    judged = [motion for motion in arm.motions if motion.validation] or list(arm.motions)
+    names = arm.recorded
+    if reason := why_not_replayed(arm.robot, names, _commanded(judged, names)):
         return {"reason": reason}
     natives = {name: export.native for name, export in made.items()}
     models = {"before": arm.robot.compiled, "after": compiled_with(arm.robot, natives)}
     told: dict[str, Any] = {}
     for when, model in models.items():
-        torque: list[Array] = []
-        position: list[Array] = []
-        for motion in judged:
-            off = _off(arm, model, motion)
-            torque.append(off[0])
-            position.append(off[1])
-        rms = [np.sqrt(np.mean(np.concatenate(part) ** 2, axis=0)) for part in (torque, position)]
+        torque, position = _gap_of(arm, model, judged)
         told[when] = {
-            name: {"torque_nm": float(rms[0][k]), "position_rad": float(rms[1][k])} for k, name in enumerate(names)
+            name: {
+                "torque_nm": float(torque[k]) if np.isfinite(torque[k]) else None,
+                "position_rad": float(position[k]),
+            }
+            for k, name in enumerate(names)
         }
     return told
+
+
+def _commanded(motions: Sequence[Motion], names: Sequence[str]) -> bool:
+    return all(motion.samples[name].position_command_rad is not None for motion in motions for name in names)
+
+
+def _gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
+    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
+    every = [_off(arm, model, motion) for motion in motions]
+    torque, position = (np.concatenate([off[part] for off in every]) for part in (0, 1))
+    return np.sqrt(np.mean(torque**2, axis=0)), np.sqrt(np.mean(position**2, axis=0))
 
 
 def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
@@ -261,7 +325,7 @@ def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
     position = (motion.position_rad - ran.position_rad)[begin:]
     measured = [s.torque_nm for s in samples]
     if any(torque is None for torque in measured):
-        return np.zeros_like(position), position
+        return np.full_like(position, np.nan), position
     torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
     rate_hz = 1.0 / float(np.median(np.diff(time)))
     b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))

@@ -49,7 +49,7 @@ def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
 def answers(
     pool: Executor | None, function: Callable[[Task], Answer], tasks: Sequence[Task]
 ) -> Iterator[Answer | FrictidError]:
-    """Yield the answer to every task in order, or an error where a worker was lost."""
+    """Yield the answer to every task in order, or the error where it has none or its worker was lost."""
     if pool is None:
         yield from map(function, tasks)
         return
@@ -57,6 +57,9 @@ def answers(
     for task, future in zip(tasks, futures, strict=True):
         try:
             answer = future.result()
+        except FrictidError as wrong:
+            yield wrong
+            continue
         except Exception:  # whatever the cluster raises: a killed worker, a broken pipe, a missing package
             # A dying worker takes its neighbours with it, so each has a second try with nobody beside it.
             wait(futures)
