@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from frictid_hil.cli.options import (
     AmplitudeOption,
@@ -36,6 +35,7 @@ from frictid_hil.cli.options import (
     robot_files,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees, format_duration
@@ -72,7 +72,7 @@ def check(
 
     def show(result: Result) -> None:
         marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
-        table = Table("", "subject", "finding", "next step")
+        table = folding("", "subject", "finding", "next step", whole=("", "subject"))
         for finding in result["findings"]:
             table.add_row(
                 marks[finding["severity"]], finding["subject"], finding["message"], finding.get("next_step", "")
@@ -272,7 +272,9 @@ def compare(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        table = Table("joint", "E [N m]", "percent of mean, [0, V]", "percent, measured range")
+        table = folding(
+            "joint", "E [N m]", "percent of mean, [0, V]", "percent, measured range", whole=("joint", "E [N m]")
+        )
         for name, figures in rotary_names(result["joints"]).items():
             table.add_row(
                 name,
@@ -289,12 +291,17 @@ def compare(
 
 def print_joints(output: Output, result: Result) -> None:
     """The table a technician reads after a calibration or an identification."""
-    table = Table(title=f"Friction of {result.get('robot') or 'the recording'}")
-    for heading in ("joint", "outcome", "F_0", "F at V", "measured range", "inertia", "time", "remarks"):
-        table.add_column(heading)
-    for name, joint in result["joints"].items():
-        table.add_row(name, *_row(joint))
-    if result["joints"]:
+    headings = ("joint", "outcome", "F_0", "F at V", "speeds", "inertia", "time", "remarks")
+    rows = [(name, *_row(joint)) for name, joint in result["joints"].items()]
+    shown = [k for k, heading in enumerate(headings) if heading not in ("time", "remarks") or any(r[k] for r in rows)]
+    table = folding(
+        *(headings[k] for k in shown),
+        whole=("joint", "F_0", "F at V"),
+        title=f"Friction of {result.get('robot') or 'the recording'}",
+    )
+    for row in rows:
+        table.add_row(*(row[k] for k in shown))
+    if rows:
         output.out.print(table)
     for key in ("profile", "run", "report"):
         if result.get(key):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from frictid_hil.cli.options import (
     BusOption,
@@ -25,6 +24,7 @@ from frictid_hil.cli.options import (
     quantity,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.mode import Mode
 from frictid_hil.units import degrees
@@ -189,9 +189,8 @@ _TRACK: dict[str, tuple[str, str, float]] = {
 
 def _show(output: Output, result: Result) -> None:
     columns = _HAND if result["task"] == "hand" else _TRACK
-    table = Table(title=f"Joint {result['joint']} of {result['robot']}: {result['task']}, setting {result['setting']}")
-    for heading in ("mode", *columns):
-        table.add_column(heading)
+    title = f"Joint {result['joint']} of {result['robot']}: {result['task']}, setting {result['setting']}"
+    table = folding("mode", *columns, whole=("mode",), title=title)
     for name, figures in result["modes"].items():
         table.add_row(name, *(_number(figures, *column) for column in columns.values()))
     if table.row_count:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from frictid_hil.cli.options import (
     BusOption,
@@ -20,6 +19,7 @@ from frictid_hil.cli.options import (
     YesOption,
 )
 from frictid_hil.cli.output import Output, Result, Told
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import UsageError
 
 app = typer.Typer(
@@ -186,7 +186,7 @@ def draft(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        table = Table("number", "value", "one-sigma")
+        table = folding("number", "value", "one-sigma")
         for name, found in result["draft"]["numbers"].items():
             table.add_row(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}")
         output.out.print(table)
@@ -221,7 +221,7 @@ def check(
     def show(result: Result) -> None:
         for name, one in (result.get("worlds") or {result["world"]: result}).items():
             title = f"Blind check, {name} world: {cases} joints, seed {seed}"
-            table = Table("figure", "value", "95 % interval", "of", title=title)
+            table = folding("figure", "value", "95 % interval", "of", title=title)
             for figure, rate in one["rates"].items():
                 if rate.get("of"):
                     interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
@@ -314,7 +314,7 @@ def record(
 
 def _print_diagnosis(output: Output, result: Result) -> None:
     output.out.print(f"[bold]{result['summary']}[/]")
-    causes = Table("cause", "confidence", "closes", "parameters", "confusable with")
+    causes = folding("cause", "confidence", "closes", "parameters", "confusable with", whole=("cause", "closes"))
     for cause in result["causes"]:
         parameters = ", ".join(
             f"{name} = {value['value']:.4g}" if isinstance(value, dict) else f"{name} = {value:.4g}"
@@ -330,13 +330,13 @@ def _print_diagnosis(output: Output, result: Result) -> None:
         )
     if result["causes"]:
         output.out.print(causes)
-    where = Table("where", "share of gap", "", "")
+    where = folding("where", "share of gap", "", "", whole=("where",))
     for region in result["where"]:
         share = region["share_of_gap"]
         if share >= 0.005:
             where.add_row(region["region"], f"{100 * share:.0f} %", "█" * round(30 * share), region["description"])
     output.out.print(where)
-    gap = Table("on validation logs", "before", "after", "noise floor")
+    gap = folding("on validation logs", "before", "after", "noise floor")
     for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
         row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
         gap.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row))

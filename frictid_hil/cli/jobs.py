@@ -6,7 +6,6 @@ import json
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from frictid_hil.cli.options import (
     BusOption,
@@ -23,6 +22,7 @@ from frictid_hil.cli.options import (
     quantity,
 )
 from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.tables import folding
 
 
 def register(app: typer.Typer) -> None:
@@ -103,9 +103,8 @@ def schedule(
 
 
 def _print_night(output: Output, result: Result) -> None:
-    table = Table(title=f"Recalibration of {result['robot']}")
-    for heading in ("joint", "outcome", "from reference", "from active", "F_0", "temperature"):
-        table.add_column(heading)
+    headings = ("joint", "outcome", "from reference", "from active", "F_0", "temperature")
+    table = folding(*headings, whole=("joint", "F_0"), title=f"Recalibration of {result['robot']}")
     for name, figures in result["drift"].items():
         verdict = "broken" if figures["broken"] else "drifted" if figures["drifted"] else "ok"
         gates = result["joints"].get(name, {}).get("outcome", "ok")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.ring import Rows
@@ -17,6 +18,8 @@ from frictid_hil.units import degrees
 
 _REDRAW_S = 0.1
 _BAR_CELLS = 10
+_ROOM_FOR_BARS = 100
+"""Columns of a terminal; on a narrower one the torque is a figure without its bar."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +37,8 @@ class Figures:
     temperature: str = ""
 
 
-def figures_of(rows: Rows, max_torque_nm: float) -> Figures:
-    """Figures of some rows of one joint (``ring.SAMPLE_ROW``)."""
+def figures_of(rows: Rows, max_torque_nm: float | None) -> Figures:
+    """Figures of some rows of one joint (``ring.SAMPLE_ROW``); no bar of the torque where its limit is None."""
     error_rad = _largest(rows["position_command_rad"] - rows["position_rad"])
     torque_nm = _largest(rows["torque_nm"])
     temperature_c = float(rows["temperature_c"][-1])
@@ -46,8 +49,10 @@ def figures_of(rows: Rows, max_torque_nm: float) -> Figures:
     )
 
 
-def torque_bar(torque_nm: float, max_torque_nm: float) -> str:
-    """A bar of ten cells, full at the limit, and the figure."""
+def torque_bar(torque_nm: float, max_torque_nm: float | None) -> str:
+    """A bar of ten cells, full at the limit, and the figure; the figure alone without a limit."""
+    if max_torque_nm is None:
+        return f"{torque_nm:5.1f} N m"
     cells = min(_BAR_CELLS, round(_BAR_CELLS * torque_nm / max_torque_nm)) if max_torque_nm > 0 else 0
     return f"{'█' * cells}{'·' * (_BAR_CELLS - cells)} {torque_nm:5.1f} N m"
 
@@ -107,10 +112,16 @@ class JointView:
         self._members = members
         self._stretch = ""
         self._drawn_at = -math.inf
-        fields = ("phase:<11", "error:>10", "torque:<20", "temperature:>7", "late:>9")
+        self._bars = console.width >= _ROOM_FOR_BARS
+        torque = "torque:<20" if self._bars else "torque:>9"
+        fields = ("phase:<11", "error:>10", torque, "temperature:>7", "late:>7")
         texts = [TextColumn(f"{{task.fields[{name}]:{form}}}") for name, form in (one.split(":") for one in fields)]
         self._progress = Progress(
-            TextColumn("joint {task.description}"), BarColumn(20), *texts, TimeRemainingColumn(), console=console
+            TextColumn("joint {task.description}"),
+            BarColumn(20 if self._bars else 8),
+            *texts,
+            TimeRemainingColumn(table_column=Column(no_wrap=True)),
+            console=console,
         )
         self._tasks: dict[str, TaskID] = {}
         for stretch, joints in members.items():
@@ -146,7 +157,7 @@ class JointView:
                 continue
             late = self._lateness[name].take(mine["t_ns"])
             if drawn:
-                figures = figures_of(mine, self._setup.joint(name).max_torque_nm)
+                figures = figures_of(mine, self._setup.joint(name).max_torque_nm if self._bars else None)
                 self._progress.update(
                     self._tasks[name],
                     completed=completed_s,

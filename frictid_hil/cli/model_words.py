@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import UsageError
 from frictid_hil.units import parse_quantity
 
@@ -78,7 +77,7 @@ def _tolerance(word: str) -> tuple[str, float | str]:
 
 def print_arm(output: Output, result: Result) -> None:
     """Joints as rows, then the arm."""
-    table = Table("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor")
+    table = folding("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor", whole=("joint",))
     for name, joint in result["joints"].items():
         causes = joint["causes"]
         gap = [joint["gap"][state]["inverse_nm"] for state in ("before", "after", "noise_floor")]
@@ -125,7 +124,7 @@ def _print_export(output: Output, result: Result) -> None:
     if "reason" in loop:
         output.out.print(f"closed loop of your model: {loop['reason']}", markup=False, soft_wrap=True)
     else:
-        table = Table("your model in MuJoCo", "torque before", "after", "position before", "after")
+        table = folding("your model in MuJoCo", "torque before", "after", "position before", "after")
         for name, before in loop["before"].items():
             states = (before, loop["after"][name])
             torque, length = _units(result["joints"].get(name, {}))

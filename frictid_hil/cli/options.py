@@ -41,7 +41,7 @@ def robot_files(incomplete: str) -> list[str]:
 
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout, nothing else.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, errors only.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
 OutOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to write to.")]

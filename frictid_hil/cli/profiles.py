@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption
 from frictid_hil.cli.output import READING, Output, Result
+from frictid_hil.cli.tables import folding
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
@@ -39,7 +39,8 @@ def show(
         for name, joint in rotary_names(result["joints"]).items():
             linear = bool(joint.get("prismatic"))
             force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
-            table = Table(title=f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
+            output.out.print(f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
+            table = folding()
             table.add_column(escape(f"V_n [{speed}]"), justify="right")
             table.add_column(escape(f"F_n [{force}]"), justify="right")
             table.add_column("95 % interval", justify="right")
@@ -111,9 +112,8 @@ def diff(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        table = Table(
-            "joint", "distance [%]", "F_0 [%]", "intervals that overlap [%]", "temperature [K]", "also changed"
-        )
+        headings = ("joint", "distance [%]", "F_0 [%]", "intervals that overlap [%]", "temperature [K]", "also changed")
+        table = folding(*headings, whole=("joint",))
         for name, figures in result["joints"].items():
             share = figures["overlap_share"]
             table.add_row(
@@ -203,19 +203,16 @@ def history(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        joints = list(dict.fromkeys(name for profile in result["profiles"] for name in profile["joints"]))
-        table = Table(title=escape(f"{robot}: F_0 [N m, N], distance from the baseline [%], temperature [degC]"))
-        table.add_column("profile (* active)", no_wrap=True)
-        for name in joints:
-            table.add_column(f"joint {name}")
+        headings = ("profile (* active)", "F_0", "from baseline", "temperature")
+        table = folding(*headings, whole=headings[:2], title=escape(result["robot"]))
         for profile in result["profiles"]:
-            cells = [_cell(profile["joints"].get(name)) for name in joints]
-            table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}", *cells)
+            table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}")
+            for name, figures in profile["joints"].items():
+                table.add_row(escape(f"  joint {name}"), *_figures(figures))
+            table.add_section()
         output.out.print(table)
-        for one in result["promotions"]:
-            output.out.print(
-                f"{one['utc']} {one['action']} {one['id']} by {one['by']}: {one['reason']}", soft_wrap=True
-            )
+        for line in _events(result):
+            output.out.print(line, soft_wrap=True, markup=False)
         if older := result["profiles_kept"] - len(result["profiles"]):
             output.out.print(f"{older} older profiles are not shown; see them with --last 0")
 
@@ -225,15 +222,29 @@ def history(
     )
 
 
-def _cell(joint: Result | None) -> str:
-    """F_0 above the other two: six joints then fit side by side."""
+def _figures(joint: Result) -> tuple[str, str, str]:
+    """F_0, distance from the baseline and temperature, with their units."""
+    unit = "N" if "coulomb_n" in joint else "N m"
     joint = rotary_names(joint)
-    if joint is None or joint["coulomb_nm"] is None:
-        return ""
-    distance, temperature = joint["distance_percent"], joint["temperature_c"]
-    below = [f"{distance:.1f} %"] if distance is not None else []
-    below += [f"{temperature:.0f} C"] if temperature is not None else []
-    return "\n".join([f"{joint['coulomb_nm']:.4g}", ", ".join(below)])
+    level, distance, temperature = joint["coulomb_nm"], joint["distance_percent"], joint["temperature_c"]
+    return (
+        "" if level is None else f"{level:.4g} {unit}",
+        "" if distance is None else f"{distance:.1f} %",
+        "" if temperature is None else f"{temperature:.0f} degC",
+    )
+
+
+def _events(result: Result) -> list[str]:
+    """Promotions, and nights that promoted nothing, by their times."""
+    events = [
+        f"{one['utc']} {one['action']} {one['id']} by {one['by']}: {one['reason']}" for one in result["promotions"]
+    ]
+    events += [
+        f"{one['utc']} nothing promoted ({one['outcome']}): {one['reason']}"
+        for one in result["recalibrations"]
+        if not one["promoted"]
+    ]
+    return sorted(events)
 
 
 def _signed(value: float | None) -> str:

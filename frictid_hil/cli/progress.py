@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from frictid_hil.cli.joint_view import JointView
 from frictid_hil.cli.output import Output
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.live import DEFAULT_ADDRESS
 from frictid_hil.jobs.live import live as live_watcher
@@ -32,16 +32,18 @@ def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
     """Whether it is real, joint order, travel, peaks, limits, locked joints, duration, as a technician reads them."""
     how = ", all joints together" if plan.together else ""
     console.print(f"[bold]{_which(setup)}[/]", soft_wrap=True)
-    table = Table(title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}")
-    table.add_column("joint")
-    for heading in (
-        "travel (limits), deg",
-        "speed of limit, deg/s",
-        "torque of limit, N m",
-        "time",
-        "others locked, deg",
-    ):
-        table.add_column(heading, overflow="fold")
+    table = folding(
+        *(
+            "joint",
+            "travel (limits), deg",
+            "speed of limit, deg/s",
+            "torque of limit, N m",
+            "time",
+            "others locked, deg",
+        ),
+        whole=("joint",),
+        title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}",
+    )
     for entry in plan.joints:
         joint = setup.joint(entry.joint)
         locked = " ".join(f"{name}:{degrees(at):.0f}" for name, at in entry.locked.items())

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from frictid_hil.cli.options import (
     AmplitudeOption,
@@ -22,6 +21,7 @@ from frictid_hil.cli.options import (
     VelocityOption,
 )
 from frictid_hil.cli.output import Output, Result
+from frictid_hil.cli.tables import folding
 from frictid_hil.units import degrees
 
 
@@ -94,9 +94,8 @@ def replay(
 
 
 def _print(output: Output, result: Result) -> None:
-    table = Table(title=f"Replay of {result['source']}")
-    for heading in ("joint", "outcome", "profile", "rows missing", "position rms", "torque rms", "remarks"):
-        table.add_column(heading)
+    headings = ("joint", "outcome", "profile", "rows missing", "position rms", "torque rms", "remarks")
+    table = folding(*headings, whole=("joint", "position rms", "torque rms"), title=f"Replay of {result['source']}")
     for name, joint in result["joints"].items():
         position, torque = joint.get("position_rms_rad"), joint.get("torque_rms_nm")
         table.add_row(
