@@ -96,6 +96,12 @@ def diagnose(
             "--validation", metavar="LOG", help="Log to judge on, by name; unless told, what was recorded last."
         ),
     ] = None,
+    split: Annotated[
+        str,
+        typer.Option(
+            "--split", metavar="HOW", help="Judge on the end of every log, 30% or 20s of it; or on whole logs: log."
+        ),
+    ] = "",
     write_model: Annotated[
         Path | None,
         typer.Option(
@@ -144,7 +150,7 @@ def diagnose(
         output.run(
             "gap_diagnose",
             lambda: diagnose_arm(
-                model_logs(model, every, joint, columns, hold, tolerance, validation, nominal, profile, mujoco),
+                model_logs(model, every, joint, columns, hold, tolerance, validation, split, nominal, profile, mujoco),
                 write=write_model,
                 apply=apply,
                 wanted=Wanted.of(export or (), randomise),
@@ -161,7 +167,7 @@ def diagnose(
             else "--hold, --tolerance, --executor, --export and several joints need --model"
         )
         output.refuse("gap_diagnose", UsageError(why))
-    source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or ())
+    source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or (), split)
     output.run(
         "gap_diagnose",
         lambda: job(source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force),

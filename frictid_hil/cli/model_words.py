@@ -23,6 +23,7 @@ def model_logs(
     hold: Sequence[str] | None,
     tolerance: Sequence[str] | None,
     validation: Sequence[str] | None,
+    split: str,
     nominal: Path | None,
     profile: Path | None,
     mujoco: Path | None,
@@ -48,6 +49,7 @@ def model_logs(
         held=dict(_held(word) for word in hold or ()),
         tolerances=dict(_tolerance(word) for word in tolerance or ()),
         validation=validation or (),
+        split=split,
         nominal=nominal,
     )
 

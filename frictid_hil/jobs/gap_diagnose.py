@@ -36,6 +36,7 @@ class Source:
         profile: friction profile, whose numbers overrule it.
         joint: its name in recordings and profile that hold several.
         validation: logs to judge on.
+        split: how logs are parted into those that are fitted and those that are judged on; see ``parted``.
     """
 
     paths: Sequence[Path]
@@ -44,6 +45,7 @@ class Source:
     profile: Path | None = None
     joint: str | None = None
     validation: Sequence[str] = ()
+    split: str = ""
 
     def load(self) -> ExperimentSet:
         """The set.
@@ -53,7 +55,7 @@ class Source:
             InputFileError, ConfigError: it is unusable.
         """
         folders = [path for path in self.paths if (path / "nominal.yaml").exists()]
-        options = (self.columns, self.nominal, self.profile, self.joint, *self.validation)
+        options = (self.columns, self.nominal, self.profile, self.joint, self.split, *self.validation)
         if not folders and len(self.paths) == 1 and self.paths[0].is_dir() and not any(options):
             folders = list(self.paths)
         if not folders:
@@ -64,6 +66,7 @@ class Source:
                 profile=self.profile,
                 joint=self.joint,
                 validation=self.validation,
+                split=self.split,
             )
         if len(self.paths) > 1 or any(options):
             raise UsageError(

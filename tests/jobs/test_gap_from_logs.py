@@ -48,6 +48,28 @@ def test_of_several_recordings_the_last_are_judged_on_or_those_named(tmp_path: P
         set_from_logs(logs, validation=["d"])
 
 
+@pytest.mark.parametrize(("split", "end_s"), [("25%", 3.0), ("4s", 4.0)])
+def test_a_split_by_time_judges_on_the_end_of_every_log(tmp_path: Path, split: str, end_s: float) -> None:
+    logs = [_log(tmp_path / f"{name}.csv") for name in ("a", "b")]
+    read = set_from_logs(logs, split=split)
+    assert [(e.name, e.validation) for e in read.experiments] == [
+        ("a", False), (f"a, last {split}", True), ("b", False), (f"b, last {split}", True),
+    ]  # fmt: skip
+    assert all(np.ptp(e.time_s) == pytest.approx(end_s, abs=0.02) for e in read.experiments if e.validation)
+
+
+def test_a_split_by_log_is_that_of_several_logs(tmp_path: Path) -> None:
+    logs = [_log(tmp_path / f"{name}.csv") for name in ("a", "b")]
+    assert [e.validation for e in set_from_logs(logs, split="log").experiments] == [False, True]
+    with pytest.raises(UsageError, match="needs several logs"):
+        set_from_logs(logs[:1], split="log")
+    for split, why in (("half", "cannot be read"), ("100%", "leaves nothing"), ("20s", "leaves nothing")):
+        with pytest.raises(UsageError, match=why):
+            set_from_logs(logs, split=split)
+    with pytest.raises(UsageError, match="both say"):
+        set_from_logs(logs, split="30%", validation=["a"])
+
+
 def test_a_nominal_file_tells_belief_and_roles(tmp_path: Path) -> None:
     told = {
         "joint": {"inertia_kg_m2": 0.5, "friction": {"coulomb_nm": 2.0}},

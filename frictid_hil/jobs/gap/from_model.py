@@ -50,6 +50,7 @@ class ModelLogs:
         held: place in rad (m) of joints that the logs do not have.
         tolerances: one-sigma by ``NUMBER`` or ``JOINT:NUMBER``.
         validation: names of logs to judge on.
+        split: how logs are parted into those that are fitted and those that are judged on; see ``parted``.
         nominal: a ``nominal.yaml`` whose sections (controller, drive, encoder, ...) say more than the model does, or
             better; of all joints that are diagnosed.
     """
@@ -61,6 +62,7 @@ class ModelLogs:
     held: Mapping[str, float] | None = None
     tolerances: Mapping[str, float | str] | None = None
     validation: Sequence[str] = ()
+    split: str = ""
     nominal: Path | None = None
 
 
@@ -218,7 +220,7 @@ def _motions(asked: ModelLogs, robot: RobotModel) -> tuple[Motion, ...]:
     motions = []
     leads = [(log, next(iter(together.values()))) for log, together in on_one_clock]
     whole = dict(on_one_clock)
-    for log, source, keep, validation in parted(leads, asked.validation):
+    for log, source, keep, validation in parted(leads, asked.validation, asked.split):
         motions.append(Motion(log, validation, {name: s.select(keep) for name, s in whole[source].items()}))
     return tuple(motions)
 

@@ -33,6 +33,7 @@ def set_from_logs(
     profile: Path | None = None,
     joint: str | None = None,
     validation: Sequence[str] = (),
+    split: str = "",
 ) -> ExperimentSet:
     """A set of recordings that lie anywhere.
 
@@ -46,6 +47,7 @@ def set_from_logs(
         profile: friction profile or run folder, whose numbers overrule the file's.
         joint: its name in recordings and profile that hold several.
         validation: names of logs (file names without ending) to judge on.
+        split: see ``parted``.
 
     Raises:
         UsageError: several joints and none named, or a validation log that is not there.
@@ -54,11 +56,14 @@ def set_from_logs(
     read_logs = [(n, _samples(path, columns, joint)) for n, path in zip(names_of(logs), logs, strict=True)]
     data, told, where = _belief(nominal, profile, joint)
     entries = {entry.name: entry for entry in told.experiments}
-    if not validation:
+    if not validation and not split:
         names = [name for name, _ in read_logs]
         validation = [name for name in names if name in entries and entries[name].role == "validation"]
     whole = dict(read_logs)
-    parts = [(name, whole[source].select(keep), judged) for name, source, keep, judged in parted(read_logs, validation)]
+    parts = [
+        (name, whole[source].select(keep), judged)
+        for name, source, keep, judged in parted(read_logs, validation, split)
+    ]
     listed = []
     for order, (name, samples, judged) in enumerate(parts):
         payload = entries[name].payload if name in entries else False
@@ -70,7 +75,7 @@ def set_from_logs(
 
 
 def parted(
-    logs: Sequence[tuple[str, Samples]], validation: Sequence[str] = ()
+    logs: Sequence[tuple[str, Samples]], validation: Sequence[str] = (), split: str = ""
 ) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
     """What is fitted and what is judged on.
 
@@ -79,9 +84,10 @@ def parted(
     Args:
         logs: names and samples.
         validation: names of the logs to judge on.
+        split: ``log`` parts by whole logs; ``30%`` or ``20s`` by time, the end of every log being judged on.
 
     Raises:
-        UsageError: two logs of one name, or a name that no log has.
+        UsageError: two logs of one name, a name that no log has, or a split that cannot be read or leaves nothing.
 
     Returns:
         (name of the part, name of its log, its rows, judged on).
@@ -95,11 +101,15 @@ def parted(
         raise UsageError(
             f"no log is called {absent[0]}", where="--validation", next_step=f"name of: {', '.join(names)}"
         )
+    if split and validation:
+        raise UsageError("--split and --validation both say what is judged on", next_step="give one of them")
+    if split and split != "log":
+        return [part for name, samples in logs for part in _by_time(name, samples, split, f"last {split}")]
     if len(logs) == 1 and not validation:
+        if split:
+            raise UsageError("--split log needs several logs", next_step="give --split 30% to part one log by time")
         ((name, samples),) = logs
-        cut = samples.time_s[0] + (1.0 - VALIDATION_SHARE) * (samples.time_s[-1] - samples.time_s[0])
-        early = samples.time_s < cut
-        return [(name, name, early, False), (f"{name}, last third", name, ~early, True)]
+        return _by_time(name, samples, f"{100.0 * VALIDATION_SHARE}%", "last third")
     every = [(name, name, np.ones(len(samples), dtype=np.bool_)) for name, samples in logs]
     if validation:
         return [(*part, part[0] in validation) for part in every]
@@ -107,6 +117,21 @@ def parted(
     after = [sum(spans[k:]) for k in range(len(spans))]
     first = max(k for k in range(1, len(logs)) if after[k] >= 0.75 * VALIDATION_SHARE * after[0] or k == 1)
     return [(*part, k >= first) for k, part in enumerate(every)]
+
+
+def _by_time(name: str, samples: Samples, split: str, called: str) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
+    """The beginning and the end of one log."""
+    length = float(samples.time_s[-1] - samples.time_s[0])
+    try:
+        end_s = float(split[:-1]) * {"%": 0.01 * length, "s": 1.0}[split[-1:]]
+    except (ValueError, KeyError):
+        raise UsageError(f"--split {split} cannot be read", next_step="write log, 30% or 20s") from None
+    if not 0.0 < end_s < length:
+        raise UsageError(
+            f"--split {split} leaves nothing to fit or nothing to judge on: the log lasts {length:.3g} s", where=name
+        )
+    early = samples.time_s < samples.time_s[-1] - end_s
+    return [(name, name, early, False), (f"{name}, {called}", name, ~early, True)]
 
 
 def _belief(nominal: Path | None, profile: Path | None, joint: str | None) -> tuple[dict[str, Any], NominalFile, str]:
