@@ -138,6 +138,18 @@ def test_position_units(values, per_turn):
             del OBJECTS[key]
 
 
+def test_a_home_offset_is_told():
+    from cia402_wire import OBJECTS
+
+    OBJECTS[0x607C, 0] = ("<i", 0)
+    try:
+        drive = ScriptedDrive(1)
+        drive.values[0x607C, 0] = 4096 * 50 // 4
+        assert "warning: positions are shifted by a home offset of 90 deg (607C)" in said(Bench(drive).open())
+    finally:
+        del OBJECTS[0x607C, 0]
+
+
 @pytest.mark.parametrize(("polarity", "severity"), [(0x80, "error"), (0x40, "error"), (0xC0, "warning")])
 def test_polarity(polarity, severity):
     from cia402_wire import OBJECTS

@@ -175,6 +175,15 @@ def test_check_finds_what_is_wrong():
         assert words in said, said
 
 
+def test_bus_load_is_that_of_the_joint_that_has_most_to_say():
+    b = Bench(ScriptedDrive(1, without={0x60B2}), ScriptedDrive(2)).open()
+    fleet = b.driver._reached()
+    least_hz = fleet.highest_rate_hz(["1"])
+    assert least_hz < fleet.highest_rate_hz(["0"])
+    assert b.driver.capabilities().max_cycle_hz == least_hz
+    assert f"{least_hz:g} Hz" in b.driver.check(None)[0].message
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [

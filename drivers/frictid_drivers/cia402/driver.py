@@ -124,13 +124,13 @@ class Cia402Driver:
         }
 
     def capabilities(self) -> Capabilities:
-        """What drives and bus can do: with the configured joints active, or with one active before ``configure``."""
+        """What drives and bus can do: with the configured joints active; before, with any one of them."""
         fleet = self._reached()
         facts = fleet.facts.values()
-        active = self._layout.active if self._layout else [self.setup.joints[0].name]
+        stretches = [self._layout.active] if self._layout else self._alone()
         may_torque = fleet.watchdog or self._settings.allow_torque_without_watchdog
         return Capabilities(
-            max_cycle_hz=fleet.highest_rate_hz(active),
+            max_cycle_hz=min(map(fleet.highest_rate_hz, stretches)),
             modes=frozenset(
                 mode
                 for mode in _MODES
@@ -144,11 +144,14 @@ class Cia402Driver:
             digital_inputs=True,
         )
 
+    def _alone(self) -> list[list[str]]:
+        return [[joint.name] for joint in self.setup.joints]
+
     def check(self, plan: Plan | None) -> list[Finding]:
         """Everything that can be said without moving or writing."""
         fleet = self._reached()
         cycle_hz = plan.cycle_hz if plan is not None else self.setup.cycle_hz
-        stretches = [[self.setup.joints[0].name]]
+        stretches = self._alone()
         if plan is not None and plan.joints:
             stretches = [[entry.joint for entry in stretch] for stretch in plan.stretches]
         # The fullest of all stretches: joints differ in what they report.
