@@ -68,7 +68,14 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     """
     robot = load_robot(options.robot)
     robot.check_joints([options.joint])
-    simulated = robot.kind(options.bus).simulated
+    kind = robot.kind(options.bus)
+    simulated = kind.simulated
+    if not kind.takes_torque:
+        raise UsageError(
+            f"driver {robot.driver(options.bus)} commands positions only: no torque could compensate friction",
+            where=f"joint {options.joint}",
+            next_step="use the profile where torque is computed: `gap diagnose`, `profile export`, your feed-forward",
+        )
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     joint = setup.joint(options.joint)
     profile, profile_path = named_profile(str(options.profile), robot.name, options.store)
@@ -148,9 +155,11 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
 
 
 def _refuse_mode(mode: Mode, preflight: Preflight) -> None:
-    if mode is not Mode.TORQUE and not preflight.capabilities.torque_offset:
-        raise UsageError("these drives take no torque offset (60B2)", next_step="use --drive-mode torque")
-    if mode not in preflight.capabilities.modes:
+    can = preflight.capabilities
+    if mode is not Mode.TORQUE and not can.torque_offset:
+        other = "use --drive-mode torque" if Mode.TORQUE in can.modes else "they have no torque mode either (6502)"
+        raise UsageError("these drives take no torque offset (60B2)", next_step=other)
+    if mode not in can.modes:
         raise UsageError(f"these drives have no {mode.name.lower()} mode (6502)")
 
 

@@ -144,6 +144,8 @@ class DriverKind:
         addressed_by: key of a joint in the robot file that says where it is found: ``node``, ``axis`` or ``id``.
         addresses: lowest and highest address there is.
         elsewhere: names of the drivers that reach the same robot on another line, by line.
+        takes_torque: a torque can be commanded, in a mode of its own or as an offset; where not, friction is identified
+            and not compensated.
         care: bounds of the supervisor that suit these devices, where other than usual, by name (``runner.care.Care``);
             a robot file overrides them.
         gates: the same of what quality gates allow (``friction.gate.GateLimits``).
@@ -154,6 +156,7 @@ class DriverKind:
     addressed_by: str = "id"
     addresses: tuple[int, int] = (0, 0x7FF)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
+    takes_torque: bool = True
     care: Mapping[str, float] = field(default_factory=dict)
     gates: Mapping[str, float] = field(default_factory=dict)
 

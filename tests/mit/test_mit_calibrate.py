@@ -13,6 +13,7 @@ from frictid_hil.cli.app import app
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.check import check
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Silent
@@ -69,6 +70,7 @@ def test_can_fd_changes_no_figure(tmp_path: Path) -> None:
 def test_compensation_follows_better_than_none(tmp_path: Path, family: str) -> None:
     options = {"allow_torque_without_watchdog": True}  # nothing here can be hurt
     path = robot_file(tmp_path, family, {"options": options})
+    assert check(str(path))["ok"]
     calibrated(path, tmp_path / "run", 4)
     wanted = Wanted("track", ("nc", "mop"), duration_s=4.0)
     result = compensate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +17,9 @@ from frictid_drivers.servos.models import MODELS
 from frictid_drivers.servos.packets import WIRES, Feetech
 from frictid_drivers.servos.simulated import Chain, VirtualServoDriver
 from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused, SafetyAbort
+from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused, SafetyAbort, UsageError
+from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
+from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint, Severity
@@ -151,6 +154,14 @@ def test_a_joint_follows_and_reports_in_its_own_units(bench: Bench) -> None:
     assert abs(other.position_rad) < 0.05
     bench.driver.close()
     assert not bench.servo(0).on
+
+
+@pytest.mark.parametrize("bus", ["virtual:so101", "serial:/dev/null"])
+def test_compensation_is_refused_before_a_bus_is_opened(tmp_path: Path, bus: str) -> None:
+    wanted = Wanted("track", ("nc", "mop"))
+    with pytest.raises(UsageError, match="commands positions only") as caught:
+        plan_compensation(CompensateOptions("so101.yaml", tmp_path / "absent.yaml", "gripper", wanted, bus=bus))
+    assert caught.value.where == "joint gripper" and "profile export" in caught.value.next_step
 
 
 def test_what_torque_means_is_said_with_its_uncertainty(bench: Bench) -> None:

@@ -61,6 +61,7 @@ class ServoDriver:
         addressed_by="id",
         addresses=(0, 252),
         elsewhere={"virtual": "virtual-servos"},
+        takes_torque=False,
         # A servo without integral part stands beside its goal; one step more or less in 40 ms is a speed.
         care={"still_rad": 0.03, "still_rad_s": 0.1},
     )
