@@ -165,7 +165,7 @@ class UnitProof:
         raise SafetyAbort(
             f"{said}: {format_angle(moved_rad)} instead of {format_angle(self._asked_rad)}",
             where=f"joint {self._joint.name}",
-            cause="command and report are in different units, or the drive's position loop does not follow",
+            cause="command and report are in different units, or the position loop leaves more undone than declared",
             next_step="compare both units with the drive's manual and the robot file; nothing may block the joint",
         )
 
