@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,17 +162,26 @@ def recordings(named: Sequence[Path]) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """The folder itself if it is a run; otherwise every run and every readable file below it."""
-    if any(folder.glob("samples*.mcap")) or is_lerobot(folder) or is_bag(folder):
-        return [folder]
-    inside = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name.lower().endswith(READABLE)]
-    if not inside:
+    """The folder itself if it is a recording; otherwise every recording below it."""
+    found = list(_below(folder))
+    if not found:
         raise UsageError(
             f"holds no recording ({', '.join(READABLE)})",
             where=str(folder),
             next_step="name a run folder, or a file",
         )
-    return [path.parent if path.name.startswith("samples") and path.suffix == ".mcap" else path for path in inside]
+    return found
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    if any(folder.glob("samples*.mcap")) or is_lerobot(folder) or is_bag(folder):
+        yield folder
+        return
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            yield from _below(path)
+        elif path.name.lower().endswith(READABLE):
+            yield path
 
 
 def _task(log: Path, options: IdentifyOptions, *, with_page: bool = False) -> _Task:
