@@ -13,7 +13,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import fields
 
-from frictid_drivers.cia402.frame_map import ERROR, FIGURES, INPUTS, MODE, STATUS, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.entry import ERROR, FIGURES, INPUTS, MODE, STATUS
+from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.objects import INTERPOLATED
 from frictid_drivers.cia402.packing import packing
 from frictid_drivers.cia402.state import JOINT_STATES

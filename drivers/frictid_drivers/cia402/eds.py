@@ -11,8 +11,9 @@ from pathlib import Path
 from canopen.objectdictionary import ODVariable
 
 from frictid_drivers.cia402 import objects as od
+from frictid_drivers.cia402.entry import Entry
 from frictid_drivers.cia402.facts import read_facts
-from frictid_drivers.cia402.frame_map import Entry, Frame, FrameMap, JointFrames
+from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.objects import IntegerType, Object
 from frictid_drivers.cia402.quirks import Catalogue, dictionary_of, integer_type
 from frictid_drivers.cia402.scale import raise_on_error, scale_of

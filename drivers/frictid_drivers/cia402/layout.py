@@ -29,7 +29,8 @@ from dataclasses import dataclass, field
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BusLoad, SyncFrame, bus_load
-from frictid_drivers.cia402.frame_map import Entry, Frame
+from frictid_drivers.cia402.entry import Entry
+from frictid_drivers.cia402.frame_map import Frame
 from frictid_hil.protocol.can_load import BitRates
 
 REPORT_INTERVAL_S = 0.010

@@ -52,7 +52,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from frictid_drivers.cia402.frame_map import Entry
+from frictid_drivers.cia402.entry import Entry
 from frictid_drivers.cia402.objects import Object
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
