@@ -7,12 +7,14 @@ import struct
 from dataclasses import replace
 
 import pytest
+import yaml
 from cia402_bench import Bench, bench
 from cia402_wire import ScriptedDrive
 
 from frictid_drivers.cia402.quirks import Catalogue, quirks_of_eds
 from frictid_drivers.virtual.eds import EDS_FILE
 from frictid_hil.errors import HardwareError, InputFileError
+from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Severity
 
 
@@ -57,6 +59,41 @@ def test_a_wrong_file_is_told(tmp_path, text):
     (tmp_path / "quirks.yaml").write_text(text)
     with pytest.raises(InputFileError, match=r"quirks\.yaml"):
         Catalogue(tmp_path)
+
+
+def known_to_be(folder, drive, **facts):
+    """A bench that knows this of the drive."""
+    told = {"schema": "frictid.quirks/1", "drives": [{"name": "mine", "vendor": 0x123, **facts}]}
+    (folder / "quirks.yaml").write_text(yaml.safe_dump(told))
+    return Bench(drive, setup=replace(bench(1).setup, folder=folder)).open()
+
+
+def test_a_torque_that_is_not_per_mille_of_the_rated_one(tmp_path):
+    b = known_to_be(tmp_path, ScriptedDrive(1), torque_unit_mnm=5.0)
+    assert b.driver.identify()["0"].torque_resolution_nm == pytest.approx(5e-3 * b.setup.joints[0].gear_ratio)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_drive_that_shows_its_mode_only_under_power(tmp_path, known):
+    class Shy(ScriptedDrive):
+        def sync(self, data):
+            powered = self.values[0x6041, 0] == 0x0237
+            self.values[0x6061, 0] = self.values[0x6060, 0] if powered else 0
+            return super().sync(data)
+
+    drive = Shy(1)
+    drive.shows_mode = False
+    b = known_to_be(tmp_path, drive, mode_when_enabled=known).start()
+    if known:
+        assert b.power().cycle(20)[0].mode is Mode.POSITION
+    else:
+        with pytest.raises(AssertionError):
+            b.power()
+
+
+def test_a_drive_that_takes_its_time_to_answer(tmp_path):
+    b = known_to_be(tmp_path, ScriptedDrive(1), sdo_timeout_s=2.0)
+    assert b.driver._reached().drives["0"]._sdo.RESPONSE_TIMEOUT == 2.0
 
 
 def test_an_eds_tells_access_limits_types_and_mapping():
