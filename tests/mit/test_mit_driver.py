@@ -138,9 +138,14 @@ def test_with_can_fd_every_frame_is_one_and_the_log_says_so(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("fd", [True, False])
-def test_can_fd_on_one_side_alone_is_silence_that_is_told(tmp_path: Path, fd: bool) -> None:
+def test_can_fd_on_one_side_alone_is_told(tmp_path: Path, fd: bool) -> None:
     b = bench(tmp_path, "damiao", **(FD if fd else {}))
     b.rack._wires[0][1]._words[35] = 4 if fd else 9
+    told = "in classical frames, the robot file has CAN FD" if fd else "in CAN FD frames, the robot file has classical"
+    with pytest.raises(HardwareError, match=told):
+        b.driver.open()
+    b = bench(tmp_path, "damiao", **(FD if fd else {}))
+    b.bus.fault = lambda frame, to_host: [] if to_host else [frame]  # an adapter that hears the one kind only
     with pytest.raises(HardwareError, match="does not answer") as caught:
         b.driver.open()
     assert "CAN FD on one side alone" in caught.value.cause

@@ -29,6 +29,7 @@ from frictid_hil.protocol.can_cycle import CanCycle
 from frictid_hil.protocol.can_line import CanLine
 from frictid_hil.protocol.can_load import BUSIEST, highest_rate_hz
 from frictid_hil.protocol.driver import (
+    FD_FRAME,
     Capabilities,
     Clock,
     DriverKind,
@@ -347,13 +348,22 @@ class MitDriver:
     def _answer(
         self, joint: JointSetup, frame: tuple[int, bytes], match: Callable[[int, bytes], float | None], what: str
     ) -> float:
-        line = self._open_line()
+        line, other_kind = self._open_line(), False
         for _ in range(_TRIES):
             line.send(*frame)
             for _, can_id, data in line.received(self.clock.now_ns() + round(_ANSWER_S * 1e9)):
                 value = match(can_id, data)
                 if value is not None:
                     return value
+                other_kind = other_kind or match(can_id ^ FD_FRAME, data) is not None
+        if other_kind:
+            kinds = ("CAN FD", "classical") if self._bus_settings.data_bitrate is None else ("classical", "CAN FD")
+            raise HardwareError(
+                f"answers in {kinds[0]} frames, the robot file has {kinds[1]} ones",
+                where=_where(joint),
+                cause="its register 35 says another bit rate",
+                next_step="set `fd` and `data_bitrate` in options, or the motor's rate with the maker's tool",
+            )
         raise HardwareError(
             f"does not answer: {what} not seen",
             where=_where(joint),

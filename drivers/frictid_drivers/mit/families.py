@@ -179,7 +179,8 @@ class Damiao(_ElevenBit):
     """DM-J motors. Register answers share the identifier of the cyclic ones: they are read before and after only.
 
     CAN FD changes the frames' kind and nothing in them. Above 1 Mbit/s (register 35, ``RATES``) a motor answers in FD
-    frames alone, and raises errors where nobody hears them (one source).
+    frames alone, and raises errors where nobody hears them (one source); below, it hears FD frames and answers in
+    classical ones (openarm_teleop, issue 8).
     """
 
     RATES: ClassVar[tuple[int, ...]] = (

@@ -200,8 +200,8 @@ def _mit_report(motor: Actuator, first: int) -> bytes:
 class _DamiaoWire:
     """Register numbers and status nibble as in the J4310 manual.
 
-    Where register 35 says more than 1 Mbit/s (codes 5 to 9) it answers in CAN FD frames and hears both kinds; below, an
-    FD frame is an error on its wire.
+    It hears classical and CAN FD frames alike, and answers in FD ones where register 35 says more than 1 Mbit/s (codes
+    5 to 9), else in classical ones: both ways were reported.
     """
 
     def __init__(self, ranges: Ranges, reply_id: int, serial: int, rate: int) -> None:
@@ -210,11 +210,9 @@ class _DamiaoWire:
         self._words: dict[int, int] = {9: 0, 10: 1, 14: 5013, 15: serial, 35: rate}
 
     def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
-        fast = self._words[35] > 4
-        if can_id & FD_FRAME and not fast:
-            return None
         answers = self._hear(motor, can_id & ~FD_FRAME, data)
-        return answers and [(answered | (FD_FRAME if fast else 0), said) for answered, said in answers]
+        kind = FD_FRAME if self._words[35] > 4 else 0
+        return answers and [(answered | kind, said) for answered, said in answers]
 
     def _hear(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
         if can_id == 0x7FF and len(data) == 8 and data[0] | data[1] << 8 == motor.id:
