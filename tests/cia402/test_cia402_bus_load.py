@@ -177,13 +177,22 @@ def test_no_fd_frame_carries_that(data_bytes, rates):
         fd_frame_bits(data_bytes, rates)
 
 
-@given(data=st.binary(max_size=64), identifier=st.integers(0, 0x7FF))
-def test_no_fd_frame_is_longer_than_its_worst_case(data, identifier):
+@given(data=st.binary(max_size=64), identifier=st.integers(0, (1 << 29) - 1), extended=st.booleans())
+def test_no_fd_frame_is_longer_than_its_worst_case(data, identifier, extended):
     """Stuff real frames bit by bit, both rates apart; the bound must hold for every one of them."""
     size = fd_size(len(data))
     data = data.ljust(size, b"\0")
     dlc = FD_SIZES.index(size)
-    bits = [0, *(identifier >> k & 1 for k in range(10, -1, -1)), 0, 0, 1, 0, 1]
+    long = [
+        1,
+        1,
+        *(identifier >> k & 1 for k in range(17, -1, -1)),
+        0,
+        1,
+        0,
+        1,
+    ]  # SRR, IDE, the rest; RRS, FDF, res, BRS
+    bits = [0, *(identifier >> k & 1 for k in range(28, 17, -1)), *(long if extended else [0, 0, 1, 0, 1])]
     head = len(bits)
     bits += [0, *(dlc >> k & 1 for k in range(3, -1, -1)), *(byte >> k & 1 for byte in data for k in range(7, -1, -1))]
     slow = fast = run = 0
@@ -195,8 +204,8 @@ def test_no_fd_frame_is_longer_than_its_worst_case(data, identifier):
             slow, fast = (slow + 1, fast) if place < head else (slow, fast + 1)
             last, run = 1 - bit, 1
     rates = BitRates(1_000_000, 5_000_000)
-    found = fd_frame_bits(len(data), rates)
-    assert head == 17
+    found = fd_frame_bits(len(data), rates, extended=extended)
+    assert head == (36 if extended else 17)
     assert found.least + slow + fast / 5 <= found.worst + 1e-9
 
 
