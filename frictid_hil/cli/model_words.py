@@ -152,6 +152,8 @@ def _print_export(output: Output, result: Result) -> None:
     for target, told in result.get("targets", {}).items():
         output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True, markup=False)
         output.out.print(f"  lost: {told['lost']}", soft_wrap=True, markup=False)
+    if result.get("report"):
+        output.out.print(f"report: {result['report']}", soft_wrap=True, markup=False)
     if result.get("model_refused"):
         output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
 

@@ -39,6 +39,10 @@ PAYLOAD_PRIOR = 0.3
 REACH_PRIOR_M = 0.15
 """One-sigma of the place of a payload's centre."""
 TILT_PRIOR_RAD = 0.1
+REGRASPED = 2
+"""Times that a payload's centre is found anew from where it was found."""
+LIGHTEST = 0.005
+"""Mass of a payload, over that of all links, from which its centre is looked for."""
 SURE = 0.9
 """Chance from which a cause of the arm is named."""
 LEAST_GAIN = 0.02
@@ -157,6 +161,8 @@ class _Bodies:
         carried = {int(m.jnt_bodyid[number]) for number in self._numbers}
         self.bodies = [b for b in range(1, m.nbody) if m.body_mass[b] > 0.0 and self._moves(b, carried)]
         self.last = max(carried)
+        # Where a payload's centre may lie, in the last body's frame: its own inertia goes by the square of that.
+        self.grasp: Array = np.zeros(3)
 
     def _moves(self, body: int, carried: set[int]) -> bool:
         while body > 0:
@@ -190,14 +196,13 @@ class _Bodies:
         return self.of(body, t, m.body_mass[body], m.body_ipos[body], m.body_inertia[body], m.body_iquat[body])
 
     def payload(self, t: Motion) -> list[Array]:
-        """Mass in the origin of the last body, and three first moments, per kg and kg m."""
+        """Mass at the grasp, and three first moments about it, per kg and kg m."""
         unit, none = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
-        mass = self.of(self.last, t, 1.0, none, none, unit)
-        columns = [mass]
+        columns = [self.of(self.last, t, 1.0, self.grasp, none, unit)]
         for axis in np.eye(3):
             # Half the difference of opposite places: what is quadratic in the place falls out.
-            there = self.of(self.last, t, 1.0, 0.1 * axis, none, unit)
-            opposite = self.of(self.last, t, 1.0, -0.1 * axis, none, unit)
+            there = self.of(self.last, t, 1.0, self.grasp + 0.1 * axis, none, unit)
+            opposite = self.of(self.last, t, 1.0, self.grasp - 0.1 * axis, none, unit)
             columns.append((there - opposite) / 0.2)
         return columns
 
@@ -264,10 +269,12 @@ def find_in_arm(
     scale = np.array([_scale(curve, fitted, k) for k, curve in enumerate(curves)])
     candidates = _candidates(bodies)
     y, nuisance, prior, rows = _stacked(fitted, scale, _nuisances)
-    columns = {name: _stacked_columns(fitted, scale, make, rows) for name, (make, _) in candidates.items()}
     masses = [_stacked_columns(fitted, scale, _one(bodies, body), rows) for body in bodies.bodies]
     within = np.concatenate([nuisance, *masses], axis=1)
     spread = np.concatenate([prior, np.full(len(masses), mass_tolerance)])
+    for _ in range(REGRASPED):
+        _grasp(bodies, _stacked_columns(fitted, scale, bodies.payload, rows), y, within, spread)
+    columns = {name: _stacked_columns(fitted, scale, make, rows) for name, (make, _) in candidates.items()}
     noise = _noise(y, np.concatenate([within, *columns.values()], axis=1))
     scores = {"none": _evidence(y, within, spread, noise)}
     for name, (_, sigma) in candidates.items():
@@ -294,6 +301,19 @@ def find_in_arm(
     return ArmFindings(cause, chances, before, after, base, _torque_of(make, found))
 
 
+def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Array) -> None:
+    """Move the grasp to where a payload's centre would lie."""
+    table, priors = np.concatenate([within, columns], axis=1), np.concatenate([spread, _payload_prior(bodies)])
+    mass, *moments = _posterior(y, table, priors, _noise(y, table))[0][-4:]
+    if mass > LIGHTEST * bodies.mass_kg:
+        bodies.grasp = np.clip(bodies.grasp + np.array(moments) / mass, -3.0 * REACH_PRIOR_M, 3.0 * REACH_PRIOR_M)
+
+
+def _payload_prior(bodies: _Bodies) -> Array:
+    mass = PAYLOAD_PRIOR * bodies.mass_kg
+    return np.array([mass, *[REACH_PRIOR_M * mass] * 3])
+
+
 def _torque_of(make: Callable[..., list[Array]], values: Array) -> Callable[[Array, Array, Array], Array]:
     def torque(position: Array, velocity: Array, acceleration: Array) -> Array:
         columns = make((position, velocity, acceleration))
@@ -304,9 +324,8 @@ def _torque_of(make: Callable[..., list[Array]], values: Array) -> Callable[[Arr
 
 def _candidates(bodies: _Bodies) -> dict[str, tuple[Callable[..., list[Array]], Array]]:
     """Columns and priors of every cause, by name."""
-    mass = PAYLOAD_PRIOR * bodies.mass_kg
     found: dict[str, tuple[Callable[..., list[Array]], Array]] = {
-        "payload": (bodies.payload, np.array([mass, *[REACH_PRIOR_M * mass] * 3])),
+        "payload": (bodies.payload, _payload_prior(bodies)),
         "base_orientation_error": (bodies.tilt, np.full(2, TILT_PRIOR_RAD)),
     }
     for body in bodies.bodies:
@@ -453,8 +472,8 @@ def _named(bodies: _Bodies, name: str, chance: float, found: Array, width: Array
     if effect == "payload":
         mass = float(found[0])
         values = {"mass_kg": _interval(mass, width[0])}
-        for axis, moment, wide in zip("xyz", found[1:], width[1:], strict=True):
-            values[f"centre_{axis}_m"] = _interval(float(moment) / mass, float(wide) / mass)
+        for axis, at, moment, wide in zip("xyz", bodies.grasp, found[1:], width[1:], strict=True):
+            values[f"centre_{axis}_m"] = _interval(float(at + moment / mass), float(wide) / mass)
         return ArmCause(effect, bodies.name(bodies.last), chance, values)
     turn, wide = found @ bodies.tilt_axes, np.abs(width @ np.abs(bodies.tilt_axes))
     told = {f"about_{axis}_rad": _interval(turn[k], wide[k]) for k, axis in enumerate("xyz") if wide[k] > 1e-12}

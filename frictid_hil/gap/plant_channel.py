@@ -37,6 +37,8 @@ EACH_LOG = "each log"
 """Family of what differs from log to log, and says nothing of a further one."""
 SEVERAL = 3
 """Logs from which on what is of one log alone can be told from what is of all."""
+LINE_ROWS = 20_000
+"""Rows of a log by which lines are looked for at most."""
 LINE_SHARE = 0.1
 """Part of what a low-pass takes away that a line over position must describe to be let through; noise gives 1e-3."""
 
@@ -158,11 +160,11 @@ def band(logs: Sequence[Recording], candidates: Sequence[Term], parts: Sequence[
     lines = [t for t in candidates if not t.effect.startswith(FAMILY) and _is_line(t.effect)]
     if len(usable) == 1 or not lines:
         return LowPass(rate, usable[0])
-    tables = [np.concatenate(part, axis=1) for part in parts]
     gained = []
+    tables = [[_taken(part, t.columns) for part in parts] for t in lines]
     for hertz in usable:
         low_pass = LowPass(rate, hertz)
-        gained.append(max(_described(logs, tables, low_pass, t.columns) for t in lines))
+        gained.append(max(_described(logs, table, low_pass) for table in tables))
     worth = [hertz for hertz, gain in zip(usable, gained, strict=True) if gain > LINE_SHARE]
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
 
@@ -175,13 +177,21 @@ def _is_line(effect: str) -> bool:
     )
 
 
-def _described(logs: Sequence[Recording], tables: Sequence[Array], low_pass: LowPass, columns: Sequence[int]) -> float:
+def _taken(blocks: Sequence[Array], numbers: Sequence[int]) -> Array:
+    """Some columns of blocks that stand side by side, their first rows."""
+    ends = np.cumsum([block.shape[1] for block in blocks])
+    homes = [int(np.searchsorted(ends, number, side="right")) for number in numbers]
+    first = ends - [block.shape[1] for block in blocks]
+    return np.stack([blocks[h][:LINE_ROWS, n - first[h]] for n, h in zip(numbers, homes, strict=True)], axis=1)
+
+
+def _described(logs: Sequence[Recording], tables: Sequence[Array], low_pass: LowPass) -> float:
     """Share of what a low-pass takes away that some columns describe in rows that they were not fitted to."""
     halves: list[list[Array]] = [[], []]
     for log, table in zip(logs, tables, strict=True):
         assert log.plant_nm is not None
-        rows = min(20_000, table.shape[0])
-        joined = np.concatenate([table[:rows, list(columns)], log.plant_nm[:rows, None]], axis=1)
+        rows = table.shape[0]
+        joined = np.concatenate([table, log.plant_nm[:rows, None]], axis=1)
         high = joined - low_pass(joined)
         halves[0].append(high[: rows // 2])
         halves[1].append(high[rows // 2 :])

@@ -384,13 +384,21 @@ def controller_demand(
 
 
 def between(column: Array, ticks: int) -> Array:
-    """A logged column at every tick of a controller that is so many times faster, shape (n * ticks,)."""
+    """A logged column at every tick of a controller that is so many times faster, shape (n * ticks,).
+
+    Each stretch is the cubic through the two rows on either side; after the last row its value is held.
+    """
     if ticks == 1:
         return column
-    rows = np.arange(column.size)
-    every = np.minimum(np.arange(column.size * ticks) / ticks, column.size - 1.0)
-    finer: Array = interpolate.make_interp_spline(rows, column, k=min(3, column.size - 1))(every)
-    return finer
+    before = 3.0 * (column[0] - column[1]) + column[2]
+    after = 3.0 * (column[-1] - column[-2]) + column[-3]
+    four = np.lib.stride_tricks.sliding_window_view(np.concatenate([[before], column, [after]]), 4)
+    finer: Array = np.repeat(column[:, None], ticks, axis=1)
+    for tick in range(1, ticks):
+        t = tick / ticks
+        weights = [t * (t - 1) * (2 - t) / 6, (t - 2) * (t * t - 1) / 2, t * (t + 1) * (2 - t) / 2, t * (t * t - 1) / 6]
+        finer[:-1, tick] = four @ np.array(weights)
+    return finer.ravel()
 
 
 def demand_parts(controller: Controller, position_rad: Array, command_rad: Array, step_s: float) -> Array:

@@ -15,10 +15,14 @@ from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.write_model import Export, closed_loop_gap, exports, write_model
+from frictid_hil.jobs.gap.write_model import Export, closed_loop_gap, exports, side_by_side, write_model
 from frictid_hil.jobs.identification.executors import answers, executor
+from frictid_hil.report.arm import arm_page
 from frictid_hil.report.gap import gap_page
-from frictid_hil.report.pages import write_page
+from frictid_hil.report.pages import Page, write_page
+
+ARM_PAGE = "arm.html"
+"""The page of the whole arm, beside one page a joint."""
 
 
 def diagnose_arm(
@@ -38,7 +42,7 @@ def diagnose_arm(
         write: where to write the user's model with the causes added; the user's own file is edited in place.
         apply: write the likeliest causes of open verdicts too.
         wanted: files for other simulators.
-        out: folder for one page a joint; None writes none.
+        out: folder for the page of the arm and one page a joint; None writes none.
         force: write over files that are there.
         executor_name: ``processes:N`` or ``dask://host:port``; None chooses.
 
@@ -49,10 +53,12 @@ def diagnose_arm(
     Returns:
         The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
         ``asked``; ``held``, ``still``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop``
-        of the user's model before and after in MuJoCo; ``export`` of a model that was written.
+        of the user's model before and after in MuJoCo; ``export`` of a model that was written; ``report`` of the arm.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
+    if out is not None:
+        pages[""] = out / ARM_PAGE
     outputs = [*pages.values(), *([write] if write is not None else []), *(wanted.files.values() if wanted else ())]
     refuse_overwriting(outputs, force=force)
     found = diagnosed(arm, executor_name)
@@ -75,10 +81,31 @@ def diagnose_arm(
         result["targets"] = write_targets(arm, found, wanted, apply=apply, force=force)
     if out is not None:
         _make_folder(out)
-        for name, page in pages.items():
-            told = gap_page(found[name], (), missing_torque(arm.joints[name].experiments))
-            joints[name]["report"] = str(write_page(told, page).resolve())
+        for name, told in joints.items():
+            page = gap_page(found[name], (), missing_torque(arm.joints[name].experiments))
+            told["report"] = str(write_page(page, pages[name]).resolve())
+        whole = _page_of_the_arm(arm, found, made, result, {name: pages[name].name for name in joints})
+        result["report"] = str(write_page(whole, pages[""]).resolve())
     return result
+
+
+def _page_of_the_arm(
+    arm: ArmSet,
+    found: Mapping[str, Diagnosis],
+    made: Mapping[str, Export],
+    told: Mapping[str, Any],
+    pages: Mapping[str, str],
+) -> Page:
+    notes = []
+    if arm.found is not None:
+        base = arm.found.base
+        notes.append(
+            f"These motions tell {base.rank} combinations of {base.columns} inertial parameters apart (condition "
+            f"{base.condition:.0f})."
+        )
+    notes += [f"{name} stands still in every log, so nothing can be said of it." for name in arm.still]
+    runs, why = side_by_side(arm, made), str(told["closed_loop"].get("reason", ""))
+    return arm_page(arm.robot.path.stem, str(told["summary"]), found, pages, notes, runs, why)
 
 
 def _written(arm: ArmSet, made: Mapping[str, Export], write: Path, force: bool) -> dict[str, Any]:

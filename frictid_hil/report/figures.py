@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from frictid_hil.friction.trajectory import Array
 
 MEASURED, PUBLISHED, IDENTIFIED, REFERENCE = "#7f8c9b", "#c07a2c", "#1f6fb2", "#3a9a5b"
+_ROWS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#7f8c9b", "#8e5ea2", "#b5453c", "#2a9d9d", "#b8a02c", "#5b6c8f", "#9c6b4f")
 _BAND = "rgba(58, 134, 200, 0.30)"
 _MOST_POINTS, _MOST_DOTS = 700, 500
 _COLUMNS = 3
@@ -28,6 +29,7 @@ class Figure:
         y_title: quantity and unit.
         caption: how to read it.
         panels: titles of panels side by side, all over one range of x; the key ``panel`` of a trace says where it goes.
+        stacked: bars of one label stand one behind the other, the first label on top.
     """
 
     title: str
@@ -36,6 +38,7 @@ class Figure:
     y_title: str
     caption: str = ""
     panels: tuple[str, ...] = ()
+    stacked: bool = False
 
     def spec(self) -> dict[str, Any]:
         """What ``Plotly.newPlot`` takes; the title stands above it on the page."""
@@ -60,8 +63,17 @@ class Figure:
                 "margin": {"l": 60, "r": 20, "t": 52, "b": 50},
                 "height": 400,
             }
+            | self._stack()
             | self._panels(),
         }
+
+    def _stack(self) -> dict[str, Any]:
+        """The part of the layout for rows of bars; empty for other figures."""
+        if not self.stacked:
+            return {}
+        axis = {"title": {"text": self.y_title, "standoff": 10}, "automargin": True, "autorange": "reversed"}
+        rows = len(self.traces[0]["y"]) if self.traces else 0
+        return {"barmode": "stack", "yaxis": axis, "height": 160 + 34 * rows}
 
     def _panels(self) -> dict[str, Any]:
         """The part of the layout that sets panels side by side; empty for a single one."""
@@ -159,6 +171,19 @@ def band(name: str, x: Array, low: Array, high: Array) -> dict[str, Any]:
 def bars(name: str, labels: Sequence[str], values: Sequence[float | None], color: str) -> dict[str, Any]:
     """One bar per label."""
     return {"type": "bar", "name": name, "x": list(labels), "y": list(values), "marker": {"color": color}}
+
+
+def rows_of_bars(name: str, labels: Sequence[str], values: Sequence[float], number: int) -> dict[str, Any]:
+    """One part of each label's row; the number chooses its colour."""
+    color = _ROWS[number % len(_ROWS)]
+    return {
+        "type": "bar",
+        "orientation": "h",
+        "name": name,
+        "y": list(labels),
+        "x": rounded(np.array(values), digits=3),
+        "marker": {"color": color},
+    }
 
 
 def rounded(values: Array, *, digits: int = 5) -> list[float | None]:

@@ -9,7 +9,7 @@ import pytest
 
 from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.residuals import held
+from frictid_hil.gap.residuals import between, held
 
 STEP_S = 0.002
 LOOP = Controller(1000.0, 9000.0, 0.0, 420.0, command_rate_weight=0.0)
@@ -46,3 +46,11 @@ def test_a_log_that_holds_every_tick_stays_as_it_is() -> None:
     made = recorded(0.5, rate_hz=500.0)
     assert in_force(made) is made
     assert in_force(replace(made, nominal=replace(made.nominal, controller=None))).experiments is made.experiments
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 5])
+def test_a_column_between_its_rows_is_smooth(ticks: int) -> None:
+    time = STEP_S * np.arange(400)
+    every = np.minimum(np.arange(400 * ticks) * STEP_S / ticks, time[-1])
+    finer = between(np.sin(7.0 * time) + 0.2 * np.sin(40.0 * time), ticks)
+    assert np.max(np.abs(finer - np.sin(7.0 * every) - 0.2 * np.sin(40.0 * every))) < 1e-5

@@ -67,8 +67,9 @@ def test_a_payload_is_weighed_where_it_hangs(found: Callable[..., ArmFindings]) 
     told = found(payload_kg=1.5, payload_at_m=(0.02, 0.03, 0.12))
     assert told.cause is not None and (told.cause.effect, told.cause.body) == ("payload", "hand_3")
     value, low, high = told.cause.parameters["mass_kg"]
-    assert value == pytest.approx(1.5, rel=0.12) and low < value < high
-    assert told.cause.parameters["centre_y_m"][0] == pytest.approx(0.03, abs=5e-3)
+    assert value == pytest.approx(1.5, rel=0.05) and low < 1.5 < high
+    assert told.cause.parameters["centre_y_m"][0] == pytest.approx(0.03, abs=2e-3)
+    assert told.cause.parameters["centre_z_m"][0] == pytest.approx(0.12, abs=5e-3)
     assert told.rms_after < 0.2 * told.rms_before
     assert told.torque is not None
     still = np.zeros((1, 6))

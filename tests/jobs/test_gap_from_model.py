@@ -149,6 +149,7 @@ def test_the_command_line_tells_every_joint(tmp_path: Path) -> None:
     told = json.loads(done.stdout)
     assert set(told["joints"]) == {"upper", "fore"} and "joints are as the model says" in told["summary"]
     assert told["joints"]["fore"]["drafted"]["friction"] and (tmp_path / "pages" / "fore.html").exists()
+    assert 'href="fore.html"' in Path(told["report"]).read_text()
     assert told["joints"]["upper"]["believed"]["controller"]["type"] == "cascade"
     again = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "pages")])
     assert again.exit_code == 2, "pages are not written over"

@@ -27,6 +27,7 @@ from frictid_hil.profiles.judgement import judge
 from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
+from frictid_hil.report.arm import JointRun, arm_page
 from frictid_hil.report.calendar import calendar
 from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.compensation import compensation_page
@@ -110,6 +111,7 @@ def pages(store: ProfileStore) -> dict[str, Page]:
         "recalibration": recalibration_page(result, Policy(), new, old, old, store.trends("arm")),
         "index": index,
         "gap": a_gap_page(),
+        "arm": an_arm_page(),
         "compensation by hand": compensated("hand"),
         "compensation by hand without a force sensor": compensated("hand", force_sensor=False),
         "compensation on a path": compensated("track"),
@@ -145,6 +147,22 @@ def a_gap_page() -> Page:
     return gap_page(found, (beside,), profiles)
 
 
+def an_arm_page() -> Page:
+    """Two joints, one of them with a cause, and how their user's model ran."""
+    quiet = Diagnosis("pan", "none", (), (Where("reversal", 1.0, ""),), Figures(0.1), Figures(0.1), Figures(0.1))
+    where = (Where("position", 0.8, "over the position"), Where("reversal", 0.2, "after reversals"))
+    cause = Cause("torque_ripple", 0.9, {"amplitude_nm": Value(0.3, 0.29, 0.31)})
+    lift = Diagnosis("lift <2>", "explained", (cause,), where, Figures(0.9), Figures(0.11), Figures(0.1))
+    time_s = 0.01 * np.arange(1000)
+    torque = np.sin(time_s)
+    runs = [
+        JointRun("pan", "moves", "torque [N m]", time_s, torque, torque - 0.1, None),
+        JointRun("lift <2>", "moves", "torque [N m]", time_s, torque, torque - 0.9, torque - 0.1),
+    ]
+    found = {"pan": quiet, "lift <2>": lift}
+    return arm_page("arm <1>", "1 of 2 joints are as the model says.", found, {"pan": "pan.html"}, ("Note.",), runs)
+
+
 @dataclass(frozen=True)
 class ModeRun:
     """One mode of compensation, as a page needs it."""
@@ -177,7 +195,7 @@ def compensated(task: str, *, force_sensor: bool = True) -> Page:
     return compensation_page("arm", "1", task, runs, modes, facts={"run": "runs/x"}, outcome="ok")
 
 
-PAGES = ("calibration", "recalibration", "index", "gap", "compensation by hand", "compensation on a path")
+PAGES = ("calibration", "recalibration", "index", "gap", "arm", "compensation by hand", "compensation on a path")
 
 
 def in_browser(page: Path, profile_folder: Path) -> tuple[str, list[str]]:
@@ -227,7 +245,8 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
         for kind, title in (("xtitle", figure.x_title), ("ytitle", figure.y_title)):
             (shown,) = re.findall(rf'class="{kind}"[^>]*>(.*?)</text>', svg)
             assert html.unescape(re.sub(r"<[^>]+>", "", shown)) == title
-            of_names = kind == "xtitle" and figure.traces[0]["type"] == "bar"
+            lying = figure.traces[0].get("orientation") == "h"
+            of_names = kind == ("ytitle" if lying else "xtitle") and figure.traces[0]["type"] == "bar"
             assert of_names or re.search(r"\[.+\]$|\[.+\] *", title), "an axis without its unit"
         assert figure.traces and all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure.traces)
         assert all(any(y is not None for y in trace["y"]) for trace in figure.traces), "a trace without data"

@@ -100,6 +100,11 @@ class Motion:
     samples: Mapping[str, Samples]
 
     @property
+    def time_s(self) -> Array:
+        """Of all its joints, shape (n,)."""
+        return next(iter(self.samples.values())).time_s
+
+    @property
     def position_rad(self) -> Array:
         """Shape (n, k)."""
         return np.stack([s.position_rad for s in self.samples.values()], axis=1)

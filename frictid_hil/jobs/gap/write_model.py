@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, Motion
+from frictid_hil.report.arm import JointRun
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
 from frictid_hil.simulation.model_edit import changed_elsewhere, compiled_with, edited_files
@@ -24,6 +25,8 @@ from frictid_hil.simulation.model_replay import replayed, why_not_replayed
 from frictid_hil.simulation.native import FORMS, FRICTION, Native, Use, native_elements
 from frictid_hil.simulation.native_check import in_posture, torque_difference
 
+SHOWN_S = 20.0
+"""Length of the withheld motion that a page shows."""
 CHECKED_S = 10.0
 """Length of the withheld motion along which an export is compared with our own simulation."""
 PRESLIDING_RAD = 2e-4
@@ -303,6 +306,42 @@ def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
     return told
 
 
+def side_by_side(arm: ArmSet, made: Mapping[str, Export]) -> tuple[JointRun, ...]:
+    """Each joint along the last log that was not fitted, its beginning: measured, the user's model, and improved.
+
+    Nothing where ``closed_loop_gap`` has a reason. Torques behind the low-pass; positions where no torque is known.
+    """
+    motion = next((m for m in reversed(arm.motions) if m.validation), arm.motions[-1])
+    names = arm.recorded
+    if why_not_replayed(arm.robot, names, _commanded([motion], names)):
+        return ()
+    keep = int(np.searchsorted(motion.time_s, motion.time_s[0] + SHOWN_S))
+    short = replace(motion, samples={n: s.select(np.arange(len(s)) < keep) for n, s in motion.samples.items()})
+    torque, position = _off(arm, arm.robot.compiled, short)
+    better = _off(arm, compiled_with(arm.robot, {n: e.native for n, e in made.items()}), short) if made else None
+    begin = keep - len(position)
+    low_pass = _low_pass(short.time_s)
+    runs = []
+    for k, (name, samples) in enumerate(short.samples.items()):
+        known = samples.torque_nm is not None
+        part, measured = 1 - known, samples.position_rad[begin:]
+        if samples.torque_nm is not None:
+            measured = low_pass(samples.torque_nm)[begin:]
+        off = (torque if known else position)[:, k]
+        improved = None if better is None else measured - better[part][:, k]
+        quantity = "torque [N m]" if known else "position [rad]"
+        if arm.robot.joint(name).prismatic:
+            quantity = "force [N]" if known else "position [m]"
+        runs.append(JointRun(name, motion.name, quantity, short.time_s[begin:], measured, measured - off, improved))
+    return tuple(runs)
+
+
+def _low_pass(time_s: Array) -> Callable[[Array], Array]:
+    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
+    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
+    return lambda columns: np.asarray(signal.filtfilt(b, a, columns, axis=0))
+
+
 def _commanded(motions: Sequence[Motion], names: Sequence[str]) -> bool:
     return all(motion.samples[name].position_command_rad is not None for motion in motions for name in names)
 
@@ -327,6 +366,4 @@ def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
     if any(torque is None for torque in measured):
         return np.full_like(position, np.nan), position
     torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
-    rate_hz = 1.0 / float(np.median(np.diff(time)))
-    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
-    return np.asarray(signal.filtfilt(b, a, torque, axis=0))[begin:], position
+    return _low_pass(time)(torque)[begin:], position

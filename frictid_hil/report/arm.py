@@ -1,0 +1,112 @@
+"""The page of an arm: joints as rows, where and which at a glance, then measured beside the user's model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.where import by_region
+from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, line, rows_of_bars
+from frictid_hil.report.pages import Link, Page, Section, Table
+from frictid_hil.simulation.effect import Region
+
+_SHOWN = 0.03
+"""Share of an arm's largest gap below which a region has no colour of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointRun:
+    """One joint along a log that was not fitted: measured, and the user's model in closed loop; arrays (n,).
+
+    Attributes:
+        joint: its name.
+        log: name of the log.
+        quantity: what is drawn, with its unit.
+        time_s: of the log.
+        measured: recorded.
+        nominal: of the model as it was.
+        improved: of the model with the causes; None where nothing was added.
+    """
+
+    joint: str
+    log: str
+    quantity: str
+    time_s: Array
+    measured: Array
+    nominal: Array
+    improved: Array | None
+
+
+def arm_page(
+    name: str,
+    summary: str,
+    found: Mapping[str, Diagnosis],
+    pages: Mapping[str, str],
+    notes: Sequence[str] = (),
+    runs: Sequence[JointRun] = (),
+    why_no_runs: str = "",
+) -> Page:
+    """The page of an arm.
+
+    Args:
+        name: of the arm.
+        summary: the one sentence.
+        found: diagnosis by joint.
+        pages: address of each joint's own page, relative to this one.
+        notes: what is said of the arm as a whole.
+        runs: of the joints, in closed loop.
+        why_no_runs: why there are none.
+    """
+    rows = tuple(_row(joint, d, pages.get(joint)) for joint, d in found.items())
+    headings = ("joint", "verdict", "causes (confidence)", "gap lies", "gap before", "after", "noise floor")
+    glance = Section(
+        "Joints",
+        words=tuple(notes),
+        tables=(Table(headings, rows, caption="RMS of torque on recordings that nothing was fitted to, N m (N)."),),
+        figures=tuple(_where(found)),
+    )
+    words = () if runs else (why_no_runs or "No log was run again.",)
+    beside = Section("Measured, your model, improved", words=words, figures=tuple(_beside(run) for run in runs))
+    return Page(f"Sim-to-real gap of {name}", summary, (glance, beside))
+
+
+def _row(joint: str, d: Diagnosis, page: str | None) -> tuple[str | Link, ...]:
+    causes = ", ".join(f"{cause.effect} ({cause.confidence:.2f})" for cause in d.causes)
+    shares = sorted(by_region(d.where).items(), key=lambda item: -item[1])[:2] if d.verdict != "none" else []
+    lies = ", ".join(f"{region.value} {100 * share:.0f} %" for region, share in shares)
+    figures = (d.before.inverse_nm, d.after.inverse_nm, d.noise_floor.inverse_nm)
+    told = tuple("-" if value is None else f"{value:.3g}" for value in figures)
+    return (Link(joint, page) if page else joint, d.verdict, causes or "-", lies or "-", *told)
+
+
+def _where(found: Mapping[str, Diagnosis]) -> list[Figure]:
+    """Each joint's gap over its noise floor, parted by region."""
+    sizes = {
+        joint: d.before.inverse_nm / d.noise_floor.inverse_nm
+        for joint, d in found.items()
+        if d.before.inverse_nm is not None and d.noise_floor.inverse_nm
+    }
+    if not sizes:
+        return []
+    parts = {joint: by_region(found[joint].where) for joint in sizes}
+    least = _SHOWN * max(sizes.values())
+    shown = [r for r in Region if max(sizes[j] * parts[j].get(r, 0.0) for j in sizes) > least]
+    traces = [
+        rows_of_bars(r.value, list(sizes), [sizes[j] * parts[j].get(r, 0.0) for j in sizes], number)
+        for number, r in enumerate(shown)
+    ]
+    caption = "The length of a row is the gap over the noise floor before anything is added; 1 is noise alone."
+    title = "Where each joint's gap lies"
+    return [Figure(title, tuple(traces), "gap / noise floor [1]", "joint", caption, stacked=True)]
+
+
+def _beside(run: JointRun) -> Figure:
+    traces = [
+        line("measured", run.time_s, run.measured, MEASURED, width=1),
+        line("your model", run.time_s, run.nominal, PUBLISHED, width=1),
+    ]
+    if run.improved is not None:
+        traces.append(line("improved", run.time_s, run.improved, IDENTIFIED, width=1))
+    return Figure(f"{run.joint}, {run.log}", tuple(traces), "time [s]", run.quantity)
