@@ -300,7 +300,7 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
             "what": f"{count} of {of} failed: {'; '.join(said[:5])}{more}",
             "where": "",
             "cause": "",
-            "next_step": "results of the others stand",
+            "next_step": "results of the others stand; the page that `--out` writes shows curve, loops and gates",
         }
     return whole
 

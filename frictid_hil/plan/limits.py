@@ -9,7 +9,7 @@ import numpy as np
 
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.plan.plan import Expected, Plan
+from frictid_hil.plan.plan import Expected, JointPlan, Plan
 from frictid_hil.plan.setup import RobotSetup
 
 _TOGETHER_STEP = (
@@ -27,45 +27,56 @@ def refuse_beyond_limits(plan: Plan, setup: RobotSetup, expected: Mapping[str, E
         PlanRefused: naming every joint whose planned position, speed or predicted torque exceeds a limit, and the
             point that leaves the workspace box furthest.
     """
-    problems: list[str] = []
-    for entry in plan.joints:
-        joint = setup.joint(entry.joint)
-        low, high = entry.travel_rad
-        if low < joint.position_min_rad or high > joint.position_max_rad:
-            problems.append(
-                f"joint {joint.name}: planned travel {math.degrees(low):.1f}..{math.degrees(high):.1f} deg leaves its "
-                f"limits {math.degrees(joint.position_min_rad):.1f}..{math.degrees(joint.position_max_rad):.1f} deg"
-            )
-        if entry.peak_velocity_rad_s > joint.max_velocity_rad_s:
-            problems.append(
-                f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its "
-                f"limit {math.degrees(joint.max_velocity_rad_s):.1f} deg/s"
-            )
-        if entry.predicted_torque_nm > joint.max_torque_nm:
-            source = expected[joint.name].source if joint.name in expected else "robot file"
-            problems.append(
-                f"joint {joint.name}: predicted torque {entry.predicted_torque_nm:.1f} N m above the limit "
-                f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source}"
-                f"{', and the most that the other joints can add' if plan.together else ''})"
-            )
-        for name, locked_rad in entry.locked.items():
-            other = setup.joint(name)
-            if not other.position_min_rad <= locked_rad <= other.position_max_rad:
-                problems.append(f"joint {name}: locked position {math.degrees(locked_rad):.1f} deg outside its limits")
-    outside = _outside_workspace(plan, setup)
-    if outside and not problems:
-        raise PlanRefused(
-            outside,
-            cause="the combined motion of the joints that move at once" if plan.together else "",
-            next_step="shift `start_position_rad` or `locked_position_rad`, lower the amplitude, or widen `workspace` "
-            "where there is room",
+    found = dict(pair for entry in plan.joints for pair in _beyond(entry, plan, setup, expected))
+    if outside := _outside_workspace(plan, setup):
+        found[outside] = (
+            "shift `start_position_rad` or `locked_position_rad`, lower the amplitude, or widen `workspace` "
+            "where there is room"
         )
-    if problems:
+    if found:
         raise PlanRefused(
-            "; ".join(dict.fromkeys([*problems, *([outside] if outside else [])])),
-            next_step="raise the amplitude (peak torque grows as V^2/A), lower the velocity, or shift the start"
+            "; ".join(found),
+            cause="the combined motion of the joints that move at once"
+            if list(found) == [outside] and plan.together
+            else "",
+            next_step="; ".join(dict.fromkeys(found.values())),
+        )
+
+
+def _beyond(
+    entry: JointPlan, plan: Plan, setup: RobotSetup, expected: Mapping[str, Expected]
+) -> Iterator[tuple[str, str]]:
+    """What of a joint's plan exceeds a limit, each with what helps."""
+    joint = setup.joint(entry.joint)
+    low, high = entry.travel_rad
+    if low < joint.position_min_rad or high > joint.position_max_rad:
+        yield (
+            f"joint {joint.name}: planned travel {math.degrees(low):.1f}..{math.degrees(high):.1f} deg leaves its "
+            f"limits {math.degrees(joint.position_min_rad):.1f}..{math.degrees(joint.position_max_rad):.1f} deg",
+            "shift `start_position_rad` (the travel runs from there to start + A), or take a shorter `--amplitude`",
+        )
+    if entry.peak_velocity_rad_s > joint.max_velocity_rad_s:
+        yield (
+            f"joint {joint.name}: planned speed {math.degrees(entry.peak_velocity_rad_s):.1f} deg/s above its "
+            f"limit {math.degrees(joint.max_velocity_rad_s):.1f} deg/s",
+            "lower the `--velocity`",
+        )
+    if entry.predicted_torque_nm > joint.max_torque_nm:
+        source = expected[joint.name].source if joint.name in expected else "robot file"
+        yield (
+            f"joint {joint.name}: predicted torque {entry.predicted_torque_nm:.1f} N m above the limit "
+            f"{joint.max_torque_nm:.1f} N m (inertia, gravity and friction from the {source}"
+            f"{', and the most that the other joints can add' if plan.together else ''})",
+            "take a longer `--amplitude` (the torque grows as V^2/A), or lower the `--velocity`"
             + _TOGETHER_STEP * plan.together,
         )
+    for name, locked_rad in entry.locked.items():
+        other = setup.joint(name)
+        if not other.position_min_rad <= locked_rad <= other.position_max_rad:
+            yield (
+                f"joint {name}: locked position {math.degrees(locked_rad):.1f} deg outside its limits",
+                "move `locked_position_rad` of that joint into its limits",
+            )
 
 
 def _outside_workspace(plan: Plan, setup: RobotSetup) -> str:
