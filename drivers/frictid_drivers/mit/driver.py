@@ -42,6 +42,7 @@ from frictid_hil.protocol.driver import (
     Timing,
     WallClock,
 )
+from frictid_hil.units import format_angle
 
 _ANSWER_S = 0.05
 _TRIES = 3
@@ -115,9 +116,7 @@ class MitDriver:
             drive_watchdog=watchdog,
             lock_step=self.clock.lock_step,
             temperature=True,
-            droop_rad={
-                joint.name: joint.rated_torque_nm / self._settings[joint.name].kp for joint in self.setup.joints
-            },
+            droop_rad={joint.name: self._droop_rad(joint) for joint in self.setup.joints},
         )
 
     def check(self, plan: Plan | None) -> list[Finding]:
@@ -407,6 +406,11 @@ class MitDriver:
         def say(severity: Severity, message: str, next_step: str = "") -> None:
             findings.append(Finding(severity, subject, message, next_step))
 
+        say(
+            Severity.OK,
+            f"its spring (kp {settings.kp:g}) leaves up to {format_angle(self._droop_rad(joint))} at rated torque; "
+            "bounds of care count that",
+        )
         end_rad = self._usable_rad(joint.name)
         if max(abs(joint.position_min_rad), abs(joint.position_max_rad)) > end_rad:
             say(Severity.ERROR, f"its limits reach beyond {end_rad:.3g} rad, {_USABLE:.0%} of what its frames can say")
@@ -442,6 +446,9 @@ class MitDriver:
                 "keep the emergency stop in your hand",
             )
         return findings
+
+    def _droop_rad(self, joint: JointSetup) -> float:
+        return joint.rated_torque_nm / self._settings[joint.name].kp
 
     def _usable_rad(self, joint: str) -> float:
         return _USABLE * self._settings[joint].motor.ranges.position_rad
