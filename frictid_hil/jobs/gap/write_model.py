@@ -89,8 +89,8 @@ def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[
         native = native_elements(joint.believed, model, use_of(arm, name), "", friction=False)
         native.lost |= {e: _NEEDS_TORQUE for e in effects if e not in _TIMING}
         made[name] = Export(model, native, "", {})
-    before = _gap_of(arm, arm.robot.compiled, fitted)[1]
-    after = _gap_of(arm, compiled_with(arm.robot, {n: export.native for n, export in made.items()}), fitted)[1]
+    before = gap_of(arm, arm.robot.compiled, fitted)[1]
+    after = gap_of(arm, compiled_with(arm.robot, {n: export.native for n, export in made.items()}), fitted)[1]
     nearer = {name for name, off, was in zip(names, after, before, strict=True) if off < was}
     return {name: export for name, export in made.items() if name in nearer}
 
@@ -295,7 +295,7 @@ def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
     models = {"before": arm.robot.compiled, "after": compiled_with(arm.robot, natives)}
     told: dict[str, Any] = {}
     for when, model in models.items():
-        torque, position = _gap_of(arm, model, judged)
+        torque, position = gap_of(arm, model, judged)
         told[when] = {
             name: {
                 "torque_nm": float(torque[k]) if np.isfinite(torque[k]) else None,
@@ -346,7 +346,7 @@ def _commanded(motions: Sequence[Motion], names: Sequence[str]) -> bool:
     return all(motion.samples[name].position_command_rad is not None for motion in motions for name in names)
 
 
-def _gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
+def gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
     """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
     every = [_off(arm, model, motion) for motion in motions]
     torque, position = (np.concatenate([off[part] for off in every]) for part in (0, 1))
