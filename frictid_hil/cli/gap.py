@@ -201,6 +201,44 @@ def draft(
     output.run("gap_draft", lambda: job(Source(logs, columns, joint=joint), out, force=force), show)
 
 
+@app.command("fleet")
+def fleet(
+    results: Annotated[
+        list[Path], typer.Argument(metavar="RESULT...", help="What `gap diagnose --json` printed, one file a robot.")
+    ],
+    randomise: Annotated[int, typer.Option("--randomise", metavar="N", min=0, help="Robots to draw into --out.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="File for the robots drawn (.json).")
+    ] = None,
+    seed: SeedOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Tell what varies between robots of one kind from what is not known of them."""
+    from rich.table import Table
+
+    from frictid_hil.jobs.gap_fleet import fleet as job
+
+    output = Output(as_json, quiet)
+
+    def show(result: Result) -> None:
+        table = Table("joint", "number", "mean", "not known", "varies between robots")
+        for name, effects in result["joints"].items():
+            for effect, numbers in effects.items():
+                for number, told in numbers.items():
+                    low, high = told["between_units"]["interval_95"]
+                    varies = f"{told['between_units']['value']:.3g} ({low:.2g} .. {high:.2g})"
+                    mean = f"{told['mean']:.4g}"
+                    row = (name, f"{effect} {number}", mean, f"{told['not_known']:.2g}")
+                    table.add_row(*row, varies if told["varies"] else f"not seen, below {high:.2g}")
+        output.out.print(table)
+        if result.get("samples"):
+            output.out.print(f"samples: {result['samples']}", soft_wrap=True, markup=False)
+
+    output.run("gap_fleet", lambda: job(results, samples=randomise, out=out, force=force, seed=seed), show)
+
+
 @app.command("check")
 def check(
     cases: Annotated[int, typer.Option("--cases", metavar="N", min=1, help="Joints to draw.")] = 40,
