@@ -73,7 +73,7 @@ def main() -> None:
         words = error.ctx.command_path.split()[1:] if error.ctx else []
         help_of = " ".join(["frictid-hil", *words, "--help"])
         told = UsageError(error.format_message(), next_step=f"`{help_of}`")
-        Output(as_json=True).refuse("-".join(words) or "usage", told)
+        Output(as_json=True).refuse("_".join(words) or "usage", told)
 
 
 if __name__ == "__main__":

@@ -145,7 +145,7 @@ def robot(
             f"{path}: look at every line, then `frictid-hil calibrate --robot {path} --dry-run`", soft_wrap=True
         )
 
-    output.run("new-robot", written, show)
+    output.run("new_robot", written, show)
 
 
 @app.command("driver")
@@ -168,4 +168,4 @@ def driver(
             output.out.print(path, soft_wrap=True)
         output.out.print("now: cd there, `pip install -e .`, `pytest`; then replace the frames by those of your device")
 
-    output.run("new-driver", written, show)
+    output.run("new_driver", written, show)

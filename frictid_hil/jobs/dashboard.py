@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,11 +50,18 @@ def serve(runs: Path, store: ProfileStore, port: int, announce: Callable[[str], 
         raise UsageError(
             "the dashboard needs starlette and uvicorn", next_step="pip install 'frictid-hil[dashboard]'"
         ) from None
-    announce(f"http://127.0.0.1:{port}/")
-    try:
-        uvicorn.run(application(runs, store), host="127.0.0.1", port=port, log_level="error", access_log=False)
-    except SystemExit:
-        raise HardwareError(f"port {port} of 127.0.0.1 cannot be had", next_step="choose another with --port") from None
+    with socket.socket() as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise HardwareError(
+                f"port {port} of 127.0.0.1 cannot be had: {error.strerror}", next_step="choose another with --port"
+            ) from None
+        announce(f"http://127.0.0.1:{port}/")
+        config = uvicorn.Config(application(runs, store), log_level="error", access_log=False)
+        with suppress(KeyboardInterrupt):
+            uvicorn.Server(config).run(sockets=[listening])
 
 
 def application(runs: Path, store: ProfileStore) -> Starlette:
@@ -71,7 +80,8 @@ def application(runs: Path, store: ProfileStore) -> Starlette:
         return HTMLResponse(html_of(Page("Not found", words, [])), status_code=404)
 
     def home(_: Request) -> Response:
-        robots = {name: store.history(name, 1)[-1].created_utc for name in store.robots()}
+        newest = {name: store.history(name, 1) for name in store.robots()}
+        robots = {name: profiles[-1].created_utc if profiles else "" for name, profiles in newest.items()}
         found = [(address, load_manifest(path)) for address, path in runs_in(runs).items()]
         found.sort(key=lambda run: str(run[1]["started_utc"]), reverse=True)
         return shown(home_page(robots, found))

@@ -15,12 +15,14 @@ def home_page(robots: Mapping[str, str], runs: Sequence[tuple[str, Mapping[str, 
     """Robots of the store and runs on the disk.
 
     Args:
-        robots: when the newest profile of each was measured (UTC), by name.
+        robots: when the newest profile of each was measured (UTC), by name; "" where no night gave one yet.
         runs: address and manifest of each, newest first.
     """
     moving = [address for address, manifest in runs if manifest["outcome"] is None]
     headline = f"{_count(len(robots), 'robot')}, {_count(len(runs), 'run')}; {len(moving)} at work or cut off."
-    robot_rows = tuple((Link(name, f"/robots/{name}"), when(measured)) for name, measured in robots.items())
+    robot_rows = tuple(
+        (Link(name, f"/robots/{name}"), when(measured) if measured else "none yet") for name, measured in robots.items()
+    )
     run_rows = tuple(
         (
             Link(when(manifest["started_utc"]), f"/runs/{address}"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,7 @@ def test_a_users_mistake_is_exit_2_with_a_reason(arguments: list[str], said: str
         (("calibrate", "--robot", "hp3j.yaml", "--json", "--bogus"), "No such option", "frictid.calibrate/1"),
         (("calibrate", "--json", "-A", "3"), "has no unit", "frictid.calibrate/1"),
         (("profile", "shwo", "--json"), "No such command", "frictid.profile/1"),
+        (("gap", "check", "--cases", "x", "--json"), "Invalid value", "frictid.gap_check/1"),
     ],
 )
 def test_json_is_one_object_for_a_mistyped_command_too(arguments: tuple[str, ...], said: str, schema: str) -> None:
@@ -129,6 +131,14 @@ def test_json_is_one_object_for_a_mistyped_command_too(arguments: tuple[str, ...
     assert (result.returncode, told["outcome"], told["schema"]) == (2, "refused", schema)
     assert said in told["error"]["what"] and "--help" in told["error"]["next_step"]
     assert said in result.stderr and "Traceback" not in result.stderr
+
+
+def test_a_port_that_is_taken_is_one_object_too() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        told = run("dashboard", "--json", "--port", str(other.getsockname()[1]))
+    assert told.returncode == 3 and "cannot be had" in as_json(told)["error"]["what"]
 
 
 def test_a_travel_too_short_for_the_torque_is_refused_beforehand(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from starlette.testclient import TestClient
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.jobs.dashboard import application
+from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.recording.samples import Samples
@@ -98,3 +99,9 @@ def test_an_address_never_becomes_a_path(browser: TestClient, address: str) -> N
 def test_nothing_is_written_and_nobody_else_is_answered(browser: TestClient) -> None:
     assert browser.post("/").status_code == 405
     assert browser.get("/", headers={"host": "attacker.example"}).status_code == 400
+
+
+def test_a_robot_whose_first_night_was_refused_is_listed(browser: TestClient, tmp_path: Path) -> None:
+    ProfileStore(tmp_path / "store").note_attempt("young", Attempt("2026-03-01T02:00:00Z", "refused", 3, reason="off"))
+    text = browser.get("/").text
+    assert "none yet" in text and browser.get("/robots/young").status_code == 200
