@@ -21,6 +21,7 @@ from frictid_hil.cli.options import (
     StoreOption,
     YesOption,
     one_of,
+    profiles,
     quantity,
 )
 from frictid_hil.cli.output import Output, Result, Told
@@ -59,6 +60,7 @@ def compensate(
             "--profile",
             "-p",
             metavar="PROFILE",
+            autocompletion=profiles,
             help="Profile, run folder, or id of the store. Default: the robot's active profile.",
         ),
     ] = "active",

@@ -40,6 +40,36 @@ def robot_files(incomplete: str) -> list[str]:
     return sorted(name for name in named | literal if name.startswith(incomplete))
 
 
+def joints(context: typer.Context, incomplete: str) -> list[str]:
+    """Shell completion of the joints of the robot that the line names."""
+    from frictid_hil.config.robot import load_robot
+    from frictid_hil.errors import FrictidError
+
+    try:
+        names = load_robot(str(context.params.get("robot"))).joint_names
+    except FrictidError:
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def robots(incomplete: str) -> list[str]:
+    """Shell completion of the robots that the user's store knows."""
+    from frictid_hil.profiles.store import ProfileStore
+
+    return [name for name in ProfileStore(None).robots() if name.startswith(incomplete)]
+
+
+def profiles(incomplete: str) -> list[str]:
+    """Shell completion of profiles: those of the user's store by id, run folders and files by path."""
+    from frictid_hil.profiles.store import ProfileStore
+
+    store = ProfileStore(None)
+    known = {one.stem for robot in store.robots() for one in (store.root / robot / "profiles").glob("*.yaml")}
+    below = Path(incomplete).parent if "/" in incomplete else Path()
+    near = {str(path) for path in below.glob("*.yaml")} | {str(path.parent) for path in below.glob("*/profile.yaml")}
+    return sorted(name for name in known | near | {"active"} if name.startswith(incomplete))
+
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout, nothing else.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
@@ -81,10 +111,18 @@ BusOption = Annotated[
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the virtual robot's noise.")]
 
-OneJointOption = Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint.")]
+OneJointOption = Annotated[
+    str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint.", autocompletion=joints)
+]
 JointOption = Annotated[
     list[str] | None,
-    typer.Option("--joint", "-j", metavar="JOINT", help="Only this joint; repeat for several. Default: all."),
+    typer.Option(
+        "--joint",
+        "-j",
+        metavar="JOINT",
+        help="Only this joint; repeat for several. Default: all.",
+        autocompletion=joints,
+    ),
 ]
 AmplitudeOption = Annotated[
     float | None,
@@ -120,7 +158,10 @@ MethodOption = Annotated[
     ),
 ]
 
-ProfileArgument = Annotated[Path, typer.Argument(metavar="PROFILE", help="Profile, or a run folder that holds one.")]
+ProfileArgument = Annotated[
+    Path,
+    typer.Argument(metavar="PROFILE", help="Profile, or a run folder that holds one.", autocompletion=profiles),
+]
 LiveOption = Annotated[
     bool, typer.Option("--live", help="Stream samples over Foxglove WebSocket to this computer (127.0.0.1:8765).")
 ]

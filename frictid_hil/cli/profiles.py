@@ -8,14 +8,17 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption
+from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption, profiles, robots
 from frictid_hil.cli.output import READING, Output, Result
 from frictid_hil.cli.tables import folding
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
 RobotName = Annotated[
-    str | None, typer.Option("--robot", "-r", metavar="ROBOT", help="Name of the robot whose store is meant by ids.")
+    str | None,
+    typer.Option(
+        "--robot", "-r", metavar="ROBOT", help="Name of the robot whose store is meant by ids.", autocompletion=robots
+    ),
 ]
 
 _SHOWN = 50
@@ -98,9 +101,21 @@ def export(
 @app.command("diff")
 def diff(
     older: Annotated[
-        str, typer.Argument(metavar="PROFILE", help="Profile, run folder; or with --robot an id, `active`, `baseline`.")
+        str,
+        typer.Argument(
+            metavar="PROFILE",
+            help="Profile, run folder; or with --robot an id, `active`, `baseline`.",
+            autocompletion=profiles,
+        ),
     ],
-    newer: Annotated[str, typer.Argument(metavar="PROFILE", help="The same.")],
+    newer: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE",
+            help="The same.",
+            autocompletion=profiles,
+        ),
+    ],
     robot: RobotName = None,
     store: StoreOption = None,
     as_json: JsonOption = False,
@@ -134,7 +149,10 @@ def diff(
 @app.command("promote")
 def promote(
     profile: Annotated[
-        str, typer.Argument(metavar="PROFILE", help="Profile, run folder; or with --robot an id of the store.")
+        str,
+        typer.Argument(
+            metavar="PROFILE", help="Profile, run folder; or with --robot an id of the store.", autocompletion=profiles
+        ),
     ],
     robot: RobotName = None,
     reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
@@ -166,7 +184,14 @@ def promote(
 
 @app.command("rollback")
 def rollback(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
+    robot: Annotated[
+        str,
+        typer.Argument(
+            metavar="ROBOT",
+            help="Name of the robot.",
+            autocompletion=robots,
+        ),
+    ],
     reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
     store: StoreOption = None,
     as_json: JsonOption = False,
@@ -185,7 +210,14 @@ def rollback(
 
 @app.command("history")
 def history(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.")],
+    robot: Annotated[
+        str,
+        typer.Argument(
+            metavar="ROBOT",
+            help="Name of the robot.",
+            autocompletion=robots,
+        ),
+    ],
     last: Annotated[
         int | None,
         typer.Option(

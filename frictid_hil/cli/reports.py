@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.options import JsonOption, QuietOption, StoreOption
+from frictid_hil.cli.options import JsonOption, QuietOption, StoreOption, robots
 from frictid_hil.cli.output import READING, Output, Result
 
 
@@ -24,6 +24,7 @@ def report(
             "--robot",
             "-r",
             metavar="ROBOT",
+            autocompletion=robots,
             help="The page of a robot with its history: its name in the store, or its file.",
         ),
     ] = None,

@@ -14,7 +14,7 @@ from frictid_hil.friction.trajectory import Array
 MEASURED, PUBLISHED, IDENTIFIED, REFERENCE = "#7f8c9b", "#c07a2c", "#1f6fb2", "#3a9a5b"
 _ROWS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#7f8c9b", "#8e5ea2", "#b5453c", "#2a9d9d", "#b8a02c", "#5b6c8f", "#9c6b4f")
 _BAND = "rgba(58, 134, 200, 0.30)"
-_MOST_POINTS, _MOST_DOTS = 700, 500
+_MOST_POINTS, _MOST_DOTS = 500, 250
 _COLUMNS = 3
 
 

@@ -14,7 +14,10 @@ from called import PROGRAM, run
 from rich.console import Console
 
 from frictid_hil.cli.progress import print_plan
+from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
+from frictid_hil.config.provenance import Provenance
 from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
+from frictid_hil.profiles.store import ProfileStore
 
 VERBS = ["check", "calibrate", "identify", "compare", "compensate", "replay", "recalibrate", "schedule"]
 VERBS += ["profile", "emulate", "gap", "report"]
@@ -194,10 +197,11 @@ def test_a_simulated_joint_that_cannot_be_is_told_with_its_place(verb: tuple[str
     assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").rglob("*.mcap"))
 
 
-def completed(line: str) -> list[str]:
+def completed(line: str, **environment: str) -> list[str]:
     """What a shell offers after ``line``."""
     words = line.split(" ")
     told = {"_FRICTID_HIL_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    told |= environment
     offered = subprocess.run([PROGRAM], env={**os.environ, **told}, capture_output=True, text=True, check=False)
     return offered.stdout.split()
 
@@ -208,3 +212,19 @@ def test_the_shell_completes_verbs_robot_files_and_choices() -> None:
     assert "hp3j.yaml" in completed("frictid-hil calibrate --robot hp")
     assert completed("frictid-hil calibrate --method al") == ["aligned"]
     assert completed("frictid-hil compensate --task ") == ["hand", "track"]
+
+
+@pytest.mark.slow
+def test_the_shell_completes_joints_robots_and_profiles(tmp_path: Path) -> None:
+    assert completed("frictid-hil calibrate --robot hp3j.yaml --joint ") == ["0", "1", "2", "3", "4", "5"]
+    assert completed("frictid-hil calibrate --robot no-such.yaml --joint ") == []
+    home = {"XDG_DATA_HOME": str(tmp_path)}
+    joint = JointProfile(
+        method="aligned", velocity_rad_s=(1.0, 2.0), torque_nm=(4.0, 5.0), coulomb_nm=Estimate(value=3.0)
+    )
+    provenance = Provenance(created_utc="2026-03-01T02:00:00Z")
+    store = ProfileStore(tmp_path / "frictid-hil" / "store")
+    stored = store.add(FrictionProfile(robot="bench", joints={"0": joint}, provenance=provenance))
+    assert completed("frictid-hil profile history be", **home) == ["bench"]
+    assert completed("frictid-hil report --robot ", **home) == ["bench"]
+    assert completed("frictid-hil profile promote 2026", **home) == [stored]

@@ -229,11 +229,19 @@ def serious(dom: str) -> list[list[object]]:
 
 def picture(address: str, to: Path, width: int, height: int) -> None:
     """A screenshot (PNG) of the top of a page, once its scripts have run."""
+    _headless(address, to.parent, f"--window-size={width},{height}", f"--screenshot={to}")
+
+
+def printed(page: Path, to: Path) -> None:
+    """The page as PDF."""
+    _headless(page.as_uri(), to.parent, f"--print-to-pdf={to}")
+
+
+def _headless(address: str, place: Path, *what: str) -> None:
     assert CHROMIUM is not None
     command = [
         CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars",
         "--disable-sync", "--disable-background-networking", "--disable-component-update",
-        f"--user-data-dir={to.parent / 'browser'}", "--virtual-time-budget=8000", f"--window-size={width},{height}",
-        f"--screenshot={to}", address,
+        f"--user-data-dir={place / 'browser'}", "--virtual-time-budget=8000", *what, address,
     ]  # fmt: skip
     subprocess.run(command, capture_output=True, timeout=300, check=True)

@@ -18,13 +18,26 @@ import numpy as np
 import pytest
 import uvicorn
 from PIL import Image
-from shown import PAGES, in_browser, needs_browser, pages, picture, recording, serious, some_history, with_axe
+from shown import (
+    PAGES,
+    in_browser,
+    needs_browser,
+    pages,
+    picture,
+    printed,
+    profile,
+    recording,
+    serious,
+    some_history,
+    with_axe,
+)
 
 from frictid_hil.jobs.dashboard import application
 from frictid_hil.profiles.promotions import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.report.calendar import calendar
+from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.figures import line
 from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import Page, write_page
@@ -110,6 +123,25 @@ def test_a_page_is_small_and_a_thinned_line_keeps_its_peaks(history: ProfileStor
     y[54_321] = 7.0
     drawn = line("spike", np.arange(y.size, dtype=float), y, "#000000")
     assert len(drawn["x"]) <= 700 and 7.0 in drawn["y"] and drawn["x"] == sorted(drawn["x"])
+
+
+def six_joints(folder: Path) -> Path:
+    """The page of a run of six joints, with their recordings."""
+    one = profile(1.3, 6)
+    new = one.model_copy(update={"joints": dict.fromkeys("012345", one.joints["0"])})
+    page = calibration_page(new, {name: recording(name) for name in new.joints}, outcome="ok", previous=profile(1.0, 1))
+    return write_page(page, folder / "six.html")
+
+
+def test_a_page_of_six_joints_is_small(tmp_path: Path) -> None:
+    assert six_joints(tmp_path).stat().st_size < 1_500_000
+
+
+@pytest.mark.slow
+@needs_browser
+def test_its_pdf_is_small(tmp_path: Path) -> None:
+    printed(six_joints(tmp_path), tmp_path / "six.pdf")
+    assert 100_000 < (tmp_path / "six.pdf").stat().st_size < 3_000_000
 
 
 def test_all_joints_are_shown_first_with_the_verdict_of_their_gates(history: ProfileStore) -> None:
