@@ -123,7 +123,7 @@ def diagnose(
         typer.Option(
             "--export",
             metavar="TARGET=FILE",
-            help="Also write the joints of a model as isaaclab (.py), bam (.json), c (.h) or samples (.json).",
+            help="Also write the joints of a model as isaaclab or mjlab (.py), bam (.json), c (.h), samples (.json).",
         ),
     ] = None,
     randomise: Annotated[

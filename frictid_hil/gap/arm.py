@@ -269,12 +269,19 @@ def find_in_arm(
     scale = np.array([_scale(curve, fitted, k) for k, curve in enumerate(curves)])
     candidates = _candidates(bodies)
     y, nuisance, prior, rows = _stacked(fitted, scale, _nuisances)
-    masses = [_stacked_columns(fitted, scale, _one(bodies, body), rows) for body in bodies.bodies]
-    within = np.concatenate([nuisance, *masses], axis=1)
+    masses = {
+        f"link_mass_error {bodies.name(body)}": _stacked_columns(fitted, scale, _one(bodies, body), rows)
+        for body in bodies.bodies
+    }
+    within = np.concatenate([nuisance, *masses.values()], axis=1)
     spread = np.concatenate([prior, np.full(len(masses), mass_tolerance)])
+    payload = _stacked_columns(fitted, scale, bodies.payload, rows)
     for _ in range(REGRASPED):
-        _grasp(bodies, _stacked_columns(fitted, scale, bodies.payload, rows), y, within, spread)
-    columns = {name: _stacked_columns(fitted, scale, make, rows) for name, (make, _) in candidates.items()}
+        if not _grasp(bodies, payload, y, within, spread):
+            break
+        payload = _stacked_columns(fitted, scale, bodies.payload, rows)
+    tilt = _stacked_columns(fitted, scale, bodies.tilt, rows)
+    columns = {"payload": payload, "base_orientation_error": tilt, **masses}
     noise = _noise(y, np.concatenate([within, *columns.values()], axis=1))
     scores = {"none": _evidence(y, within, spread, noise)}
     for name, (_, sigma) in candidates.items():
@@ -301,12 +308,14 @@ def find_in_arm(
     return ArmFindings(cause, chances, before, after, base, _torque_of(make, found))
 
 
-def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Array) -> None:
-    """Move the grasp to where a payload's centre would lie."""
+def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Array) -> bool:
+    """Move the grasp to where a payload's centre would lie; whether there is enough of one to say."""
     table, priors = np.concatenate([within, columns], axis=1), np.concatenate([spread, _payload_prior(bodies)])
     mass, *moments = _posterior(y, table, priors, _noise(y, table))[0][-4:]
-    if mass > LIGHTEST * bodies.mass_kg:
-        bodies.grasp = np.clip(bodies.grasp + np.array(moments) / mass, -3.0 * REACH_PRIOR_M, 3.0 * REACH_PRIOR_M)
+    if mass <= LIGHTEST * bodies.mass_kg:
+        return False
+    bodies.grasp = np.clip(bodies.grasp + np.array(moments) / mass, -3.0 * REACH_PRIOR_M, 3.0 * REACH_PRIOR_M)
+    return True
 
 
 def _payload_prior(bodies: _Bodies) -> Array:

@@ -1,4 +1,4 @@
-"""Improved joints for other simulators: Isaac Lab, BAM, a C header. What each cannot hold is told.
+"""Improved joints for other simulators: Isaac Lab, mjlab, BAM, a C header. What each cannot hold is told.
 
 Every target gets the same few numbers of a joint (``Numbers``), made of our simulated joint with its causes.
 """
@@ -133,6 +133,44 @@ def _range(values: Sequence[float]) -> tuple[float, float]:
     return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
+def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:
+    """Position actuators of mjlab, with what its configuration has no place for beside them."""
+    lines = [
+        '"""Joints identified by frictid-hil, as actuators of mjlab.',
+        "",
+        "For your own MJCF as it was, less its actuators: the improved one holds its friction already. frictionloss is",
+        "a soft constraint that creeps below its level.",
+        '"""',
+        "",
+        "from mjlab.actuator import BuiltinPositionActuatorCfg",
+        "",
+        "ACTUATORS = (",
+    ]
+    for name, n in joints.items():
+        values = {
+            "stiffness": n.kp_nm_per_rad,
+            "damping": n.kv_nm_s_per_rad,
+            "armature": n.armature_kg_m2,
+            "frictionloss": n.dry_nm,
+        }
+        if math.isfinite(n.torque_limit_nm):
+            values["effort_limit"] = n.torque_limit_nm
+        told = ", ".join(f"{key}={value:.6g}" for key, value in values.items())
+        lines.append(f"    BuiltinPositionActuatorCfg(target_names_expr=({json.dumps(name)},), {told}),")
+    damping = {name: float(f"{n.viscous_nm_s_per_rad:.6g}") for name, n in joints.items()}
+    steps = {name: round(n.delay_s / step_s) for name, n in joints.items()}
+    lines += [
+        ")",
+        "",
+        "# N m s/rad: `damping` of the joints in your MJCF; the configuration above has no place for it.",
+        f"JOINT_DAMPING = {damping!r}",
+        f"# Physics steps of {step_s:g} s for delay_min_lag and delay_max_lag; versions differ in which class has them.",
+        f"DELAY_STEPS = {steps!r}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
 def bam(n: Numbers) -> str:
     """Parameters of one actuator for BAM, its model m2 (Coulomb, viscous, Stribeck); torque is in N m, not volts."""
     return json.dumps(
@@ -245,6 +283,7 @@ def samples_json(samples: Mapping[str, Sequence[Numbers]]) -> str:
 LOST = {
     "isaaclab": "presliding, the curve beyond one slope, asymmetry, ripple and play have no place in its joints",
     "bam": "presliding, the curve beyond one slope, asymmetry, ripple, play and delay have no place in its model m2",
+    "mjlab": "presliding, Stribeck, a curve beyond one slope, asymmetry, ripple and play; the improved MJCF keeps them",
     "c": "asymmetry, ripple, play, delay, load: the step function is friction over speed and presliding",
     "samples": "nothing of the numbers; effects without a number of their own are not in them",
 }
@@ -270,6 +309,7 @@ def written_as(
     makers: dict[str, Callable[[], dict[str, str]]] = {
         "isaaclab": lambda: {file: isaac_lab(joints, samples, step_s)},
         "bam": lambda: {f"{stem or ending}_{name}{dot}{ending if stem else ''}": bam(n) for name, n in joints.items()},
+        "mjlab": lambda: {file: mjlab(joints, step_s)},
         "c": lambda: {file: c_header(joints)},
         "samples": lambda: {file: samples_json(samples)},
     }

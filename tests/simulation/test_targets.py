@@ -44,6 +44,16 @@ def test_the_numbers_are_those_of_the_improved_joint(joint: Numbers) -> None:
     assert friction_nm(joint, 0.8, 1.0) == pytest.approx(3.8, rel=0.02)
 
 
+def test_mjlab_gets_actuators_and_is_told_what_they_cannot_hold(joint: Numbers) -> None:
+    (text,) = written_as("mjlab", "a.py", {"lift": joint}, {}, 0.002).values()
+    code = "\n".join(line for line in text.splitlines() if not line.startswith("from mjlab"))
+    exec(compile(code, "a.py", "exec"), names := {"BuiltinPositionActuatorCfg": dict})
+    (lift,) = names["ACTUATORS"]  # type: ignore[misc]
+    assert lift["target_names_expr"] == ("lift",) and lift["frictionloss"] == pytest.approx(3.0, rel=0.02)
+    assert (lift["stiffness"], lift["damping"], lift["effort_limit"]) == (900.0, 30.0, 40.0)
+    assert names["JOINT_DAMPING"] == {"lift": pytest.approx(1.0, rel=0.03)} and names["DELAY_STEPS"] == {"lift": 3}
+
+
 def test_isaac_lab_gets_levels_delay_in_steps_and_ranges(joint: Numbers) -> None:
     (text,) = written_as("isaaclab", "a.py", {"lift": joint}, {"lift": [joint, joint]}, 0.002).values()
     made: dict[str, dict[str, object]] = {}
