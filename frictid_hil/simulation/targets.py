@@ -164,7 +164,7 @@ def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:
         "",
         "# N m s/rad: `damping` of the joints in your MJCF; the configuration above has no place for it.",
         f"JOINT_DAMPING = {damping!r}",
-        f"# Physics steps of {step_s:g} s for delay_min_lag and delay_max_lag; versions differ in which class has them.",
+        f"# Steps of {step_s:g} s for delay_min_lag and delay_max_lag; which class has them depends on the version.",
         f"DELAY_STEPS = {steps!r}",
         "",
     ]

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,8 +48,9 @@ def test_the_numbers_are_those_of_the_improved_joint(joint: Numbers) -> None:
 def test_mjlab_gets_actuators_and_is_told_what_they_cannot_hold(joint: Numbers) -> None:
     (text,) = written_as("mjlab", "a.py", {"lift": joint}, {}, 0.002).values()
     code = "\n".join(line for line in text.splitlines() if not line.startswith("from mjlab"))
-    exec(compile(code, "a.py", "exec"), names := {"BuiltinPositionActuatorCfg": dict})
-    (lift,) = names["ACTUATORS"]  # type: ignore[misc]
+    names: dict[str, Any] = {"BuiltinPositionActuatorCfg": dict}
+    exec(compile(code, "a.py", "exec"), names)
+    (lift,) = names["ACTUATORS"]
     assert lift["target_names_expr"] == ("lift",) and lift["frictionloss"] == pytest.approx(3.0, rel=0.02)
     assert (lift["stiffness"], lift["damping"], lift["effort_limit"]) == (900.0, 30.0, 40.0)
     assert names["JOINT_DAMPING"] == {"lift": pytest.approx(1.0, rel=0.03)} and names["DELAY_STEPS"] == {"lift": 3}
