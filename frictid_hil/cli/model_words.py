@@ -133,6 +133,8 @@ def _print_export(output: Output, result: Result) -> None:
             torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
             table.add_row(name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states))
         output.out.print(table)
+        for name in loop["farther"]:
+            output.out.print(f"{name}: the change takes your model farther from the recording; look before you use it")
     for name, joint in result.get("export", {}).get("joints", {}).items():
         off = joint["torque_difference_percent"]
         how = (

@@ -71,6 +71,9 @@ def test_the_cause_is_written_into_a_copy_that_is_nearer_to_the_machine(arm: Arm
     assert gap["after"]["lift"]["torque_nm"] < 0.25 * gap["before"]["lift"]["torque_nm"]
     assert gap["after"]["lift"]["position_rad"] < 0.5 * gap["before"]["lift"]["position_rad"]
     assert gap["after"]["wrist_3"]["torque_nm"] == pytest.approx(gap["before"]["wrist_3"]["torque_nm"], rel=0.05)
+    assert gap["farther"] == []
+    wrong = exports(arm, healthy(arm, pan=found("explained"), lift=found("explained")))
+    assert closed_loop_gap(arm, wrong)["farther"] == ["pan"], "friction that the pan has not"
 
 
 @pytest.mark.slow

@@ -25,6 +25,8 @@ from frictid_hil.simulation.model_replay import replayed, why_not_replayed
 from frictid_hil.simulation.native import FORMS, FRICTION, Native, Use, native_elements
 from frictid_hil.simulation.native_check import in_posture, torque_difference
 
+FARTHER = 1.05
+"""Gap after over that before, from which an improved joint is told to be none."""
 SHOWN_S = 20.0
 """Length of the withheld motion that a page shows."""
 CHECKED_S = 10.0
@@ -285,7 +287,7 @@ def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
 
     Returns:
         ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
-        torque behind a low-pass), or ``reason``.
+        torque behind a low-pass) and ``farther``, the changed joints that came no nearer; or ``reason``.
     """
     judged = [motion for motion in arm.motions if motion.validation] or list(arm.motions)
     names = arm.recorded
@@ -303,7 +305,15 @@ def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
             }
             for k, name in enumerate(names)
         }
+    told["farther"] = [name for name in made if _farther(told["before"][name], told["after"][name])]
     return told
+
+
+def _farther(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> bool:
+    """Whether a change took the user's model away from the recordings: by torque, or by position without any."""
+    number = "position_rad" if before["torque_nm"] is None else "torque_nm"
+    was, now = before[number], after[number]
+    return was is not None and now is not None and not now <= FARTHER * was
 
 
 def side_by_side(arm: ArmSet, made: Mapping[str, Export]) -> tuple[JointRun, ...]:
