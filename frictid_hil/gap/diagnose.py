@@ -18,7 +18,7 @@ from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
-from frictid_hil.gap.findings import Finding, Sampled, findings, sampled
+from frictid_hil.gap.findings import Finding, Sampled, findings, sampled, whole_draws
 from frictid_hil.gap.forward import Replay, Replayed, settled_nm, why_not
 from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulated
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
@@ -211,6 +211,7 @@ def _told(
         model=replay.model(effects if applied else {}) if replay is not None else None,
         candidate=replay.model(effects) if replay is not None else None,
         held_out=held_out(plant) if plant is not None else {},
+        samples=whole_draws(list(effects), channels) if effects and channels else (),
         raw=None if plant is None else Raw(*plant.posterior.channel.raw, plant.posterior.channel.cutoff_hz),
     )
 

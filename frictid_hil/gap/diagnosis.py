@@ -103,6 +103,7 @@ class Diagnosis:
         candidate: the joint with the likeliest causes added, whatever the verdict; for who asks for it all the same.
         held_out: by effect, change of the held-out squares when it alone is added, percent.
         raw: the gap before any filter; None where it is not formed.
+        samples: draws of the posterior, parameters by effect; empty where nothing was sampled.
     """
 
     name: str
@@ -120,6 +121,7 @@ class Diagnosis:
     candidate: JointModel | None = None
     held_out: Mapping[str, float] = field(default_factory=dict)
     raw: Raw | None = None
+    samples: tuple[Mapping[str, Mapping[str, float]], ...] = ()
 
     def improved_model(self) -> JointModel | None:
         """The joint with the named causes added; the nominal joint where nothing is applied; None without a controller.

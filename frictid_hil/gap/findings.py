@@ -161,17 +161,26 @@ def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
     """The effect's parameters over all draws that hold it."""
     told: dict[str, list[float]] = {}
     for k in range(DRAWS):
-        joined: dict[str, float] = {}
-        for channel in channels:
-            for name, value in parameters(effect, channel, channel.draws[k]).items():
-                joined[name] = joined.get(name, 0.0) + value if name in joined else value
-        for name, value in joined.items():
+        for name, value in _of_draw(effect, channels, k).items():
             told.setdefault(name, []).append(value)
     result = {}
     for name, values in told.items():
         low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
         result[name] = Value(float(middle), float(low), float(high))
     return result
+
+
+def whole_draws(effects: Sequence[str], channels: Sequence[Sampled]) -> tuple[dict[str, dict[str, float]], ...]:
+    """The parameters of some effects in every draw, an effect only where the draw holds it: what belongs together."""
+    return tuple({e: told for e in effects if (told := _of_draw(e, channels, k))} for k in range(DRAWS))
+
+
+def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, float]:
+    joined: dict[str, float] = {}
+    for channel in channels:
+        for name, value in parameters(effect, channel, channel.draws[k]).items():
+            joined[name] = joined.get(name, 0.0) + value if name in joined else value
+    return joined
 
 
 def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:

@@ -85,6 +85,8 @@ def test_parameters_come_back_with_intervals_that_hold_them() -> None:
     value = d.causes[0].parameters["error_share"]
     assert value.value == pytest.approx(0.08, abs=0.004)
     assert value.low is not None and value.high is not None and value.low < value.value < value.high
+    drawn = [sample["gravity_error"]["error_share"] for sample in d.samples if "gravity_error" in sample]
+    assert np.quantile(drawn, [0.025, 0.975]) == pytest.approx([value.low, value.high]) and len(d.samples) == 400
 
 
 @pytest.mark.slow

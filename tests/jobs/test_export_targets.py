@@ -53,3 +53,23 @@ def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: Ar
     assert told["c"]["files"] == [str(tmp_path / "f.h")] and told["samples"]["lost"]
     with pytest.raises(UsageError, match="would be overwritten"):
         write_targets(arm, found, wanted, apply=False, force=False)
+
+
+def test_numbers_of_a_sample_come_from_one_draw_of_the_posterior(arm: ArmSet, tmp_path: Path) -> None:
+    causes = (
+        Cause("friction_level_error", 0.9, {"error_share": Value(0.5, 0.1, 0.9)}),
+        Cause("viscous_error", 0.9, {"error_share": Value(0.5, 0.1, 0.9)}),
+    )
+    shares = np.linspace(0.1, 0.9, 50)
+    # The more level, the less slope; and every fifth draw has no error of the level at all.
+    draws = tuple(
+        ({} if k % 5 == 0 else {"friction_level_error": {"error_share": float(s)}})
+        | {"viscous_error": {"error_share": float(1.0 - s)}}
+        for k, s in enumerate(shares)
+    )
+    found = {"lift": Diagnosis("lift", "explained", causes, (), Figures(), Figures(), Figures(), samples=draws)}
+    write_targets(arm, found, Wanted({"samples": tmp_path / "s.json"}, samples=300), apply=False, force=False)
+    drawn = [sample["lift"] for sample in json.loads((tmp_path / "s.json").read_text())["samples"]]
+    held = [(one["dry_nm"], one["viscous_nm_s_per_rad"] / one["dry_nm"]) for one in drawn if one["dry_nm"] > 2.1]
+    assert np.corrcoef(np.array(held).T)[0, 1] < -0.9
+    assert 0.1 < np.mean([one["dry_nm"] < 2.1 for one in drawn]) < 0.3

@@ -80,7 +80,7 @@ def write_targets(
         joints[name] = numbers_of(joint.believed, joint_model(joint, effects), use)
         drawn: list[Numbers] = []
         for _ in range(wanted.samples):
-            other = {e: _drawn(e, values, found[name], random) for e, values in effects.items()}
+            other = _drawn(effects, found[name], random)
             drawn.append(numbers_of(joint.believed, joint_model(joint, other), use))
         if drawn:
             samples[name] = drawn
@@ -101,8 +101,30 @@ def write_targets(
     }
 
 
-def _drawn(effect: str, values: Mapping[str, float], found: Diagnosis, random: np.random.Generator) -> dict[str, float]:
-    """Parameters of one effect within what the diagnosis leaves open; numbers of a sample come from one draw."""
+def _drawn(
+    effects: Mapping[str, Mapping[str, float]], found: Diagnosis, random: np.random.Generator
+) -> dict[str, dict[str, float]]:
+    """The effects of one draw of the posterior: level and slope that belong together, and no effect that it lacks."""
+    if not found.samples:
+        return {effect: _within_interval(effect, values, found, random) for effect, values in effects.items()}
+    draw = found.samples[int(random.integers(len(found.samples)))]
+    drawn = {}
+    for effect in effects:
+        limits = {p.name: p for p in all_effects()[effect].parameters}
+        told = {
+            n: float(np.clip(v, limits[n].lower, limits[n].upper))
+            for n, v in draw.get(effect, {}).items()
+            if n in limits
+        }
+        if told:
+            drawn[effect] = all_effects()[effect].complete(told)
+    return drawn
+
+
+def _within_interval(
+    effect: str, values: Mapping[str, float], found: Diagnosis, random: np.random.Generator
+) -> dict[str, float]:
+    """Parameters of an effect that was read without a posterior, each within its interval."""
     cause = next(cause for cause in found.causes if cause.effect == effect)
     limits = {p.name: p for p in all_effects()[effect].parameters}
     drawn = dict(values)
