@@ -75,8 +75,9 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
 
 @pytest.mark.slow
 @needs_browser
-def test_the_contrast_holds_in_the_dark_too(history: ProfileStore, tmp_path: Path) -> None:
-    path = write_page(pages(history)["index"], tmp_path / "index.html")
+@pytest.mark.parametrize("name", ["index", "calibration", "recalibration", "gap"])
+def test_the_contrast_holds_in_the_dark_too(name: str, history: ProfileStore, tmp_path: Path) -> None:
+    path = write_page(pages(history)[name], tmp_path / "page.html")
     path.write_text(path.read_text().replace("screen and (prefers-color-scheme: dark)", "screen"))
     dom, _ = in_browser(with_axe(path), tmp_path / "browser")
     assert serious(dom) == []
