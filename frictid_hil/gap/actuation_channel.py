@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,12 +16,21 @@ from frictid_hil.gap.plant_channel import (
     BEYOND,
     SIZES,
     family,
-    report_of,
     stride_of,
     thinned,
     without_nuisances,
 )
-from frictid_hil.gap.residuals import LowPass, Recording, demand_of, demand_parts, held, reported, rms, settled
+from frictid_hil.gap.residuals import (
+    LowPass,
+    Recording,
+    demand_of,
+    demand_parts,
+    held,
+    reported,
+    rms,
+    settled,
+    ticks_of,
+)
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse_loops import lagged
@@ -30,6 +39,10 @@ SLOWEST = 10
 """Control ticks to a row of the log up to which what the controller did between two rows can be told from them."""
 WITHIN_ROWS = 0.3
 """One-sigma of when a command took effect and a velocity was taken, in rows of a log slower than its controller."""
+
+
+NEAREST = (1.0 / math.sqrt(2.0), math.sqrt(2.0))
+"""Coefficients of a time: values to try at most double, so that the nearest one is no further from the true one."""
 
 
 def forms() -> dict[str, ActuationForm]:
@@ -66,7 +79,11 @@ def why_not_replayed(nominal: Nominal, recordings: Sequence[Recording]) -> str |
 
 
 def actuation_channel(
-    nominal: Nominal, recordings: Sequence[Recording], library: Collection[str], seen: Mapping[str, float]
+    nominal: Nominal,
+    recordings: Sequence[Recording],
+    library: Collection[str],
+    seen: Mapping[str, float],
+    believed: Sequence[Recording] = (),
 ) -> Channel | None:
     """The channel of a set; None where the demand cannot be formed.
 
@@ -75,33 +92,39 @@ def actuation_channel(
         recordings: all logs of the set.
         library: effects that may be used.
         seen: effect -> value found in the kinematic channel.
+        believed: the believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
     """
     if why_not_replayed(nominal, recordings) is not None:
         return None
     logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
     controller = nominal.controller
     limit_nm = controller.torque_limit_nm if controller is not None else math.inf
-    believed = nominal.believed_effects
-    demands = [r.demand_nm for r in logs if r.demand_nm is not None]
-    base = [through(d, believed, r.step_s, limit_nm) for d, r in zip(demands, logs, strict=True)]
+    drives = [_Drive.of(r, nominal, limit_nm) for r in logs]
+    base = [drive.torque(nominal.believed_effects) for drive in drives]
+    report = nominal.torque_report_filter
+    residuals = [_residual(r, b, report) for r, b in zip(logs, base, strict=True)]
+    if believed:
+        exact = [
+            _residual(b, _Drive.of(b, nominal, limit_nm).torque(nominal.believed_effects), report) for b in believed
+        ]
+        residuals = [left - shown for left, shown in zip(residuals, exact, strict=True)]
     views = [_view(r, controller, limit_nm) for r in logs]
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
     nuisances += _timing(nominal, base, logs, builder)
-    scale = rms(np.concatenate([r.actuation_nm for r in logs if r.actuation_nm is not None]))
+    scale = rms(np.concatenate(residuals))
     for name, form in forms().items():
         if name not in library:
             continue
-        for value, columns in _shapes(name, form, views, logs, nominal, base, seen):
+        for value, columns in _shapes(name, form, views, drives, nominal, base, seen):
             numbers = builder.add(columns)
-            spread = 0.3 if form.late else 0.1
-            candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread)))
+            spread, ends = (0.3, NEAREST) if form.late else (0.1, (-math.inf, math.inf))
+            candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread), *ends))
     for name, columns in _generic(logs, base).items():
         numbers = builder.add(columns)
         candidates += [family(name, size * scale, numbers, columns) for size in SIZES]
     low_pass = LowPass.at(1.0 / logs[0].step_s)
-    report = report_of(nominal.torque_report_filter, logs, low_pass)
-    rows = tuple(_rows(r, base[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
+    rows = tuple(_rows(r, residuals[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, nuisances, candidates)
     return Channel(
         "actuation",
@@ -183,34 +206,27 @@ def _shapes(
     name: str,
     form: ActuationForm,
     views: Sequence[DriveView],
-    logs: Sequence[Recording],
+    drives: Sequence[_Drive],
     nominal: Nominal,
     base: Sequence[Array],
     seen: Mapping[str, float],
 ) -> list[tuple[dict[str, float], list[Array]]]:
     """(parameters, columns) of one effect at every value worth trying."""
-    limit_nm, believed = views[0].limit_nm, nominal.believed_effects
+    believed = nominal.believed_effects
     result: list[tuple[dict[str, float], list[Array]]] = []
+    if form.torque is None and nominal.controller is None:
+        return result
     for value in form.guesses(views, seen.get(name)):
         for detail in form.details or (0.0,):
             values = {form.parameter: float(value), **({form.detail: detail} if form.detail else {})}
             if form.torque is None:
-                changed = [
-                    through(
-                        demand_of(nominal.controller, r.experiment, r.step_s, float(value)),
-                        believed,
-                        r.step_s,
-                        limit_nm,
-                    )
-                    for r in logs
-                    if nominal.controller is not None
-                ]
+                late = [_Drive.of(d.recording, nominal, d.limit_nm, float(value)) for d in drives]
+                changed = [drive.torque(believed) for drive in late]
             else:
                 held_by = believed.get(name, {}).get(form.parameter, 0.0) if form.late else 0.0
                 effects = {**believed, name: {**values, form.parameter: held_by + float(value)}}
-                changed = [through(v.demand_nm, effects, v.step_s, limit_nm) for v in views]
-            if len(changed) == len(base):
-                result.append((values, [(c - b)[:, None] for c, b in zip(changed, base, strict=True)]))
+                changed = [drive.torque(effects) for drive in drives]
+            result.append((values, [(c - b)[:, None] for c, b in zip(changed, base, strict=True)]))
     return result
 
 
@@ -233,16 +249,54 @@ def _generic(logs: Sequence[Recording], base: Sequence[Array]) -> dict[str, list
     return table
 
 
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """What a drive is asked for in one recording, at every tick of its controller.
+
+    Attributes:
+        recording: its rows.
+        demand_nm: at every tick, shape (n * ticks,).
+        ticks: of the controller to a row.
+        limit_nm: of the torque.
+    """
+
+    recording: Recording
+    demand_nm: Array
+    ticks: int
+    limit_nm: float
+
+    @staticmethod
+    def of(recording: Recording, nominal: Nominal, limit_nm: float, velocity_lag_s: float = 0.0) -> _Drive:
+        """The drive of one recording; its controller sees a velocity that lags so much more than is believed."""
+        controller, e = nominal.controller, recording.experiment
+        assert recording.demand_nm is not None
+        if controller is None or e.torque_demand_nm is not None:
+            return _Drive(recording, recording.demand_nm, 1, limit_nm)
+        demand = demand_of(controller, e, recording.step_s, velocity_lag_s, every_tick=True)
+        return _Drive(recording, demand, ticks_of(controller, recording.step_s), limit_nm)
+
+    def torque(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
+        """Torque that the drive makes with these effects, at every row, N m, shape (n,)."""
+        return through(self.demand_nm, effects, self.recording.step_s / self.ticks, self.limit_nm)[:: self.ticks]
+
+
+def _residual(recording: Recording, asked_nm: Array, report: ReportFilter | None) -> Array:
+    """Reported torque less the believed one, as the drive reports it, N m, shape (n,)."""
+    torque = recording.experiment.torque_nm
+    assert torque is not None
+    if report is not None:
+        asked_nm = reported(asked_nm[:, None], report, recording.step_s)[:, 0]
+    return settled(torque - asked_nm, recording.step_s)
+
+
 def _rows(
-    recording: Recording, base: Array, parts: list[Array], low_pass: LowPass, report: ReportFilter | None
+    recording: Recording, residual_nm: Array, parts: list[Array], low_pass: LowPass, report: ReportFilter | None
 ) -> Rows:
     e = recording.experiment
-    assert e.torque_nm is not None
-    model = np.concatenate([*parts, base[:, None]], axis=1)
+    columns = np.concatenate(parts, axis=1)
     if report is not None:
-        model = reported(model, report, recording.step_s)
-    residual = settled(e.torque_nm - model[:, -1], recording.step_s)
-    table = thinned(np.concatenate([model[:, :-1], residual[:, None]], axis=1), low_pass)[1:-2]
+        columns = reported(columns, report, recording.step_s)
+    table = thinned(np.concatenate([columns, residual_nm[:, None]], axis=1), low_pass)[1:-2]
     return Rows(
         e.name,
         e.validation,

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet
+from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.residuals import LowPass, demand_of, held, uniform
 
 FASTEST = 1.05
@@ -24,10 +25,18 @@ def between_rows(controller: Controller | None, step_s: float) -> bool:
 
 
 def in_force(experiments: ExperimentSet) -> ExperimentSet:
-    """The set with each command at the time when it came into force, up to a row late, as the torques fit best."""
-    controller = experiments.nominal.controller
-    fitted = [e for e in experiments.experiments if not e.validation] or list(experiments.experiments)
-    tables = [t for e in fitted if controller is not None and (t := _table(controller, e)) is not None]
+    """The set with each command at the time when it came into force, up to a row late, as the torques fit best.
+
+    What the believed joint itself shows on a log so slow is no lateness, where it can be simulated.
+    """
+    nominal = experiments.nominal
+    tables = []
+    if any(_between_rows(nominal, e) for e in experiments.experiments):
+        known = why_not(experiments) is None
+        exact = Replay(experiments).recorded() if known else (None,) * len(experiments.experiments)
+        pairs = list(zip(experiments.experiments, exact, strict=True))
+        fitted = [(e, own) for e, own in pairs if not e.validation] or pairs
+        tables = [_table(nominal.controller, e, own) for e, own in fitted if _between_rows(nominal, e)]
     if not tables:
         return experiments
     table = np.concatenate(tables)
@@ -36,21 +45,27 @@ def in_force(experiments: ExperimentSet) -> ExperimentSet:
     return replace(experiments, experiments=tuple(shifted))
 
 
+def _between_rows(nominal: Nominal, e: Experiment) -> bool:
+    """Whether a log whose demand is replayed lacks ticks of its controller."""
+    known = e.torque_nm is not None and e.position_command_rad is not None and e.torque_demand_nm is None
+    return known and between_rows(nominal.controller, float(np.median(np.diff(e.time_s))))
+
+
 def _shifted(e: Experiment, late: float) -> Experiment:
     command = e.position_command_rad
     return e if command is None else replace(e, position_command_rad=(1.0 - late) * command + late * held(command))
 
 
-def _table(controller: Controller, raw: Experiment) -> Array | None:
+def _table(controller: Controller | None, raw: Experiment, exact: Experiment | None) -> Array:
     """What a command one row later and a constant would change, and the torque that is left, (rows, 3)."""
     e, step_s, _ = uniform(raw)
-    known = e.torque_nm is not None and e.position_command_rad is not None and e.torque_demand_nm is None
-    if not known or not between_rows(controller, step_s):
-        return None
-    assert e.torque_nm is not None and e.position_command_rad is not None
+    assert controller is not None and e.torque_nm is not None
     demand = demand_of(controller, e, step_s)
     late = demand_of(controller, _shifted(e, 1.0), step_s) - demand
-    columns = np.column_stack([late, np.ones_like(demand)])
+    left = e.torque_nm - held(demand)
+    if exact is not None and exact.torque_nm is not None:
+        left -= exact.torque_nm - held(demand_of(controller, exact, step_s))
+    columns = np.column_stack([held(np.column_stack([late, np.ones_like(demand)])), left])
     low_pass = LowPass.at(1.0 / step_s)
-    rows: Array = low_pass(np.column_stack([held(columns), e.torque_nm - held(demand)]))[5 : -5 : low_pass.stride]
+    rows: Array = low_pass(columns)[5 : -5 : low_pass.stride]
     return rows

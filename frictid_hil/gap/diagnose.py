@@ -25,6 +25,7 @@ from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior
+from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
@@ -53,7 +54,7 @@ def diagnose(
         negligible: gap that the user calls none, as a share of the friction level.
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
-    experiments, reasons = completed(in_force(checked(experiments)))
+    experiments, reasons = completed(in_force(as_meant(checked(experiments))))
     reasons = dict(reasons)
     if (open_question := one_sided(experiments)) is not None:
         reasons["motion"] = open_question
@@ -62,10 +63,12 @@ def diagnose(
     logs = recordings(experiments)
     nominal = experiments.nominal
     kinematic = fit_kinematics(logs, nominal.encoder_resolution_rad, nominal.velocity_filter_s, allowed)
-    channels = [sampled(Posterior(c, len(allowed))) for c in _channels(nominal, logs, allowed, reasons, kinematic)]
+    replay = Replay(experiments) if why_not(experiments) is None else None
+    believed = _believed(experiments, replay)
+    found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed)
+    channels = [sampled(Posterior(c, len(allowed))) for c in found_in]
     found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
     gaps = [closed(c, [f.effect for f in found if f.chance >= UNDECIDED]) for c in channels]
-    replay = Replay(experiments) if why_not(experiments) is None else None
     runs = None if replay is None else replay({}, validation=_judged_role(logs))
     quiet = _raw_quiet(channels, negligible) and _loop_quiet(gaps, runs)
     said = verdict(found, channels, gaps, _negligible(nominal, channels, negligible), quiet)
@@ -81,18 +84,26 @@ def _channels(
     allowed: Sequence[str],
     reasons: dict[str, str],
     kinematic: KinematicFit,
+    believed: Sequence[Recording],
 ) -> list[Channel]:
     """The channels that these recordings have."""
-    plant = plant_channel(nominal, logs, allowed, reasons)
+    plant = plant_channel(nominal, logs, allowed, reasons, believed)
     if plant is None:
         reasons["inverse_nm"] = "no log has a torque"
         reasons["forward_position_rad"] = "position against the command through a fitted chain, not a replay"
         tracking = tracking_channel(logs, allowed)
         return [] if tracking is None else [tracking]
-    actuation = actuation_channel(nominal, logs, allowed, {n: kinematic.read[n] for n in kinematic.found})
+    actuation = actuation_channel(nominal, logs, allowed, {n: kinematic.read[n] for n in kinematic.found}, believed)
     if actuation is None:
         reasons["actuation"] = why_not_replayed(nominal, logs) or "no log has torque and demand"
     return [plant] if actuation is None else [plant, actuation]
+
+
+def _believed(experiments: ExperimentSet, replay: Replay | None) -> tuple[Recording, ...]:
+    """The believed joint recorded as the set was: what sampling and filters make of it is no gap."""
+    if replay is None or any(e.torque_nm is None for e in experiments.experiments):
+        return ()
+    return recordings(replace(experiments, experiments=replay.recorded()))
 
 
 def _with_readings(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Term
@@ -20,6 +21,8 @@ VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
+FORM = 0.1
+"""One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
 
@@ -122,9 +125,9 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
     result = []
     for row, name in enumerate(names):
         there = shown[row] > 0.0
-        chance = float(np.mean(there))
-        if chance == 0.0:
+        if not there.any():
             continue
+        chance = float(np.mean(_beyond_form(table, row)))
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
             Finding(
@@ -138,6 +141,18 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             )
         )
     return sorted(result, key=lambda f: -f.size)
+
+
+def _beyond_form(table: Array, row: int) -> Array:
+    """Chance that a cause shows and is not what the form of a larger one leaves, by draw, shape (draws,).
+
+    Args:
+        table: sizes of all causes, shape (causes, draws).
+        row: of the cause.
+    """
+    spread = FORM * np.max(np.delete(table, row, axis=0), axis=0, initial=1.0)
+    chance: Array = special.ndtr((table[row] - VISIBLE) / spread) * (table[row] > 0.0)
+    return chance
 
 
 def _joined(sizes: Sequence[Array]) -> Array:

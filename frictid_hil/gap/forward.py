@@ -21,6 +21,8 @@ from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, Simu
 
 Effects = Mapping[str, Mapping[str, float]]
 
+SAME_RATE = 0.05
+"""A row holds a whole number of control ticks where the two clocks differ by no more than this share."""
 SETTLING_S = 0.3
 """Time the controller takes after the first slide to forget the start."""
 
@@ -117,6 +119,23 @@ class Replay:
             added_nm=controller.added_nm,
         )
 
+    def recorded(self, *, rounded: bool = False) -> tuple[Experiment, ...]:
+        """The believed joint itself, recorded as the set was.
+
+        Args:
+            rounded: its encoder and its drive round as believed; else they round nothing.
+        """
+        model, state = self._nominal, None
+        if not rounded:
+            model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))
+            model = replace(model, drive=replace(model.drive, torque_quantum_per_mille=0.0))
+        made = []
+        for e in self._experiments:
+            rows = self._rows(model, e, state, SUBSTEP_S)
+            state = rows.state
+            made.append(replace(e, position_rad=rows.position_rad, torque_nm=rows.torque_nm, velocity_rad_s=None))
+        return tuple(made)
+
     def model(self, effects: Effects) -> JointModel:
         """The nominal joint with effects added (to those it already has)."""
         merged = {name: dict(values) for name, values in self._nominal.effects.items()}
@@ -151,10 +170,14 @@ class Replay:
     def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None, substep_s: float) -> Simulated:
         """One recording simulated, its torque reported as the drive does: the controller's last tick, filtered."""
         assert e.position_command_rad is not None
-        ticks = max(1, round(self._controller.rate_hz * float(np.median(np.diff(e.time_s)))))
+        step_s = float(np.median(np.diff(e.time_s)))
+        ticks = max(1, round(self._controller.rate_hz * step_s))
         last = (e.time_s.size - 1) * ticks + 1
         time, command = between(e.time_s, ticks)[:last], between(e.position_command_rad, ticks)[:last]
-        rows = closed_loop(model, self._controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
+        # A log's clock and its controller's differ a little; a row is a whole number of ticks all the same.
+        exact = abs(self._controller.rate_hz * step_s / ticks - 1.0) < SAME_RATE
+        controller = replace(self._controller, rate_hz=ticks / step_s) if exact else self._controller
+        rows = closed_loop(model, controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
         torque = rows.torque_nm
         if self._report is not None:
             torque = reported(torque[:, None], self._report, float(np.median(np.diff(time))))[:, 0]

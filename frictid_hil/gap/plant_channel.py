@@ -44,7 +44,11 @@ LINE_SHARE = 0.1
 
 
 def plant_channel(
-    nominal: Nominal, recordings: Sequence[Recording], library: Collection[str], estimated: Collection[str]
+    nominal: Nominal,
+    recordings: Sequence[Recording],
+    library: Collection[str],
+    estimated: Collection[str],
+    believed: Sequence[Recording] = (),
 ) -> Channel | None:
     """The channel of a set; None where no log has a torque.
 
@@ -53,15 +57,20 @@ def plant_channel(
         recordings: all logs of the set.
         library: effects that may be used.
         estimated: ``inertia`` and ``friction`` where they were fitted to these logs, so that they are free.
+        believed: the believed joint recorded as the same logs, where it can be simulated: what it shows is no gap.
     """
     logs = [r for r in recordings if r.view is not None and r.plant_nm is not None]
     if not logs:
         return None
+    report = nominal.torque_report_filter
+    residuals = [plant_residual(r, report) for r in logs]
+    if believed:
+        residuals = [left - plant_residual(b, report) for left, b in zip(residuals, believed, strict=True)]
     views, noises = quiet_views(nominal, logs)
     measured = [r.view for r in logs if r.view is not None]
     builder = Builder([[] for _ in logs])
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
-    scale = min(friction_nm / 3.0, _gap_nm(logs))
+    scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))
     known = nuisances(nominal, views, logs, builder, estimated)
     candidates = []
     for name in (n for n in all_effects() if n in library):
@@ -84,12 +93,11 @@ def plant_channel(
         numbers = builder.add(columns)
         for size in SIZES:
             candidates.append(family(name, size * scale, numbers, columns))
-    low_pass = band(logs, candidates, builder.parts)
-    report = report_of(nominal.torque_report_filter, logs, low_pass)
-    rows = tuple(_rows(r, builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
+    low_pass = band(residuals, logs[0].step_s, candidates, builder.parts)
+    rows = tuple(_rows(r, residuals[k], builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, known, candidates)
     step_s = logs[0].step_s * stride_of(low_pass)
-    raw, known_floor = _raw(logs, noises), _known_floor(logs, rows, low_pass)
+    raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
     return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
 
 
@@ -102,10 +110,10 @@ def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[A
     return Term(FAMILY + name, {"size": size}, numbers, np.zeros(each.size), deviation)
 
 
-def _raw(logs: Sequence[Recording], noises: Sequence[Array]) -> tuple[float, float]:
+def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence[Array]) -> tuple[float, float]:
     """(RMS of the residual of the validation logs before any filter, what noise of torque and position leaves), N m."""
     chosen = [k for k, r in enumerate(logs) if r.experiment.validation] or list(range(len(logs)))
-    gap = rms(np.concatenate([p for k in chosen if (p := logs[k].plant_nm) is not None]))
+    gap = rms(np.concatenate([residuals[k] for k in chosen]))
     white = [white_rms(t) for k in chosen if (t := logs[k].experiment.torque_nm) is not None]
     own = [differenced_rms(t) for k in chosen if (t := logs[k].experiment.rigid_body_torque_nm) is not None]
     noise = math.hypot(rms(np.concatenate([noises[k] for k in chosen])), rms(np.array(white)))
@@ -118,10 +126,10 @@ def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowP
     return math.hypot(rms(np.array(white)), rms(np.concatenate([log.known_noise for log in rows])))
 
 
-def _gap_nm(logs: Sequence[Recording]) -> float:
+def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
     """RMS of the residual behind the usual low-pass, N m."""
-    low_pass = LowPass.at(1.0 / logs[0].step_s)
-    return rms(np.concatenate([low_pass(r.plant_nm)[5:-5] for r in logs if r.plant_nm is not None]))
+    low_pass = LowPass.at(1.0 / step_s)
+    return rms(np.concatenate([low_pass(residual)[5:-5] for residual in residuals]))
 
 
 def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> tuple[Rows, ...]:
@@ -150,12 +158,14 @@ def _by_log(views: Sequence[View]) -> list[Array]:
     return blocks
 
 
-def band(logs: Sequence[Recording], candidates: Sequence[Term], parts: Sequence[Sequence[Array]]) -> LowPass:
+def band(
+    residuals: Sequence[Array], step_s: float, candidates: Sequence[Term], parts: Sequence[Sequence[Array]]
+) -> LowPass:
     """The low-pass: 20 Hz, or as much more as lines over position need that stand above it.
 
     Noise of the position grows with frequency, so that no more is let through than a cause can use.
     """
-    rate = 1.0 / logs[0].step_s
+    rate = 1.0 / step_s
     usable = [hertz for hertz in BANDS_HZ if hertz <= 0.2 * rate] or [0.2 * rate]
     lines = [t for t in candidates if not t.effect.startswith(FAMILY) and _is_line(t.effect)]
     if len(usable) == 1 or not lines:
@@ -164,7 +174,7 @@ def band(logs: Sequence[Recording], candidates: Sequence[Term], parts: Sequence[
     tables = [[_taken(part, t.columns) for part in parts] for t in lines]
     for hertz in usable:
         low_pass = LowPass(rate, hertz)
-        gained.append(max(_described(logs, table, low_pass) for table in tables))
+        gained.append(max(_described(residuals, table, low_pass) for table in tables))
     worth = [hertz for hertz, gain in zip(usable, gained, strict=True) if gain > LINE_SHARE]
     return LowPass(rate, next((h for h in usable if not worth or h > worth[-1]), usable[-1]))
 
@@ -185,13 +195,12 @@ def _taken(blocks: Sequence[Array], numbers: Sequence[int]) -> Array:
     return np.stack([blocks[h][:LINE_ROWS, n - first[h]] for n, h in zip(numbers, homes, strict=True)], axis=1)
 
 
-def _described(logs: Sequence[Recording], tables: Sequence[Array], low_pass: LowPass) -> float:
+def _described(residuals: Sequence[Array], tables: Sequence[Array], low_pass: LowPass) -> float:
     """Share of what a low-pass takes away that some columns describe in rows that they were not fitted to."""
     halves: list[list[Array]] = [[], []]
-    for log, table in zip(logs, tables, strict=True):
-        assert log.plant_nm is not None
+    for residual, table in zip(residuals, tables, strict=True):
         rows = table.shape[0]
-        joined = np.concatenate([table, log.plant_nm[:rows, None]], axis=1)
+        joined = np.concatenate([table, residual[:rows, None]], axis=1)
         high = joined - low_pass(joined)
         halves[0].append(high[: rows // 2])
         halves[1].append(high[rows // 2 :])
@@ -226,16 +235,30 @@ def thinned(columns: Array, low_pass: LowPass) -> Array:
     return np.ascontiguousarray(every[start : start + rows])
 
 
+def plant_residual(recording: Recording, report: ReportFilter | None) -> Array:
+    """Reported torque less what the believed joint asks for, as the drive reports it, N m, shape (n,)."""
+    view, plant = recording.view, recording.plant_nm
+    assert view is not None and plant is not None
+    if report is None:
+        return plant
+    left: Array = view.torque_nm - reported((view.torque_nm - plant)[:, None], report, recording.step_s)[:, 0]
+    return left
+
+
 def _rows(
-    recording: Recording, parts: list[Array], noise_nm: Array, low_pass: LowPass, report: ReportFilter | None
+    recording: Recording,
+    residual_nm: Array,
+    parts: list[Array],
+    noise_nm: Array,
+    low_pass: LowPass,
+    report: ReportFilter | None,
 ) -> Rows:
-    view, torque = recording.view, recording.experiment.torque_nm
-    assert view is not None and torque is not None and recording.plant_nm is not None
-    model = np.stack([noise_nm, view.torque_nm - recording.plant_nm, view.torque_nm], axis=1)
-    model = np.concatenate([*parts, model], axis=1)
+    view = recording.view
+    assert view is not None
+    columns = np.concatenate([*parts, noise_nm[:, None]], axis=1)
     if report is not None:
-        model[:, :-1] = reported(model[:, :-1], report, recording.step_s)
-    table = thinned(model, low_pass)
+        columns = reported(columns, report, recording.step_s)
+    table = thinned(np.concatenate([columns, residual_nm[:, None]], axis=1), low_pass)
     held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
     first = min(held // stride_of(low_pass) + 1, table.shape[0] // 3)
     table = table[first:-2]
@@ -243,24 +266,7 @@ def _rows(
         recording.experiment.name,
         recording.experiment.validation,
         first * stride_of(low_pass) * recording.step_s,
-        table[:, -1] - table[:, -2],
-        table[:, :-3],
-        table[:, -3],
+        table[:, -1],
+        table[:, :-2],
+        table[:, -2],
     )
-
-
-def report_of(told: ReportFilter | None, logs: Sequence[Recording], low_pass: LowPass) -> ReportFilter | None:
-    """The declared filter as it is meant: some give the time constant of each of its lags, some that of the whole."""
-    if told is None or told.order == 1:
-        return told
-    meant = (told, ReportFilter(1, told.time_constant_s))
-    left = [0.0, 0.0]
-    for log in logs:
-        view, plant = log.view, log.plant_nm
-        assert view is not None and plant is not None
-        model = np.stack([view.torque_nm - plant, view.acceleration_rad_s2, view.slip, np.ones_like(plant)], axis=1)
-        for k, form in enumerate(meant):
-            table = low_pass(np.concatenate([reported(model, form, log.step_s), view.torque_nm[:, None]], axis=1))
-            weights = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)[0]
-            left[k] += float(np.sum((table[:, -1] - table[:, :-1] @ weights) ** 2))
-    return meant[int(np.argmin(left))]

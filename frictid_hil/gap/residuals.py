@@ -354,6 +354,7 @@ def controller_demand(
     *,
     integral_nm: float = 0.0,
     velocity_lag_s: float = 0.0,
+    every_tick: bool = False,
 ) -> Array:
     """The controller replayed on a measured position; in force when the next sample is taken, shape (n,).
 
@@ -366,8 +367,9 @@ def controller_demand(
         step_s: sampling step.
         integral_nm: level of the integral at the start.
         velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
+        every_tick: the demand of every tick of the controller, not of the last one before each row.
     """
-    ticks = max(1, round(controller.rate_hz * step_s))
+    ticks = ticks_of(controller, step_s)
     position, command = between(position_rad, ticks), between(command_rad, ticks)
     tick_s = step_s / ticks
     difference = np.diff(position, prepend=position[0]) / tick_s
@@ -380,7 +382,12 @@ def controller_demand(
     direct = controller.kp_nm_per_rad * error + controller.added_nm(command, tick_s)
     direct += controller.kd_nm_s_per_rad * (controller.command_rate_weight * feed - velocity)
     demand = _integrated(direct, controller.ki_nm_per_rad_s * tick_s * error, controller.torque_limit_nm, integral_nm)
-    return demand[ticks - 1 :: ticks]
+    return demand if every_tick else demand[ticks - 1 :: ticks]
+
+
+def ticks_of(controller: Controller | None, step_s: float) -> int:
+    """Ticks of the controller to a row of the log, at least one."""
+    return 1 if controller is None else max(1, round(controller.rate_hz * step_s))
 
 
 def between(column: Array, ticks: int) -> Array:
@@ -447,7 +454,14 @@ def start_rows(values: Array, step_s: float) -> int:
     return min(values.size, max(8, int(SETTLED_S / step_s)))
 
 
-def demand_of(controller: Controller, experiment: Experiment, step_s: float, velocity_lag_s: float = 0.0) -> Array:
+def demand_of(
+    controller: Controller,
+    experiment: Experiment,
+    step_s: float,
+    velocity_lag_s: float = 0.0,
+    *,
+    every_tick: bool = False,
+) -> Array:
     """The controller's demand along a recording; its integral starts where the reported torque says."""
     if experiment.torque_demand_nm is not None:
         return experiment.torque_demand_nm
@@ -464,4 +478,12 @@ def demand_of(controller: Controller, experiment: Experiment, step_s: float, vel
             velocity_lag_s=velocity_lag_s,
         )
         level = float(np.median(experiment.torque_nm[1:rows] - held(free)[1:]))
-    return controller_demand(controller, q, command, step_s, integral_nm=level, velocity_lag_s=velocity_lag_s)
+    return controller_demand(
+        controller,
+        q,
+        command,
+        step_s,
+        integral_nm=level,
+        velocity_lag_s=velocity_lag_s,
+        every_tick=every_tick,
+    )
