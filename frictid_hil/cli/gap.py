@@ -102,6 +102,16 @@ def diagnose(
             "--split", metavar="HOW", help="Judge on the end of every log, 30% or 20s of it; or on whole logs: log."
         ),
     ] = "",
+    negligible: Annotated[
+        float | None,
+        typer.Option(
+            "--negligible",
+            metavar="PERCENT",
+            min=0.0,
+            max=100.0,
+            help="Gap that means nothing to you, in percent of the friction level; 5 unless told.",
+        ),
+    ] = None,
     write_model: Annotated[
         Path | None,
         typer.Option(
@@ -146,6 +156,8 @@ def diagnose(
 
     output = Output(as_json, quiet)
     every = [*(logs or ()), *(more_logs or ())]
+    if model is not None and negligible is not None:
+        output.refuse("gap_diagnose", UsageError("--negligible is of one joint; it does not go with --model"))
     if model is not None:
         output.run(
             "gap_diagnose",
@@ -170,7 +182,15 @@ def diagnose(
     source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or (), split)
     output.run(
         "gap_diagnose",
-        lambda: job(source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force),
+        lambda: job(
+            source,
+            write_model=write_model,
+            mujoco=mujoco,
+            apply=apply,
+            out=out,
+            force=force,
+            negligible=None if negligible is None else 0.01 * negligible,
+        ),
         lambda result: _print_diagnosis(output, result),
     )
 

@@ -257,7 +257,7 @@ def _causes(said: Verdict, channels: Sequence[Sampled], gaps: Sequence[Closed]) 
         Cause(
             effect=f.effect,
             confidence=round(f.chance if said.word != "unknown" else min(f.chance, 0.4), 3),
-            parameters=f.parameters,
+            parameters=f.parameters if said.word != "unknown" else {},
             confusable_with=f.rivals,
             gap_closed_percent=round(100.0 * share * f.size**2 / total, 2) if total > 0.0 else None,
         )

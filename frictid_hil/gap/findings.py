@@ -58,6 +58,7 @@ class Sampled:
         posterior: of the channel.
         draws: samples.
         sizes: by cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
+        blurs: by cause, one-sigma of what the forms of the others may have put on it, in the same unit.
         generic: the same of all generic functions together.
         explained: the same of all causes together.
     """
@@ -65,6 +66,7 @@ class Sampled:
     posterior: Posterior
     draws: Sequence[Draw]
     sizes: Mapping[str, Array]
+    blurs: Mapping[str, Array]
     generic: Array
     explained: Array
 
@@ -76,6 +78,7 @@ def sampled(posterior: Posterior) -> Sampled:
     x = x - np.mean(x, axis=0) * (posterior.channel.name == "actuation")
     gram = x.T @ x / x.shape[0]
     sizes: dict[str, Array] = {}
+    blurs: dict[str, Array] = {}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
@@ -90,17 +93,22 @@ def sampled(posterior: Posterior) -> Sampled:
         causes = {name: part for name, part in parts.items() if name and not name.startswith(FAMILY)}
         # What has no name is last: it may take back, as a rigid-body column does that is off the other way.
         unnamed = [parts[""]] if "" in parts else []
-        for effect, net in zip(causes, _net([*causes.values(), *unnamed], gram), strict=False):
+        for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes.setdefault(effect, np.zeros(len(draws)))[k] = net / posterior.floor
+            blurs.setdefault(effect, np.zeros(len(draws)))[k] = blur / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
-    return Sampled(posterior, draws, sizes, generic, explained)
+    return Sampled(posterior, draws, sizes, blurs, generic, explained)
 
 
-def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> Array:
-    """RMS of what each cause makes, less what others take back: a pair that more than half cancels explains nothing."""
+def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
+    """(RMS of what each cause makes less what others take back, one-sigma of what their forms may have put on it).
+
+    A pair that more than half cancels explains nothing. A cause that moves as a larger one does is told from it by
+    their forms alone, and no joint is quite as its formula.
+    """
     if not parts:
-        return np.zeros(0)
+        return np.zeros(0), np.zeros(0)
     vectors = np.zeros((len(parts), gram.shape[0]))
     for k, (columns, values) in enumerate(parts):
         np.add.at(vectors[k], columns, values)
@@ -111,7 +119,10 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> Array:
     cancels = pair < 0.25 * np.maximum(squares[:, None], squares)
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
-    return net
+    apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
+    lent = FORM * own / apart
+    np.fill_diagonal(lent, 0.0)
+    return net, np.max(lent, axis=1, initial=0.0)
 
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
@@ -120,6 +131,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
     if not names:
         return []
     table = np.array([_joined([c.sizes.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
+    blurs = np.array([_joined([c.blurs.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
     shown = np.where(table > VISIBLE, table, 0.0)
     leads = np.bincount(np.argmax(shown, axis=0)[np.max(shown, axis=0) > 0.0], minlength=len(names)) / DRAWS
     result = []
@@ -127,7 +139,8 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
         there = shown[row] > 0.0
         if not there.any():
             continue
-        chance = float(np.mean(_beyond_form(table, row)))
+        blur = np.maximum(blurs[row], FORM)
+        chance = float(np.mean(special.ndtr((table[row] - VISIBLE) / blur) * (table[row] > 0.0)))
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
             Finding(
@@ -141,18 +154,6 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             )
         )
     return sorted(result, key=lambda f: -f.size)
-
-
-def _beyond_form(table: Array, row: int) -> Array:
-    """Chance that a cause shows and is not what the form of a larger one leaves, by draw, shape (draws,).
-
-    Args:
-        table: sizes of all causes, shape (causes, draws).
-        row: of the cause.
-    """
-    spread = FORM * np.max(np.delete(table, row, axis=0), axis=0, initial=1.0)
-    chance: Array = special.ndtr((table[row] - VISIBLE) / spread) * (table[row] > 0.0)
-    return chance
 
 
 def _joined(sizes: Sequence[Array]) -> Array:

@@ -23,6 +23,8 @@ READ_DIRECTLY = "kinematics"
 """Where a cause is read from positions and velocities themselves."""
 LISTED = 0.25
 """Chance from which a cause is listed."""
+NEEDED = 0.9
+"""Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
 LEADS = 0.6
 """Chance of being the largest cause below which a rival makes the answer ambiguous."""
 
@@ -69,8 +71,9 @@ def verdict(
     nothing = not named or float(np.median(explained)) < STANDS_OUT
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
     unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
-    # A gap that is small beside the noise and small in practice is none, whatever trace explains it.
+    # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
+    tiny = tiny and not any(_needed(f, channels) for f in named)
     if tiny or (quiet and (nothing or generic_wins)):
         return Verdict("none", ())
     new = any(gap.appeared is not None for gap in gaps)
@@ -81,6 +84,13 @@ def verdict(
     if first.leads < LEADS and rivals:
         return Verdict("ambiguous", named)
     return Verdict("explained", named)
+
+
+def _needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
+    """Whether a cause stands out and hardly any draw does without it beyond what its tolerance allows."""
+    if cause.chance < NEEDED or cause.size < STANDS_OUT:
+        return False
+    return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)
 
 
 def _unnamed(loud: Sequence[Sampled]) -> bool:

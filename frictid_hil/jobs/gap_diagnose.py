@@ -10,6 +10,7 @@ from typing import Any
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.gap.diagnose import NEGLIGIBLE
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
@@ -101,6 +102,7 @@ def diagnose(
     apply: bool = False,
     out: Path | None = None,
     force: bool = False,
+    negligible: float | None = None,
 ) -> dict[str, Any]:
     """Diagnose a set.
 
@@ -112,6 +114,7 @@ def diagnose(
         apply: write it even where the verdict does not recommend it.
         out: folder for the report page; None writes none.
         force: write over files that are there.
+        negligible: gap that means nothing to the user, over the friction level; the diagnosis' own share unless told.
 
     Raises:
         InputFileError, ConfigError: the set is unusable.
@@ -125,7 +128,7 @@ def diagnose(
     outputs = (write_model, mujoco, callback, None if out is None else out / "gap.html")
     refuse_overwriting([path for path in outputs if path is not None], force=force)
     experiments = (Source((source,)) if isinstance(source, Path) else source).load()
-    found = find_causes(experiments)
+    found = find_causes(experiments, negligible=NEGLIGIBLE if negligible is None else negligible)
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
     del result["schema"]  # the command line's own
     result["tolerances"] = list(experiments.nominal.tolerances.lines())

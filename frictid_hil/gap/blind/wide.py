@@ -448,7 +448,7 @@ def _drawn(rng: np.random.Generator, setting: Setting, name: str, peak_nm: float
 def _parameters(name: str, before: Physics, after: Physics) -> dict[str, float]:
     """In the diagnosis' own words, where it has the very same number."""
     return {
-        "torque_bias": {"bias_nm": after.bias - before.bias},
+        "torque_bias": {"bias_nm": before.bias - after.bias},
         "gravity_error": {"error_share": after.gravity / before.gravity - 1.0 if before.gravity else 0.0},
         "inertia_error": {"error_share": after.link_inertia / before.link_inertia - 1.0},
         "torque_constant_error": {"error_share": after.gain - 1.0},
