@@ -13,6 +13,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.posterior import Draw, Posterior
+from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
 DRAWS = 400
@@ -23,6 +24,8 @@ ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
+TWO_SIDED = 1.96
+"""Sigmas of a 95 % interval."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
 
@@ -148,7 +151,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
                 min(SURE, chance),
                 math.sqrt(float(np.mean(shown[row] ** 2))),
                 float(leads[row]),
-                _values(name, channels),
+                _values(name, channels, math.hypot(FORM, rms(blurs[row]) / max(rms(table[row]), FORM * VISIBLE))),
                 _rivals(row, names, there, shown),
                 home.posterior.channel.name,
             )
@@ -173,8 +176,8 @@ def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> 
     return tuple(name for _, name in sorted(found, reverse=True)[:3])
 
 
-def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
-    """The effect's parameters over all draws that hold it."""
+def _values(effect: str, channels: Sequence[Sampled], form: float) -> dict[str, Value]:
+    """The effect's parameters over all draws that hold it; ``form`` is one-sigma of what forms do to them, relative."""
     told: dict[str, list[float]] = {}
     for k in range(DRAWS):
         for name, value in _of_draw(effect, channels, k).items():
@@ -182,7 +185,10 @@ def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
     result = {}
     for name, values in told.items():
         low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
-        result[name] = Value(float(middle), float(low), float(high))
+        own = TWO_SIDED * form * abs(middle)
+        result[name] = Value(
+            float(middle), float(middle - math.hypot(middle - low, own)), float(middle + math.hypot(high - middle, own))
+        )
     return result
 
 
