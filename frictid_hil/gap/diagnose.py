@@ -24,9 +24,10 @@ from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulat
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
+from frictid_hil.gap.position_noise import white_rms
 from frictid_hil.gap.posterior import Posterior
 from frictid_hil.gap.report_filter import as_meant
-from frictid_hil.gap.residuals import Recording, recordings, rms
+from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
 from frictid_hil.gap.verdict import FLOORS, Verdict, verdict
@@ -35,6 +36,8 @@ from frictid_hil.simulation.effects import all_effects
 
 NEGLIGIBLE = 0.05
 """Gap that means nothing in practice, over the friction level: friction repeats to about this from day to day."""
+LOUD = 3.0
+"""Gap of the closed loop over white noise, above which it is no noise: a slow part eight times as strong in power."""
 READ = 0.97
 """Chance of what is read from reported positions and velocities themselves."""
 TIED = 0.45
@@ -70,8 +73,9 @@ def diagnose(
     found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
     gaps = [closed(c, [f.effect for f in found if f.chance >= UNDECIDED]) for c in channels]
     runs = None if replay is None else replay({}, validation=_judged_role(logs))
-    quiet = _raw_quiet(channels, negligible) and _loop_quiet(gaps, runs)
-    said = verdict(found, channels, gaps, _negligible(nominal, channels, negligible), quiet)
+    nothing_nm = _negligible(nominal, channels, negligible)
+    quiet = _raw_quiet(channels, negligible) and _loop_quiet(gaps, runs, _white_nm(logs), nothing_nm)
+    said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
@@ -156,10 +160,22 @@ def _judged_role(logs: Sequence[Recording]) -> bool | None:
     return True if any(r.experiment.validation for r in logs) else None
 
 
-def _loop_quiet(gaps: Sequence[Closed], runs: Mapping[str, Replayed] | None) -> bool:
-    """Whether the joint simulated in closed loop shows no more than noise either; noise as the actuation shows it."""
+def _white_nm(logs: Sequence[Recording]) -> float:
+    """RMS that white noise of the reported torque leaves behind the low-pass, on the logs a gap is told of, N m."""
+    role = _judged_role(logs)
+    judged = [r for r in logs if role is None or r.experiment.validation]
+    gain = LowPass.at(1.0 / logs[0].step_s).white_gain
+    return gain * rms(np.array([white_rms(t) for r in judged if (t := r.experiment.torque_nm) is not None] or [0.0]))
+
+
+def _loop_quiet(
+    gaps: Sequence[Closed], runs: Mapping[str, Replayed] | None, white_nm: float, negligible_nm: float
+) -> bool:
+    """Whether the joint simulated in closed loop shows no more than noise either: as the actuation does, and white."""
     noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
-    return runs is None or noise is None or settled_nm(runs) <= FLOORS * noise
+    if runs is None or noise is None:
+        return True
+    return settled_nm(runs) <= min(FLOORS * noise, max(LOUD * white_nm, negligible_nm))
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -73,7 +74,8 @@ def verdict(
     unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
-    tiny = tiny and not any(_needed(f, channels) for f in named)
+    shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
+    tiny = tiny and not (shows and any(_needed(f, channels) for f in named))
     if tiny or (quiet and (nothing or generic_wins)):
         return Verdict("none", ())
     new = any(gap.appeared is not None for gap in gaps)
