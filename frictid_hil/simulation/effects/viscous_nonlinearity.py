@@ -40,6 +40,17 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
+def shapes(views: Sequence[View]) -> tuple[Shape, ...]:
+    """Bends to try; a straight line only where no rate is believed, as it is an error of the rate elsewhere."""
+    believed = any(np.any(v.rate_nm != 0.0) for v in views)
+    return BENDS if believed else (*BENDS, {"knee_rad_s": 0.2, "bend": 1.0})
+
+
+BENDS = grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 2.0, 3.0)) + grid(
+    knee_rad_s=(0.2, 0.6, 1.8), bend=(-3.0, -1.5)
+)
+
+
 # -- the effect ---------------------------------------------------------------------------------------------------
 
 
@@ -75,8 +86,8 @@ EFFECT = Effect(
     hooks=(Hook("rate", rate),),
     illustrate=illustrate,
     inverse=InverseForm(
-        shapes=grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 1.0, 2.0, 3.0))
-        + grid(knee_rad_s=(0.2, 0.6, 1.8), bend=(-3.0, -1.5)),
+        shapes=BENDS,
+        shapes_for=shapes,
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
     ),
