@@ -24,8 +24,6 @@ ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
-TWO_SIDED = 1.96
-"""Sigmas of a 95 % interval."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
 
@@ -151,7 +149,7 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
                 min(SURE, chance),
                 math.sqrt(float(np.mean(shown[row] ** 2))),
                 float(leads[row]),
-                _values(name, channels, math.hypot(FORM, rms(blurs[row]) / max(rms(table[row]), FORM * VISIBLE))),
+                _values(name, channels),
                 _rivals(row, names, there, shown),
                 home.posterior.channel.name,
             )
@@ -176,25 +174,41 @@ def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> 
     return tuple(name for _, name in sorted(found, reverse=True)[:3])
 
 
-def _values(effect: str, channels: Sequence[Sampled], form: float) -> dict[str, Value]:
-    """The effect's parameters over all draws that hold it; ``form`` is one-sigma of what forms do to them, relative."""
-    told: dict[str, list[float]] = {}
-    for k in range(DRAWS):
+def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
+    """The effect's parameters over all draws that hold it, its interval with what forms may have put on them."""
+    told: dict[str, list[tuple[float, float]]] = {}
+    for k, lent in enumerate(_lent(effect, channels)):
         for name, value in _of_draw(effect, channels, k).items():
-            told.setdefault(name, []).append(value)
+            told.setdefault(name, []).append((value, lent * value))
     result = {}
-    for name, values in told.items():
-        low, middle, high = np.quantile(values, [0.025, 0.5, 0.975])
-        own = TWO_SIDED * form * abs(middle)
-        result[name] = Value(
-            float(middle), float(middle - math.hypot(middle - low, own)), float(middle + math.hypot(high - middle, own))
-        )
+    for name, pairs in told.items():
+        plain, widened = np.array(pairs).T
+        low, high = np.quantile(widened, [0.025, 0.975])
+        result[name] = Value(float(np.median(plain)), float(low), float(high))
     return result
+
+
+def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
+    """Factors by which a cause's numbers may be off because no joint is quite as its formula, one a draw, (draws,)."""
+    size = rms(_joined([c.sizes.get(effect, np.zeros(DRAWS)) for c in channels]))
+    blur = rms(_joined([c.blurs.get(effect, np.zeros(DRAWS)) for c in channels]))
+    spread = math.hypot(FORM, blur / max(size, FORM * VISIBLE))
+    normal = special.ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
+    factors: Array = 1.0 + spread * np.random.default_rng(0).permutation(normal)
+    return factors
 
 
 def whole_draws(effects: Sequence[str], channels: Sequence[Sampled]) -> tuple[dict[str, dict[str, float]], ...]:
     """The parameters of some effects in every draw, an effect only where the draw holds it: what belongs together."""
-    return tuple({e: told for e in effects if (told := _of_draw(e, channels, k))} for k in range(DRAWS))
+    lent = {effect: _lent(effect, channels) for effect in effects}
+    return tuple(
+        {
+            effect: {name: float(lent[effect][k]) * value for name, value in told.items()}
+            for effect in effects
+            if (told := _of_draw(effect, channels, k))
+        }
+        for k in range(DRAWS)
+    )
 
 
 def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, float]:

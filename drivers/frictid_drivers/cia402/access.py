@@ -131,7 +131,7 @@ class Drive(ABC):
                 f"the drive has no {item.name}",
                 where=self.where(item.address),
                 cause="another drive than expected, or another firmware",
-                next_step="compare the drive's EDS with docs/guides/connect-a-drive.md",
+                next_step="compare the drive's EDS with docs/reference/canopen-settings.md",
             )
         return value
 
