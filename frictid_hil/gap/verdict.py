@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
 UNNAMED = 0.25
 """Size of what has no name over that of all causes, from which on their names do not tell the gap: 6 % of its power."""
+DOUBTED = 0.8
+"""Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
 HELPS = 0.98
 """Gap of the validation logs with the causes over that without, above which they explain nothing there."""
 READ_DIRECTLY = "kinematics"
@@ -79,6 +81,8 @@ def verdict(
     if tiny or (quiet and (nothing or generic_wins)):
         return Verdict("none", ())
     new = any(gap.appeared is not None for gap in gaps)
+    if unnamed and not any(_stays(gap) for gap in gaps):
+        unnamed, named = False, tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     if nothing or unnamed or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
     first = named[0]
@@ -99,6 +103,12 @@ def _unnamed(loud: Sequence[Sampled]) -> bool:
     """Whether what has no name is a fair part of what channels with a gap hold."""
     generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
     return float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
+
+
+def _stays(gap: Closed) -> bool:
+    """Whether the named causes leave as much of a channel's visible gap as what has no name may make."""
+    visible = max(0.0, gap.before**2 - gap.floor**2)
+    return gap.before > FLOORS * gap.floor and gap.after**2 - gap.floor**2 > UNNAMED**2 * visible
 
 
 def _faint(channel: Sampled, gap: Closed) -> bool:
