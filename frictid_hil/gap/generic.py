@@ -47,27 +47,59 @@ REACHES = (0.1, 0.25, 0.5)
 def families(views: Sequence[View]) -> dict[str, list[Array]]:
     """Columns of every family, per view of shape (n, k)."""
     every = np.concatenate([v.position_rad for v in views])
-    low, high = np.quantile(every, [0.001, 0.999])
-    centres = np.linspace(low, high, 7)
+    low, high = (float(end) for end in np.quantile(every, [0.001, 0.999]))
+    return {
+        START: [_start(v) for v in views],
+        **_of_position(views, low, high),
+        **_of_velocity(views),
+        **_of_time(views),
+        "acceleration": [_accelerated(v) for v in views],
+        "torque": _of_torque(views),
+        "travel": [_since_reversal(v, high - low) for v in views],
+    }
+
+
+def _start(v: View) -> Array:
+    way, rest = since_start(v.position_rad, v.step_s, 2.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
+    fading = v.slip[:, None] * np.exp(-way[:, None] / np.array(WAYS_RAD))
+    return np.concatenate([fading, fading * np.log1p(rest / REST_S)[:, None]], axis=1)
+
+
+def _of_position(views: Sequence[View], low_rad: float, high_rad: float) -> dict[str, list[Array]]:
+    centres = np.linspace(low_rad, high_rad, 7)
     width = max(float(centres[1] - centres[0]), 1e-9)
+    bumps = [np.exp(-0.5 * ((v.position_rad[:, None] - centres) / width) ** 2) for v in views]
+    return {
+        "position": bumps,
+        "position friction": [bump * v.slip[:, None] for bump, v in zip(bumps, views, strict=True)],
+        "position viscous": [bump * v.velocity_rad_s[:, None] for bump, v in zip(bumps, views, strict=True)],
+    }
+
+
+def _of_velocity(views: Sequence[View]) -> dict[str, list[Array]]:
     top = max(float(np.quantile(np.abs(v.velocity_rad_s), 0.99)) for v in views)
     knots = max(top, 1e-9) * np.array([0.01, 0.03, 0.08, 0.2, 0.45, 0.8])
+
+    def hats(v: View) -> Array:
+        return np.stack([np.interp(np.abs(v.velocity_rad_s), knots, row) for row in np.eye(knots.size)], axis=1)
+
+    return {
+        "velocity": [hats(v) * v.slip[:, None] for v in views],
+        "velocity and direction": [hats(v) * np.abs(v.slip)[:, None] for v in views],
+        "lagged motion": [_late(v) for v in views],
+    }
+
+
+def _late(v: View) -> Array:
+    columns = []
+    for lag_s in (0.01, 0.03, 0.08):
+        columns.append(lagged(v.slip, v.step_s, lag_s) - v.slip)
+        columns.append(lagged(v.velocity_rad_s, v.step_s, lag_s) - v.velocity_rad_s)
+    return np.stack(columns, axis=1)
+
+
+def _of_time(views: Sequence[View]) -> dict[str, list[Array]]:
     span_s = max(v.start_s + v.slip.size * v.step_s for v in views)
-
-    def place(v: View) -> Array:
-        bumps: Array = np.exp(-0.5 * ((v.position_rad[:, None] - centres) / width) ** 2)
-        return bumps
-
-    def speed(v: View) -> Array:
-        hats: Array = np.stack([np.interp(np.abs(v.velocity_rad_s), knots, row) for row in np.eye(knots.size)], axis=1)
-        return hats
-
-    def late(v: View) -> Array:
-        columns = []
-        for lag_s in (0.01, 0.03, 0.08):
-            columns.append(lagged(v.slip, v.step_s, lag_s) - v.slip)
-            columns.append(lagged(v.velocity_rad_s, v.step_s, lag_s) - v.velocity_rad_s)
-        return np.stack(columns, axis=1)
 
     def session(v: View) -> Array:
         t = (v.start_s + v.step_s * np.arange(v.slip.size)) / span_s
@@ -78,38 +110,22 @@ def families(views: Sequence[View]) -> dict[str, list[Array]]:
         quick, slow = np.exp(-t / 2.0), np.exp(-t / 8.0)
         return np.stack([quick, quick * v.slip, slow, slow * v.slip], axis=1)
 
-    def accelerated(v: View) -> Array:
-        a = lagged(v.acceleration_rad_s2, v.step_s, 0.01)
-        return np.stack([np.abs(a), np.abs(a) * v.slip, a * np.abs(a), a * np.abs(v.velocity_rad_s)], axis=1)
+    return {"time": [session(v) for v in views], "time in a log": [within(v) for v in views]}
 
+
+def _accelerated(v: View) -> Array:
+    a = lagged(v.acceleration_rad_s2, v.step_s, 0.01)
+    return np.stack([np.abs(a), np.abs(a) * v.slip, a * np.abs(a), a * np.abs(v.velocity_rad_s)], axis=1)
+
+
+def _of_torque(views: Sequence[View]) -> list[Array]:
     top_nm = max(float(np.quantile(np.abs(v.torque_nm), 0.99)) for v in views)
+    shares = [v.torque_nm / max(top_nm, 1e-12) for v in views]
+    return [np.stack([t * np.abs(t), t**3], axis=1) for t in shares]
 
-    def gain(v: View) -> Array:
-        t = v.torque_nm / max(top_nm, 1e-12)
-        return np.stack([t * np.abs(t), t**3], axis=1)
 
-    def since_reversal(v: View) -> Array:
-        return np.stack([slip_state(v.position_rad, 1.0 / max(r * (high - low), 1e-9)) for r in REACHES], axis=1)
-
-    def start(v: View) -> Array:
-        way, rest = since_start(v.position_rad, v.step_s, 2.0 * v.coulomb_nm / v.stiffness_nm_per_rad)
-        fading = v.slip[:, None] * np.exp(-way[:, None] / np.array(WAYS_RAD))
-        return np.concatenate([fading, fading * np.log1p(rest / REST_S)[:, None]], axis=1)
-
-    return {
-        START: [start(v) for v in views],
-        "position": [place(v) for v in views],
-        "position friction": [place(v) * v.slip[:, None] for v in views],
-        "position viscous": [place(v) * v.velocity_rad_s[:, None] for v in views],
-        "velocity": [speed(v) * v.slip[:, None] for v in views],
-        "velocity and direction": [speed(v) * np.abs(v.slip)[:, None] for v in views],
-        "lagged motion": [late(v) for v in views],
-        "time": [session(v) for v in views],
-        "time in a log": [within(v) for v in views],
-        "acceleration": [accelerated(v) for v in views],
-        "torque": [gain(v) for v in views],
-        "travel": [since_reversal(v) for v in views],
-    }
+def _since_reversal(v: View, travel_rad: float) -> Array:
+    return np.stack([slip_state(v.position_rad, 1.0 / max(r * travel_rad, 1e-9)) for r in REACHES], axis=1)
 
 
 @njit(cache=True)
