@@ -216,6 +216,8 @@ def draft(
         for name, found in result["draft"]["numbers"].items():
             table.add_row(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}")
         output.out.print(table)
+        for warning in result["draft"]["warnings"]:
+            output.out.print(f"warning: {warning}", soft_wrap=True, markup=False)
         output.out.print(f"nominal: {result['nominal']}", soft_wrap=True, markup=False)
 
     output.run("gap_draft", lambda: job(Source(logs, columns, joint=joint), out, force=force), show)

@@ -130,6 +130,17 @@ def test_a_draft_finds_the_joint_and_says_how_sure_it_is(tmp_path: Path) -> None
     assert set_from_logs(logs, nominal=out).nominal.tolerances.inertia_kg_m2.source == "stated"
 
 
+def test_a_draft_says_which_number_no_joint_has(tmp_path: Path) -> None:
+    log = _log(tmp_path / "odd.csv")
+    table = np.loadtxt(log, delimiter=",", skiprows=1)
+    table[:, 2] -= 2.0 * COULOMB * np.tanh(np.gradient(table[:, 1], STEP_S) / 1e-3)
+    np.savetxt(log, table, delimiter=",", header="time_s,position_rad,torque_nm", comments="")
+    told = draft(Source([log]), tmp_path / "n.yaml")
+    assert [line.split()[0] for line in told["draft"]["warnings"]] == ["coulomb_nm"]
+    assert set_from_logs([log], nominal=tmp_path / "n.yaml").nominal.curve is not None
+    assert draft(Source([_log(tmp_path / "fine.csv")]), tmp_path / "m.yaml")["draft"]["warnings"] == []
+
+
 def test_a_draft_is_not_written_over_a_file_unless_told(tmp_path: Path) -> None:
     log, out = _log(tmp_path / "a.csv"), tmp_path / "nominal.yaml"
     out.write_text("mine")

@@ -134,8 +134,19 @@ def _document(
             },
             "torque_rms_nm": _rounded(float(np.sqrt(np.mean(torque**2)))),
             "left_rms_nm": _rounded(left),
+            "warnings": _impossible(weights, sigma, () if rigid else (_INERTIA,)),
         },
     }
+
+
+def _impossible(weights: Array, sigma: Array, rigid: Sequence[int]) -> list[str]:
+    """A line for each number that came out below zero; the draft holds 0 in its place."""
+    return [
+        f"{_NAMES[k]} came out as {weights[k]:.3g}, which no joint has, and is taken as 0: these recordings do not "
+        "tell it from the rest; add one that reverses at several speeds, or write the number yourself"
+        for k in (*rigid, _COULOMB, _VISCOUS)
+        if np.isfinite(sigma[k]) and weights[k] < 0.0
+    ]
 
 
 def _share(sigma: float, value: float) -> float:
