@@ -20,6 +20,8 @@ from frictid_hil.gap.blind.outsiders import OUTSIDERS
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
 
+pytestmark = pytest.mark.slow
+
 PRACTICE = Path(
     os.environ.get("FRICTID_PRACTICE_DATA", Path(__file__).resolve().parents[3] / "shared" / "data" / "gap-practice")
 )

@@ -22,6 +22,8 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.recording.read import read
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = [DOCS / "index.md", *sorted((DOCS / "guides").glob("*.md"))]
 

@@ -17,6 +17,8 @@ import frictid_hil
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[2] / "docs" / "troubleshooting.md"
 
 

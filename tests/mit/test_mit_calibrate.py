@@ -20,6 +20,8 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.steady import true_curve_nm
 
+pytestmark = pytest.mark.slow
+
 COULOMB_NM = 0.24
 
 

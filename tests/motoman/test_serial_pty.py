@@ -25,6 +25,8 @@ from frictid_hil.plan.plan import Hold, JointPlan, Sine
 from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.recording.mcap_reader import read_mcap
 
+pytestmark = pytest.mark.slow
+
 SERVE = """
 import sys
 from pathlib import Path
