@@ -238,14 +238,12 @@ def fleet(
     quiet: QuietOption = False,
 ) -> None:
     """Tell what varies between robots of one kind from what is not known of them."""
-    from rich.table import Table
-
     from frictid_hil.jobs.gap_fleet import fleet as job
 
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        table = Table("joint", "number", "mean", "not known", "varies between robots")
+        table = folding("joint", "number", "mean", "not known", "varies between robots")
         for name, effects in result["joints"].items():
             for effect, numbers in effects.items():
                 for number, told in numbers.items():

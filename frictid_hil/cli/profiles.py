@@ -14,6 +14,7 @@ from frictid_hil.cli.tables import folding
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
+RobotArgument = Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.", autocompletion=robots)]
 RobotName = Annotated[
     str | None,
     typer.Option(
@@ -184,14 +185,7 @@ def promote(
 
 @app.command("rollback")
 def rollback(
-    robot: Annotated[
-        str,
-        typer.Argument(
-            metavar="ROBOT",
-            help="Name of the robot.",
-            autocompletion=robots,
-        ),
-    ],
+    robot: RobotArgument,
     reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
     store: StoreOption = None,
     as_json: JsonOption = False,
@@ -210,14 +204,7 @@ def rollback(
 
 @app.command("history")
 def history(
-    robot: Annotated[
-        str,
-        typer.Argument(
-            metavar="ROBOT",
-            help="Name of the robot.",
-            autocompletion=robots,
-        ),
-    ],
+    robot: RobotArgument,
     last: Annotated[
         int | None,
         typer.Option(

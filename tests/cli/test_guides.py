@@ -86,10 +86,19 @@ def test_every_command_of_a_page_is_one(page: Path) -> None:
             assert shortened, f"{command}: {message}"
 
 
-def test_a_command_that_is_none_would_be_noticed() -> None:
-    for wrong in ("calibrate --robbot hp3j.yaml", "profile shwo x", "calibrate --amplitude 20", "identify"):
-        with pytest.raises(Exception):  # noqa: B017  # typer's usage errors have no public name
-            understood(wrong)
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ("calibrate --robbot hp3j.yaml", "No such option: --robbot"),
+        ("profile shwo x", "no verb shwo"),
+        ("calibrate --amplitude 20", "'20' has no unit"),
+        ("identify", "Missing parameter"),
+    ],
+)
+def test_a_command_that_is_none_would_be_noticed(wrong: str, why: str) -> None:
+    # Typer's usage errors have no public name; their words tell them apart.
+    with pytest.raises(Exception, match=why):
+        understood(wrong)
 
 
 # -- what a reader has ---------------------------------------------------------------------------------------------

@@ -39,7 +39,8 @@ def sweeps() -> tuple[Array, Array, Array]:
     acceleration = np.array(steps)
     velocity = np.cumsum(acceleration) * 1e-3
     every = round(PERIOD_S / 1e-3)
-    return tuple(values[::every] for values in (np.cumsum(velocity) * 1e-3, velocity, acceleration))  # type: ignore[return-value]
+    position = np.cumsum(velocity) * 1e-3
+    return position[::every], velocity[::every], acceleration[::every]
 
 
 def bag(path: Path) -> Path:
