@@ -1,11 +1,10 @@
-"""``frictid-hil emulate``: emulates a controller, with the robot's simulated joints behind it."""
+"""``frictid-hil emulate``: emulates a controller or drives, with the robot's simulated joints behind them."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import entry_points
-from pathlib import Path
 from types import FrameType
 
 from frictid_hil.config.robot import load_robot
@@ -19,27 +18,28 @@ def emulate(
     *,
     announce: Callable[[str], None],
     robot_name: str,
-    link: Path | None = None,
-    faults: Sequence[str] = (),
+    bus: str | None = None,
+    **settings: object,
 ) -> None:
     """Serve until Ctrl-C or SIGTERM.
 
     Args:
-        kind: name of an installed emulator (``motoman``).
-        announce: told the port once it can be opened.
+        kind: name of an installed emulator (``motoman``, ``cia402``).
+        announce: told the port or bus once it can be opened.
         robot_name: robot file.
-        link: name for the port, under which it also comes back after a fault.
-        faults: what shall go wrong, in the emulator's words.
+        bus: ``interface:channel`` instead of the file's own.
+        settings: what else this emulator takes.
 
     Raises:
-        UsageError: no such emulator, a link that cannot be, or a fault that is none.
+        UsageError: no such emulator, or settings that it cannot take.
+        HardwareError: the bus cannot be opened.
         ConfigError: the robot file is wrong.
     """
     installed = {point.name: point for point in entry_points(group=_GROUP)}
     if kind not in installed:
         raise UsageError(f"no emulator named {kind!r}; installed: {', '.join(sorted(installed)) or 'none'}")
     robot = load_robot(robot_name)
-    setup = robot.to_setup()
+    setup = robot.to_setup(bus)
     serve = installed[kind].load()
     stopping = False
 
@@ -50,7 +50,7 @@ def emulate(
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with robot.document.locating():
-            serve(setup, announce=announce, link=link, faults=faults, stop=lambda: stopping)
+            serve(setup, announce=announce, stop=lambda: stopping, **settings)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

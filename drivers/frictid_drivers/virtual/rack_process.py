@@ -81,7 +81,7 @@ class SyncTime:
 
 
 class Wire(Protocol):
-    """What the drives need of the bus between processes: a ``Hub``."""
+    """What the drives need of the bus between processes: a ``Hub``, or a ``BusWire``."""
 
     heard: Callable[[int, bytes, int], None]
 
@@ -100,6 +100,24 @@ class Wire(Protocol):
 
     def serve(self) -> None:
         """All that has arrived."""
+        ...
+
+
+class WhoAsks(Protocol):
+    """For whom the drives are here: an ``Owner``, or whoever started ``emulate``."""
+
+    @property
+    def dismissed(self) -> bool:
+        """The drives are no longer needed."""
+        ...
+
+    @property
+    def gone(self) -> bool:
+        """It ended without saying so."""
+        ...
+
+    def listen(self) -> None:
+        """Look whether there is word of it."""
         ...
 
 
@@ -134,7 +152,7 @@ class RackProcess:
         self._drives.advance(self._time.time_ns(wall_ns))
         return wall_ns
 
-    def run(self, owner: Owner) -> None:
+    def run(self, owner: WhoAsks) -> None:
         """Serve until the owner says so, or is gone and the robot stands still."""
         self._drives.power_on()
         leave_in_fault(self._rack, self._faults)
@@ -196,6 +214,14 @@ class Owner:
         self.gone = self.gone or os.getppid() != self._pid
 
 
+def be_punctual() -> None:
+    """Real-time scheduling where it is permitted, and no collection of what is there by now."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+    gc.collect()
+    gc.freeze()
+
+
 def main() -> int:
     """Entry of the process."""
     # Ctrl-C is for the owner, who then dismisses us.
@@ -211,10 +237,7 @@ def main() -> int:
         print(f"failed: {error}", flush=True)
         return 1
     rack.warm_up()
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
-    gc.collect()
-    gc.freeze()
+    be_punctual()
     process = RackProcess(rack, hub, faults)
     print(READY, flush=True)
     try:
