@@ -65,8 +65,8 @@ def test_a_bus_that_is_down_loses_frames_and_no_more():
 
 
 def test_kinds_of_frames_are_kept():
-    settings = {"interface": "virtual", "channel": "kinds", "protocol": can.CanProtocol.CAN_FD}
-    with can.Bus(**settings) as bus, can.Bus(**settings) as other:
+    bus, other = (can.Bus("kinds", interface="virtual", protocol=can.CanProtocol.CAN_FD) for _ in range(2))
+    with bus, other:
         wire, heard = on_a_bus.BusWire(bus), []
         wire.heard = lambda can_id, data, stamp_ns: heard.append((can_id, data))
         wire.send(0x181 | FD_FRAME, bytes(12))
