@@ -1,14 +1,17 @@
-"""Every fault at every phase of a run, judged by the simulated servos' own state and the withheld truth.
+"""Every fault at every phase of every verb that moves, judged by the simulated drives' own state and withheld truth.
 
-    python benchmarks/faults.py [--seeds 1] [--only lag] [--verbs calibrate] [--kept FILE] [--docs PAGE]
+    python benchmarks/faults.py [--runs 2000] [--seed 1] [--only lag] [--verbs calibrate] [--kept FILE] [--docs PAGE]
 
-Two joints of the shipped robot, lock-step, one process; about four seconds a run. A clean run first tells when each
-phase is; then each fault strikes once in each, at a moment drawn by its seed. The host's word counts for nothing:
+Two joints, lock-step, one process, about a second a run. A clean run of each verb first tells when each phase is; then
+faults strike, each at a moment and a cycle rate drawn by its seed. ``--runs`` draws so many from all, evenly over the
+verbs; without it each fault strikes once in each phase. The host's word counts for nothing:
 
-* **at rest, without power**: after the run, and a second in which nobody talks to them, the servos stand and have no
-  power; and they did so in time after the host's stop, or after the drive's own watchdog;
-* **everything kept**: every row that the loop recorded is in the run's recording, and it can be read;
-* **no wrong curve called ok**: no joint with outcome ok has a curve more than its interval and 2 % off the truth;
+* **at rest, without power**: after the run, and a second in which nobody talks to them, the drives stand and have no
+  power; they did so in time after the host's stop; and no joint ever left its limits or passed its highest speed;
+* **everything kept**: every row that the loop recorded is in the run's recording, and it can be read; so can every
+  profile that was in the store before;
+* **no wrong curve called ok**: no joint with outcome ok, and no profile that was promoted, has a curve more than its
+  interval and 2 % off the truth;
 * and no defect of the program: every ending is one of our errors, with a next step.
 """
 
@@ -18,6 +21,7 @@ import argparse
 import contextlib
 import json
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -26,24 +30,32 @@ import traceback
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.virtual import VirtualDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
-from frictid_drivers.virtual.rack import Rack
+from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.errors import Defect, FrictidError, UsageError
+from frictid_hil.errors import Defect, FrictidError
+from frictid_hil.gap.experiments import plan_document
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.check import check
 from frictid_hil.jobs.compare import true_curve
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
 from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.jobs.gap_record import GapRecordOptions, record
+from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
+from frictid_hil.jobs.reset import reset
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
+from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap_reader import read_rows
 from frictid_hil.runner.events import Event, PhaseStarted, Preflight
 from frictid_hil.runner.ring import Ring, sample_ring
@@ -51,20 +63,39 @@ from frictid_hil.runs import run as run_module
 
 Draw = Callable[[np.random.Generator], dict[str, Any]]
 
+NAME = "faulty-bench"
 JOINT, OTHER = "3", "4"
-ROBOT = """\
-schema: frictid.robot/1
+ROBOTS = {
+    "two joints": """\
 extends: hp3j.yaml
-name: faulty-bench
-bus: virtual:faulty-bench-{pid}
-joints: {{"0": null, "1": null, "2": null, "5": null}}
-"""
+joints: {"0": null, "1": null, "2": null, "5": null}
+""",
+    "one joint": """\
+extends: hp3j.yaml
+joints: {"0": null, "1": null, "2": null, "4": null, "5": null}
+procedure: {cycles: 3}
+policy: {warm_up: {fixed_s: 0}}
+""",
+}
+VERBS = {
+    "calibrate": "two joints",
+    "together": "two joints",
+    "compensate": "two joints",
+    "recalibrate": "one joint",
+    "gap record": "one joint",
+    "check": "two joints",
+    "reset": "two joints",
+}
+"""What is run, and on which robot."""
+STILL = ("check", "reset")
+"""Verbs without power."""
+RATES_HZ = (250.0, 250.0, 250.0, 250.0, 500.0, 500.0, 1000.0)
+"""Drawn from: most runs are slow, and therefore cheap."""
 REST_S, OFF_S, OFF_MPS = 0.5, 2.6, 0.02
 """Longest from the host's stop to rest and to the end of power (docs/reference/stops.md), and what counts as rest."""
 SILENT_S = 1.0
 """Nobody talks to the drives for so long: their own watchdogs have had their say."""
 MARGIN = 0.02
-PHASES = ("preflight", "configure", "enable", "rehearsal", "move", "cycles", "drift", "reversal", "return")
 BEFORE_SYNC = ("preflight", "configure")
 HANGS_S = 240
 
@@ -172,11 +203,21 @@ class Case:
     name: str
     seed: int
 
+    def drawn(self) -> np.random.Generator:
+        """The dice of this injection."""
+        return np.random.default_rng(zlib.crc32(f"{self.verb}/{self.phase}/{self.name}/{self.seed}".encode()))
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the cycles, drawn."""
+        return float(self.drawn().choice(RATES_HZ))
+
     def row(self, phases: Mapping[str, Phase]) -> dict[str, Any]:
         """The fault as a robot file would list it."""
-        words = f"{self.verb}/{self.phase}/{self.name}/{self.seed}"
-        rng = np.random.default_rng(zlib.crc32(words.encode()))
+        rng = self.drawn()
         row = (SDO if self.phase in BEFORE_SYNC else IN_MOTION)[self.name](rng)
+        if "joint" in row and VERBS[self.verb] == "one joint":
+            row["joint"] = JOINT
         phase = phases[self.phase]
         if self.phase not in BEFORE_SYNC:
             return {**row, "at_s": round(float(rng.uniform(phase.start_s, phase.end_s)), 4)}
@@ -214,17 +255,31 @@ class Verdict:
     took_s: float = 0.0
 
 
+@dataclass(frozen=True)
+class Axle:
+    """A simulated joint as it really is."""
+
+    name: str
+    powered: Callable[[], bool]
+    position_rad: Callable[[], float]
+    velocity_rad_s: Callable[[], float]
+    within_rad: tuple[float, float]
+    fastest_rad_s: float
+
+
 class Watched(Silent):
-    """Follows a run from behind: the servos' own state at every step of their time, and the phases."""
+    """Follows a run from behind: the drives' own state at every step of their time, and the phases."""
 
     def __init__(self) -> None:
-        self.rack = Rack()
+        self.rack: Any = None
+        self.axles: list[Axle] = []
         self.rings: list[Ring] = []
         self.phases: dict[str, Phase] = {}
         self.stop_ns: int | None = None
         self.moved_ns = self.powered_ns = 0
         self.origin_ns: int | None = None
         self.answers = 0
+        self.beyond: dict[str, str] = {}
         self._phase = "preflight"
         self.phases["preflight"] = Phase(0.0)
 
@@ -238,9 +293,10 @@ class Watched(Silent):
         return True
 
     def _begin(self, name: str) -> None:
+        now_ns = 0 if self.rack is None else self.rack.now_ns
         if self.origin_ns is None and name != "configure":
-            self.origin_ns = self.rack.now_ns
-        now_s = (self.rack.now_ns - (self.rack.now_ns if self.origin_ns is None else self.origin_ns)) * 1e-9
+            self.origin_ns = now_ns
+        now_s = (now_ns - (now_ns if self.origin_ns is None else self.origin_ns)) * 1e-9
         last = self.phases[self._phase]
         last.end_s, last.last_sdo = now_s, self.answers
         self._phase = name if name not in self.phases else f"{name} again"
@@ -252,16 +308,15 @@ class Watched(Silent):
 
     @contextlib.contextmanager
     def watching(self) -> Iterator[None]:
-        """Hooks where the servos' time goes on, where rows are kept, and where the host stops."""
+        """Hooks where the drives' time goes on, where rows are kept, and where the host stops."""
         opened, stopped = VirtualDriver.open, Cia402Driver.quick_stop
 
         def open_(driver: VirtualDriver, sink: Any = None) -> None:
-            self._follow(driver._rack)
+            self._follow_can(driver)
             opened(driver, sink)
 
         def stop(driver: Cia402Driver) -> None:
-            if self.stop_ns is None and any(servo.axis.powered for servo in self.rack.servos.values()):
-                self.stop_ns = self.rack.now_ns
+            self._stopped()
             stopped(driver)
 
         def ring(**how: Any) -> Ring:
@@ -278,45 +333,82 @@ class Watched(Silent):
             for owner, name, value in before:
                 setattr(owner, name, value)
 
-    def _follow(self, rack: Rack) -> None:
-        self.rack, self.stop_ns, advance, send = rack, None, rack.advance, rack.send
+    def _stopped(self) -> None:
+        if self.stop_ns is None and any(axle.powered() for axle in self.axles):
+            self.stop_ns = self.rack.now_ns
 
-        def advanced(to_ns: int) -> None:
-            advance(to_ns)
-            for servo in rack.servos.values():
-                if servo.axis.powered:
-                    self.powered_ns = rack.now_ns
-                    if abs(servo.axis._plant.velocity_rad_s) > OFF_MPS:
-                        self.moved_ns = rack.now_ns
+    def _follow_can(self, driver: VirtualDriver) -> None:
+        rack: Any = driver._rack
+        send, joints = rack.send, driver._setup.joints
 
         def counted(can_id: int, data: bytes) -> None:
             self.answers += can_id & 0x780 == 0x580
             send(can_id, data)
 
-        hooked: Any = rack
-        hooked.advance, hooked.send = advanced, counted
+        def axles() -> list[Axle]:
+            return [
+                Axle(
+                    joint.name,
+                    lambda axis=rack.servos[joint.name].axis: axis.powered,
+                    lambda plant=rack.servos[joint.name].axis._plant: plant.position_rad,
+                    lambda plant=rack.servos[joint.name].axis._plant: plant.velocity_rad_s,
+                    (joint.position_min_rad, joint.position_max_rad),
+                    joint.max_velocity_rad_s,
+                )
+                for joint in joints
+            ]
+
+        rack.send = counted
+        self._follow(rack, axles)
+
+    def _follow(self, rack: Any, axles: Callable[[], list[Axle]]) -> None:
+        self.rack, self.stop_ns, self.axles, advance = rack, None, [], rack.advance
+
+        def advanced(to_ns: int) -> None:
+            advance(to_ns)
+            if not self.axles:
+                self.axles = axles()
+            for axle in self.axles:
+                if axle.powered():
+                    self.powered_ns = rack.now_ns
+                    self._look(axle)
+
+        rack.advance = advanced
+
+    def _look(self, axle: Axle) -> None:
+        speed = abs(axle.velocity_rad_s())
+        if speed > OFF_MPS:
+            self.moved_ns = self.rack.now_ns
+            low, high = axle.within_rad
+            if not low <= axle.position_rad() <= high:
+                self.beyond.setdefault("limits", f"joint {axle.name} left its limits")
+            if speed > axle.fastest_rad_s:
+                self.beyond["speed"] = f"joint {axle.name} passed its highest speed"
 
 
 class Bench:
-    """The robot, its truth, a profile to compensate with, and the phases of clean runs."""
+    """Robots, their truth, a profile to compensate with, a store, and the phases of clean runs."""
 
     def __init__(self, folder: Path) -> None:
         os.environ["XDG_CONFIG_HOME"] = os.environ["XDG_DATA_HOME"] = str(folder / "home")
         os.environ["XDG_STATE_HOME"] = str(folder / "home")
         self.folder = folder
-        self.file = folder / "faulty-bench.yaml"
-        self.file.write_text(ROBOT.format(pid=os.getpid()))
-        self.robot: Robot = load_robot(str(self.file))
         self.clean: dict[str, dict[str, Phase]] = {}
+        self._store: Path | None = None
         self._profile: Path | None = None
+        self.file, self.robot = cache(self._file), cache(lambda kind: load_robot(str(self.file(kind, 250.0))))
+
+    def _file(self, kind: str, rate_hz: float) -> Path:
+        path = self.folder / f"{kind.replace(' ', '-')}-{rate_hz:g}.yaml"
+        head = f"schema: frictid.robot/1\nname: {NAME}\nbus: virtual:{NAME}-{os.getpid()}\ncycle_hz: {rate_hz:g}\n"
+        path.write_text(head + ROBOTS[kind])
+        return path
 
     def phases(self, verb: str) -> dict[str, Phase]:
         """Of a clean run of a verb."""
         if verb not in self.clean:
-            if verb == "compensate":
-                self._calibrated()
             watched, verdict = Watched(), Verdict(verb, "clean", "nothing", 0)
-            self.run(watched, verdict, [])
+            self._run(watched, verdict, [], 250.0)
             if verdict.failures or verdict.exit_code:
                 raise SystemExit(f"the clean {verb} fails: {verdict.failures} {verdict.said}")
             self.clean[verb] = watched.phases
@@ -325,23 +417,23 @@ class Bench:
     def struck(self, case: Case) -> Verdict:
         """One injection and its verdict."""
         verdict = Verdict(**asdict(case))
-        self.run(Watched(), verdict, [case.row(self.phases(case.verb))])
+        faults = [case.row(self.phases(case.verb))]
+        if case.verb == "reset":
+            faults.append({"kind": "left_in_fault", "joint": JOINT})
+        self._run(Watched(), verdict, faults, case.rate_hz)
         return verdict
 
-    def run(self, watched: Watched, verdict: Verdict, faults: Sequence[Mapping[str, Any]]) -> None:
+    def _run(self, watched: Watched, verdict: Verdict, faults: Sequence[Mapping[str, Any]], rate_hz: float) -> None:
         """One run of a verb with these faults, judged."""
-        began = time.monotonic()
-        os.environ[ENVIRONMENT] = json.dumps(faults)
-        joints: dict[str, Any] = {}
+        file, began = self.file(VERBS[verdict.verb], rate_hz), time.monotonic()
         with tempfile.TemporaryDirectory(dir=self.folder) as folder:
-            out = Path(folder) / "run"
+            verb = _Verb(self, verdict, watched, file, Path(folder))
+            os.environ[ENVIRONMENT] = json.dumps(faults)
             signal.signal(signal.SIGALRM, _hangs)
             signal.alarm(HANGS_S)
             try:
-                with watched.watching():
-                    joints = self._verb(verdict, watched, out)
-            except UsageError as error:
-                _ended(verdict, error)
+                with contextlib.chdir(folder), watched.watching():
+                    verb.run()
             except FrictidError as error:
                 _ended(verdict, error)
             except TimeoutError:
@@ -352,78 +444,101 @@ class Bench:
             finally:
                 signal.alarm(0)
             watched.finish()
-            self._judge_servos(watched, verdict)
-            _judge_recording(watched, verdict, out)
-        if verdict.verb != "compensate":
-            self._judge_curves(joints, verdict)
+            _judge_drives(watched, verdict)
+            if verdict.verb not in STILL:
+                _judge_recording(watched, verdict, Path(folder))
+            if verdict.verb == "recalibrate":
+                _judge_store(ProfileStore(verb.store), verdict, self.robot(VERBS[verdict.verb]))
+            _judge_curves(verb.joints, verdict, self.robot(VERBS[verdict.verb]))
         verdict.took_s = round(time.monotonic() - began, 1)
 
-    def _verb(self, verdict: Verdict, watched: Watched, out: Path) -> dict[str, Any]:
-        if verdict.verb == "compensate":
-            profile = self._calibrated()
-            asked = CompensateOptions(
-                str(self.file), profile, JOINT, Wanted("track", ("nc", "mo"), duration_s=2.0), out=out
-            )
-            ended = compensate(asked, watched).ended
-            _ended(verdict, ended.error)
-            return {}
-        together = verdict.verb == "together"
-        options = CalibrateOptions(
-            str(self.file),
-            joints=(JOINT, OTHER) if together else (JOINT,),
-            program="quick",
-            together=together,
-            rate_hz=500.0 if together else None,
-            out=out,
-        )
-        result = calibrate(options, watched)
-        _ended(verdict, result.ended.error)
-        return dict(result.joints)
-
-    def _calibrated(self) -> Path:
+    def calibrated(self) -> Path:
+        """A profile of the joint."""
         if self._profile is None:
-            before, os.environ[ENVIRONMENT] = os.environ.get(ENVIRONMENT, "[]"), "[]"
-            result = calibrate(
-                CalibrateOptions(str(self.file), joints=(JOINT,), program="quick", out=self.folder / "profile"),
-                Silent(),
-            )
-            os.environ[ENVIRONMENT] = before
-            assert result.profile_file is not None
-            self._profile = result.profile_file
+            with _no_faults():
+                options = CalibrateOptions(
+                    str(self.file("two joints", 250.0)), joints=(JOINT,), program="quick", out=self.folder / "profile"
+                )
+                self._profile = calibrate(options, Silent()).profile_file
+            assert self._profile is not None
         return self._profile
 
-    def _judge_servos(self, watched: Watched, verdict: Verdict) -> None:
-        rack = watched.rack
-        ended_ns = rack.now_ns
-        rack.advance(ended_ns + round(SILENT_S * 1e9))
-        for name, servo in rack.servos.items():
-            if servo.axis.powered:
-                verdict.failures.append(f"joint {name} has power after the end")
-            if abs(servo.axis._plant.velocity_rad_s) > OFF_MPS and servo.axis.powered:
-                verdict.failures.append(f"joint {name} moves after the end")
-        if watched.stop_ns is not None:
-            verdict.noticed = True
-            verdict.rest_s = round(max(0, watched.moved_ns - watched.stop_ns) * 1e-9, 3)
-            verdict.off_s = round(max(0, watched.powered_ns - watched.stop_ns) * 1e-9, 3)
-            if verdict.rest_s > REST_S:
-                verdict.failures.append(f"at rest {verdict.rest_s:.2f} s after the stop")
-            if verdict.off_s > OFF_S:
-                verdict.failures.append(f"without power {verdict.off_s:.2f} s after the stop")
+    def store(self) -> Path:
+        """A store with a profile in force."""
+        if self._store is None:
+            with _no_faults():
+                self._store = self.folder / "store"
+                file = str(self.file("one joint", 250.0))
+                result = recalibrate(RecalibrateOptions(file, store=self._store, out=self.folder / "night"), Silent())
+            assert result["promoted"], result
+        return self._store
 
-    def _judge_curves(self, joints: Mapping[str, Any], verdict: Verdict) -> None:
-        worst = 0.0
-        for name, joint in joints.items():
-            if joint.get("outcome") != "ok":
-                verdict.noticed = True
-                continue
-            speeds = np.array(joint["velocity_rad_s"])
-            truth = true_curve(self.robot, name, float(speeds[-1]) * 1.01).magnitude(speeds)
-            low, high = np.array(joint["torque_interval_nm"]).T
-            beyond = np.maximum(low - truth, truth - high) / truth.mean()
-            worst = max(worst, float(beyond.max()))
-        verdict.off_percent = round(100 * worst, 2)
-        if worst > MARGIN:
-            verdict.failures.append(f"a curve {100 * worst:.1f} % outside its interval is called ok")
+
+class _Verb:
+    """One run of a verb."""
+
+    def __init__(self, bench: Bench, verdict: Verdict, watched: Watched, file: Path, folder: Path) -> None:
+        self._verdict, self._watched, self._file = verdict, watched, str(file)
+        self._folder, self.store = folder, folder / "store"
+        self._profile = bench.calibrated() if verdict.verb == "compensate" else None
+        if verdict.verb == "recalibrate":
+            shutil.copytree(bench.store(), self.store)
+        self.joints: Mapping[str, Any] = {}
+
+    def run(self) -> None:
+        """To its end; what it told is in the verdict."""
+        name = self._verdict.verb.replace(" ", "_")
+        getattr(self, f"_{name}")()
+
+    def _calibrate(self, *, together: bool = False) -> None:
+        joints = (JOINT, OTHER) if together else (JOINT,)
+        options = CalibrateOptions(
+            self._file,
+            joints=joints,
+            program="quick",
+            together=together,
+            seed=self._verdict.seed,
+            out=self._folder / "run",
+        )
+        result = calibrate(options, self._watched)
+        _ended(self._verdict, result.ended.error)
+        self.joints = result.joints
+
+    def _together(self) -> None:
+        self._calibrate(together=True)
+
+    def _compensate(self) -> None:
+        assert self._profile is not None
+        wanted = Wanted("track", ("nc", "mo", "mop"), duration_s=2.0)
+        options = CompensateOptions(
+            self._file, self._profile, JOINT, wanted, seed=self._verdict.seed, out=self._folder / "run"
+        )
+        _ended(self._verdict, compensate(options, self._watched).ended.error)
+
+    def _recalibrate(self) -> None:
+        options = RecalibrateOptions(self._file, store=self.store, seed=self._verdict.seed, out=self._folder / "run")
+        _told(self._verdict, recalibrate(options, self._watched))
+
+    def _gap_record(self) -> None:
+        plan = Path(self._file).with_name("experiments.yaml")
+        plan.write_text(yaml.safe_dump(plan_document(("breakaway",), "for a fault")))
+        options = GapRecordOptions(
+            self._file, joint=JOINT, plan=plan, payload=False, seed=self._verdict.seed, out=self._folder / "run"
+        )
+        _ended(self._verdict, record(options, self._watched).ended.error)
+
+    def _check(self) -> None:
+        _told(self._verdict, check(self._file))
+
+    def _reset(self) -> None:
+        _told(self._verdict, reset(self._file, ask=lambda findings: True))
+
+
+@contextlib.contextmanager
+def _no_faults() -> Iterator[None]:
+    before, os.environ[ENVIRONMENT] = os.environ.get(ENVIRONMENT, "[]"), "[]"
+    yield
+    os.environ[ENVIRONMENT] = before
 
 
 def _hangs(_number: int, _frame: object) -> None:
@@ -442,9 +557,44 @@ def _ended(verdict: Verdict, error: FrictidError | None) -> None:
         verdict.failures.append("no next step is told")
 
 
-def _judge_recording(watched: Watched, verdict: Verdict, out: Path) -> None:
+def _told(verdict: Verdict, result: Mapping[str, Any]) -> None:
+    """How a verb ended that answers in JSON."""
+    verdict.exit_code = result.get("exit_code", 0)
+    verdict.ended, verdict.noticed = ("ok", False) if verdict.exit_code == 0 else (str(result.get("outcome")), True)
+    error = result.get("error")
+    if error:
+        verdict.said = error["what"]
+        if not error["next_step"]:
+            verdict.failures.append("no next step is told")
+
+
+# -- the judgement -----------------------------------------------------------------------------------------------------
+
+
+def _judge_drives(watched: Watched, verdict: Verdict) -> None:
+    rack = watched.rack
+    if rack is None:
+        return
+    rack.advance(rack.now_ns + round(SILENT_S * 1e9))
+    for axle in watched.axles:
+        if axle.powered():
+            verdict.failures.append(f"joint {axle.name} has power after the end")
+            if abs(axle.velocity_rad_s()) > OFF_MPS:
+                verdict.failures.append(f"joint {axle.name} moves after the end")
+    verdict.failures += watched.beyond.values()
+    if watched.stop_ns is not None:
+        verdict.noticed = True
+        verdict.rest_s = round(max(0, watched.moved_ns - watched.stop_ns) * 1e-9, 3)
+        verdict.off_s = round(max(0, watched.powered_ns - watched.stop_ns) * 1e-9, 3)
+        if verdict.rest_s > REST_S:
+            verdict.failures.append(f"at rest {verdict.rest_s:.2f} s after the stop")
+        if verdict.off_s > OFF_S:
+            verdict.failures.append(f"without power {verdict.off_s:.2f} s after the stop")
+
+
+def _judge_recording(watched: Watched, verdict: Verdict, folder: Path) -> None:
     recorded = sum(ring._head for ring in watched.rings)
-    files = sorted(out.rglob("samples*.mcap"))
+    files = sorted(folder.rglob("samples*.mcap"))
     try:
         kept = sum(len(rows) for file in files for rows in read_rows(file).values())
     except FrictidError as error:
@@ -454,21 +604,79 @@ def _judge_recording(watched: Watched, verdict: Verdict, out: Path) -> None:
         verdict.failures.append(f"{recorded - kept} of {recorded} rows are not in the recording")
 
 
-def cases(verbs: Sequence[str], seeds: int, only: str, phases: Callable[[str], Mapping[str, Phase]]) -> list[Case]:
+def _judge_store(store: ProfileStore, verdict: Verdict, robot: Robot) -> None:
+    history = [stored.id for stored in store.history(NAME)]
+    try:
+        profiles = [store.load(NAME, identity) for identity in history]
+        active = store.active_profile(NAME)
+    except FrictidError as error:
+        verdict.failures.append(f"the store cannot be read: {error}")
+        return
+    if not profiles or active is None:
+        verdict.failures.append("the store has lost its profile")
+    else:
+        _judge_profile(active, verdict, robot)
+
+
+def _judge_profile(profile: FrictionProfile, verdict: Verdict, robot: Robot) -> None:
+    joints = {
+        name: {
+            "outcome": "ok",
+            "velocity_rad_s": joint.velocity_rad_s,
+            "torque_interval_nm": joint.torque_interval_nm,
+        }
+        for name, joint in profile.joints.items()
+    }
+    _judge_curves(joints, verdict, robot)
+
+
+def _judge_curves(joints: Mapping[str, Any], verdict: Verdict, robot: Robot) -> None:
+    worst = 0.0
+    for name, joint in joints.items():
+        if joint.get("outcome") != "ok":
+            verdict.noticed = True
+            continue
+        speeds = np.array(joint["velocity_rad_s"])
+        truth = true_curve(robot, name, float(speeds[-1]) * 1.01).magnitude(speeds)
+        low, high = np.array(joint["torque_interval_nm"]).T
+        beyond = np.maximum(low - truth, truth - high) / truth.mean()
+        worst = max(worst, float(beyond.max()))
+    verdict.off_percent = max(verdict.off_percent, round(100 * worst, 2))
+    if worst > MARGIN:
+        verdict.failures.append(f"a curve {100 * worst:.1f} % outside its interval is called ok")
+
+
+# -- the campaign ------------------------------------------------------------------------------------------------------
+
+
+def cases(
+    verbs: Sequence[str], seeds: Sequence[int], only: str, phases: Callable[[str], Mapping[str, Phase]]
+) -> list[Case]:
     """All injections, the verbs in turn."""
     found = []
     for verb in verbs:
-        for phase in phases(verb):
-            if phase == "end" or (
-                phases(verb)[phase].end_s <= phases(verb)[phase].start_s and phase not in BEFORE_SYNC
-            ):
+        for phase, when in phases(verb).items():
+            before = phase in BEFORE_SYNC
+            if phase == "end" or (when.end_s <= when.start_s and (not before or when.last_sdo <= when.first_sdo)):
                 continue
-            for name in SDO if phase in BEFORE_SYNC else IN_MOTION:
-                early = phase in ("reference", "enable", "rehearsal")
+            for name in SDO if before else IN_MOTION:
+                early = phase in ("reference", "enable", "units", "move", "rehearsal")
                 if (early and name in WHOLE_RUN) or only not in f"{verb} {phase} {name}":
                     continue
-                found += [Case(verb, phase, name, seed) for seed in range(seeds)]
+                found += [Case(verb, phase, name, seed) for seed in seeds]
     return found
+
+
+def drawn(todo: Sequence[Case], runs: int | None, seed: int) -> list[Case]:
+    """So many of them, evenly over the verbs; verbs without power have few."""
+    shuffled = [todo[at] for at in np.random.default_rng(seed).permutation(len(todo))]
+    if runs is None:
+        return shuffled
+    by_verb = {verb: [case for case in shuffled if case.verb == verb] for verb in {case.verb: None for case in todo}}
+    picked: list[Case] = []
+    while len(picked) < runs and any(by_verb.values()):
+        picked += [left.pop() for left in by_verb.values() if left]
+    return picked[:runs]
 
 
 def page(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
@@ -512,26 +720,24 @@ def page(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
 
 
 def main() -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--runs", type=int, help="so many, drawn evenly over the verbs; all unless told")
+    parser.add_argument("--seed", type=int, default=0, help="the first one")
+    parser.add_argument("--seeds", type=int, default=1, help="how many moments of each fault in each phase")
     parser.add_argument("--only", default="", help="part of 'verb phase fault'")
-    parser.add_argument("--verbs", default="calibrate,together,compensate")
+    parser.add_argument("--verbs", default=",".join(VERBS))
     parser.add_argument("--kept", type=Path, help="goes on after an interruption")
     parser.add_argument("--docs", type=Path)
-    parser.add_argument("--share", type=float, default=1.0, help="share of the injections, drawn by seed")
     asked = parser.parse_args()
-    kept = (
-        [Verdict(**json.loads(line)) for line in asked.kept.read_text().splitlines()]
-        if (asked.kept and asked.kept.exists())
-        else []
-    )
+    lines = asked.kept.read_text().splitlines() if asked.kept and asked.kept.exists() else []
+    kept = [Verdict(**json.loads(line)) for line in lines]
     done = {(v.verb, v.phase, v.name, v.seed) for v in kept}
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
-        todo = cases(asked.verbs.split(","), asked.seeds, asked.only, bench.phases)
-        rng = np.random.default_rng(17)
-        rng.shuffle(todo)
-        for case in todo[: round(asked.share * len(todo))]:
+        seeds = range(asked.seed, asked.seed + asked.seeds)
+        todo = drawn(cases(asked.verbs.split(","), seeds, asked.only, bench.phases), asked.runs, asked.seed)
+        for case in todo:
             if (case.verb, case.phase, case.name, case.seed) in done:
                 continue
             verdict = bench.struck(case)
@@ -539,10 +745,8 @@ def main() -> None:
             if asked.kept:
                 with asked.kept.open("a") as file:
                     file.write(json.dumps(asdict(verdict)) + "\n")
-            print(
-                f"{case.verb} {case.phase} {case.name}: {verdict.ended} {verdict.said[:90]} {verdict.failures}",
-                flush=True,
-            )
+            told = f"{verdict.ended} {verdict.said[:90]} {verdict.failures} {verdict.took_s}"
+            print(f"{case.verb} {case.phase} {case.name} {case.seed}: {told}", flush=True)
     if asked.docs:
         asked.docs.write_text(page(kept, "python " + " ".join(sys.argv), git_revision() or "?"))
     failed = sum(bool(verdict.failures) for verdict in kept)
