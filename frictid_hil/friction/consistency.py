@@ -17,12 +17,17 @@ from frictid_hil.friction.estimate import Estimate
 from frictid_hil.friction.gate import Gate
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.friction.turnover import turnover_lateness
 
 MOST_SEEN_S = 0.0015
 """What the data may ask for beyond the declared delay of the torque, where they are sure of it ..."""
 MOST_SEEN_WITH_LINK_S = 0.003
 SURE = 2.5
 """... by so many standard deviations, its own and the declared one's."""
+MOST_TURNOVER_S = 0.012
+"""Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
+MOST_TURNOVER_SEEN_S = 0.004
+"""... and where the delay that the data ask for has the same sign and is more than ``MOST_SEEN_S``."""
 MOST_APART_S = 0.008
 """Reported velocity against differenced position: a filter that nobody declared does no harm to the curve ..."""
 MOST_UNSTEADY_S = 0.004
@@ -47,7 +52,8 @@ def consistency(recording: CycleRecording, motion: Motion, result: Estimate, mos
         result: what was identified.
         most_changed: see ``GateLimits.other_stretches``.
     """
-    asked = [_delay(recording, result), _velocity(recording, motion), _inertia(recording, result), _flat(recording)]
+    asked = [_delay(recording, result), _turnover(recording, motion, result), _velocity(recording, motion)]
+    asked += [_inertia(recording, result), _flat(recording)]
     return [gate for gate in (*asked, _elsewhere(recording, result, most_changed)) if gate is not None]
 
 
@@ -69,6 +75,26 @@ def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
         abs(seen_s),
         allowed_s,
         said,
+        "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures",
+    )
+
+
+def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Gate | None:
+    """Friction turns over after the same travel at every speed: what it takes longer is lateness."""
+    late_s = turnover_lateness(recording, motion)
+    if late_s.size == 0:
+        return None
+    worst_s = float(late_s[np.argmax(np.abs(late_s))])
+    # Two witnesses need to say less: inertia alone makes some milliseconds of one of them.
+    both = result.figures.get("seen_delay_s", 0.0) * np.sign(worst_s) > MOST_SEEN_S
+    allowed_s = MOST_TURNOVER_SEEN_S if both else MOST_TURNOVER_S
+    return Gate.about(
+        "turnover",
+        abs(worst_s) <= allowed_s,
+        abs(worst_s),
+        allowed_s,
+        f"after a fast turning point friction turns over {1e3 * worst_s:+.1f} ms later than after the same travel in "
+        f"slow cycles (allowed {1e3 * allowed_s:.0f} ms)",
         "torque or position are late: a filter that was not declared (`options: timing`), or reports of old figures",
     )
 

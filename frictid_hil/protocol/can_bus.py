@@ -16,6 +16,9 @@ from frictid_hil.errors import HardwareBusy, HardwareError, UsageError
 
 BusFactory = Callable[[], can.BusABC]
 
+BUS_ERRORS = (can.CanError, OSError, RuntimeError, ValueError)
+"""What python-can's interfaces raise from send and receive, whatever their vendor's library is."""
+
 # What it logs is told by our errors, with cause and next step; it must not reach stderr on its own.
 logging.getLogger("can").addHandler(logging.NullHandler())
 

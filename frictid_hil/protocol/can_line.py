@@ -12,7 +12,14 @@ from typing import Any
 import can
 
 from frictid_hil.errors import HardwareError
-from frictid_hil.protocol.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, BusFactory, BusLock, open_bus
+from frictid_hil.protocol.can_bus import (
+    BUS_ERRORS,
+    DEFAULT_BITRATE,
+    DEFAULT_DATA_BITRATE,
+    BusFactory,
+    BusLock,
+    open_bus,
+)
 from frictid_hil.protocol.can_load import BitRates, highest_rate_hz
 from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock, FrameSink
 
@@ -88,7 +95,7 @@ class CanLine:
         )
         try:
             self._bus.send(message)
-        except (can.CanError, OSError) as error:
+        except BUS_ERRORS as error:
             self._failures += 1
             if self._failures >= _WIRE_FAILURES:
                 self._failures = 0
@@ -115,8 +122,13 @@ class CanLine:
             # In lock-step answers are there when ``send`` returns: what is not there will not come.
             try:
                 message = self._bus.recv(0.0 if self._clock.lock_step else left_s)
-            except (can.CanError, OSError) as error:
-                raise HardwareError(f"cannot receive: {error}", where=self._name) from error
+            except BUS_ERRORS as error:
+                raise HardwareError(
+                    f"cannot receive: {error}",
+                    where=self._name,
+                    cause="an unplugged adapter, or a failure of its driver",
+                    next_step="check adapter and wiring; motors stop by their own watchdogs if they have any",
+                ) from error
             if message is None:
                 return
             if message.is_error_frame or message.is_remote_frame:
@@ -133,7 +145,7 @@ class CanLine:
 
     def close(self) -> None:
         """Release the bus; safe to call twice."""
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(*BUS_ERRORS):
             self._bus.shutdown()
         if self._lock is not None:
             self._lock.release()

@@ -34,6 +34,15 @@ def test_a_torque_that_is_late(sound, by_s):
     assert failed(late(sound, "torque_nm", by_s)) & {"seen_delay", "inertia"}
 
 
+@pytest.mark.parametrize("by_s", [0.02, 0.06])
+def test_a_torque_that_is_late_in_the_fast_ones_of_few_cycles(plants, by_s):
+    """One slow and one fast sine, as `--program quick` has: a fit cannot tell lateness from less inertia."""
+    few = plants.record(plants.arm[2], replace(plants.procedure(20), cycles=2))
+    assert "turnover" not in failed(few)
+    spoilt = late(few, "torque_nm", by_s, since_s=float(few.procedure.cycle_starts_s[1]))
+    assert "turnover" in failed(spoilt)
+
+
 @pytest.mark.slow
 def test_a_position_that_is_late_from_the_middle_on(sound):
     spoilt = late(sound, "position_rad", 0.01, since_s=0.5 * sound.procedure.duration_s)

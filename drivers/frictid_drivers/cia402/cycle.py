@@ -32,13 +32,12 @@ from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, QUICK_STOP, DriveState, Target
 from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.can_bus import BUS_ERRORS
 from frictid_hil.protocol.driver import Clock, Feedback, FrameSink, SetPoint
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
 _WIRE_FAILURES = 3
-BUS_ERRORS = (can.CanError, OSError, RuntimeError, ValueError)
-"""What python-can's interfaces raise from send and receive, whatever their vendor's library is."""
 _INSIST_NS = 90_000_000
 """By SDO after so long, by NMT after twice, disabled voltage after three times of it."""
 _BRAKE_NS = 400_000_000

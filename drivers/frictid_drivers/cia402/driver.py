@@ -20,7 +20,7 @@ from frictid_drivers.cia402 import configure, inspection, reentry
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import Decoder
-from frictid_drivers.cia402.cycle import BUS_ERRORS, Cycle
+from frictid_drivers.cia402.cycle import Cycle
 from frictid_drivers.cia402.fleet import NMT_PRE_OPERATIONAL, NMT_START, Fleet
 from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
 from frictid_drivers.cia402.layout import Layout
@@ -31,7 +31,7 @@ from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.can_bus import BusFactory, BusLock, open_bus
+from frictid_hil.protocol.can_bus import BUS_ERRORS, BusFactory, BusLock, open_bus
 from frictid_hil.protocol.driver import (
     Capabilities,
     Clock,

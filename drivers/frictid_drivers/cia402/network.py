@@ -7,10 +7,11 @@ thread inherits the wrong scheduling class.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
@@ -18,6 +19,8 @@ import canopen
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from frictid_hil.errors import HardwareError
+from frictid_hil.protocol.can_bus import BUS_ERRORS
 from frictid_hil.protocol.driver import FD_FRAME, FrameSink
 
 # What it logs is told by our errors, with cause and next step; it must not reach stderr on its own.
@@ -29,6 +32,7 @@ def logged_id(message: can.Message) -> int:
     return message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
 
 
+_SDO_BYTES = 8
 BUS_OFF = "bus-off"
 _PASSIVE = "error-passive"
 
@@ -70,15 +74,25 @@ class Wire(canopen.Network):
         self._sink_lock = threading.Lock()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send one frame (canopen's own way out)."""
+        """Send one frame (canopen's own way out).
+
+        Raises:
+            InterfaceFailed: now.
+        """
         message = can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(data), is_remote_frame=remote)
         with self.send_lock:
             self._tell(can_id, message.data, True)
-            self._wire.send(message)
+            with _working("send"):
+                self._wire.send(message)
 
     def pump(self, timeout_s: float) -> bool:
-        """Receive at most one frame and hand it to its subscribers; False when none came in time."""
-        message = self._wire.recv(timeout_s)
+        """Receive at most one frame and hand it to its subscribers; False when none came in time.
+
+        Raises:
+            InterfaceFailed: now.
+        """
+        with _working("receive"):
+            message = self._wire.recv(timeout_s)
         if message is None:
             return False
         if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
@@ -105,6 +119,23 @@ class Wire(canopen.Network):
                 self._sink(self._now_ns(), can_id, bytes(data), sent)
 
 
+class InterfaceFailed(HardwareError, can.CanError):
+    """Send or receive failed. It is python-can's error, too, so that canopen tries a request again."""
+
+
+@contextlib.contextmanager
+def _working(doing: str) -> Iterator[None]:
+    try:
+        yield
+    except BUS_ERRORS as error:
+        raise InterfaceFailed(
+            f"the interface cannot {doing}: {error}",
+            where="bus",
+            cause="an unplugged adapter, a link that is down, bus-off, or a failure of the adapter's driver",
+            next_step="check adapter, link and wiring, then start again",
+        ) from error
+
+
 class InlineSdoClient(SdoClient):
     """canopen's SDO client that reads the bus itself while it waits."""
 
@@ -124,7 +155,10 @@ class InlineSdoClient(SdoClient):
             remaining = deadline - time.monotonic()
             if remaining <= 0 or (not self.network.pump(remaining) and time.monotonic() >= deadline):
                 raise SdoCommunicationError("No SDO response received")
-        return super().read_response()  # type: ignore[no-untyped-call]  # canopen is only partly typed
+        answer = super().read_response()  # type: ignore[no-untyped-call]  # canopen is only partly typed
+        if len(answer) != _SDO_BYTES:
+            raise SdoCommunicationError(f"an answer of {len(answer)} bytes instead of {_SDO_BYTES}")
+        return answer
 
 
 class Node(canopen.RemoteNode):
@@ -171,6 +205,6 @@ class HeartbeatTimer:
         while not self._stop.wait(self._period_s):
             try:
                 self._send()
-            except can.CanError:
+            except HardwareError:
                 # A full buffer or a bus-off passes; the drives' watchdogs are the judge of how long is too long.
                 continue

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-import can
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from frictid_drivers.cia402.access import Aborted, Drive
@@ -59,7 +58,7 @@ class SdoDrive(Drive):
             yield
         except SdoAbortedError as error:
             raise Aborted(error.code, str(error)) from error
-        except (SdoCommunicationError, can.CanError) as error:
+        except SdoCommunicationError as error:
             said = "" if str(error) == "No SDO response received" else f" ({error})"
             raise HardwareError(
                 f"no answer to SDO within {self._sdo.RESPONSE_TIMEOUT:g} s{said}",

@@ -9,22 +9,27 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Protocol
+
+import can
 
 from frictid_drivers.mit.driver import MitDriver
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings, read_settings
+from frictid_drivers.virtual.faults import HOST_KINDS
+from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import FD_FRAME, Clock, WallClock
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
-from frictid_hil.testing.wire import FakeCanBus, Frame, ManualClock
+from frictid_hil.testing.wire import Devices, FakeCanBus, Frame, ManualClock
 
 _LOOP_NS = 500_000
 _TORQUE_MODE = 10
 _LONG_ID = 1 << 31
+_SERVICE_PORT = 0x7FF
 
 
 class VirtualMitDriver(MitDriver):
@@ -33,9 +38,35 @@ class VirtualMitDriver(MitDriver):
     kind = replace(MitDriver.kind, simulated=True, line="virtual", elsewhere={"can": "mit"})
 
     def __init__(self, setup: RobotSetup) -> None:
-        self.rack = Rack(setup)
-        clock: Clock = WallClock() if setup.realtime else ManualClock(self.rack.advance)
-        super().__init__(setup, bus_factory=lambda: FakeCanBus(self.rack, clock), clock=clock)
+        # Late, because faulty motors are motors of this file.
+        from frictid_drivers.mit.faulty_motors import FaultyMotors, motor_faults
+
+        faults = motor_faults(setup)
+        healthy = replace(setup, options={name: value for name, value in setup.options.items() if name != "faults"})
+        self.rack = Rack(healthy)
+        self._begin: list[Callable[[], None]] = []
+        motors: Devices = self.rack
+        if faults:
+            motors = faulty = FaultyMotors(self.rack, faults)
+            self._begin.append(faulty.begin)
+        clock: Clock = WallClock() if setup.realtime else ManualClock(motors.advance)
+
+        def open_bus() -> can.BusABC:
+            bus = FakeCanBus(motors, clock)
+            ours = [fault for fault in faults if fault.kind in HOST_KINDS]
+            if not ours:
+                return bus
+            spoilt = FaultyBus(bus, ours, clock.now_ns)
+            self._begin.append(spoilt.begin)
+            return spoilt
+
+        super().__init__(healthy, bus_factory=open_bus, clock=clock)
+
+    def start_cycling(self) -> None:
+        """As ``MitDriver``; times of faults count from here."""
+        super().start_cycling()
+        for begin in self._begin:
+            begin()
 
     def mount_payload(self, joint: str, mounted: bool) -> None:
         """Put the payload of the robot file on a joint, or take it off."""
@@ -109,6 +140,11 @@ class Actuator:
         """In the motor's direction, as it believes."""
         return self.direction * self.plant.torque_nm
 
+    def told(self, quantity: str) -> float:
+        """``position``, ``velocity`` or ``torque`` as its reports say."""
+        value: float = getattr(self, quantity)
+        return value
+
 
 class Wire(Protocol):
     """How one family speaks; returns None for a frame that is not meant for this motor."""
@@ -145,6 +181,13 @@ class Rack:
                 actuator.heard()
                 return answer
         return []
+
+    def meant(self, can_id: int, data: bytes) -> str | None:
+        """The joint whose motor a frame of the host is for; None for nobody's."""
+        number = can_id & 0xFF if can_id & _LONG_ID else can_id & 0x7FF
+        if number == _SERVICE_PORT and not can_id & _LONG_ID:
+            number = int.from_bytes(data[:2], "little")
+        return next((name for name, actuator in self.actuators.items() if actuator.id == number), None)
 
     def advance(self, to_ns: int) -> None:
         """Run time goes on."""
@@ -191,9 +234,9 @@ def _mit_command(motor: Actuator, data: bytes) -> None:
 
 def _mit_report(motor: Actuator, first: int) -> bytes:
     r = motor.ranges
-    p = _to_bits(motor.position, r.position_rad, 16)
-    v = _to_bits(motor.velocity, r.velocity_rad_s, 12)
-    t = _to_bits(motor.torque, r.torque_nm, 12)
+    p = _to_bits(motor.told("position"), r.position_rad, 16)
+    v = _to_bits(motor.told("velocity"), r.velocity_rad_s, 12)
+    t = _to_bits(motor.told("torque"), r.torque_nm, 12)
     return bytes([first, p >> 8, p & 255, v >> 4, (v & 15) << 4 | t >> 8, t & 255])
 
 
@@ -215,7 +258,7 @@ class _DamiaoWire:
         return answers and [(answered | kind, said) for answered, said in answers]
 
     def _hear(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
-        if can_id == 0x7FF and len(data) == 8 and data[0] | data[1] << 8 == motor.id:
+        if can_id == _SERVICE_PORT and len(data) == 8 and data[0] | data[1] << 8 == motor.id:
             return self._service(motor, data)
         if can_id != motor.id or len(data) != 8:
             return None
@@ -298,9 +341,9 @@ class _RobStrideWire:
     def _report(self, motor: Actuator) -> Frame:
         r, state = motor.ranges, (2 if motor.on else 0) << 6 | (1 if motor.fault else 0)
         figures = (
-            _to_bits(motor.position, r.position_rad, 16),
-            _to_bits(motor.velocity, r.velocity_rad_s, 16),
-            _to_bits(motor.torque, r.torque_nm, 16),
+            _to_bits(motor.told("position"), r.position_rad, 16),
+            _to_bits(motor.told("velocity"), r.velocity_rad_s, 16),
+            _to_bits(motor.told("torque"), r.torque_nm, 16),
             285,
         )
         return self._id(2, motor, state), struct.pack(">4H", *figures)

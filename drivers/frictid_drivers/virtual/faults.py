@@ -110,7 +110,8 @@ class Fault:
         after: how many frames or calls pass first.
         joints: whose.
         nodes: of these joints.
-        cob_ids: which frames.
+        frames: which, by name.
+        cob_ids: and by identifier, where these are CANopen's.
         delay_s: how late.
         code: EMCY or SDO abort code.
         index: object.
@@ -127,12 +128,13 @@ class Fault:
     after: int = 0
     joints: tuple[str, ...] = ()
     nodes: tuple[int, ...] = ()
+    frames: str = ""
     cob_ids: frozenset[int] = frozenset()
     delay_s: float = 0.0
     code: int = 0
     index: int = 0
     quantity: int = 0
-    level: int = 0
+    level: float = 0.0
     factor: float = 1.0
     error: str = "can"
 
@@ -150,8 +152,15 @@ class Fault:
 ENVIRONMENT = "FRICTID_VIRTUAL_FAULTS"
 
 
-def faults_of(setup: RobotSetup) -> tuple[Fault, ...]:
+def faults_of(
+    setup: RobotSetup, *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
+) -> tuple[Fault, ...]:
     """The faults of a robot file and of the environment.
+
+    Args:
+        setup: the robot.
+        kinds: that its simulated drives know.
+        frames: names of the frames on its wire.
 
     Raises:
         InvalidFields: what is wrong with the robot file's.
@@ -163,15 +172,23 @@ def faults_of(setup: RobotSetup) -> tuple[Fault, ...]:
     except ValueError as error:
         raise UsageError(f"not JSON: {error}", where=ENVIRONMENT) from None
     nodes = {joint.name: joint.address for joint in setup.joints}
-    return read_faults(setup.options.get("faults"), nodes) + read_faults(further, nodes)
+    return tuple(
+        fault
+        for rows in (setup.options.get("faults"), further)
+        for fault in read_faults(rows, nodes, kinds=kinds, frames=frames)
+    )
 
 
-def read_faults(rows: Any, nodes: Mapping[str, int]) -> tuple[Fault, ...]:
+def read_faults(
+    rows: Any, nodes: Mapping[str, int], *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
+) -> tuple[Fault, ...]:
     """A list of faults.
 
     Args:
         rows: the list under ``options.faults``; None for none.
         nodes: node numbers of the joints that it may name.
+        kinds: that it may name.
+        frames: likewise.
 
     Raises:
         InvalidFields: what is wrong, by ``options.faults.N.KEY``.
@@ -184,20 +201,20 @@ def read_faults(rows: Any, nodes: Mapping[str, int]) -> tuple[Fault, ...]:
         rows = None
     for number, row in enumerate(rows or ()):
         fields = Fields(row, ("options", "faults", number), top.problems)
-        faults.append(_fault(fields, nodes))
+        faults.append(_fault(fields, nodes, kinds, frames))
         fields.no_others()
     top.finish()
     return tuple(faults)
 
 
-def _fault(fields: Fields, known: Mapping[str, int]) -> Fault:
-    kind = fields.choice("kind", "", KINDS)
+def _fault(fields: Fields, known: Mapping[str, int], kinds: tuple[str, ...], frames: tuple[str, ...]) -> Fault:
+    kind = fields.choice("kind", "", kinds)
     joint = fields.choice("joint", "", ("", *known))
     node = round(fields.number("node", 0.0, low=1.0, high=127.0)) if "node" in fields else 0
-    service = fields.choice("frames", "", ("", *SERVICES))
+    service = fields.choice("frames", "", ("", *frames))
     quantity = fields.choice("quantity", "", ("", *QUANTITIES))
     if kind in FRAME_KINDS and not service:
-        fields.problem("frames", f"is required: one of {', '.join(SERVICES)}")
+        fields.problem("frames", f"is required: one of {', '.join(frames)}")
     if kind in REPORT_KINDS and kind != "flap" and not quantity:
         fields.problem("quantity", f"is required: one of {', '.join(QUANTITIES)}")
     names = (joint,) if joint else tuple(name for name, number in known.items() if node in (0, number))
@@ -211,12 +228,13 @@ def _fault(fields: Fields, known: Mapping[str, int]) -> Fault:
         after=round(fields.number("after", 0.0, low=0.0)),
         joints=names,
         nodes=nodes,
-        cob_ids=_cob_ids(service, nodes) if service else frozenset(),
+        frames=service,
+        cob_ids=_cob_ids(service, nodes) if service in SERVICES else frozenset(),
         delay_s=fields.number("delay_s", 0.0, low=0.0),
         code=round(fields.number("code", usual_code, low=1.0, high=0xFFFFFFFF)),
         index=round(fields.number("index", 0.0, low=0.0, high=0xFFFF)),
         quantity=QUANTITIES["status"] if kind == "flap" else QUANTITIES.get(quantity, 0),
-        level=round(fields.number("level", 0.0)),
+        level=fields.number("level", 0.0),
         factor=fields.number("factor", 1.0),
         error=fields.choice("error", "can", ERRORS),
     )

@@ -71,6 +71,10 @@ class FaultyBus(can.BusABC):
         super().__init__(channel="faulty")
         self._can_protocol = self._bus.protocol
 
+    def begin(self) -> None:
+        """Times of faults count from here; a SYNC says so by itself."""
+        self._start_ns = self._clock()
+
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send what the cable makes of the frame.
 
@@ -78,7 +82,7 @@ class FaultyBus(can.BusABC):
             Exception: whatever the faults say.
         """
         if msg.arbitration_id == SYNC_ID and self._start_ns is None:
-            self._start_ns = self._clock()
+            self.begin()
         self._fail(self._send_errors)
         if self._is_off():
             raise can.CanOperationError("injected: the bus is off")

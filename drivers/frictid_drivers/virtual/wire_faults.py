@@ -91,7 +91,7 @@ class WireFaults:
         frames = [(now_ns, can_id, data)]
         for state, cob_ids in self._frames:
             if plain in cob_ids:
-                frames = [out for frame in frames for out in _spoil(state, elapsed_ns, frame)]
+                frames = [out for frame in frames for out in spoil(state, elapsed_ns, frame)]
         return frames
 
 
@@ -99,7 +99,14 @@ def _ids(fault: Fault) -> frozenset[int]:
     return frozenset(_SDO_ANSWER + node for node in fault.nodes) if fault.kind == "abort" else fault.cob_ids
 
 
-def _spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]:
+def spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]:
+    """What becomes of a frame that this fault concerns.
+
+    Args:
+        state: a fault of kind ``FRAME_KINDS`` or ``abort``.
+        elapsed_ns: since the first SYNC; -1 before it.
+        frame: with the time at which it comes.
+    """
     now_ns, can_id, data = frame
     fault = state.fault
     if fault.kind == "reorder" and state.held is not None:
@@ -120,7 +127,7 @@ def _spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]
         state.held = state.held or (can_id, data)
         return [frame, (now_ns, *state.held)]
     if fault.kind == "truncate":
-        return [(now_ns, can_id, data[: fault.level])]
+        return [(now_ns, can_id, data[: round(fault.level)])]
     if fault.kind == "misaddress":
         return [(now_ns, can_id + 1, data)]
     if fault.kind == "abort":
@@ -175,35 +182,37 @@ class ReportMapping:
         return found
 
 
-class _ReportFault:
-    """One figure of the reports of some nodes, gone wrong."""
+class WrongFigure:
+    """One figure that drives report, gone wrong.
+
+    Args:
+        fault: of kind ``REPORT_KINDS``.
+    """
 
     def __init__(self, fault: Fault) -> None:
         self.fault = fault
         self._work = FaultAtWork(fault)
-        self._before: dict[int, deque[tuple[int, int]]] = {}
+        self._before: dict[int, deque[tuple[int, float]]] = {}
         self._turn = False
 
-    def applied(self, mapping: ReportMapping, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> bytes:
-        """The report as it goes on."""
-        if can_id & 0x7F not in self.fault.nodes or not 0x180 <= can_id < 0x580:
-            return data
-        for place in mapping.places(can_id, self.fault.quantity):
-            signed = self.fault.kind != "flap"
-            value = int.from_bytes(data[place], "little", signed=signed)
-            before = self._before.setdefault(can_id & 0x7F, deque())
-            before.append((now_ns, value))
-            if self._work.strikes(elapsed_ns):
-                value = self._wrong(before, now_ns, value)
-            elif self.fault.kind != "lag":
-                before.clear()
-            size = place.stop - place.start
-            most = (1 << 8 * size - 1) - 1 if signed else (1 << 8 * size) - 1
-            value = max(-most if signed else 0, min(most, value))
-            data = data[: place.start] + value.to_bytes(size, "little", signed=signed) + data[place.stop :]
-        return data
+    def applied(self, node: int, now_ns: int, elapsed_ns: float, value: float) -> float:
+        """The figure as it goes on.
 
-    def _wrong(self, before: deque[tuple[int, int]], now_ns: int, value: int) -> int:
+        Args:
+            node: that reports it.
+            now_ns: on the caller's clock.
+            elapsed_ns: since the first SYNC; -1 before it.
+            value: that it would be.
+        """
+        before = self._before.setdefault(node, deque())
+        before.append((now_ns, value))
+        if self._work.strikes(elapsed_ns):
+            return self._wrong(before, now_ns, value)
+        if self.fault.kind != "lag":
+            before.clear()
+        return value
+
+    def _wrong(self, before: deque[tuple[int, float]], now_ns: int, value: float) -> float:
         kind, level = self.fault.kind, self.fault.level
         if kind == "freeze":
             return before[0][1]
@@ -212,16 +221,38 @@ class _ReportFault:
         if kind == "clip":
             return max(-level, min(level, value))
         if kind == "scale":
-            return round(value * self.fault.factor)
+            return value * self.fault.factor
         if kind == "jump":
             return value + level
         if kind == "flap":
             self._turn = not self._turn
-            return value & ~0x6F | _WITHOUT_POWER if self._turn else value
+            return int(value) & ~0x6F | _WITHOUT_POWER if self._turn else value
         due_ns = now_ns - round(self.fault.delay_s * 1e9)
         while len(before) > 1 and before[1][0] <= due_ns:
             before.popleft()
         return before[0][1]
+
+
+class _ReportFault:
+    """One figure of the reports of some nodes, gone wrong on the wire."""
+
+    def __init__(self, fault: Fault) -> None:
+        self.fault = fault
+        self._figure = WrongFigure(fault)
+
+    def applied(self, mapping: ReportMapping, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> bytes:
+        """The report as it goes on."""
+        if can_id & 0x7F not in self.fault.nodes or not 0x180 <= can_id < 0x580:
+            return data
+        for place in mapping.places(can_id, self.fault.quantity):
+            signed = self.fault.kind != "flap"
+            value = int.from_bytes(data[place], "little", signed=signed)
+            wrong = round(self._figure.applied(can_id & 0x7F, now_ns, elapsed_ns, value))
+            size = place.stop - place.start
+            most = (1 << 8 * size - 1) - 1 if signed else (1 << 8 * size) - 1
+            wrong = max(-most if signed else 0, min(most, wrong))
+            data = data[: place.start] + wrong.to_bytes(size, "little", signed=signed) + data[place.stop :]
+        return data
 
 
 class Injections:

@@ -1,0 +1,108 @@
+"""Faults of simulated motors by schedule: from the robot file and the environment, on the wire and in the motors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mit_bench import robot
+
+from frictid_drivers.mit.faulty_motors import KINDS
+from frictid_drivers.mit.simulated import VirtualMitDriver
+from frictid_drivers.virtual.faults import ENVIRONMENT
+from frictid_hil.errors import FrictidError, HardwareError, InvalidFields
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
+
+FAMILIES = ("damiao", "robstride")
+
+
+class Running:
+    """A driver of two motors with faults, cycling at 500 Hz, both joints under power."""
+
+    def __init__(self, folder: Path, family: str, *faults: dict[str, Any]) -> None:
+        setup = robot(folder, family, {"options": {"faults": list(faults)}}, joints=2).to_setup()
+        self.driver = VirtualMitDriver(setup)
+        self.driver.open()
+        self.driver.configure(500.0, ["0", "1"])
+        self.driver.start_cycling()
+        for joint in ("0", "1"):
+            self.driver.enable(joint, Mode.POSITION)
+
+    def cycles(self, count: int) -> list[Feedback]:
+        for _ in range(count):
+            self.driver.clock.wait_until(self.driver.clock.now_ns() + 2_000_000)
+            reports = self.driver.exchange([SetPoint(), SetPoint()])
+        return list(reports)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_frames_of_one_joint_are_lost_for_a_while(tmp_path: Path, family: str) -> None:
+    run = Running(tmp_path, family, {"kind": "drop", "frames": "report", "joint": "0", "at_s": 0.05, "count": 10})
+    assert [report.age_cycles for report in run.cycles(20)] == [0, 0]
+    assert [report.age_cycles for report in run.cycles(12)] == [8, 0]
+    assert [report.age_cycles for report in run.cycles(5)] == [0, 0]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_motor_that_hears_nothing_lets_go_by_its_watchdog(tmp_path: Path, family: str) -> None:
+    run = Running(tmp_path, family, {"kind": "mute", "joint": "1", "at_s": 0.05})
+    run.cycles(20)
+    assert run.driver.rack.actuators["1"].on
+    run.cycles(80)
+    assert not run.driver.rack.actuators["1"].on and run.driver.rack.actuators["0"].on
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_what_a_motor_reports_is_wrong_and_what_it_does_is_not(tmp_path: Path, family: str) -> None:
+    run = Running(tmp_path, family, {"kind": "jump", "quantity": "torque", "joint": "0", "level": 1.0, "at_s": 0.05})
+    assert run.cycles(20)[0].torque_nm == pytest.approx(0.0, abs=0.2)
+    reports = run.cycles(20)
+    assert reports[0].torque_nm == pytest.approx(1.0, abs=0.2) and abs(reports[1].torque_nm) < 0.2
+    assert run.driver.rack.actuators["0"].torque == pytest.approx(0.0, abs=0.2)
+
+
+def test_late_reports_come_in_a_later_cycle(tmp_path: Path) -> None:
+    late = {"kind": "delay", "frames": "report", "joint": "0", "delay_s": 0.005, "at_s": 0.05, "count": 1}
+    run = Running(tmp_path, "damiao", late)
+    run.cycles(25)
+    assert [run.cycles(1)[0].age_cycles for _ in range(3)] == [0, 0, 0]
+    kept = Running(tmp_path, "damiao", {**late, "count": 3})
+    assert 2 <= max(kept.cycles(1)[0].age_cycles for _ in range(35)) <= 3
+
+
+def test_power_lost_in_the_motor_is_seen(tmp_path: Path) -> None:
+    run = Running(tmp_path, "damiao", {"kind": "fault", "joint": "0", "at_s": 0.05})
+    assert run.cycles(20)[0].state is JointState.ENABLED
+    assert run.cycles(20)[0].state is JointState.FAULT
+
+
+def test_the_environment_adds_to_the_file_and_mistakes_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(ENVIRONMENT, json.dumps([{"kind": "emcy"}]))
+    with pytest.raises(InvalidFields) as refused:
+        Running(tmp_path, "damiao")
+    assert refused.value.problems[0].path == ("options", "faults", 0, "kind")
+    monkeypatch.setenv(ENVIRONMENT, json.dumps([{"kind": "drop", "frames": "tpdo1"}]))
+    with pytest.raises(InvalidFields, match="command, report"):
+        Running(tmp_path, "damiao")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("at_s", [None, 0.05])
+def test_every_kind_ends_in_a_report_or_in_one_of_our_errors(tmp_path: Path, kind: str, at_s: float | None) -> None:
+    fields = {"frames": "report", "quantity": "torque", "delay_s": 0.003, "error": "runtime"}
+    when = {} if at_s is None else {"at_s": at_s}
+    run = None
+    try:
+        run = Running(tmp_path, "robstride", {"kind": kind, **fields, **when})
+        run.cycles(100)
+    except FrictidError as error:
+        assert error.what and (error.next_step or not isinstance(error, HardwareError))
+    if run is not None:
+        run.driver.close()
+        run.driver.rack.advance(2_000_000_000)
+        assert not any(motor.on for motor in run.driver.rack.actuators.values())
