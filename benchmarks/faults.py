@@ -30,7 +30,7 @@ import traceback
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +38,15 @@ import numpy as np
 import yaml
 
 from frictid_drivers.cia402 import Cia402Driver
+from frictid_drivers.mit import MitDriver
+from frictid_drivers.mit.simulated import Rack as Motors
+from frictid_drivers.mit.simulated import VirtualMitDriver
 from frictid_drivers.virtual import VirtualDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
 from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.config.write import dump
 from frictid_hil.errors import Defect, FrictidError
 from frictid_hil.gap.experiments import plan_document
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
@@ -55,6 +59,7 @@ from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.reset import reset
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap_reader import read_rows
 from frictid_hil.runner.events import Event, PhaseStarted, Preflight
@@ -65,17 +70,25 @@ Draw = Callable[[np.random.Generator], dict[str, Any]]
 
 NAME = "faulty-bench"
 JOINT, OTHER = "3", "4"
-ROBOTS = {
-    "two joints": """\
-extends: hp3j.yaml
-joints: {"0": null, "1": null, "2": null, "5": null}
-""",
-    "one joint": """\
-extends: hp3j.yaml
-joints: {"0": null, "1": null, "2": null, "4": null, "5": null}
-procedure: {cycles: 3}
-policy: {warm_up: {fixed_s: 0}}
-""",
+
+
+def _arm(*absent: str, **further: Any) -> dict[str, Any]:
+    return {"extends": "hp3j.yaml", "joints": dict.fromkeys(absent), **further}
+
+
+def _motors(model: str) -> dict[str, Any]:
+    values = load_robot("mit-bench.yaml").values()
+    (joint,) = values["joints"].values()
+    options = {**joint["options"], "model": model}
+    joints = {name: {**joint, "id": number, "options": options} for number, name in enumerate((JOINT, OTHER), 1)}
+    return {**values, "joints": joints}
+
+
+ROBOTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "two joints": lambda: _arm("0", "1", "2", "5"),
+    "one joint": lambda: _arm("0", "1", "2", "4", "5", procedure={"cycles": 3}, policy={"warm_up": {"fixed_s": 0}}),
+    "damiao": lambda: _motors("DM-J4310"),
+    "robstride": lambda: _motors("RS00"),
 }
 VERBS = {
     "calibrate": "two joints",
@@ -85,6 +98,10 @@ VERBS = {
     "gap record": "one joint",
     "check": "two joints",
     "reset": "two joints",
+    "damiao calibrate": "damiao",
+    "damiao compensate": "damiao",
+    "robstride calibrate": "robstride",
+    "robstride together": "robstride",
 }
 """What is run, and on which robot."""
 STILL = ("check", "reset")
@@ -189,9 +206,68 @@ SDO: dict[str, Draw] = {
     "interface fails in set-up": _of_bus(kind="send_error", error="os"),
     "interface deaf in set-up": _of_bus(kind="receive_error", error="runtime"),
 }
+MOTORS: dict[str, Draw] = {
+    "torque late 6 ms": _of_joint(kind="lag", quantity="torque", delay_s=0.006),
+    "torque late 20 ms": _of_joint(kind="lag", quantity="torque", delay_s=0.02),
+    "torque late 60 ms": _of_joint(kind="lag", quantity="torque", delay_s=0.06),
+    "position late 10 ms": _of_joint(kind="lag", quantity="position", delay_s=0.01),
+    "torque clipped 0.3 N m": _of_joint(kind="clip", quantity="torque", level=0.3),
+    "torque times 1.5": _of_joint(kind="scale", quantity="torque", factor=1.5),
+    "torque times 0.7": _of_joint(kind="scale", quantity="torque", factor=0.7),
+    "torque frozen": _of_joint(kind="freeze", quantity="torque"),
+    "torque inverted": _of_joint(kind="invert", quantity="torque"),
+    "torque zero": _of_joint(kind="scale", quantity="torque", factor=0.0),
+    "torque offset": _of_joint(kind="jump", quantity="torque", level=0.5),
+    "velocity frozen": _of_joint(kind="freeze", quantity="velocity"),
+    "velocity inverted": _of_joint(kind="invert", quantity="velocity"),
+    "velocity zero": _of_joint(kind="scale", quantity="velocity", factor=0.0),
+    "position frozen": _of_either(kind="freeze", quantity="position"),
+    "position jumps": _of_either(kind="jump", quantity="position", level=0.6),
+    "position jumps for 3 ms": _of_either(kind="jump", quantity="position", level=0.6, for_s=0.003),
+    "position inverted": _of_either(kind="invert", quantity="position"),
+    "position scaled 1.1": _of_joint(kind="scale", quantity="position", factor=1.1),
+    "reports lost 1": _of_either(kind="drop", frames="report", count=1),
+    "reports lost 100": _of_either(kind="drop", frames="report", count=100),
+    "commands lost 100": _of_either(kind="drop", frames="command", count=100),
+    "every command lost": _of_either(kind="drop", frames="command"),
+    "reports late 5 ms": _of_joint(kind="delay", frames="report", delay_s=0.005),
+    "commands late 20 ms": _of_joint(kind="delay", frames="command", delay_s=0.02),
+    "reports twice": _of_either(kind="duplicate", frames="report"),
+    "reports reordered": _of_joint(kind="reorder", frames="report", count=50),
+    "reports corrupt 1": _of_joint(kind="corrupt", frames="report", count=1),
+    "reports corrupt 20": _of_joint(kind="corrupt", frames="report", count=20),
+    "commands corrupt 1": _of_joint(kind="corrupt", frames="command", count=1),
+    "reports cut short": _of_either(kind="truncate", frames="report", level=3, count=20),
+    "reports of a wrong node": _of_either(kind="misaddress", frames="report", count=20),
+    "foreign commands": _of_either(kind="foreign", frames="command"),
+    "foreign reports": _of_joint(kind="foreign", frames="report"),
+    "node silent": _of_either(kind="mute"),
+    "node silent 50 ms": _of_either(kind="mute", for_s=0.05),
+    "node reboots": _of_either(kind="reset"),
+    "drive faults": _of_either(kind="fault"),
+    "brake stays closed": _of_joint(kind="blocked"),
+} | INTERFACE
+MOTORS_SET_UP: dict[str, Draw] = {
+    "answer lost": _of_either(kind="drop", frames="report", count=1),
+    "every answer lost": _of_either(kind="drop", frames="report"),
+    "answer short": _of_either(kind="truncate", frames="report", level=3, count=1),
+    "answer corrupt": _of_either(kind="corrupt", frames="report", count=1),
+    "answer of a wrong node": _of_either(kind="misaddress", frames="report", count=1),
+    "answered twice": _of_either(kind="duplicate", frames="report", count=3),
+    "request lost": _of_either(kind="drop", frames="command", count=1),
+    "interface fails in set-up": _of_bus(kind="send_error", error="os"),
+    "interface deaf in set-up": _of_bus(kind="receive_error", error="runtime"),
+}
 IN_MOTION = WRONG_REPORTS | FRAMES | DRIVES | INTERFACE
 WHOLE_RUN = ("torque times 1.5", "torque times 0.7", "torque offset", "position scaled 1.1")
 """From the beginning these are another robot, not a fault: no host can tell. They strike later only."""
+
+
+def faults_of(verb: str, phase: str) -> Mapping[str, Draw]:
+    """What can go wrong in a phase of a verb."""
+    if VERBS[verb] in ("damiao", "robstride"):
+        return MOTORS_SET_UP if phase in BEFORE_SYNC else MOTORS
+    return SDO if phase in BEFORE_SYNC else IN_MOTION
 
 
 @dataclass(frozen=True)
@@ -215,7 +291,7 @@ class Case:
     def row(self, phases: Mapping[str, Phase]) -> dict[str, Any]:
         """The fault as a robot file would list it."""
         rng = self.drawn()
-        row = (SDO if self.phase in BEFORE_SYNC else IN_MOTION)[self.name](rng)
+        row = faults_of(self.verb, self.phase)[self.name](rng)
         if "joint" in row and VERBS[self.verb] == "one joint":
             row["joint"] = JOINT
         phase = phases[self.phase]
@@ -267,11 +343,23 @@ class Axle:
     fastest_rad_s: float
 
 
+def _axle(joint: JointSetup, powered: Callable[[], bool], plant: Any) -> Axle:
+    return Axle(
+        joint.name,
+        powered,
+        lambda: float(plant.position_rad),
+        lambda: float(plant.velocity_rad_s),
+        (joint.position_min_rad, joint.position_max_rad),
+        joint.max_velocity_rad_s,
+    )
+
+
 class Watched(Silent):
     """Follows a run from behind: the drives' own state at every step of their time, and the phases."""
 
     def __init__(self) -> None:
         self.rack: Any = None
+        self.now: Callable[[], int] = lambda: 0
         self.axles: list[Axle] = []
         self.rings: list[Ring] = []
         self.phases: dict[str, Phase] = {}
@@ -293,7 +381,7 @@ class Watched(Silent):
         return True
 
     def _begin(self, name: str) -> None:
-        now_ns = 0 if self.rack is None else self.rack.now_ns
+        now_ns = self.now()
         if self.origin_ns is None and name != "configure":
             self.origin_ns = now_ns
         now_s = (now_ns - (now_ns if self.origin_ns is None else self.origin_ns)) * 1e-9
@@ -310,6 +398,7 @@ class Watched(Silent):
     def watching(self) -> Iterator[None]:
         """Hooks where the drives' time goes on, where rows are kept, and where the host stops."""
         opened, stopped = VirtualDriver.open, Cia402Driver.quick_stop
+        made, braked, advance, receive = VirtualMitDriver.__init__, MitDriver.quick_stop, Motors.advance, Motors.receive
 
         def open_(driver: VirtualDriver, sink: Any = None) -> None:
             self._follow_can(driver)
@@ -319,11 +408,35 @@ class Watched(Silent):
             self._stopped()
             stopped(driver)
 
+        def make(driver: VirtualMitDriver, setup: RobotSetup) -> None:
+            made(driver, setup)
+            self._follow_motors(driver)
+
+        def brake(driver: MitDriver) -> None:
+            self._stopped()
+            braked(driver)
+
+        def advanced(rack: Motors, to_ns: int) -> None:
+            advance(rack, to_ns)
+            self._advanced()
+
+        def received(rack: Motors, can_id: int, data: bytes) -> Any:
+            self.answers += 1
+            return receive(rack, can_id, data)
+
         def ring(**how: Any) -> Ring:
             self.rings.append(sample_ring(**how))
             return self.rings[-1]
 
-        vars_ = [(VirtualDriver, "open", open_), (Cia402Driver, "quick_stop", stop), (run_module, "sample_ring", ring)]
+        vars_: list[tuple[Any, str, Any]] = [
+            (VirtualDriver, "open", open_),
+            (Cia402Driver, "quick_stop", stop),
+            (VirtualMitDriver, "__init__", make),
+            (MitDriver, "quick_stop", brake),
+            (Motors, "advance", advanced),
+            (Motors, "receive", received),
+            (run_module, "sample_ring", ring),
+        ]
         before = [(owner, name, getattr(owner, name)) for owner, name, _ in vars_]
         for owner, name, value in vars_:
             setattr(owner, name, value)
@@ -335,7 +448,7 @@ class Watched(Silent):
 
     def _stopped(self) -> None:
         if self.stop_ns is None and any(axle.powered() for axle in self.axles):
-            self.stop_ns = self.rack.now_ns
+            self.stop_ns = self.now()
 
     def _follow_can(self, driver: VirtualDriver) -> None:
         rack: Any = driver._rack
@@ -346,39 +459,36 @@ class Watched(Silent):
             send(can_id, data)
 
         def axles() -> list[Axle]:
-            return [
-                Axle(
-                    joint.name,
-                    lambda axis=rack.servos[joint.name].axis: axis.powered,
-                    lambda plant=rack.servos[joint.name].axis._plant: plant.position_rad,
-                    lambda plant=rack.servos[joint.name].axis._plant: plant.velocity_rad_s,
-                    (joint.position_min_rad, joint.position_max_rad),
-                    joint.max_velocity_rad_s,
-                )
-                for joint in joints
-            ]
+            axes = [(joint, rack.servos[joint.name].axis) for joint in joints]
+            return [_axle(joint, partial(getattr, axis, "powered"), axis._plant) for joint, axis in axes]
 
-        rack.send = counted
-        self._follow(rack, axles)
-
-    def _follow(self, rack: Any, axles: Callable[[], list[Axle]]) -> None:
-        self.rack, self.stop_ns, self.axles, advance = rack, None, [], rack.advance
+        advance = rack.advance
 
         def advanced(to_ns: int) -> None:
             advance(to_ns)
-            if not self.axles:
-                self.axles = axles()
-            for axle in self.axles:
-                if axle.powered():
-                    self.powered_ns = rack.now_ns
-                    self._look(axle)
+            self.axles = self.axles or axles()
+            self._advanced()
 
-        rack.advance = advanced
+        rack.send, rack.advance = counted, advanced
+        self.rack, self.stop_ns, self.axles, self.now = rack, None, [], lambda: rack.now_ns
+
+    def _follow_motors(self, driver: VirtualMitDriver) -> None:
+        motors = driver.rack.actuators
+        self.rack, self.stop_ns = driver.rack, None
+        self.now = lambda: max(motor._now_ns for motor in motors.values())
+        pairs = [(joint, motors[joint.name]) for joint in driver.setup.joints]
+        self.axles = [_axle(joint, partial(getattr, motor, "on"), motor.plant) for joint, motor in pairs]
+
+    def _advanced(self) -> None:
+        for axle in self.axles:
+            if axle.powered():
+                self.powered_ns = self.now()
+                self._look(axle)
 
     def _look(self, axle: Axle) -> None:
         speed = abs(axle.velocity_rad_s())
         if speed > OFF_MPS:
-            self.moved_ns = self.rack.now_ns
+            self.moved_ns = self.now()
             low, high = axle.within_rad
             if not low <= axle.position_rad() <= high:
                 self.beyond.setdefault("limits", f"joint {axle.name} left its limits")
@@ -395,13 +505,14 @@ class Bench:
         self.folder = folder
         self.clean: dict[str, dict[str, Phase]] = {}
         self._store: Path | None = None
-        self._profile: Path | None = None
+        self.calibrated = cache(self._calibrated)
         self.file, self.robot = cache(self._file), cache(lambda kind: load_robot(str(self.file(kind, 250.0))))
 
     def _file(self, kind: str, rate_hz: float) -> Path:
         path = self.folder / f"{kind.replace(' ', '-')}-{rate_hz:g}.yaml"
-        head = f"schema: frictid.robot/1\nname: {NAME}\nbus: virtual:{NAME}-{os.getpid()}\ncycle_hz: {rate_hz:g}\n"
-        path.write_text(head + ROBOTS[kind])
+        bus = f"virtual:{NAME}-{os.getpid()}"
+        values = {"schema": "frictid.robot/1", **ROBOTS[kind](), "name": NAME, "bus": bus, "cycle_hz": rate_hz}
+        path.write_text(dump(values))
         return path
 
     def phases(self, verb: str) -> dict[str, Phase]:
@@ -452,16 +563,15 @@ class Bench:
             _judge_curves(verb.joints, verdict, self.robot(VERBS[verdict.verb]))
         verdict.took_s = round(time.monotonic() - began, 1)
 
-    def calibrated(self) -> Path:
+    def _calibrated(self, kind: str) -> Path:
         """A profile of the joint."""
-        if self._profile is None:
-            with _no_faults():
-                options = CalibrateOptions(
-                    str(self.file("two joints", 250.0)), joints=(JOINT,), program="quick", out=self.folder / "profile"
-                )
-                self._profile = calibrate(options, Silent()).profile_file
-            assert self._profile is not None
-        return self._profile
+        with _no_faults():
+            options = CalibrateOptions(
+                str(self.file(kind, 250.0)), joints=(JOINT,), program="quick", out=self.folder / f"{kind} profile"
+            )
+            profile = calibrate(options, Silent()).profile_file
+        assert profile is not None
+        return profile
 
     def store(self) -> Path:
         """A store with a profile in force."""
@@ -480,15 +590,15 @@ class _Verb:
     def __init__(self, bench: Bench, verdict: Verdict, watched: Watched, file: Path, folder: Path) -> None:
         self._verdict, self._watched, self._file = verdict, watched, str(file)
         self._folder, self.store = folder, folder / "store"
-        self._profile = bench.calibrated() if verdict.verb == "compensate" else None
+        self._profile = bench.calibrated(VERBS[verdict.verb]) if verdict.verb.endswith("compensate") else None
         if verdict.verb == "recalibrate":
             shutil.copytree(bench.store(), self.store)
         self.joints: Mapping[str, Any] = {}
 
     def run(self) -> None:
         """To its end; what it told is in the verdict."""
-        name = self._verdict.verb.replace(" ", "_")
-        getattr(self, f"_{name}")()
+        verb = self._verdict.verb
+        getattr(self, "_gap_record" if verb == "gap record" else f"_{verb.split()[-1]}")()
 
     def _calibrate(self, *, together: bool = False) -> None:
         joints = (JOINT, OTHER) if together else (JOINT,)
@@ -575,7 +685,7 @@ def _judge_drives(watched: Watched, verdict: Verdict) -> None:
     rack = watched.rack
     if rack is None:
         return
-    rack.advance(rack.now_ns + round(SILENT_S * 1e9))
+    rack.advance(watched.now() + round(SILENT_S * 1e9))
     for axle in watched.axles:
         if axle.powered():
             verdict.failures.append(f"joint {axle.name} has power after the end")
@@ -659,7 +769,7 @@ def cases(
             before = phase in BEFORE_SYNC
             if phase == "end" or (when.end_s <= when.start_s and (not before or when.last_sdo <= when.first_sdo)):
                 continue
-            for name in SDO if before else IN_MOTION:
+            for name in faults_of(verb, phase):
                 early = phase in ("reference", "enable", "units", "move", "rehearsal")
                 if (early and name in WHOLE_RUN) or only not in f"{verb} {phase} {name}":
                     continue

@@ -81,6 +81,9 @@ def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
 
 def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Gate | None:
     """Friction turns over after the same travel at every speed: what it takes longer is lateness."""
+    # Samples that are further apart than what is allowed cannot tell.
+    if float(np.median(np.diff(recording.time_s))) > 1.05 * MOST_TURNOVER_SEEN_S:
+        return None
     late_s = turnover_lateness(recording, motion)
     if late_s.size == 0:
         return None
