@@ -202,7 +202,7 @@ SDO: dict[str, Draw] = {
     "SDO answer corrupt": _of_either(kind="corrupt", frames="sdo", count=1),
     "SDO of a wrong node": _of_either(kind="misaddress", frames="sdo", count=1),
     "SDO answered twice": _of_either(kind="duplicate", frames="sdo", count=3),
-    "node silent in set-up": _of_either(kind="mute"),
+    "node silent in set-up": _of_either(kind="drop", frames="sdo"),
     "interface fails in set-up": _of_bus(kind="send_error", error="os"),
     "interface deaf in set-up": _of_bus(kind="receive_error", error="runtime"),
 }
@@ -299,7 +299,7 @@ class Case:
             return {**row, "at_s": round(float(rng.uniform(phase.start_s, phase.end_s)), 4)}
         share = 0.5 if "joint" in row else 1.0  # half of the answers are of either joint
         after = int(rng.integers(round(phase.first_sdo * share), max(1, round(phase.last_sdo * share) - 1)))
-        return {**row, "after": after} if row["kind"] != "mute" else row
+        return {**row, "after": after}
 
 
 @dataclass
@@ -704,6 +704,8 @@ def _judge_drives(watched: Watched, verdict: Verdict) -> None:
 
 def _judge_recording(watched: Watched, verdict: Verdict, folder: Path) -> None:
     recorded = sum(ring._head for ring in watched.rings)
+    if not recorded:
+        return
     files = sorted(folder.rglob("samples*.mcap"))
     try:
         kept = sum(len(rows) for file in files for rows in read_rows(file).values())
