@@ -60,12 +60,15 @@ class CanCycle:
             rows.feed(*heard)
         deadline_ns = self._clock.now_ns() + self._window_ns
         refused: SafetyAbort | None = None
+        frames = []
         for at, (wish, set_point) in enumerate(zip(self.wishes, set_points, strict=True)):
             try:
                 order = wish.order(set_point)
             except SafetyAbort as abort:
                 refused, order = abort, Order(Do.BRAKE)
-            frame = self._frame(at, order)
+            frames.append(self._frame(at, order))
+        # Only now: the first command makes all reports a cycle older, and orders go by fresh ones.
+        for frame in frames:
             rows.feed(line.send(*frame), *frame)
         if refused is not None:
             self.quick_stop()

@@ -52,6 +52,19 @@ def test_a_joint_follows_its_set_point(tmp_path: Path, family: str) -> None:
     b.driver.close()
 
 
+def test_every_motor_that_moves_has_its_spring_computed_here(tmp_path: Path) -> None:
+    """Its own would show less torque at the end of a cycle than the mean: negative viscous friction."""
+    b = bench(tmp_path, "damiao", joints=3)
+    b.begin()
+    b.enabled(Mode.POSITION)
+    for _ in range(20):
+        for set_point in b.set_points:
+            set_point.position_rad += 0.002
+            set_point.velocity_rad_s = 1.0
+        b.cycles(1)
+    assert [motor.asked[2] < 2.0 for motor in b.rack.actuators.values()] == [True, True, True]
+
+
 def test_a_motor_on_its_head_moves_the_joint_the_same_way(tmp_path: Path, family: str) -> None:
     setup = robot(tmp_path, family).to_setup()
     b = Bench(replace(setup, joints=(replace(setup.joints[0], direction=-1),)))
