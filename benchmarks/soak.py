@@ -1,0 +1,177 @@
+"""One process that calibrates, compensates, recalibrates and replays, again and again: what does it keep?
+
+    python benchmarks/soak.py [--minutes 120] [--wall-clock-every 20]
+
+One joint of the shipped robot, other noise in every round. After every round: memory of this process, open files,
+threads, children, held locks, segments of shared memory. What the run folders hold is deleted, as a person would. Every
+so many rounds the calibration is on the wall clock, with processes and shared memory of its own. The median memory of
+the last tenth of the rounds is to be within 1 % of that of the tenth after the first (libraries load and caches fill
+in the first tenth); everything else is to be what it was after the first rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from frictid_hil.config.provenance import git_revision
+from frictid_hil.config.robot import load_robot
+from frictid_hil.config.write import dump
+from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
+from frictid_hil.jobs.compensate import CompensateOptions, compensate
+from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
+from frictid_hil.jobs.replay import ReplayOptions, replay
+from frictid_hil.jobs.watch import Silent
+
+JOINT = "5"
+WITHIN = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What this process holds at a moment.
+
+    Attributes:
+        files: open file descriptors.
+        threads: of the system's counting.
+        children: processes.
+        locks: on files, of this process.
+        shared: segments of shared memory that are ours.
+    """
+
+    files: int
+    threads: int
+    children: int
+    locks: int
+    shared: int
+
+
+def held() -> Held:
+    """At this moment."""
+    me = psutil.Process()
+    locks = Path("/proc/locks").read_text().split("\n")
+    return Held(
+        files=me.num_fds(),
+        threads=max(me.num_threads(), threading.active_count()),
+        children=len(me.children(recursive=True)),
+        locks=sum(line.split()[4:5] == [str(os.getpid())] for line in locks),
+        shared=len(list(Path("/dev/shm").glob("frictid*"))) + len(list(Path("/dev/shm").glob("psm_*"))),
+    )
+
+
+def robot_file(place: Path) -> str:
+    """One joint, a short procedure."""
+    values = load_robot("hp3j").values()
+    values |= {"name": "soak", "bus": f"virtual:soak-{os.getpid()}"}
+    values["procedure"] = {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3, "ratio": 0.8}
+    values["policy"] = {"warm_up": {"fixed_s": 0.0}}
+    values["joints"] = {JOINT: values["joints"][JOINT] | {"locked_position_rad": 0.0, "start_position_rad": 0.0}}
+    path = place / "soak.yaml"
+    path.write_text(dump(values))
+    return str(path)
+
+
+def one_round(robot: str, place: Path, number: int, *, wall_clock: bool = False) -> list[str]:
+    """Each of the four once; returns their outcomes."""
+    runs, store = place / "runs", place / "store"
+    shutil.rmtree(runs, ignore_errors=True)
+    runs.mkdir()
+    measured = runs / "calibrated"
+    options = CalibrateOptions(robot, out=measured, seed=number, realtime=wall_clock, store=store)
+    done: list[dict[str, Any]] = [calibrate(options, Silent()).to_json()]
+    if not wall_clock:
+        wanted = Wanted("hand", ("nc", "mop"), duration_s=2.0)
+        profile = measured / "profile.yaml"
+        told = CompensateOptions(robot, profile, JOINT, wanted, seed=number, out=runs / "hand", store=store)
+        done.append(compensate(told, Silent()).to_json())
+        done.append(recalibrate(RecalibrateOptions(robot, store=store, seed=number, out=runs / "night"), Silent()))
+        done.append(replay(ReplayOptions(measured, robot)))
+    return [str(one["outcome"]) for one in done]
+
+
+@dataclass(frozen=True, slots=True)
+class Soaked:
+    """What the rounds showed.
+
+    Attributes:
+        memory_mb: after every round.
+        before: held after the first rounds.
+        after: held at the end.
+        outcomes: how often each.
+        lasted_s: all rounds.
+    """
+
+    memory_mb: list[float]
+    before: Held
+    after: Held
+    outcomes: dict[str, int]
+    lasted_s: float
+
+    @property
+    def growth(self) -> float:
+        """Of memory, from the second tenth of the rounds to the last, as a share."""
+        tenth = max(1, len(self.memory_mb) // 10)
+        early, late = self.memory_mb[tenth : 2 * tenth], self.memory_mb[-tenth:]
+        return float(np.median(late) / np.median(early)) - 1.0
+
+
+def soak(lasts_s: float, *, wall_clock_every: int = 20, tell: Callable[[str], None] = print) -> Soaked:
+    """Rounds for so long, at least three."""
+    began, memory_mb, outcomes, before = time.monotonic(), list[float](), dict[str, int](), held()
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(temporary)
+        robot = robot_file(place)
+        while len(memory_mb) < 3 or time.monotonic() - began < lasts_s:
+            number = len(memory_mb)
+            wall_clock = wall_clock_every > 0 and number % wall_clock_every == 1
+            for outcome in one_round(robot, place, number, wall_clock=wall_clock):
+                outcomes[outcome] = outcomes.get(outcome, 0) + 1
+            gc.collect()
+            memory_mb.append(psutil.Process().memory_info().rss / 1e6)
+            if number == 1:  # by now every kind of run has been there once
+                before = held()
+            tell(f"round {number}: {memory_mb[-1]:.1f} MB, {astuple(held())}, {outcomes}")
+    return Soaked(memory_mb, before, held(), outcomes, time.monotonic() - began)
+
+
+def main() -> int:
+    """Print what it showed; 1 where something was kept."""
+    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    asked.add_argument("--minutes", type=float, default=120.0)
+    asked.add_argument("--wall-clock-every", type=int, default=20, help="rounds; 0 for never")
+    options = asked.parse_args()
+    found = soak(
+        60.0 * options.minutes,
+        wall_clock_every=options.wall_clock_every,
+        tell=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    print(
+        f"commit {git_revision()[:8]}, Python {platform.python_version()}: {len(found.memory_mb)} rounds in "
+        f"{found.lasted_s / 60:.0f} min, outcomes {found.outcomes}"
+    )
+    print(
+        f"memory {found.memory_mb[0]:.1f} MB after the first round, {min(found.memory_mb[1:]):.1f} to "
+        f"{max(found.memory_mb):.1f} MB after the others; {100 * found.growth:+.2f} % from early to late"
+    )
+    print(f"held after two rounds: {found.before}")
+    print(f"held at the end:       {found.after}")
+    return int(abs(found.growth) > WITHIN or found.after != found.before)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
