@@ -129,3 +129,46 @@ def test_a_stop_is_judged_by_what_the_joint_reports(benchmark_named: Callable[[s
     assert stopped.beyond_rad == pytest.approx(0.05, abs=0.002)
     stood = stops.judged(times.tolist(), [0.3] * times.size, 1.0, (0.0, 1.05), 130)
     assert (stood.stop_s, stood.speed_rad_s, stood.beyond_rad) == (0.0, 0.0, 0.0)
+
+
+def test_no_wire_carries_six_joints_at_one_kilohertz(benchmark_named: Callable[[str], Any]) -> None:
+    cycle = benchmark_named("cycle")
+    assert 35 < cycle.layout_of(1, 1000.0).load().average_percent < 50
+    assert 55 < cycle.layout_of(6, 250.0).load().average_percent < 80
+    assert cycle.layout_of(6, 1000.0).load().average_percent > 150
+
+
+@pytest.mark.slow
+def test_the_loop_is_timed_beside_stock_canopen_and_beside_an_empty_one(benchmark_named: Callable[[str], Any]) -> None:
+    cycle = benchmark_named("cycle")
+    ours, stock, wire = cycle.alone(cycle.compared_us, 2, 1, 100)
+    assert 0 < min(wire) < min(ours) and 0 < min(wire) < min(stock)
+    before, loop, after = cycle.alone(cycle.timed, 2, 100.0, 0.3)
+    assert loop.cycles == 30 and before.cycles == after.cycles == 15
+    assert loop.late_us[0] <= loop.late_us[1] <= loop.late_us[2] <= loop.late_us[3]
+    assert loop.share > 0.0
+
+
+def test_missed_deadlines_and_lateness_are_figured_from_the_waits(benchmark_named: Callable[[str], Any]) -> None:
+    kept = benchmark_named("cycle").judged([50_000] * 998 + [900_000, 5_000_000], 4, 0.25, 1.0)
+    assert (kept.late_us[0], kept.late_us[3], kept.missed, kept.share) == (50.0, 5000.0, 4, 0.25)
+    assert "4 of 1004" in str(kept)
+
+
+@pytest.mark.slow
+def test_a_round_of_the_soak_keeps_nothing(benchmark_named: Callable[[str], Any], tmp_path: Path) -> None:
+    soak = benchmark_named("soak")
+    robot = soak.robot_file(tmp_path)
+    assert soak.one_round(robot, tmp_path, 0) == ["ok"] * 4
+    before = soak.held()
+    assert soak.one_round(robot, tmp_path, 1) == ["ok"] * 4
+    assert soak.held() == before
+    with (tmp_path / "kept").open("w"):
+        assert soak.held() != before
+
+
+def test_memory_is_compared_from_early_to_late(benchmark_named: Callable[[str], Any]) -> None:
+    soak = benchmark_named("soak")
+    held = soak.held()
+    rounds = [200.0] * 2 + [250.0] * 17 + [255.0] * 2
+    assert soak.Soaked(rounds, held, held, {}, 1.0).growth == pytest.approx(0.02)

@@ -29,6 +29,7 @@ from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
+_SECONDARY = ("torque_offset", "target_mode", "target_torque", "target_velocity")
 _INTERPOLATE = 0x10
 """Controlword bit 4 in interpolated position mode: follow the set-points."""
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
@@ -88,6 +89,7 @@ class Axis:
         self._target_units: int | None = None
         self._held_at_rad: float | None = None
         self._emergency = (Command(primary), Command(secondary))
+        self._secondary_told: tuple[int, int, int, int] | None = None
         self._stop_look_cycles = max(2, reset_cycles // 5)
         self._stop_cycles = 0
         self._stop_from_rad_s = 0.0
@@ -203,11 +205,12 @@ class Axis:
         primary.set("target_position", self._target_units)
         primary.set("torque_offset", offset)
         primary.pack()
-        secondary.set("torque_offset", offset)
-        secondary.set("target_mode", self._mode_value(mode))
-        secondary.set("target_torque", torque)
-        secondary.set("target_velocity", velocity)
-        secondary.pack()
+        told = (offset, self._mode_value(mode), torque, velocity)
+        if told != self._secondary_told:
+            self._secondary_told = told
+            for meaning, value in zip(_SECONDARY, told, strict=True):
+                secondary.set(meaning, value)
+            secondary.pack()
 
     def sent(self) -> None:
         """The primary command went out: its target is in force from the next SYNC on, in the mode that follows it."""
