@@ -56,6 +56,14 @@ def _paths() -> list[StopPath]:
         StopPath("Ctrl-C, SIGTERM, SIGHUP or a closed terminal, once", cycles, _ALONG, stop, Interrupted),
         StopPath("the same, twice", cycles, _QUICK, quick, Interrupted),
         StopPath("the command is killed (SIGKILL)", cycles, f"the loop: {_ALONG}", stop, None),
+        StopPath(
+            "the command is suspended (SIGSTOP), or its disk does not answer",
+            "when half of the memory for samples is full, about half a minute",
+            f"the loop: {_ALONG}",
+            stop,
+            SafetyAbort,
+        ),
+        StopPath("the computer's clock is set", "never: nothing here goes by it", "none", "-", None),
         StopPath("the loop is killed", watchdog, _BY_DRIVE, "the drive's ramp", SafetyAbort),
         StopPath(
             "the loop is suspended or hangs (SIGSTOP)",

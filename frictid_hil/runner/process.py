@@ -186,9 +186,18 @@ def _lost(exit_code: int | None, setup: RobotSetup, *, hangs: bool, powered: boo
     )
 
 
+def _unattended() -> SafetyAbort:
+    return SafetyAbort(
+        "the command took no samples for so long that they would soon be lost; the joint was brought to rest",
+        cause="it was suspended (Ctrl-Z, SIGSTOP), or its disk does not answer",
+        next_step="let it go on (`fg`), or look at the disk; samples up to here are kept",
+    )
+
+
 def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
     """The cyclic process."""
-    stop = HeardStop(heard.fileno(), order.parent_pid)
+    samples, frames = sample_ring(name=order.samples), frame_ring(name=order.frames)
+    stop = HeardStop(heard.fileno(), order.parent_pid, lambda: samples.half_full or frames.half_full)
 
     def terminated(_signal: int, _frame: object) -> None:
         stop.terminated = True
@@ -199,7 +208,6 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
     signal.signal(signal.SIGTERM, terminated)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     outcome: FrictidError | None = None
-    samples, frames = sample_ring(name=order.samples), frame_ring(name=order.frames)
 
     def tell(event: Event) -> None:
         try:
@@ -229,6 +237,8 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
             stop=stop,
             care=order.care,
         ).run()
+    except Interrupted as error:
+        outcome = _unattended() if stop.left_alone else error
     except FrictidError as error:
         outcome = error
     except Exception as error:  # the parent must learn of a defect here too

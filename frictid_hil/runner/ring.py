@@ -112,6 +112,11 @@ class Ring:
         """Rows lost because the reader fell behind."""
         return self._counters[_DROPPED]
 
+    @property
+    def half_full(self) -> bool:
+        """The reader is far behind; for the process that appends."""
+        return 2 * (self._head - self._counters[_TAIL]) > self._capacity
+
     def append(self, *values: Any) -> None:
         """Pack one row; drops and counts it where the ring is full."""
         head = self._head

@@ -80,22 +80,25 @@ class StopSignals:
 
 
 class HeardStop:
-    """The other end of that pipe, in the process of the loop; the level also rises when the parent is gone.
+    """The other end of that pipe, in the process of the loop; the level also rises when the parent is gone or stands.
 
     Args:
         pipe: to read signal numbers from.
         parent_pid: who writes them.
+        behind: whether the parent has taken no rows for so long that they would soon be lost.
 
     Attributes:
         terminated: this process itself was asked to end.
+        left_alone: the parent was behind.
     """
 
-    def __init__(self, pipe: int, parent_pid: int) -> None:
+    def __init__(self, pipe: int, parent_pid: int, behind: Callable[[], bool] = lambda: False) -> None:
         os.set_blocking(pipe, False)
         self._pipe = pipe
         self._parent_pid = parent_pid
         self._level = NOTHING_ASKED
-        self.terminated = False
+        self._behind = behind
+        self.terminated = self.left_alone = False
 
     @property
     def level(self) -> int:
@@ -103,6 +106,7 @@ class HeardStop:
         with contextlib.suppress(BlockingIOError):
             asked = sum(number in STOP_SIGNALS for number in os.read(self._pipe, 64))
             self._level = min(QUICK_STOP, self._level + asked)
-        if self.terminated or os.getppid() != self._parent_pid:
+        self.left_alone = self.left_alone or self._behind()
+        if self.terminated or self.left_alone or os.getppid() != self._parent_pid:
             return max(DECELERATE, self._level)
         return self._level

@@ -11,7 +11,8 @@ import pytest
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import Interrupted
 from frictid_hil.runner.cycle import DECELERATE, NOTHING_ASKED, QUICK_STOP
-from frictid_hil.runner.process import _Life, _lost
+from frictid_hil.runner.process import _Life, _lost, _unattended
+from frictid_hil.runner.ring import SAMPLE_ROW, sample_ring
 from frictid_hil.runner.stop_signals import STOP_SIGNALS, HeardStop, StopSignals
 
 
@@ -48,6 +49,21 @@ def test_the_loop_stops_when_its_parent_is_gone() -> None:
     heard, wire = os.pipe()
     assert HeardStop(heard, os.getppid()).level == NOTHING_ASKED
     assert HeardStop(heard, os.getppid() + 1).level == DECELERATE
+    os.close(wire)
+    os.close(heard)
+
+
+def test_the_loop_stops_when_nobody_takes_what_it_measures() -> None:
+    heard, wire = os.pipe()
+    ring = sample_ring(8)
+    loop = HeardStop(heard, os.getppid(), lambda: ring.half_full)
+    row = [0] * len(SAMPLE_ROW.names or ())
+    for count in range(1, 9):
+        ring.append(*row)
+        assert loop.level == (DECELERATE if count > 4 else NOTHING_ASKED) and loop.left_alone is (count > 4)
+    ring.drain()
+    assert loop.level == DECELERATE, "once is enough"
+    assert _unattended().exit_code == 4 and "Ctrl-Z" in _unattended().cause
     os.close(wire)
     os.close(heard)
 
