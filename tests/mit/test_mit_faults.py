@@ -94,7 +94,7 @@ def test_the_environment_adds_to_the_file_and_mistakes_are_named(
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at_s", [None, 0.05])
 def test_every_kind_ends_in_a_report_or_in_one_of_our_errors(tmp_path: Path, kind: str, at_s: float | None) -> None:
-    fields = {"frames": "report", "quantity": "torque", "delay_s": 0.003, "error": "runtime"}
+    fields = {"frames": "report", "quantity": "torque", "delay_s": 0.003, "error": "runtime", "level": 1e6}
     when = {} if at_s is None else {"at_s": at_s}
     run = None
     try:

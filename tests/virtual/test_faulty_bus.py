@@ -1,5 +1,6 @@
 """The interface ``faulty``: any bus with wrong reports, refusals, foreign senders and an interface that fails."""
 
+import math
 import struct
 
 import can
@@ -11,7 +12,7 @@ from frictid_drivers.virtual.faults import KINDS, Fault, read_faults
 from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.rack import Rack
-from frictid_drivers.virtual.wire_faults import WireFaults
+from frictid_drivers.virtual.wire_faults import OccupiedWire, WireFaults
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.protocol.driver import SetPoint
 
@@ -126,6 +127,31 @@ def test_a_bus_that_goes_off_says_so_once_and_carries_nothing(make_robot):
         assert first.is_error_frame and first.arbitration_id & 0x40 and then is None
 
 
+def test_frames_take_their_time_on_an_occupied_wire_and_the_lowest_goes_first():
+    wire, passed = OccupiedWire(1e6), []
+    for can_id in (0x183, 0x182, 0x181):
+        wire.put(0, can_id, bytes(8), lambda can_id=can_id: passed.append(can_id))
+    wire.put(50_000, 0x080, b"", lambda: passed.append(0x080))
+    assert wire.next_ns == 135_000  # with the most stuff bits, 8 bytes are 135 bits
+    wire.run(134_999)
+    assert passed == []
+    wire.run(135_000)
+    assert passed == [0x181]
+    wire.run(1_000_000)
+    assert passed == [0x181, 0x080, 0x182, 0x183] and wire.next_ns == math.inf
+
+
+def test_a_host_that_stands_still_sends_later(make_robot):
+    rack = Rack()
+    rack.install(make_robot())
+    stall = [{"kind": "stall", "delay_s": 0.02, "at_s": 0.0}]
+    stood = []
+    with FaultyBus(LockStepBus(rack, "stalls"), stall, lambda: rack.now_ns, stand_still=stood.append) as bus:
+        for _ in range(3):
+            bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+    assert stood == [0.02]
+
+
 def test_injected_warnings_and_resets_reach_both_ends(make_robot):
     faults = [{"kind": "emcy", "node": 1, "count": 3, "at_s": 0.0}, {"kind": "reset", "node": 1, "at_s": 0.0}]
     with on_a_bus(make_robot, *faults) as bus:
@@ -160,7 +186,15 @@ def test_faults_for_a_bus_that_injects_none_are_refused(make_robot, runtime_fold
 
 
 def row_of(kind: str) -> dict:
-    fields: dict = {"kind": kind, "quantity": "torque", "frames": "tpdo1", "delay_s": 0.003, "index": 0x2031}
+    fields: dict = {
+        "kind": kind,
+        "quantity": "torque",
+        "frames": "tpdo1",
+        "delay_s": 0.003,
+        "index": 0x2031,
+        "level": 1e6,
+    }
+    fields["level"] = 1e6
     return {**fields, "at_s": 0.12} if kind not in ("missing", "left_in_fault", "abort") else fields
 
 

@@ -63,6 +63,7 @@ def test_reading_a_robot_file():
         ([{"kind": "drop"}], ("options", "faults", 0, "frames")),
         ([{"kind": "reset"}, {"kind": "reset", "joint": "9"}], ("options", "faults", 1, "joint")),
         ([{"kind": "reset", "at": 3}], ("options", "faults", 0, "at")),
+        ([{"kind": "occupied"}], ("options", "faults", 0, "level")),
         ([{"kind": "reset", "at_s": -1}], ("options", "faults", 0, "at_s")),
         ([7], ("options", "faults", 0)),
     ],
@@ -159,6 +160,13 @@ def test_switches_of_a_drive(make_bench):
     bench.heard.clear()
     bench.drives.process(0x602, bytes.fromhex("4016100000000000"))
     assert bench.heard[0][2] == "8016100000000206"
+
+
+def test_clocks_that_drift_apart(make_bench):
+    bench = make_bench(Fault("drift", factor=1.01))
+    bench.run(100)
+    assert bench.drives.now_ns == pytest.approx(100 * MS, abs=MS)
+    assert bench.rack.now_ns == pytest.approx(101 * MS, abs=MS)
 
 
 def test_bad_cable_in_front_of_any_bus(make_robot):

@@ -56,7 +56,12 @@ class VirtualMitDriver(MitDriver):
             ours = [fault for fault in faults if fault.kind in HOST_KINDS]
             if not ours:
                 return bus
-            spoilt = FaultyBus(bus, ours, clock.now_ns)
+            spoilt = FaultyBus(
+                bus,
+                ours,
+                now_ns=clock.now_ns,
+                stand_still=lambda lasts_s: clock.wait_until(clock.now_ns() + round(lasts_s * 1e9)),
+            )
             self._begin.append(spoilt.begin)
             return spoilt
 

@@ -7,7 +7,6 @@ difference; this class only builds the bus, takes it exclusively and tears it do
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -103,7 +102,15 @@ class VirtualDriver:
         ours = [fault for fault in self._faults if fault.kind in HOST_KINDS]
         if not ours:
             return bus
-        return FaultyBus(bus, ours, time.monotonic_ns if self._setup.realtime else lambda: self._rack.now_ns)
+        if self._setup.realtime:
+            return FaultyBus(bus, ours)
+        drives = self._drives
+        return FaultyBus(
+            bus,
+            ours,
+            now_ns=lambda: drives.now_ns,
+            stand_still=lambda lasts_s: drives.advance(drives.now_ns + round(lasts_s * 1e9)),
+        )
 
     def close(self) -> None:
         """Bring everything to rest and let go of the channel."""

@@ -41,12 +41,16 @@ on any bus: what the host's own interface does
 send_error       ``send`` raises                               error, for_s, count, after
 receive_error    ``recv`` raises                               error, for_s, count, after
 bus_off          an error frame, then only errors              for_s
+stall            the host stands still before a frame          delay_s, count, after
+occupied         frames need time on a wire of ``level`` bit/s level
 in simulated drives
 -----------------------------------------------------------------------------------------------------------
 fault            the drive faults                              code
 stuck_encoder    the drive's own encoder stands for ever
 blocked          the brake stays closed                        for_s
 interlock_open   the interlock input opens (60FDh bit 3)       for_s
+drift            the drives' clocks go ``factor`` times as     factor
+                 fast as the host's
 missing          the drive has no such object, from the start  index
 left_in_fault    the drive is found in fault, as after a run   code
                  that was cut off (8130h unless told)
@@ -55,6 +59,7 @@ left_in_fault    the drive is found in fault, as after a run   code
 ``at_s`` counts from the first SYNC; without it a fault is there from the beginning (those of drives: from the first
 SYNC). ``after`` lets so many frames or calls pass first. ``frames`` is ``sync``, ``host_heartbeat``, ``sdo``, ``emcy``,
 ``heartbeat`` or ``rpdo1`` to ``tpdo4``; without ``joint`` (or ``node``, its number) it means that of every joint.
+An occupied wire means something on the wall clock; in lock-step a frame that takes any time comes a cycle later.
 ``quantity`` is ``position``, ``velocity`` or ``torque``, and ``level`` of it is in the drive's own units. ``error`` is
 ``can``, ``os``, ``runtime`` or ``value``.
 """
@@ -62,6 +67,7 @@ SYNC). ``after`` lets so many frames or calls pass first. ``frames`` is ``sync``
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -74,8 +80,8 @@ from frictid_hil.simulation.fields import Fields
 FRAME_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt", "truncate", "misaddress", "foreign")
 NODE_KINDS = ("abort", "mute", "reset", "emcy")
 REPORT_KINDS = ("freeze", "invert", "lag", "clip", "scale", "jump", "flap")
-HOST_KINDS = ("send_error", "receive_error", "bus_off")
-DRIVE_KINDS = ("fault", "stuck_encoder", "blocked", "interlock_open", "missing", "left_in_fault")
+HOST_KINDS = ("send_error", "receive_error", "bus_off", "stall", "occupied")
+DRIVE_KINDS = ("fault", "stuck_encoder", "blocked", "interlock_open", "drift", "missing", "left_in_fault")
 KINDS = FRAME_KINDS + NODE_KINDS + REPORT_KINDS + HOST_KINDS + DRIVE_KINDS
 QUANTITIES = {"position": 0x6064, "velocity": 0x606C, "torque": 0x6077, "status": 0x6041}
 """What drives report, and the object that it is."""
@@ -116,8 +122,8 @@ class Fault:
         code: EMCY or SDO abort code.
         index: object.
         quantity: object of the report.
-        level: of the report, in the drive's units; bytes that are left.
-        factor: of the report.
+        level: of the report, in the drive's units; bytes that are left; bit/s of the wire.
+        factor: of the report, or of the drives' clocks.
         error: that the interface raises.
     """
 
@@ -217,6 +223,8 @@ def _fault(fields: Fields, known: Mapping[str, int], kinds: tuple[str, ...], fra
         fields.problem("frames", f"is required: one of {', '.join(frames)}")
     if kind in REPORT_KINDS and kind != "flap" and not quantity:
         fields.problem("quantity", f"is required: one of {', '.join(QUANTITIES)}")
+    if kind == "occupied" and fields.number("level", 0.0) < 1.0:
+        fields.problem("level", "is required: bit/s of the wire")
     names = (joint,) if joint else tuple(name for name, number in known.items() if node in (0, number))
     nodes = tuple(known[name] for name in names) or ((node,) if node else tuple(range(1, 128)))
     usual_code = {"left_in_fault": 0x8130, "abort": 0x08000020}.get(kind, 0x5000)
@@ -224,7 +232,7 @@ def _fault(fields: Fields, known: Mapping[str, int], kinds: tuple[str, ...], fra
         kind=kind,
         at_s=fields.number("at_s", 0.0, low=0.0) if "at_s" in fields else None,
         for_s=fields.number("for_s", FOREVER_S, low=0.0),
-        count=round(fields.number("count", 1 if kind == "emcy" else _NO_LIMIT, low=1.0)),
+        count=round(fields.number("count", 1 if kind in ("emcy", "stall") else _NO_LIMIT, low=1.0)),
         after=round(fields.number("after", 0.0, low=0.0)),
         joints=names,
         nodes=nodes,
@@ -235,7 +243,7 @@ def _fault(fields: Fields, known: Mapping[str, int], kinds: tuple[str, ...], fra
         index=round(fields.number("index", 0.0, low=0.0, high=0xFFFF)),
         quantity=QUANTITIES["status"] if kind == "flap" else QUANTITIES.get(quantity, 0),
         level=fields.number("level", 0.0),
-        factor=fields.number("factor", 1.0),
+        factor=fields.number("factor", 1.0, low=0.01 if kind == "drift" else -math.inf),
         error=fields.choice("error", "can", ERRORS),
     )
 

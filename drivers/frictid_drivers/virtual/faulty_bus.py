@@ -18,7 +18,7 @@ from typing import Any
 import can
 
 from frictid_drivers.virtual.faults import SERVICES, Fault, read_faults
-from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Injections, Late, WireFaults
+from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Injections, Late, OccupiedWire, WireFaults
 from frictid_hil.errors import InvalidFields
 
 _ERRORS: Mapping[str, Callable[[], Exception]] = {
@@ -38,6 +38,7 @@ class FaultyBus(can.BusABC):
         channel: ``interface:channel`` of the good bus, or the bus itself; it is shut down together with this.
         faults: as read, or as a robot file lists them.
         now_ns: run time; the monotonic clock unless told.
+        stand_still: lets so many seconds pass.
         arguments: of the good bus.
 
     Raises:
@@ -49,6 +50,7 @@ class FaultyBus(can.BusABC):
         channel: str | can.BusABC,
         faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        stand_still: Callable[[float], None] = time.sleep,
         **arguments: Any,
     ) -> None:
         known = _described(faults)
@@ -64,6 +66,10 @@ class FaultyBus(can.BusABC):
         self._send_errors = [FaultAtWork(fault) for fault in known if fault.kind == "send_error"]
         self._receive_errors = [FaultAtWork(fault) for fault in known if fault.kind == "receive_error"]
         self._off = [FaultAtWork(fault) for fault in known if fault.kind == "bus_off"]
+        self._stalls = [FaultAtWork(fault) for fault in known if fault.kind == "stall"]
+        self._stand_still = stand_still
+        rates = [fault.level for fault in known if fault.kind == "occupied"]
+        self._wire = OccupiedWire(min(rates)) if rates else None
         self._told_off = False
         self._late_out, self._late_in = Late(), Late()
         self._received: list[can.Message] = []
@@ -86,23 +92,48 @@ class FaultyBus(can.BusABC):
         self._fail(self._send_errors)
         if self._is_off():
             raise can.CanOperationError("injected: the bus is off")
-        self._late_out.run(self._clock())
+        for stall in self._stalls:
+            if stall.strikes(self._elapsed_ns()):
+                self._stand_still(stall.fault.delay_s)
+        self._run_late()
         self._inject()
         now_ns, elapsed_ns = self._clock(), self._elapsed_ns()
         self._incoming.hear(msg.arbitration_id, bytes(msg.data))
         for due_ns, can_id, data in self._outgoing.through(now_ns, elapsed_ns, msg.arbitration_id, bytes(msg.data)):
             frame = _changed(msg, can_id, data)
-            if due_ns <= now_ns:
+            if due_ns > now_ns:
+                self._late_out.put(due_ns, _later(self._pass_out, frame))
+            elif self._wire is None:
                 self._bus.send(frame, timeout)
             else:
-                self._late_out.put(due_ns, _later(self._bus.send, frame))
+                self._pass_out(frame)
+        self._run_late()
+
+    def _pass_out(self, frame: can.Message) -> None:
+        if self._wire is None:
+            self._bus.send(frame)
+        else:
+            self._wire.put(self._clock(), frame.arbitration_id, bytes(frame.data), lambda: self._bus.send(frame))
+
+    def _pass_in(self, frame: can.Message) -> None:
+        if self._wire is None:
+            self._received.append(frame)
+        else:
+            arrive = _later(self._received.append, frame)
+            self._wire.put(self._clock(), frame.arbitration_id, bytes(frame.data), arrive)
+
+    def _run_late(self) -> None:
+        now_ns = self._clock()
+        self._late_out.run(now_ns)
+        self._late_in.run(now_ns)
+        if self._wire is not None:
+            self._wire.run(now_ns)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         self._fail(self._receive_errors)
         deadline_s = None if timeout is None else time.monotonic() + timeout
         while True:
-            self._late_out.run(self._clock())
-            self._late_in.run(self._clock())
+            self._run_late()
             self._inject()
             off = self._is_off()
             if off and not self._told_off:
@@ -111,6 +142,8 @@ class FaultyBus(can.BusABC):
             if self._received:
                 return self._received.pop(0), False
             left_s = 0.01 if deadline_s is None else min(0.01, max(0.0, deadline_s - time.monotonic()))
+            if self._wire is not None:
+                left_s = min(left_s, max(0.0, (self._wire.next_ns - self._clock()) * 1e-9))
             msg = self._bus.recv(left_s)
             if msg is None:
                 if deadline_s is not None and time.monotonic() >= deadline_s:
@@ -124,9 +157,9 @@ class FaultyBus(can.BusABC):
         for due_ns, can_id, data in passed:
             frame = _changed(msg, can_id, data)
             if due_ns <= now_ns:
-                self._received.append(frame)
+                self._pass_in(frame)
             else:
-                self._late_in.put(due_ns, _later(self._received.append, frame))
+                self._late_in.put(due_ns, _later(self._pass_in, frame))
 
     def shutdown(self) -> None:
         """Both buses."""

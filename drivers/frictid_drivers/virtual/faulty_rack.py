@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 from frictid_drivers.virtual.faults import FOREVER_S, Fault
@@ -26,17 +27,20 @@ class FaultyRack:
         self._late = Late()
         self._start_ns: int | None = None
         self._muted: set[int] = set()
+        self._pace = math.prod(fault.factor for fault in faults if fault.kind == "drift")
+        self._host_ns, self._drives_ns = 0, 0
         rack.transmit = self._from_drives
 
     @property
     def now_ns(self) -> int:
-        """Run time."""
-        return self._rack.now_ns
+        """Run time of the host."""
+        return self._host_ns + round((self._rack.now_ns - self._drives_ns) / self._pace)
 
     @property
     def next_event_ns(self) -> int:
         """When something falls due by itself."""
-        return round(min(self._rack.next_event_ns, self._late.next_ns))
+        drives_ns = self._host_ns + (self._rack.next_event_ns - self._drives_ns) / self._pace
+        return round(min(drives_ns, self._late.next_ns))
 
     def power_on(self) -> None:
         """All drives boot."""
@@ -55,9 +59,15 @@ class FaultyRack:
     def advance(self, to_ns: int) -> None:
         """Let run time go on."""
         while self._late.next_ns <= to_ns:
-            self._rack.advance(round(self._late.next_ns))
-            self._late.run(self._rack.now_ns)
-        self._rack.advance(to_ns)
+            self._advance_drives(round(self._late.next_ns))
+            self._late.run(self.now_ns)
+        self._advance_drives(to_ns)
+
+    def _advance_drives(self, to_ns: int) -> None:
+        drives_ns = self._drives_ns + round((to_ns - self._host_ns) * self._pace)
+        self._rack.advance(drives_ns)
+        if self._pace != 1.0 and to_ns > self._host_ns:
+            self._host_ns, self._drives_ns = to_ns, drives_ns
 
     # -- frames --------------------------------------------------------------------------------------------------------
 

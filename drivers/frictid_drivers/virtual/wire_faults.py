@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from frictid_drivers.virtual.faults import FOREVER_S, FRAME_KINDS, REPORT_KINDS, SERVICES, Fault
+from frictid_hil.protocol.can_load import frame_bits
 from frictid_hil.protocol.driver import FD_FRAME
 
 SYNC_ID = 0x080
@@ -279,6 +280,42 @@ class Injections:
                     warning = fault.code.to_bytes(2, "little") + b"\x81" + bytes(5)
                     to_host += [(SYNC_ID + node, warning)] * fault.times
         return to_drives, to_host
+
+
+class OccupiedWire:
+    """A wire on which frames take time, one after the other; of those that wait, the lowest identifier goes first.
+
+    Args:
+        bits_per_s: its bit rate; frames are as long as with the most stuff bits.
+    """
+
+    def __init__(self, bits_per_s: float) -> None:
+        self._bits_per_s = bits_per_s
+        self._waiting: list[tuple[int, int, int, Callable[[], None]]] = []
+        self._free_ns = 0
+
+    @property
+    def next_ns(self) -> float:
+        """When the next frame has passed; infinite where none waits."""
+        return self._passed()[0] if self._waiting else math.inf
+
+    def put(self, now_ns: int, can_id: int, data: bytes, deliver: Callable[[], None]) -> None:
+        """A frame that wants to pass."""
+        bits = frame_bits(min(8, len(data))).worst
+        self._waiting.append((now_ns, can_id, round(1e9 * bits / self._bits_per_s), deliver))
+
+    def run(self, now_ns: int) -> None:
+        """Deliver what has passed by now."""
+        while self._waiting and (passed := self._passed())[0] <= now_ns:
+            self._free_ns, at = passed
+            self._waiting.pop(at)[3]()
+
+    def _passed(self) -> tuple[int, int]:
+        """When the frame that goes next has passed, and which it is."""
+        begin_ns = max(self._free_ns, min(frame[0] for frame in self._waiting))
+        ready = [at for at, frame in enumerate(self._waiting) if frame[0] <= begin_ns]
+        first = min(ready, key=lambda at: self._waiting[at][1])
+        return begin_ns + self._waiting[first][2], first
 
 
 class Late:
