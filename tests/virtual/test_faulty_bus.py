@@ -2,6 +2,7 @@
 
 import math
 import struct
+from functools import partial
 
 import can
 import pytest
@@ -128,10 +129,10 @@ def test_a_bus_that_goes_off_says_so_once_and_carries_nothing(make_robot):
 
 
 def test_frames_take_their_time_on_an_occupied_wire_and_the_lowest_goes_first():
-    wire, passed = OccupiedWire(1e6), []
+    wire, passed = OccupiedWire(1e6), list[int]()
     for can_id in (0x183, 0x182, 0x181):
-        wire.put(0, can_id, bytes(8), lambda can_id=can_id: passed.append(can_id))
-    wire.put(50_000, 0x080, b"", lambda: passed.append(0x080))
+        wire.put(0, can_id, bytes(8), partial(passed.append, can_id))
+    wire.put(50_000, 0x080, b"", partial(passed.append, 0x080))
     assert wire.next_ns == 135_000  # with the most stuff bits, 8 bytes are 135 bits
     wire.run(134_999)
     assert passed == []
