@@ -21,6 +21,21 @@ ONE_SINUSOID = (
 ALIKE_ON_A_SINUSOID = {"presliding_hysteresis": "torque_delay", "torque_delay": "presliding_hysteresis"}
 """Causes that such a motion cannot tell from each other."""
 
+ALIKE_ONE_WAY = frozenset(
+    (
+        "torque_bias",
+        "friction_level_error",
+        "viscous_error",
+        "viscous_nonlinearity",
+        "stribeck",
+        "direction_asymmetry",
+        "directional_efficiency",
+        "load_dependent_friction",
+        "gravity_error",
+    )
+)
+"""Causes that a motion in one direction, or at one speed, cannot tell from one another: friction, bias and gravity."""
+
 
 def one_sinusoid(experiments: ExperimentSet) -> bool:
     """Whether every log moves along one and the same sinusoid: one frequency, one travel."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
-from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ONE_SINUSOID, below_first_pair, one_sinusoid
+from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
@@ -30,7 +30,7 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import FLOORS, Verdict, verdict
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, Verdict, verdict
 from frictid_hil.gap.where import lives, where
 from frictid_hil.simulation.effects import all_effects
 
@@ -186,13 +186,16 @@ def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> 
     open_question = "motion" in reasons or "sinusoid" in reasons or not judged_apart
     if said.word != "explained" or not open_question:
         return said
-    lowered = [replace(f, chance=min(f.chance, UNDECIDED)) for f in said.named]
+    # What the motion can tell comes first, as sure as it is; the others may stand for one another.
+    told = [f for f in said.named if "motion" in reasons and f.effect not in ALIKE_ONE_WAY and judged_apart]
+    others = [f for f in said.named if f not in told]
+    lowered = [*told, *(replace(f, chance=min(f.chance, UNDECIDED)) for f in others)]
     for k, one in enumerate(list(lowered) if "sinusoid" in reasons else []):
         partner = ALIKE_ON_A_SINUSOID.get(one.effect)
         if partner is None:
             continue
-        others = tuple(r for r in one.rivals if r != partner)
-        lowered[k] = replace(one, chance=min(one.chance, TIED), rivals=(partner, *others))
+        rivals = tuple(r for r in one.rivals if r != partner)
+        lowered[k] = replace(one, chance=min(one.chance, TIED), rivals=(partner, *rivals))
         if partner not in {f.effect for f in lowered}:
             lowered.append(Finding(partner, TIED, 0.0, 0.0, {}, (one.effect,), one.where))
     return Verdict("ambiguous", tuple(lowered), said.place)
@@ -232,7 +235,7 @@ def _told(
         after=after,
         noise_floor=floor,
         per_log=runs.per_log() if runs is not None else {},
-        next_experiment=_next(said, logs),
+        next_experiment=_next(said, experiments.nominal, logs, plant),
         reasons=reasons,
         summary=_summary(experiments.name, said, lives(places), gaps),
         model=replay.model(effects if applied else {}) if replay is not None else None,
@@ -296,12 +299,14 @@ def _explain(said: Verdict, gaps: Sequence[Closed], reasons: dict[str, str], exp
         reasons["gap"] = "the set has no validation log; figures are of the logs that were fitted"
 
 
-def _next(said: Verdict, logs: Sequence[Recording]) -> NextExperiment | None:
+def _next(said: Verdict, nominal: Nominal, logs: Sequence[Recording], plant: Sampled | None) -> NextExperiment | None:
     if said.word != "ambiguous":
         return None
-    first = said.named[0]
-    others = [*first.rivals, *(f.effect for f in said.named[1:]), first.effect]
-    return next_experiment(first.effect, others[0], tuple(r.experiment.name for r in logs))
+    open_ones = [f for f in said.named if f.chance <= DOUBTED] or list(said.named)
+    first = open_ones[0]
+    others = [*first.rivals, *(f.effect for f in (*open_ones[1:], *said.named) if f is not first), first.effect]
+    of_torque = plant if plant is not None and plant.posterior.channel.name == "plant" else None
+    return next_experiment(first.effect, others[0], nominal, logs, of_torque)
 
 
 def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed]) -> str:

@@ -12,7 +12,7 @@ from scipy import special
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.diagnosis import Value
-from frictid_hil.gap.posterior import Draw, Posterior
+from frictid_hil.gap.posterior import FORM, Draw, Posterior
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -22,8 +22,6 @@ VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
-FORM = 0.1
-"""One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
 
@@ -75,8 +73,9 @@ class Sampled:
 def sampled(posterior: Posterior) -> Sampled:
     """Draws with the sizes of their causes, over all logs of the channel."""
     draws = posterior.draws(posterior.search(), DRAWS)
-    x = np.concatenate([log.x for log in posterior.channel.logs])
-    x = x - np.mean(x, axis=0) * (posterior.channel.name == "actuation")
+    # The level of a log is free but along the motion, so that a constant there is no size.
+    levels = float(posterior.channel.name != "plant")
+    x = np.concatenate([log.x - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     sizes: dict[str, Array] = {}
     blurs: dict[str, Array] = {}

@@ -28,7 +28,7 @@ from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
 
 BEYOND = 6.0
-"""One-sigma of a belief that is plainly wrong, over its tolerance: what a maker calls 5 % and is not may be 30 %."""
+"""One-sigma of a belief that is plainly wrong, over its tolerance, at least: then the tolerance says little more."""
 SIZES = (0.1, 0.3, 1.0)
 """Sizes of a generic function, over what a cause may well make: half decades."""
 BANDS_HZ = (20.0, 40.0, 80.0, 160.0)
@@ -79,7 +79,10 @@ def plant_channel(
             continue
         told = [t for t in known if t.effect == name and name not in ("presliding_hysteresis",)]
         for term in told:
-            candidates.append(replace(term, deviation=BEYOND * term.deviation))
+            least, largest = form.first_coefficient
+            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
+            deviation = np.maximum(BEYOND * term.deviation, visible)
+            candidates.append(replace(term, deviation=deviation, least=least, largest=largest))
         if told:
             continue
         for shape in form.grid_for(measured):

@@ -20,7 +20,7 @@ from scipy import special
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
-from frictid_hil.gap.channel import FAMILY, Channel
+from frictid_hil.gap.channel import FAMILY, Channel, Term
 
 SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Variance of the slow part over that of the noise: half decades."""
@@ -42,6 +42,8 @@ REDRAWN = 20
 """Times that a draw outside of its bounds is drawn anew before it is put on them."""
 STRETCHES = 6
 """Parts of the recordings that are left out one by one, at least."""
+FORM = 0.1
+"""One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -72,15 +74,36 @@ class Model:
     by_setting: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """What is known of a model's coefficients, nuisances included.
+
+    Attributes:
+        terms: that they belong to, in order.
+        mean: of all coefficients, shape (k,).
+        root: of their covariance, shape (k, k).
+    """
+
+    terms: tuple[Term, ...]
+    mean: Array
+    root: Array
+
+
 class Posterior:
     """Scores of models of one channel.
 
     Args:
         channel: what is explained.
+        library: number of effects that may be used.
+
+    Attributes:
+        floor: RMS that noise alone leaves.
+        doubt: variance of what tells models apart, over that of the noise; from the search on.
     """
 
     def __init__(self, channel: Channel, library: int) -> None:
         self.channel = channel
+        self.doubt = 1.0
         self._chance = math.log(EXPECTED / library)
         self.settings: list[Setting] = []
         self._prepare()
@@ -261,18 +284,28 @@ class Posterior:
     def search(self) -> list[Model]:
         """Models worth a look, the likeliest first.
 
-        The likeliest may predict stretches that it was not fitted to worse than its own uncertainty allows: then the
-        model is wrong beyond its noise, and every row tells as much less.
+        The likeliest may predict stretches that it was not fitted to worse than its own uncertainty allows, and no
+        joint is quite as the forms of its causes: the model is wrong beyond its noise, and every row tells as much
+        less.
         """
         found = self._search()
-        worse = self._surprise(found[0])
-        if worse <= 1.0:
+        surprise = max(1.0, self._surprise(found[0]))
+        self.doubt = max(surprise, self._lent(found[0]))
+        if self.doubt <= 1.0:
             return found
-        self._grams, self._rights = self._grams / worse, self._rights / worse
-        self._base = self._base / worse
-        self._left = [gram / worse for gram in self._left]
+        self._grams, self._rights = self._grams / self.doubt, self._rights / self.doubt
+        self._base = self._base / self.doubt
+        self._left = [gram / surprise for gram in self._left]
         self._known = {}
         return self._search()
+
+    def _lent(self, model: Model) -> float:
+        """Variance of what tells a model from its rivals, over that of the noise, as its causes are off their forms.
+
+        What a model explains of the recordings it explains up to the square of ``FORM``; that rest may lie just where
+        a rival is better.
+        """
+        return 1.0 + FORM**2 * (model.score - self.model(()).score)
 
     def _surprise(self, model: Model) -> float:
         """Mean square of what a model leaves of stretches left out one by one, over what it itself expects of them.
@@ -358,8 +391,7 @@ class Posterior:
             values = mean + root @ random.standard_normal(mean.size)
             if np.all((values[starts] >= low) & (values[starts] <= high)):
                 return values
-        values[starts] = np.clip(values[starts], low, high)
-        return values
+        return _put_inside(values, root, starts, low, high)
 
     def _coefficients(self, model: Model, g: int) -> tuple[np.ndarray, Array, Array]:
         """(columns, mean, square root of the covariance) of scaled coefficients at one point of the grid."""
@@ -392,6 +424,17 @@ class Posterior:
         np.add.at(theta, self._columns[at], self._scale[at] * mean)
         return theta
 
+    def rival(self, cause: str, other: str) -> Known | None:
+        """What the likeliest model knows that holds one cause and not the other; None where the channel has no such."""
+        single = self.singles().get(cause)
+        if single is None:
+            return None
+        models = [m for m in self._known.values() if cause in m.effects and other not in m.effects]
+        model = max([self.model((single,)), *models], key=lambda m: m.score)
+        at, mean, root = self._coefficients(model, int(np.argmax(model.by_setting)))
+        terms = (*self.channel.nuisances, *(self.channel.candidates[t] for t in model.terms))
+        return Known(terms, self._scale[at] * mean, self._scale[at][:, None] * root)
+
     def singles(self) -> dict[str, int]:
         """The best shape of every cause, alone."""
         empty = self.model(())
@@ -423,6 +466,27 @@ class Draw:
     setting: int
     at: np.ndarray
     values: Array
+
+
+def _put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:
+    """Values put on the bounds that they lie beyond; what is like them follows, as their covariance has it.
+
+    Args:
+        values: drawn, shape (k,).
+        root: of their covariance, shape (k, k).
+        starts: which of them have bounds.
+        low: their bounds.
+        high: see there.
+    """
+    for _ in starts:
+        beyond = np.maximum(low - values[starts], 0.0) - np.maximum(values[starts] - high, 0.0)
+        worst = int(np.argmax(np.abs(beyond)))
+        if beyond[worst] == 0.0:
+            break
+        row = root[starts[worst]]
+        values = values + root @ row * (beyond[worst] / float(row @ row))
+    values[starts] = np.clip(values[starts], low, high)
+    return values
 
 
 def _log_between(low: Array, high: Array) -> Array:

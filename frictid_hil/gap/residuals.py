@@ -145,10 +145,15 @@ def recordings(experiments: ExperimentSet) -> tuple[Recording, ...]:
 
 
 def _late_of_row(experiments: ExperimentSet) -> float | None:
-    """How late a row's torque is, in rows, where no controller tells: as the motion fits best; None where one does."""
+    """How late a row's torque is, in rows, where no controller tells: as the motion fits best; None where one does.
+
+    A rigid-body column was made for the torque of its own row.
+    """
     nominal = experiments.nominal
     if nominal.controller is not None:
         return None
+    if any(e.rigid_body_torque_nm is not None for e in experiments.experiments):
+        return 0.0
     left = np.zeros(len(LATE))
     for raw in experiments.experiments:
         if raw.torque_nm is None:

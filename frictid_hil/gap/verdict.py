@@ -28,6 +28,10 @@ LISTED = 0.25
 """Chance from which a cause is listed."""
 NEEDED = 0.9
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
+PLAIN = 1.25
+"""Size, over the floor, from which a likely cause is told though its tolerance allows it and its gap is small."""
+LIKELY = 0.85
+"""Chance of such a cause."""
 LEADS = 0.6
 """Chance of being the largest cause below which a rival makes the answer ambiguous."""
 
@@ -93,7 +97,9 @@ def verdict(
 
 
 def _needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
-    """Whether a cause stands out and hardly any draw does without it beyond what its tolerance allows."""
+    """Whether a cause is plain to see, or stands out and hardly any draw does without it beyond its tolerance."""
+    if cause.chance >= LIKELY and cause.size >= PLAIN:
+        return True
     if cause.chance < NEEDED or cause.size < STANDS_OUT:
         return False
     return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)

@@ -12,8 +12,9 @@ from frictid_hil.gap import noise
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import Finding, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import Posterior
+from frictid_hil.gap.posterior import Posterior, _put_inside
 from frictid_hil.gap.residuals import recordings
+from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
 
 
@@ -35,6 +36,22 @@ def test_a_cause_comes_first_with_an_interval_that_holds_it(effect: str, paramet
     told = first.parameters[parameter]
     assert told.low is not None and told.high is not None
     assert told.low - 0.05 * value < value < told.high + 0.05 * value
+
+
+@pytest.mark.slow
+def test_a_belief_far_beyond_its_tolerance_is_wrong_and_no_other_form_of_friction() -> None:
+    tight = replace(gap_sets.NOMINAL.tolerances, viscous=Sigma(0.005, 0.0, "stated"))
+    experiments = gap_sets.make({"viscous_error": {"error_share": -0.4}}, replace(gap_sets.NOMINAL, tolerances=tight))
+    first = diagnose(experiments).causes[0]
+    assert first.effect == "viscous_error" and first.confidence > 0.9
+    assert first.parameters["error_share"].value == pytest.approx(-0.4, abs=0.1)
+
+
+def test_what_may_not_be_drawn_is_made_up_for_by_what_is_like_it() -> None:
+    root = np.linalg.cholesky(np.array([[1.0, -0.9, 0.0], [-0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    told = _put_inside(np.array([-3.0, 3.0, 0.5]), root, np.array([0, 2]), np.array([-1.0, -np.inf]), np.full(2, 9.0))
+    # The two are nearly one cause with opposite signs: the second gives back what the first may not make.
+    np.testing.assert_allclose(told, [-1.0, 3.0 - 0.9 * 2.0, 0.5])
 
 
 def test_a_whitened_row_is_white_and_of_unit_size() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -58,5 +59,6 @@ EFFECT = Effect(
         shapes=({},),
         regressors=regressors,
         parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
+        first_coefficient=(-1.0, math.inf),
     ),
 )
