@@ -317,6 +317,14 @@ def record(
     plan: Annotated[
         Path | None, typer.Option("--plan", metavar="FILE", help="Record just what an ambiguous diagnosis asked for.")
     ] = None,
+    until_decided: Annotated[
+        float | None,
+        typer.Option(
+            "--until-decided",
+            metavar="SECONDS",
+            help="Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
+        ),
+    ] = None,
     profile: Annotated[
         Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
     ] = None,
@@ -342,6 +350,7 @@ def record(
 ) -> None:
     """Run the diagnostic experiments on the bus and write an experiment set."""
     from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.jobs.gap_decide import record_until_decided
     from frictid_hil.jobs.gap_record import GapRecordOptions
     from frictid_hil.jobs.gap_record import record as job
 
@@ -365,6 +374,8 @@ def record(
         if resume is not None and recorded is not None:
             raise UsageError("--resume moves the joint and --from does not; give one")
         try:
+            if until_decided is not None:
+                return record_until_decided(options, watcher, until_decided)
             return job(options, watcher, move=recorded is None)
         finally:
             watcher.close()
@@ -372,6 +383,9 @@ def record(
     def show(result: Result) -> None:
         output.out.print(f"{len(result['experiments'])} experiments: {', '.join(result['experiments'])}")
         output.out.print(f"set: {result['set']}", soft_wrap=True)
+        if told := result.get("diagnosis"):
+            output.out.print(told["summary"], markup=False)
+            output.out.print(f"nothing more is recorded: {result['ended_because']}", markup=False)
 
     output.run("gap_record", run, show)
 

@@ -59,6 +59,7 @@ class GapRecordOptions:
         bus: ``interface:channel``.
         short: the short set.
         plan: plan file of a diagnosis that could not decide; overrules ``short``.
+        experiments: names of experiments; overrule ``plan``.
         profile: friction profile that the simulator believes.
         payload: a person is there to mount the payload when asked; None: on a simulated robot only, which mounts its
             own.
@@ -75,6 +76,7 @@ class GapRecordOptions:
     bus: str | None = None
     short: bool = False
     plan: Path | None = None
+    experiments: tuple[str, ...] = ()
     profile: Path | None = None
     payload: bool | None = None
     centre_rad: float | None = None
@@ -170,6 +172,24 @@ def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) ->
         return recording.concluded(error)
 
 
+def recordable(options: GapRecordOptions) -> dict[str, float]:
+    """Duration in s of every experiment that this joint has the room and the payload for, by name.
+
+    Raises:
+        UsageError, ConfigError: as ``record``.
+    """
+    robot = load_robot(options.robot)
+    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
+    robot.check_joints([options.joint])
+    joint = setup.joint(options.joint)
+    profile = load_profile(options.profile).joint(options.joint) if options.profile else None
+    simulated = robot.kind(options.bus).simulated
+    belief = belief_of(joint, profile, simulated_drive=simulated)
+    without = _why_no_payload(options, belief, simulated=simulated)
+    every = catalogue(envelope_of(robot, joint, options), seed=options.seed)
+    return {e.name: e.duration_s for e in (every.values() if without is None else _unloaded(list(every.values())))}
+
+
 def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
     if options.resume is not None and not move and not options.robot:
         options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
@@ -192,7 +212,8 @@ def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
     if not experiments:
         raise UsageError(f"all experiments asked for need the payload: {without}", where=options.robot)
     earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
-    if earlier is not None and options.plan is None and options.resume is None:
+    asked_for = options.plan is not None or options.experiments or options.resume is not None
+    if earlier is not None and not asked_for:
         raise UsageError(
             "holds an experiment set already",
             where=str(options.out),
@@ -263,6 +284,8 @@ def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> E
 
 def _names(options: GapRecordOptions, envelope: Envelope) -> tuple[str, ...]:
     """The experiments that the options name."""
+    if options.experiments:
+        return options.experiments
     if options.plan is not None:
         return _read_plan(options.plan)
     return SHORT if options.short else (*FULL, *(name for name in ("second_posture",) if name in catalogue(envelope)))

@@ -15,6 +15,7 @@ from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.search import find
 from frictid_hil.errors import FrictidError, Interrupted, UsageError
+from frictid_hil.gap.diagnosis import Diagnosis, Figures, NextExperiment
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.experiments import (
     SCHEMA,
@@ -27,6 +28,7 @@ from frictid_hil.gap.experiments import (
     plan_document,
 )
 from frictid_hil.jobs import gap_record
+from frictid_hil.jobs.gap_decide import FIRST, _next, record_until_decided
 from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
@@ -302,3 +304,37 @@ def test_every_experiment_starts_and_ends_at_rest_and_in_one_piece() -> None:
         assert np.abs(parts).max() <= 2.9
     with pytest.raises(UsageError, match="no experiment"):
         chosen(["sines_small", "waltz"], envelope)
+
+
+def test_recording_goes_on_with_what_tells_most_until_it_is_decided(robot: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    decided = record_until_decided(GapRecordOptions(robot, "0", out=out, payload=False), Silent(), 200.0)
+    told = decided.to_json()
+    assert told["outcome"] == "ok" and tuple(told["experiments"][:3]) == FIRST
+    assert [e.name for e in ExperimentSet.load(out).experiments] == told["experiments"]
+    assert told["duration_s"] <= 200.0 and told["ended_because"]
+    assert told["diagnosis"]["verdict"] == "explained"
+    assert told["diagnosis"]["causes"][0]["effect"] == "direction_asymmetry"
+
+
+def test_what_is_not_decided_asks_for_more_until_time_or_experiments_run_out() -> None:
+    asked = NextExperiment("chirp_fast tells", 10.0, ("a", "b"), {"experiments": ["chirp_fast"]})
+    open_one = diagnosis_of("ambiguous", asked)
+    possible = {"chirp": 10.0, "chirp_fast": 11.0, "breakaway": 20.0}
+    assert _next(open_one, possible, ["chirp"], 30.0) == (["chirp_fast"], "chirp_fast tells")
+    assert _next(open_one, possible, ["chirp", "chirp_fast"], 30.0)[0] == ["breakaway"]
+    assert _next(open_one, possible, ["chirp"], 5.0) == ([], "chirp_fast would take 11 s, and 5 s are left")
+    assert not _next(open_one, possible, list(possible), 99.0)[0]
+    assert _next(diagnosis_of("none", None), possible, [], 99.0) == ([], "the verdict is none")
+
+
+def diagnosis_of(verdict: str, asked: NextExperiment | None) -> Diagnosis:
+    nothing = Figures(None, None, None)
+    return Diagnosis("one", verdict, (), (), nothing, nothing, nothing, next_experiment=asked)
+
+
+def test_until_decided_refuses_what_contradicts_it(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="chooses the experiments itself"):
+        record_until_decided(GapRecordOptions(robot, "0", short=True), Silent(), 200.0)
+    with pytest.raises(UsageError, match="first experiments take"):
+        record_until_decided(GapRecordOptions(robot, "0"), Silent(), 5.0)
