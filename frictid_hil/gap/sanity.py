@@ -43,7 +43,7 @@ def checked(experiments: ExperimentSet) -> ExperimentSet:
     for e in experiments.experiments:
         _check(e, experiments.nominal)
     signs = [s for e in experiments.experiments if (s := _torque_sign(e)) is not None]
-    if signs and max(signs) < 0.0:
+    if signs and max(signs) < 0.0 and sum(_work_j(e) for e in experiments.experiments) < 0.0:
         raise InputFileError(
             "torque and velocity have opposite signs: the joint seems to drive the motor all the time",
             where=experiments.name,
@@ -214,6 +214,13 @@ def _torque_sign(e: Experiment) -> float | None:
     )
     weights = np.linalg.lstsq(columns, centred, rcond=None)[0]
     return float(weights[0]) / max(float(np.std(centred)), 1e-12)
+
+
+def _work_j(e: Experiment) -> float:
+    """Work of the reported torque along a log, J; a joint gives back what its inertia and its height took, no more."""
+    if e.torque_nm is None:
+        return 0.0
+    return float(np.sum(0.5 * (e.torque_nm[1:] + e.torque_nm[:-1]) * np.diff(e.position_rad)))
 
 
 def completed(experiments: ExperimentSet) -> tuple[ExperimentSet, dict[str, str]]:

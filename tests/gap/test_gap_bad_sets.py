@@ -15,6 +15,7 @@ import yaml
 from frictid_hil.errors import ConfigError, InputFileError
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import MAX_ROWS, Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.sanity import checked
 
 DEGREES = 180.0 / np.pi
 HEADER = "time_s,position_rad,torque_nm,position_command_rad"
@@ -183,3 +184,16 @@ def test_ten_million_rows_are_a_stated_limit_not_a_lost_machine(tmp_path: Path) 
     with pytest.raises(InputFileError, match=f"10000000 rows; at most {MAX_ROWS}") as told:
         ExperimentSet.load(tmp_path)
     assert told.value.next_step
+
+
+def test_a_joint_that_rings_at_rest_has_no_swapped_sign() -> None:
+    """In most rows it rings with the torque against the motion; the work is done in the moves all the same."""
+    time = 0.002 * np.arange(6000)
+    moving = ((time > 4.0) & (time < 4.6)).astype(float) - ((time > 9.0) & (time < 9.6))
+    ringing = 5e-4 * np.sin(2.0 * np.pi * 15.0 * time) * (moving == 0.0)
+    position = np.cumsum(0.5 * moving) * 0.002 + ringing
+    torque = 0.4 * moving - 0.1 * np.sign(np.gradient(ringing))
+    log = Experiment("rings", False, False, 0, time, position, torque_nm=torque)
+    assert checked(ExperimentSet("rings", Nominal(), (log,))).experiments
+    with pytest.raises(InputFileError, match="opposite signs"):
+        checked(ExperimentSet("swapped", Nominal(), (replace(log, torque_nm=-0.4 * moving - 0.01),)))
