@@ -44,6 +44,8 @@ STRETCHES = 6
 """Parts of the recordings that are left out one by one, at least."""
 FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
+MOST_DOUBT = 3.0
+"""Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -305,7 +307,7 @@ class Posterior:
         What a model explains of the recordings it explains up to the square of ``FORM``; that rest may lie just where
         a rival is better.
         """
-        return 1.0 + FORM**2 * (model.score - self.model(()).score)
+        return min(MOST_DOUBT, 1.0 + FORM**2 * (model.score - self.model(()).score))
 
     def _surprise(self, model: Model) -> float:
         """Mean square of what a model leaves of stretches left out one by one, over what it itself expects of them.

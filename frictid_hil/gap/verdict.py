@@ -20,18 +20,16 @@ UNNAMED = 0.25
 """Size of what has no name over that of all causes, from which on their names do not tell the gap: 6 % of its power."""
 DOUBTED = 0.8
 """Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
+HALF = 0.5
+"""Part of a gap from which on it is open although causes were named."""
 HELPS = 0.98
 """Gap of the validation logs with the causes over that without, above which they explain nothing there."""
 READ_DIRECTLY = "kinematics"
 """Where a cause is read from positions and velocities themselves."""
 LISTED = 0.25
 """Chance from which a cause is listed."""
-NEEDED = 0.9
+NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
-PLAIN = 1.25
-"""Size, over the floor, from which a likely cause is told though its tolerance allows it and its gap is small."""
-LIKELY = 0.85
-"""Chance of such a cause."""
 LEADS = 0.6
 """Chance of being the largest cause below which a rival makes the answer ambiguous."""
 
@@ -89,6 +87,9 @@ def verdict(
         unnamed, named = False, tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     if nothing or unnamed or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
+    if any(_open(gap, 0.0) for gap in gaps):
+        # What stays means nothing in practice; it may still be of another cause.
+        named = tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
     if first.leads < LEADS and rivals:
@@ -97,9 +98,7 @@ def verdict(
 
 
 def _needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
-    """Whether a cause is plain to see, or stands out and hardly any draw does without it beyond its tolerance."""
-    if cause.chance >= LIKELY and cause.size >= PLAIN:
-        return True
+    """Whether a cause stands out and hardly any draw does without it beyond what its tolerance allows."""
     if cause.chance < NEEDED or cause.size < STANDS_OUT:
         return False
     return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)
@@ -125,7 +124,7 @@ def _faint(channel: Sampled, gap: Closed) -> bool:
 def _open(gap: Closed, negligible: float) -> bool:
     """Whether more than half of a channel's visible gap stays."""
     visible = max(0.0, gap.before**2 - gap.floor**2)
-    return gap.after > max(FLOORS * gap.floor, negligible) and gap.after**2 - gap.floor**2 > 0.5 * visible
+    return gap.after > max(FLOORS * gap.floor, negligible) and gap.after**2 - gap.floor**2 > HALF**2 * visible
 
 
 def _root_sum(sizes: Sequence[np.ndarray]) -> np.ndarray:
