@@ -12,6 +12,7 @@ in the first tenth); everything else is to be what it was after the first rounds
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import os
 import platform
@@ -51,7 +52,7 @@ class Held:
         threads: of the system's counting.
         children: processes.
         locks: on files, of this process.
-        shared: segments of shared memory that are ours.
+        shared: segments of shared memory that nobody has any more.
     """
 
     files: int
@@ -70,8 +71,17 @@ def held() -> Held:
         threads=max(me.num_threads(), threading.active_count()),
         children=len(me.children(recursive=True)),
         locks=sum(line.split()[4:5] == [str(os.getpid())] for line in locks),
-        shared=len(list(Path("/dev/shm").glob("frictid*"))) + len(list(Path("/dev/shm").glob("psm_*"))),
+        shared=len(abandoned()),
     )
+
+
+def abandoned() -> set[str]:
+    """Segments of shared memory that no process has: a crash or a leak left them."""
+    there = {path.name for path in Path("/dev/shm").glob("psm_*")}
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with contextlib.suppress(OSError):  # ended meanwhile, or another user's
+            there -= {line.rpartition("/")[2] for line in maps.read_text().splitlines() if "/dev/shm/" in line}
+    return there
 
 
 def robot_file(place: Path) -> str:

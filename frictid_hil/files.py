@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import secrets
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -73,12 +74,11 @@ def write_whole(path: Path, text: str | bytes) -> None:
         FrictidError: disk full, or no permission.
     """
     content = text.encode() if isinstance(text, str) else text
-    staged = None
+    staged = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        staged = Path(name)
+        # Made anew, so through no link; readable for whom the account's umask lets it be.
+        handle = os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         with os.fdopen(handle, "wb") as file:
-            os.fchmod(handle, 0o644)
             file.write(content)
             file.flush()
             os.fsync(handle)
@@ -87,8 +87,7 @@ def write_whole(path: Path, text: str | bytes) -> None:
     except OSError as error:
         raise could_not_write(path, error) from error
     finally:
-        if staged is not None:
-            staged.unlink(missing_ok=True)
+        staged.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

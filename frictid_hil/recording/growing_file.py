@@ -12,7 +12,7 @@ class GrowingFile:
     """Appends pieces to a new file, each of them all or nothing.
 
     Args:
-        path: of the new file; an existing one is replaced.
+        path: of the new file; an existing one is replaced, a link is not followed.
 
     Attributes:
         end: bytes written so far.
@@ -25,9 +25,10 @@ class GrowingFile:
         self._path = path
         self.end = 0
         try:
-            self._file = path.open("wb", buffering=0)
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o666)
         except OSError as error:
             raise could_not_write(path, error) from error
+        self._file = os.fdopen(handle, "wb", buffering=0)
 
     @property
     def closed(self) -> bool:

@@ -21,7 +21,7 @@ def runtime_folder() -> Path:
     """Where locks and sockets live: ``$FRICTID_RUNTIME_DIR``, ``$XDG_RUNTIME_DIR``, or a temporary folder per user.
 
     Raises:
-        HardwareError: it cannot be created.
+        HardwareError: it cannot be created, or others may write to it.
     """
     own = os.environ.get("FRICTID_RUNTIME_DIR")
     session = os.environ.get("XDG_RUNTIME_DIR")
@@ -39,6 +39,13 @@ def runtime_folder() -> Path:
             where=str(folder),
             next_step="set FRICTID_RUNTIME_DIR to a folder you may write to",
         ) from None
+    # Everybody may put something under this name into a folder for all.
+    if folder.parent == Path(tempfile.gettempdir()) and {folder.lstat().st_uid, folder.stat().st_uid} != {os.getuid()}:
+        raise HardwareError(
+            "is not a folder of yours: somebody else has put something there under this name",
+            where=str(folder),
+            next_step="set FRICTID_RUNTIME_DIR to a folder of your own",
+        )
     return folder
 
 
