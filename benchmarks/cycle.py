@@ -54,7 +54,7 @@ from frictid_hil.runner.ring import frame_ring, sample_ring
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
 
 RATES_HZ, ACTIVE = (250, 500, 1000), (1, 6, 12)
-PATIENCE_S = 0.05
+PATIENCE_S = 2.0
 ENABLED, CSP = 0x1237, 8
 SYNC, HEARTBEAT, OPERATIONAL = 0x80, 0x700, b"\5"
 KINDS = {0x6040: 6, 0x607A: 4, 0x60B2: 3, 0x6041: 6, 0x6064: 4, 0x6077: 3, 0x606C: 4}
