@@ -84,6 +84,12 @@ def abandoned() -> set[str]:
     return there
 
 
+def own_memory_mb() -> float:
+    """Without the pages of libraries' files, which the system takes away and brings back as it likes."""
+    status = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in status if line.startswith("RssAnon:")) * 1.024e-3
+
+
 def robot_file(place: Path) -> str:
     """One joint, a short procedure."""
     values = load_robot("hp3j").values()
@@ -152,7 +158,7 @@ def soak(lasts_s: float, *, wall_clock_every: int = 20, tell: Callable[[str], No
             for outcome in one_round(robot, place, number, wall_clock=wall_clock):
                 outcomes[outcome] = outcomes.get(outcome, 0) + 1
             gc.collect()
-            memory_mb.append(psutil.Process().memory_info().rss / 1e6)
+            memory_mb.append(own_memory_mb())
             if number == 1:  # by now every kind of run has been there once
                 before = held()
             tell(f"round {number}: {memory_mb[-1]:.1f} MB, {astuple(held())}, {outcomes}")
