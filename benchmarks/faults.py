@@ -23,7 +23,6 @@ import json
 import os
 import shutil
 import signal
-import sys
 import tempfile
 import time
 import traceback
@@ -791,44 +790,48 @@ def drawn(todo: Sequence[Case], runs: int | None, seed: int) -> list[Case]:
     return picked[:runs]
 
 
-def page(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
-    """The evidence as a page."""
+BEGIN, END = "<!-- written by benchmarks/faults.py -->", "<!-- end of what it wrote -->"
+
+
+def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
+    """The figures as tables."""
     failed = [verdict for verdict in verdicts if verdict.failures]
     lines = [
-        "# Faults on purpose",
-        "",
-        f"`{command}` at {commit}: {len(verdicts)} injections,",
-        f"{len(failed)} of them failed one of these questions, judged by",
-        "the simulated servos' own state and the withheld truth, whatever the host said:",
-        "",
-        "- the joints are at rest and without power in time;",
-        "- every row that the loop recorded is in the recording, and it can be read;",
-        "- no curve more than its interval and 2 % off the truth is called ok;",
-        "- every ending is one of our errors, with a next step.",
+        f"`{command}` at {commit}: {len(verdicts)} injections, {len(failed)} failed.",
         "",
         "| Verb | Injections | Noticed | Longest to rest | Longest to power off | Failed |",
         "|---|---|---|---|---|---|",
     ]
-    for verb in dict.fromkeys(verdict.verb for verdict in verdicts):
-        rows = [verdict for verdict in verdicts if verdict.verb == verb]
-        lines.append(
-            f"| {verb} | {len(rows)} | {sum(row.noticed for row in rows)} | {max(row.rest_s for row in rows):.2f} s "
-            f"| {max(row.off_s for row in rows):.2f} s | {sum(bool(row.failures) for row in rows)} |"
-        )
-    lines += ["", "## By fault", "", "| Fault | Injections | Stopped or refused | Failed |", "|---|---|---|---|"]
-    for name in dict.fromkeys(verdict.name for verdict in verdicts):
-        rows = [verdict for verdict in verdicts if verdict.name == name]
-        lines.append(
-            f"| {name} | {len(rows)} | {sum(row.noticed for row in rows)} | {sum(bool(row.failures) for row in rows)} |"
-        )
-    lines += ["", "## Every failure", ""]
+    for verb, rows in _by(verdicts, lambda verdict: verdict.verb):
+        rest_s, off_s = max(row.rest_s for row in rows), max(row.off_s for row in rows)
+        lines.append(f"| {verb} | {_counted(rows)} | {rest_s:.2f} s | {off_s:.2f} s | {_failed(rows)} |")
+    lines += ["", "### By phase", "", "| Phase | Injections | Noticed | Failed |", "|---|---|---|---|"]
+    for phase, rows in _by(verdicts, lambda verdict: verdict.phase):
+        lines.append(f"| {phase} | {_counted(rows)} | {_failed(rows)} |")
+    lines += ["", "### By fault", "", "| Fault | Injections | Noticed | Failed |", "|---|---|---|---|"]
+    for name, rows in _by(verdicts, lambda verdict: verdict.name):
+        lines.append(f"| {name} | {_counted(rows)} | {_failed(rows)} |")
+    lines += ["", "### Every failure", ""]
     lines += (
         ["| Verb | Phase | Fault | Seed | Ended | What failed |", "|---|---|---|---|---|---|"] if failed else ["None."]
     )
     for row in failed:
-        told = "; ".join(row.failures).replace("|", "/")
-        lines.append(f"| {row.verb} | {row.phase} | {row.name} | {row.seed} | {row.ended} | {told} |")
+        said = "; ".join(row.failures).replace("|", "/")
+        lines.append(f"| {row.verb} | {row.phase} | {row.name} | {row.seed} | {row.ended} | {said} |")
     return "\n".join(lines) + "\n"
+
+
+def _by(verdicts: Sequence[Verdict], key: Callable[[Verdict], str]) -> list[tuple[str, list[Verdict]]]:
+    names = sorted({key(verdict) for verdict in verdicts})
+    return [(name, [verdict for verdict in verdicts if key(verdict) == name]) for name in names]
+
+
+def _counted(rows: Sequence[Verdict]) -> str:
+    return f"{len(rows)} | {sum(row.noticed for row in rows)}"
+
+
+def _failed(rows: Sequence[Verdict]) -> int:
+    return sum(bool(row.failures) for row in rows)
 
 
 def main() -> None:
@@ -840,27 +843,38 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of 'verb phase fault'")
     parser.add_argument("--verbs", default=",".join(VERBS))
     parser.add_argument("--kept", type=Path, help="goes on after an interruption")
-    parser.add_argument("--docs", type=Path)
+    parser.add_argument("--again", action="store_true", help="only what failed in --kept; its verdicts are replaced")
+    parser.add_argument("--docs", type=Path, help="page whose marked part is written anew")
     asked = parser.parse_args()
     lines = asked.kept.read_text().splitlines() if asked.kept and asked.kept.exists() else []
     kept = [Verdict(**json.loads(line)) for line in lines]
+    again = [Case(v.verb, v.phase, v.name, v.seed) for v in kept if v.failures]
+    if asked.again:
+        kept = [verdict for verdict in kept if not verdict.failures]
     done = {(v.verb, v.phase, v.name, v.seed) for v in kept}
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
         seeds = range(asked.seed, asked.seed + asked.seeds)
-        todo = drawn(cases(asked.verbs.split(","), seeds, asked.only, bench.phases), asked.runs, asked.seed)
+        todo = again if asked.again else []
+        if not asked.again and (asked.runs is None or asked.runs > 0):
+            every = cases(asked.verbs.split(","), seeds, asked.only, bench.phases)
+            todo = drawn(every, asked.runs, asked.seed)
         for case in todo:
             if (case.verb, case.phase, case.name, case.seed) in done:
                 continue
             verdict = bench.struck(case)
             kept.append(verdict)
-            if asked.kept:
+            if asked.kept and not asked.again:
                 with asked.kept.open("a") as file:
                     file.write(json.dumps(asdict(verdict)) + "\n")
-            told = f"{verdict.ended} {verdict.said[:90]} {verdict.failures} {verdict.took_s}"
-            print(f"{case.verb} {case.phase} {case.name} {case.seed}: {told}", flush=True)
+            ending = f"{verdict.ended} {verdict.said[:90]} {verdict.failures} {verdict.took_s}"
+            print(f"{case.verb} {case.phase} {case.name} {case.seed}: {ending}", flush=True)
+    if asked.kept and asked.again:
+        asked.kept.write_text("".join(json.dumps(asdict(verdict)) + "\n" for verdict in kept))
     if asked.docs:
-        asked.docs.write_text(page(kept, "python " + " ".join(sys.argv), git_revision() or "?"))
+        before, rest = asked.docs.read_text().split(BEGIN)
+        text = told(kept, f"python benchmarks/faults.py --runs {len(kept)}", git_revision()[:8])
+        asked.docs.write_text(f"{before}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}")
     failed = sum(bool(verdict.failures) for verdict in kept)
     print(f"{len(kept)} injections, {failed} failed")
 

@@ -198,7 +198,7 @@ def inject(layer: str, faults: Sequence[str], *, limit_s: float, told: Callable[
             told(event)
 
     module: Any = run_module
-    module.load_driver = lambda name: driver
+    module.new_driver = lambda name, setup: driver(setup)
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         robot, out = Path(folder) / "robot.yaml", Path(folder) / "run"

@@ -85,7 +85,7 @@ def measure_in_virtual_time(robot: Path, joint: str, out: Path) -> bool:
         return MotomanDriver(setup, port_factory=lambda path, baud, parity: LoopbackPort(emulator, baud, parity))
 
     module: Any = run_module
-    module.load_driver = lambda name: driver
+    module.new_driver = lambda name, setup: driver(setup)
     result = calibrate(CalibrateOptions(str(robot), out=out, joints=(joint,)), Silent()).to_json()
     entry = result["joints"][joint]
     percent = compare(out, None, str(robot))["joints"].get(joint, {}).get("e_percent_measured_range")
