@@ -16,6 +16,7 @@ every recorded position must be the one that the joint had at that tick.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -39,7 +40,7 @@ from frictid_drivers.motoman.emulator.jobs import Job
 from frictid_drivers.motoman.emulator.loopback import LoopbackPort
 from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import FrictidError
+from frictid_hil.errors import FrictidError, InputFileError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compare import compare
 from frictid_hil.jobs.watch import Silent
@@ -259,7 +260,9 @@ def judge_recording(watched: Watched, out: Path, *, code: int) -> Iterator[str]:
     streamed = list(watched.truth_pulses.values())
     recorded = jobs_to_fetch > 0 or bool(streamed and max(streamed) - min(streamed) > MOVED_PULSES)
     path = out / "samples.mcap"
-    kept = read_mcap(path, JOINT)[0] if path.exists() and path.stat().st_size else None
+    kept = None
+    with contextlib.suppress(InputFileError):  # what cannot be read counts as lost
+        kept = read_mcap(path, JOINT)[0] if path.exists() and path.stat().st_size else None
     if kept is None or len(kept.time_ns) == 0:
         if recorded:
             yield "nothing was recorded"
