@@ -17,7 +17,7 @@ from frictid_drivers.virtual import VirtualDriver, channel
 from frictid_drivers.virtual.rack_launcher import encode_setup, start_rack
 from frictid_drivers.virtual.side_channel import write
 from frictid_drivers.virtual.socket_bus import SocketBus
-from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
+from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, SafetyAbort, UsageError
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Driver, JointState, SetPoint, WallClock
 
@@ -203,6 +203,16 @@ def test_wall_clock_run(make_robot):
     assert run.feedback[0].position_rad == pytest.approx(run.points[0].position_rad, abs=0.002)
     assert time.monotonic() - began_s > 0.85, "run time is the wall clock's"
     run.driver.stop_cycling()
+    run.driver.close()
+
+
+@pytest.mark.slow
+def test_faults_strike_across_two_processes_too(make_robot):
+    """The drives' own process spoils what they say, and this one what is sent."""
+    faults = [{"kind": "mute", "joint": "1", "at_s": 0.4}, {"kind": "stall", "at_s": 0.3, "delay_s": 0.02}]
+    run = Run(make_robot(realtime=True, options={"faults": faults}))
+    with pytest.raises(SafetyAbort, match="no heartbeat"):
+        run.cycle(1000, swing)
     run.driver.close()
 
 
