@@ -771,7 +771,7 @@ def cases(
             if phase == "end" or (when.end_s <= when.start_s and (not before or when.last_sdo <= when.first_sdo)):
                 continue
             for name in faults_of(verb, phase):
-                early = phase in ("reference", "enable", "units", "move", "rehearsal")
+                early = phase in ("reference", "enable", "units", "approach", "move", "rehearsal")
                 if (early and name in WHOLE_RUN) or only not in f"{verb} {phase} {name}":
                     continue
                 found += [Case(verb, phase, name, seed) for seed in seeds]

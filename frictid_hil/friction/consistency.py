@@ -23,7 +23,9 @@ MOST_SEEN_S = 0.0015
 """What the data may ask for beyond the declared delay of the torque, where they are sure of it ..."""
 MOST_SEEN_WITH_LINK_S = 0.003
 SURE = 2.5
-"""... by so many standard deviations, its own and the declared one's."""
+"""... by so many standard deviations, its own and the declared one's ..."""
+MOST_UNSURE_S = 0.006
+"""... but for joints that move together, which have no gate of inertia, no more than this and a step of the clock."""
 MOST_TURNOVER_S = 0.012
 """Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
 MOST_TURNOVER_SEEN_S = 0.004
@@ -64,7 +66,10 @@ def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
         return None
     sure_s = SURE * math.hypot(deviation_s, recording.skew.uncertainty_s)
     # A link that swings drags the figure; a torque that is very late looks like one.
-    allowed_s = max(MOST_SEEN_S if result.link_resonance_hz is None else MOST_SEEN_WITH_LINK_S, sure_s)
+    least_s = MOST_SEEN_S if result.link_resonance_hz is None else MOST_SEEN_WITH_LINK_S
+    if recording.coupled:
+        sure_s = min(sure_s, MOST_UNSURE_S + float(np.median(np.diff(recording.time_s))))
+    allowed_s = max(least_s, sure_s)
     said = (
         f"the data ask for {1e3 * seen_s:+.2f} +- {2e3 * deviation_s:.2f} ms of torque delay beyond the declared one "
         f"(allowed {1e3 * allowed_s:.2f} ms)"

@@ -86,3 +86,12 @@ def test_friction_that_was_another_in_the_rehearsal(sound):
     assert "other_stretches" not in failed(replace(sound, elsewhere=(("rehearsal", velocity, torque),)))
     wrong = 12.0 * np.cos(2 * phase) + curve.torque(velocity) / 1.5
     assert "other_stretches" in failed(replace(sound, elsewhere=(("rehearsal", velocity, wrong),)))
+
+
+def test_a_late_half_cycle_of_joints_that_move_together_is_not_excused_by_doubt(sound):
+    doubtful = replace(estimate(sound), figures={"seen_delay_s": 0.01, "seen_delay_deviation_s": 0.005})
+    told = {
+        coupled: {gate.name: gate for gate in gates(replace(sound, coupled=coupled), doubtful)}["seen_delay"]
+        for coupled in (False, True)
+    }
+    assert told[False].passed and not told[True].passed
