@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal
+from scipy import linalg, special, signal
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -268,6 +268,36 @@ def find_in_arm(
     judged = [t for t in tables if t.validation] or tables
     scale = np.array([_scale(curve, fitted, k) for k, curve in enumerate(curves)])
     candidates = _candidates(bodies)
+    y, within, spread, columns = _regression(bodies, fitted, scale, mass_tolerance)
+    noise = _noise(y, np.concatenate([within, *columns.values()], axis=1))
+    scores = {"none": _evidence(y, within, spread, noise)}
+    for name, (_, sigma) in candidates.items():
+        table = np.concatenate([within, columns[name]], axis=1)
+        scores[name] = _evidence(y, table, np.concatenate([spread, sigma]), noise)
+    chances = dict(zip(scores, special.softmax(list(scores.values())).tolist(), strict=True))
+    base = _base_parameters(bodies, fitted)
+    name = max(chances, key=lambda n: chances[n])
+    own = spread[: spread.size - len(bodies.bodies)]
+    before = _judged_rms(judged, scale, None, own, fitted)
+    nothing = ArmFindings(None, chances, before, before, base)
+    if name == "none":
+        return nothing
+    make, sigma = candidates[name]
+    after = _judged_rms(judged, scale, make, np.concatenate([own, sigma]), fitted)
+    table = np.concatenate([within, columns[name]], axis=1)
+    values, covariance = _posterior(y, table, np.concatenate([spread, sigma]), noise)
+    found, width = values[-sigma.size :], 1.96 * np.sqrt(np.diag(covariance))[-sigma.size :]
+    sure = chances[name] >= SURE and after < (1.0 - LEAST_GAIN) * before
+    if not sure or not _beyond(name, found, width, mass_tolerance):
+        return ArmFindings(None, chances, before, after, base)
+    cause = _named(bodies, name, chances[name], found, width)
+    return ArmFindings(cause, chances, before, after, base, _torque_of(make, found))
+
+
+def _regression(
+    bodies: _Bodies, fitted: Sequence[_Table], scale: Array, mass_tolerance: float
+) -> tuple[Array, Array, Array, dict[str, Array]]:
+    """(y, what tolerances allow, its one-sigma, columns of each cause of the arm); link masses come last in both."""
     y, nuisance, prior, rows = _stacked(fitted, scale, _nuisances)
     masses = {
         f"link_mass_error {bodies.name(body)}": _stacked_columns(fitted, scale, _one(bodies, body), rows)
@@ -281,31 +311,7 @@ def find_in_arm(
             break
         payload = _stacked_columns(fitted, scale, bodies.payload, rows)
     tilt = _stacked_columns(fitted, scale, bodies.tilt, rows)
-    columns = {"payload": payload, "base_orientation_error": tilt, **masses}
-    noise = _noise(y, np.concatenate([within, *columns.values()], axis=1))
-    scores = {"none": _evidence(y, within, spread, noise)}
-    for name, (_, sigma) in candidates.items():
-        table = np.concatenate([within, columns[name]], axis=1)
-        scores[name] = _evidence(y, table, np.concatenate([spread, sigma]), noise)
-    best = max(scores.values())
-    weights = {name: math.exp(max(-700.0, score - best)) for name, score in scores.items()}
-    chances = {name: weight / sum(weights.values()) for name, weight in weights.items()}
-    base = _base_parameters(bodies, fitted)
-    name = max(chances, key=lambda n: chances[n])
-    before = _judged_rms(judged, scale, None, spread[: prior.size], fitted)
-    nothing = ArmFindings(None, chances, before, before, base)
-    if name == "none":
-        return nothing
-    make, sigma = candidates[name]
-    after = _judged_rms(judged, scale, make, np.concatenate([spread[: prior.size], sigma]), fitted)
-    table = np.concatenate([within, columns[name]], axis=1)
-    values, covariance = _posterior(y, table, np.concatenate([spread, sigma]), noise)
-    found, width = values[-sigma.size :], 1.96 * np.sqrt(np.diag(covariance))[-sigma.size :]
-    sure = chances[name] >= SURE and after < (1.0 - LEAST_GAIN) * before
-    if not sure or not _beyond(name, found, width, mass_tolerance):
-        return ArmFindings(None, chances, before, after, base)
-    cause = _named(bodies, name, chances[name], found, width)
-    return ArmFindings(cause, chances, before, after, base, _torque_of(make, found))
+    return y, within, spread, {"payload": payload, "base_orientation_error": tilt, **masses}
 
 
 def _grasp(bodies: _Bodies, columns: Array, y: Array, within: Array, spread: Array) -> bool:

@@ -140,24 +140,10 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
     healthy = [(t, a) for t, a in cases if t["kind"] == "none"]
     outside = [(t, a) for t, a in visible if t["kind"] == "outside"]
     confident = [(t, a) for t, a in cases if a.confidence >= CONFIDENT]
-    classes = ("small", "medium", "large")
     return {
         "cases": len(cases),
         "errors": [{"case": t["case"], "message": a.message} for t, a in cases if a.verdict == "error"],
-        "singles": {
-            "top_1": Rate.over(a.first == _name(t) for t, a in singles).to_json(),
-            "top_2": Rate.over(_name(t) in a.ranking[:2] for t, a in singles).to_json(),
-            "top_1_or_alias": Rate.over(_same_or_alias(t, a) for t, a in singles).to_json(),
-            "by_size": {
-                size: {
-                    "top_1": Rate.over(a.first == _name(t) for t, a in singles if t["size_class"] == size).to_json(),
-                    "top_2": Rate.over(
-                        _name(t) in a.ranking[:2] for t, a in singles if t["size_class"] == size
-                    ).to_json(),
-                }
-                for size in classes
-            },
-        },
+        "singles": _singles(singles),
         "invisible": Rate.over(
             a.first in ("none", "unknown") if t["kind"] == "outside" else a.first in ("none", *_names(t))
             for t, a in cases
@@ -195,6 +181,27 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
         "confusion": _confusion(cases),
         "seconds": _times([a.seconds for _, a in cases]),
         "misses": [_miss(t, a) for t, a in cases if not _right(t, a)],
+    }
+
+
+def _singles(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+    """Joints with one effect, all and by its size."""
+
+    def top(count: int, chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+        return Rate.over(_name(t) in a.ranking[:count] for t, a in chosen).to_json()
+
+    sizes = {size: [(t, a) for t, a in cases if t["size_class"] == size] for size in ("small", "medium", "large")}
+    return {
+        "top_1": Rate.over(a.first == _name(t) for t, a in cases).to_json(),
+        "top_2": top(2, cases),
+        "top_1_or_alias": Rate.over(_same_or_alias(t, a) for t, a in cases).to_json(),
+        "by_size": {
+            size: {
+                "top_1": Rate.over(a.first == _name(t) for t, a in chosen).to_json(),
+                "top_2": top(2, chosen),
+            }
+            for size, chosen in sizes.items()
+        },
     }
 
 

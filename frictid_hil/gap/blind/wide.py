@@ -220,20 +220,7 @@ def _setting(rng: np.random.Generator) -> Setting:
     tick = float(rng.choice([0.001, 0.002, 0.004]))
     law = str(rng.choice(["pid", "cascade", "pid_feedforward"], p=[0.5, 0.35, 0.15]))
     control, believed = _control(rng, law, inertia, physics, tick, 3.0 * rated, fast=size in ("hobby", "direct"))
-    quality = log_uniform(rng, 0.005, 0.1)
-    tolerance = {
-        name: float(np.clip(quality * log_uniform(rng, 0.4, 1.6), 0.005, 0.1))
-        for name in ("inertia_kg_m2", "gravity_torque_nm", "friction_torque", "viscous", "presliding_stiffness")
-    }
-    tolerance["torque_constant"] = float(np.clip(0.35 * quality * log_uniform(rng, 0.5, 1.5), 0.005, 0.05))
-    knowledge = str(rng.choice(["known", "rough", "unknown"], p=[0.3, 0.35, 0.35]))
-    if knowledge == "known":
-        tolerance["controller_gains"] = 0.0
-    elif knowledge == "rough":
-        tolerance["controller_gains"] = log_uniform(rng, 0.02, 0.1)
-    if gravity == 0.0:
-        del tolerance["gravity_torque_nm"]
-    absolute = {} if gravity == 0.0 else {"zero_offset_rad": log_uniform(rng, 2e-4, 4e-3)}
+    knowledge, tolerance, absolute = _beliefs(rng, gravity > 0.0)
     noise = rated * log_uniform(rng, 1e-3, 0.012)
     physics = _with_traces(rng, physics, 0.4 * noise)
     kind = str(rng.choice(["full", "short", "multisine", "pick_place"], p=[0.2, 0.2, 0.35, 0.25]))
@@ -263,6 +250,25 @@ def _setting(rng: np.random.Generator) -> Setting:
         absolute=absolute,
         believed=believed,
     )
+
+
+def _beliefs(rng: np.random.Generator, heavy: bool) -> tuple[str, dict[str, float], dict[str, float]]:
+    """(what is known of the controller, relative one-sigma of the believed numbers, absolute ones)."""
+    quality = log_uniform(rng, 0.005, 0.1)
+    tolerance = {
+        name: float(np.clip(quality * log_uniform(rng, 0.4, 1.6), 0.005, 0.1))
+        for name in ("inertia_kg_m2", "gravity_torque_nm", "friction_torque", "viscous", "presliding_stiffness")
+    }
+    tolerance["torque_constant"] = float(np.clip(0.35 * quality * log_uniform(rng, 0.5, 1.5), 0.005, 0.05))
+    knowledge = str(rng.choice(["known", "rough", "unknown"], p=[0.3, 0.35, 0.35]))
+    if knowledge == "known":
+        tolerance["controller_gains"] = 0.0
+    elif knowledge == "rough":
+        tolerance["controller_gains"] = log_uniform(rng, 0.02, 0.1)
+    if not heavy:
+        del tolerance["gravity_torque_nm"]
+    absolute = {} if not heavy else {"zero_offset_rad": log_uniform(rng, 2e-4, 4e-3)}
+    return knowledge, tolerance, absolute
 
 
 def _control(
@@ -781,15 +787,20 @@ def _truth(
             for r, a, s in zip(reasons, alone, sizes, strict=True)
         ],
         "true_parameters": parameters,
-        "facts": {
-            "size": setting.size,
-            "law": setting.law,
-            "motions": setting.kind,
-            "gear_ratio": setting.physics.gear_ratio,
-            "rate_family": setting.physics.rate_family,
-            "slip_family": setting.physics.slip_family,
-            "rate_hz": 1.0 / setting.step_s,
-        },
+        "facts": _facts(setting),
+    }
+
+
+def _facts(setting: Setting) -> dict[str, Any]:
+    """Of the joint, for who looks at a miss."""
+    return {
+        "size": setting.size,
+        "law": setting.law,
+        "motions": setting.kind,
+        "gear_ratio": setting.physics.gear_ratio,
+        "rate_family": setting.physics.rate_family,
+        "slip_family": setting.physics.slip_family,
+        "rate_hz": 1.0 / setting.step_s,
     }
 
 
