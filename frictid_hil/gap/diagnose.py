@@ -171,11 +171,14 @@ def _white_nm(logs: Sequence[Recording]) -> float:
 def _loop_quiet(
     gaps: Sequence[Closed], runs: Mapping[str, Replayed] | None, white_nm: float, negligible_nm: float
 ) -> bool:
-    """Whether the joint simulated in closed loop shows no more than noise either: as the actuation does, and white."""
+    """Whether the joint simulated in closed loop shows no more than noise either: as the actuation does, and white.
+
+    What an encoder's steps make of the torque is known in a replay, and another draw of them in a simulation.
+    """
     noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
     if runs is None or noise is None:
         return True
-    return settled_nm(runs) <= min(FLOORS * noise, max(LOUD * white_nm, negligible_nm))
+    return settled_nm(runs) <= min(FLOORS * max(noise, white_nm), max(LOUD * white_nm, negligible_nm))
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:
