@@ -82,7 +82,7 @@ def verdict(
     tiny = tiny and not (shows and any(_needed(f, channels) for f in named))
     if tiny or (quiet and (nothing or generic_wins)):
         return Verdict("none", ())
-    new = any(gap.appeared is not None for gap in gaps)
+    new = any(gap.appeared is not None and _stays(gap) for gap in gaps)
     if unnamed and not any(_stays(gap) for gap in gaps):
         unnamed, named = False, tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     if nothing or unnamed or new or any(_open(gap, negligible) for gap in gaps):

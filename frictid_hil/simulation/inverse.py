@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from frictid_hil.friction.trajectory import Array
 
 Shape = Mapping[str, float]
@@ -91,6 +93,23 @@ class InverseForm:
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:
         """The shapes to try on these recordings."""
         return self.shapes if self.shapes_for is None else self.shapes_for(views)
+
+
+def most_telling(
+    views: Sequence[View], shapes: Sequence[Shape], regressors: Callable[[Sequence[View], Shape], list[Array]]
+) -> int:
+    """Number of the shape whose first column describes most of what the believed joint leaves of the torque."""
+    rest = np.concatenate(
+        [
+            v.torque_nm - v.load_nm - v.motor_inertia_kg_m2 * v.acceleration_rad_s2 - v.coulomb_nm * v.slip - v.rate_nm
+            for v in views
+        ]
+    )
+    told = []
+    for shape in shapes:
+        column = np.concatenate(regressors(views, shape))[:, 0]
+        told.append(float(column @ rest) ** 2 / max(float(column @ column), 1e-300))
+    return int(np.argmax(told))
 
 
 def grid(**axes: Sequence[float]) -> tuple[Shape, ...]:

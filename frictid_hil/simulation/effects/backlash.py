@@ -8,7 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid, most_telling
 from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
@@ -70,20 +70,34 @@ SHAPES = grid(gap_rad=GAPS_RAD, contact_stiffness_nm_per_rad=(1.2e4, 4e4), conta
 
 
 def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
-    """Gaps whose closed contact lets the link ring at 35 or at 70 Hz, whatever the joint's size."""
+    """Gaps whose closed contact lets the link ring, or hardly, whatever the joint's size; closer at the best.
+
+    How a link that rings bounces hangs on how it meets the gap, so that no two joints do it alike; what a well damped
+    contact shows is the same for all.
+    """
     link = max((v.link_inertia_kg_m2 for v in views), default=0.0)
     if link <= 0.0:
         return SHAPES
-    found: list[Shape] = []
-    for frequency_hz in (35.0, 70.0):
-        pulsation = 2.0 * np.pi * frequency_hz
-        stiffness = float(np.clip(link * pulsation**2, *STIFFNESS_BOUNDS))
-        found += grid(
-            gap_rad=GAPS_RAD,
-            contact_stiffness_nm_per_rad=(stiffness,),
-            contact_relaxation_s=(2.0 * 0.08 / pulsation,),
-        )
-    return tuple(found)
+    coarse = [_shape(link, gap_rad, *contact) for contact in CONTACTS for gap_rad in GAPS_RAD]
+    best = most_telling(views, coarse, regressors)
+    contact, gap_rad = CONTACTS[best // len(GAPS_RAD)], GAPS_RAD[best % len(GAPS_RAD)]
+    return (*coarse, *(_shape(link, factor * gap_rad, *contact) for factor in CLOSER))
+
+
+def _shape(link_kg_m2: float, gap_rad: float, frequency_hz: float, ratio: float) -> dict[str, float]:
+    pulsation = 2.0 * np.pi * frequency_hz
+    stiffness = float(np.clip(link_kg_m2 * pulsation**2, *STIFFNESS_BOUNDS))
+    return {
+        "gap_rad": gap_rad,
+        "contact_stiffness_nm_per_rad": stiffness,
+        "contact_relaxation_s": 2.0 * ratio / pulsation,
+    }
+
+
+CONTACTS = ((35.0, 0.08), (70.0, 0.08), (30.0, 0.4), (70.0, 0.4))
+"""Frequency in Hz at which the link rings in the closed contact, and damping over the critical one."""
+CLOSER = (0.75, 0.85, 1.15, 1.3)
+"""Gaps that are tried beside the one that describes most."""
 
 
 def behind_play(position_rad: Array, gap_rad: float, step_s: float) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid, most_telling
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
@@ -61,17 +61,26 @@ SHAPES = grid(
 
 
 def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
-    """Resonances of the link from 4 to 60 Hz, lightly and well damped, whatever the joint's size."""
+    """Resonances of the link from 4 to 45 Hz, lightly and well damped, of any joint; closer at the best."""
     link = max((v.link_inertia_kg_m2 for v in views), default=0.0)
     if link <= 0.0:
         return SHAPES
-    found: list[Shape] = []
-    for frequency_hz in (4.0, 5.0, 6.0, 7.0, 8.0, 9.5, 11.0, 13.0, 15.0, 18.0, 21.0, 25.0, 30.0, 37.0, 45.0):
-        pulsation = 2.0 * np.pi * frequency_hz
-        for ratio in (0.03, 0.12):
-            compliance = float(np.clip(1.0 / (link * pulsation**2), *COMPLIANCE_BOUNDS))
-            found.append({"compliance_rad_per_nm": compliance, "relaxation_s": 2.0 * ratio / pulsation})
-    return tuple(found)
+    coarse = [_shape(link, hertz, ratio) for hertz in RESONANCES_HZ for ratio in RATIOS]
+    best = RESONANCES_HZ[most_telling(views, coarse, regressors) // len(RATIOS)]
+    return (*coarse, *(_shape(link, factor * best, ratio) for factor in CLOSER for ratio in RATIOS))
+
+
+def _shape(link_kg_m2: float, frequency_hz: float, ratio: float) -> dict[str, float]:
+    pulsation = 2.0 * np.pi * frequency_hz
+    compliance = float(np.clip(1.0 / (link_kg_m2 * pulsation**2), *COMPLIANCE_BOUNDS))
+    return {"compliance_rad_per_nm": compliance, "relaxation_s": 2.0 * ratio / pulsation}
+
+
+RESONANCES_HZ = (4.0, 5.0, 6.0, 7.0, 8.0, 9.5, 11.0, 13.0, 15.0, 18.0, 21.0, 25.0, 30.0, 37.0, 45.0)
+RATIOS = (0.03, 0.12)
+"""Damping of the resonance over the critical one."""
+CLOSER = (0.9, 0.95, 1.05, 1.1)
+"""Resonances that are tried beside the one that describes most."""
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
