@@ -66,7 +66,11 @@ def verdict(
         otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
     """
     helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
-    named = tuple(f for f in found if f.chance >= LISTED and f.where not in helpless)
+    unreached = [g.channel for g in gaps if g.before <= math.hypot(1.0, STANDS_OUT) * g.floor]
+    loud = [f for f in found if f.size >= FLOORS and _needed(f, channels)]
+    named = tuple(
+        f for f in found if f.chance >= LISTED and (f.where not in helpless or (f in loud and f.where in unreached))
+    )
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     generic = _root_sum([channel.generic for channel in channels])
@@ -79,8 +83,10 @@ def verdict(
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
     shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
-    tiny = tiny and not (shows and any(_needed(f, channels) for f in named))
-    if tiny or (quiet and (nothing or generic_wins)):
+    # What identification logs plainly hold is no "none" because the validation logs never came to it.
+    told = any(f in loud for f in named)
+    tiny = tiny and not told and not (shows and any(_needed(f, channels) for f in named))
+    if tiny or (quiet and not told and (nothing or generic_wins)):
         return Verdict("none", ())
     new = any(gap.appeared is not None and _stays(gap) for gap in gaps)
     if unnamed and not any(_stays(gap) for gap in gaps):
