@@ -11,6 +11,7 @@ import numpy as np
 from frictid_hil.gap.channel import FAMILY
 from frictid_hil.gap.findings import VISIBLE, Finding, Sampled
 from frictid_hil.gap.how_far import Closed
+from frictid_hil.gap.residuals import rms
 
 FLOORS = 2.0
 """A gap below so many noise floors is none, by promise."""
@@ -66,11 +67,8 @@ def verdict(
         otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
     """
     helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
-    unreached = [g.channel for g in gaps if g.before <= math.hypot(1.0, STANDS_OUT) * g.floor]
-    loud = [f for f in found if f.size >= FLOORS and _needed(f, channels)]
-    named = tuple(
-        f for f in found if f.chance >= LISTED and (f.where not in helpless or (f in loud and f.where in unreached))
-    )
+    unreached = [f for f in found if f.size >= FLOORS and _needed(f, channels) and _unreached(f, channels)]
+    named = tuple(f for f in found if f.chance >= LISTED and (f.where not in helpless or f in unreached))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
     generic = _root_sum([channel.generic for channel in channels])
@@ -84,7 +82,7 @@ def verdict(
     tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
     shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
-    told = any(f in loud for f in named)
+    told = any(f in unreached for f in named)
     tiny = tiny and not told and not (shows and any(_needed(f, channels) for f in named))
     if tiny or (quiet and not told and (nothing or generic_wins)):
         return Verdict("none", ())
@@ -108,6 +106,21 @@ def _needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
     if cause.chance < NEEDED or cause.size < STANDS_OUT:
         return False
     return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)
+
+
+def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
+    """Whether the validation logs never come to where a cause shows, so that they say nothing of it."""
+    for channel in (c for c in channels if c.posterior.channel.name == cause.where):
+        draw = next((d for d in channel.draws if cause.effect in d.model.effects), None)
+        judged = [log for log in channel.posterior.channel.logs if log.validation]
+        if draw is None or not judged:
+            return False
+        columns, values = channel.posterior.contributions(draw)[cause.effect]
+        parts = [log.x[:, columns] @ values for log in judged]
+        levels = float(channel.posterior.channel.name != "plant")
+        made = np.concatenate([part - levels * np.mean(part) for part in parts])
+        return rms(made) < VISIBLE * channel.posterior.floor
+    return False
 
 
 def _unnamed(loud: Sequence[Sampled]) -> bool:
