@@ -106,6 +106,17 @@ def send(message: can.Message) -> None:
         bus.send(message)
 
 
+def at_last(attempt: Callable[[], Any]) -> dict[str, Any]:
+    """What is told once a busy computer has let the drives come to themselves: of four attempts the first that is ok."""
+    found = told(attempt)
+    for _ in range(3):
+        if found.get("ok"):
+            break
+        time.sleep(3.0)
+        found = told(attempt)
+    return found
+
+
 def told(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """The result, or the error that ended it, and how long it took."""
     began = time.monotonic()
@@ -133,8 +144,8 @@ def main(folder: Path) -> dict[str, Any]:
         found["check while down"] = told(lambda: check(robot))
         link("up")
         found["reset"] = told(lambda: reset(robot, ask=lambda faults: True))
-        found["check after"] = told(lambda: check(robot))
-        found["fd"] = told(lambda: check(fd))
+        found["check after"] = at_last(lambda: check(robot))
+        found["fd"] = at_last(lambda: check(fd))
         link("down")
         link("mtu", "16")
         link("up")

@@ -29,6 +29,8 @@ EXTENDED = 0x8000_0000
 """Bit of ``can_id`` that says the frame has a 29-bit id."""
 
 LOG_SUFFIXES = (".blf", ".asc", ".log", ".trc", ".db", ".mf4")
+LONGEST = 64
+"""Bytes of a CAN FD frame at most; what a damaged log holds beyond is no frame."""
 MOST_TEXT_RATIO = 40
 _LEAST_TEXT_BYTES = 1_000_000
 _FRAMES_PER_CONTAINER = 2048
@@ -257,7 +259,7 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
         with opened() as reader:
             start_s = float(getattr(reader, "start_timestamp", 0.0) or 0.0) if path.suffix.lower() == ".blf" else 0.0
             for message in reader:
-                if message.is_error_frame or message.is_remote_frame:
+                if message.is_error_frame or message.is_remote_frame or len(message.data) > LONGEST:
                     skipped += 1
                 else:
                     messages.append(message)
@@ -274,7 +276,7 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
     times_s = np.array([message.timestamp for message in messages], np.float64)
     if not np.all(np.isfinite(times_s)) or abs(times_s - start_s).max() > 9e9:
         raise InputFileError("a time is not finite, or out of range", where=str(path))
-    width = 64 if any(message.is_fd or len(message.data) > 8 for message in messages) else 8
+    width = LONGEST if any(message.is_fd or len(message.data) > 8 for message in messages) else 8
     return Frames(
         t_ns=_run_time_ns(times_s, start_s),
         can_id=np.array([_flagged_id(message) for message in messages], np.uint32),
