@@ -107,7 +107,7 @@ def send(message: can.Message) -> None:
 
 
 def at_last(attempt: Callable[[], Any]) -> dict[str, Any]:
-    """What is told once a busy computer has let the drives come to themselves: the first of four attempts that is ok."""
+    """What is told once drives on a busy computer have come to themselves: the first of four attempts that is ok."""
     found = told(attempt)
     for _ in range(3):
         if found.get("ok"):
