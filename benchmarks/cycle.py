@@ -354,12 +354,13 @@ class _Swinging:
 
 def our_loop(channel: str, active: int, cycle_hz: float, cycles: int) -> Kept:
     """The loop that moves robots, whole."""
-    drive = OurDrives(channel, active, cycle_hz)
+    drive: Any = OurDrives(channel, active, cycle_hz)  # the part of a driver that the loop calls
     limits = [JointLimits(-1.0, 1.0, 10.0, 100.0, silence_s=1.0) for _ in range(active)]
     names = [str(number) for number in range(active)]
     supervisor = Supervisor(names, limits, cycle_hz)
     samples = sample_ring(shared=False)
-    loop: Any = CyclicLoop(drive, supervisor, samples, cycle_hz, _NoStop(), joints=active)  # type: ignore[arg-type]
+    never: Any = _NoStop()
+    loop: Any = CyclicLoop(drive, supervisor, samples, cycle_hz, never, joints=active)
     for _ in range(20):
         feedback = loop.cycle(supervised=False)
     assert all(report.state is JointState.ENABLED for report in feedback), feedback

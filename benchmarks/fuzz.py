@@ -593,7 +593,7 @@ def tried(
 
 
 def _child(answer: Any, name: str, inputs: int, lasts_s: float, seed: int, last: Path) -> None:
-    kinds()[name]().use  # noqa: B018 - libraries are loaded before memory is bounded
+    kinds()[name]()  # loads the libraries before memory is bounded
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + 3 * MOST_BYTES, size + 3 * MOST_BYTES))
     answer.put(tried(name, inputs=inputs, lasts_s=lasts_s, seed=seed, last=last))

@@ -316,3 +316,13 @@ def test_a_full_disk_keeps_what_was_written(tmp_path: Path, monkeypatch: pytest.
     assert len(read_frames(path)) == 100
     with pytest.raises(FrictidError, match="cannot be written"):
         BusLogWriter(tmp_path / "absent" / "bus.blf")
+
+
+def test_a_frame_beyond_64_bytes_is_damage_and_no_frame(tmp_path):
+    lines = [";$FILEVERSION=2.1", ";$STARTTIME=43008.9", ";$COLUMNS=N,O,T,B,I,d,R,L,D"]
+    for k, length in enumerate((8, 100, 8)):
+        lines.append(f"{k + 1:7d} {k:13.3f} DT  1     0181 Rx -  {length:3d}  {' '.join(['2A'] * length)}")
+    path = tmp_path / "a.trc"
+    path.write_text("\r\n".join(lines) + "\r\n")
+    frames = read_frames(path)
+    assert list(frames.length) == [8, 8] and frames.skipped == 1
