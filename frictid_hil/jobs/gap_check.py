@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import UsageError
-from frictid_hil.files import refuse_overwriting
-from frictid_hil.gap.blind.check import run_check
+from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.gap.blind.check import code_digest, run_check
 from frictid_hil.gap.blind.worlds import WORLDS
 
 
@@ -33,7 +35,7 @@ def run_gap_check(
         worlds: names of the worlds to draw from, ``cases`` joints each.
         processes: at once; one per processor core unless given.
         leave_one_out: also take each joint's own effect out of the library and diagnose again.
-        force: write over the result and the page of an earlier check.
+        force: write over the result and the page of an earlier check, and drop the answers of an unfinished one.
         progress: given a line now and then.
 
     Returns:
@@ -42,8 +44,8 @@ def run_gap_check(
         None), ``out``. Of several: ``outcome``, ``seed``, ``cases``, ``worlds`` (the same by name), ``out``.
 
     Raises:
-        UsageError: no case asked for, no such world, or ``out`` holds the result or the page of a finished check. An
-            interrupted one goes on.
+        UsageError: no case asked for, no such world, or ``out`` holds a finished check, or answers of another one.
+            The same check, interrupted, goes on with its answers.
     """
     if cases < 1:
         raise UsageError(f"{cases} cases cannot be scored", next_step="ask for at least 20: `gap check --cases 20`")
@@ -53,6 +55,9 @@ def run_gap_check(
     folders = {name: out if out is None or len(worlds) == 1 else out / name for name in worlds}
     written = [folder / file for folder in folders.values() if folder for file in ("result.json", "gap-check.md")]
     refuse_overwriting(written, force=force)
+    for name, folder in folders.items():
+        if folder is not None:
+            _claim(folder, (name, cases, seed), force=force)
     results = {}
     for name, folder in folders.items():
         result = run_check(
@@ -71,6 +76,28 @@ def run_gap_check(
     if len(results) == 1:
         return {"outcome": "ok", **next(iter(results.values())), **kept}
     return {"outcome": "ok", "seed": seed, "cases": cases, "worlds": results, **kept}
+
+
+def _claim(folder: Path, asked: tuple[str, int, int], *, force: bool) -> None:
+    """Note in the folder which check it belongs to.
+
+    The note is a digest: seed and world are not to be read beside the cases.
+
+    Raises:
+        UsageError: another check has answers there, unless ``force``.
+    """
+    digest = hashlib.sha256(json.dumps([*asked, code_digest()]).encode()).hexdigest()
+    note, answers = folder / "check.sha256", folder / "answers.jsonl"
+    same = note.exists() and note.read_text() == digest
+    if answers.exists() and answers.stat().st_size and not same and not force:
+        raise UsageError(
+            "holds answers of another unfinished check, which would be dropped",
+            where=str(answers),
+            cause="that check had another world, number of cases or seed, or was begun by another version",
+            next_step="choose another place, or add --force to drop them",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(note, digest)
 
 
 def _told(world: str, tell: Callable[[str], None]) -> Callable[[str, int, int], None]:
