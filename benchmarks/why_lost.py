@@ -61,20 +61,18 @@ def cell(errors: tuple[float, float]) -> str:
 
 def long_travel() -> list[str]:
     """A = 20 deg, both plants where the sweep is ahead."""
-    lines = ["| plant | joint | changed | aligned | constant velocity |", "|---|---|---|---|---|"]
+    heads = ["aligned", "chosen by the truth", "chosen for the other joint", "no feed-forward"]
+    heads += ["no dip: aligned", "no dip: chosen by the truth"]
+    lines = [f"| plant | joint | {' | '.join(heads)} |", "|" + "---|" * (2 + len(heads))]
+    usual = Sweep(23.0, False, 0.02)
     for kind, (name, sweep) in itertools.product(("rigid", "load"), SWEEPS.items()):
         base, start = estimators.joints()[name]
         model = estimators.plant(kind, base)
         other = next(value for key, value in SWEEPS.items() if key != name)
         task, even = task_of(model, start, 20.0), task_of(without(model, "stribeck"), start, 20.0)
-        usual = Sweep(23.0, False, 0.02)
-        rows: list[tuple[str, Task, Sweep]] = [
-            ("nothing", task, sweep),
-            ("the setting that the truth chose for the other joint", task, other),
-            ("23 rad/s2, no feed-forward, 20 ms to settle", task, usual),
-            ("no Stribeck dip", even, sweep),
-        ]
-        lines += [f"| {kind} | {name} | {said} | {cell(ours(at))} | {cell(swept(at, by))} |" for said, at, by in rows]
+        sweeps = [swept(task, sweep), swept(task, other), swept(task, usual)]
+        errors = [ours(task), *sweeps, ours(even), swept(even, sweep)]
+        lines.append(f"| {kind} | {name} | {' | '.join(map(cell, errors))} |")
     return lines
 
 
@@ -104,20 +102,21 @@ def short_travel() -> list[str]:
 
 TEXT = """## Reasons, tested
 
-Where another method is ahead, the reason is tested by taking the cause away: percent over [0, V] / over the measured
-range. Printed by `python benchmarks/why_lost.py`.
+    python benchmarks/why_lost.py
 
-**A = 20 deg, constant velocity ahead of aligned.** In a setting that was not chosen by the truth the sweep falls
-behind, by little (the other joint's setting) or by much (no feed-forward). Without the Stribeck dip, which both
-continue by a line below their lowest speed (11.5 deg/s there, 10.7 here), ours is level or ahead over [0, V] even of
-the chosen setting.
+Each reason is tested by taking the cause away; percent over [0, V] / over the measured range.
+
+**A = 20 deg: constant velocity is ahead of aligned.** Both continue the curve by a line below their lowest speed
+(11.5 deg/s there, 10.7 here), and the line of the sweep happens to fit the Stribeck dip better. Without the dip,
+`aligned` is level or ahead. With a setting that the truth did not choose, the sweep falls behind: a little with the
+setting of the other joint, by much with 23 rad/s2, no feed-forward and 20 ms to settle.
 
 {long}
 
-**A = 5 deg, friction that grows with the load, joint 1.** The load on the gear is gravity *and* the link's own
-acceleration. A plateau has none; at the ends of our windows it is (1 - c^2)^(1/2) of its peak, which grows as V^2 / A,
-and so friction is higher there than at constant speed. Narrower windows or a longer travel take that away; without
-gravity, where all load is inertia, it is worst.
+**A = 5 deg, joint 1, friction that grows with the load: constant velocity is ahead of all of ours.** The gear carries
+gravity *and* the acceleration of its own link. At constant speed there is none; at the ends of our windows it is (1 -
+c^2)^(1/2) of its peak, which grows as V^2 / A. So friction is higher in the windows. Narrower windows or a longer
+travel help. Without gravity, where all load is inertia, it is worst.
 
 {short}
 """
