@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import json
 import os
 import shutil
@@ -30,6 +31,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -794,7 +796,7 @@ BEGIN, END = "<!-- written by benchmarks/faults.py -->", "<!-- end of what it wr
 
 
 def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
-    """The figures as tables."""
+    """The figures by verb, and every failure."""
     failed = [verdict for verdict in verdicts if verdict.failures]
     lines = [
         f"`{command}` at {commit}: {len(verdicts)} injections, {len(failed)} failed.",
@@ -805,12 +807,6 @@ def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
     for verb, rows in _by(verdicts, lambda verdict: verdict.verb):
         rest_s, off_s = max(row.rest_s for row in rows), max(row.off_s for row in rows)
         lines.append(f"| {verb} | {_counted(rows)} | {rest_s:.2f} s | {off_s:.2f} s | {_failed(rows)} |")
-    lines += ["", "### By phase", "", "| Phase | Injections | Noticed | Failed |", "|---|---|---|---|"]
-    for phase, rows in _by(verdicts, lambda verdict: verdict.phase):
-        lines.append(f"| {phase} | {_counted(rows)} | {_failed(rows)} |")
-    lines += ["", "### By fault", "", "| Fault | Injections | Noticed | Failed |", "|---|---|---|---|"]
-    for name, rows in _by(verdicts, lambda verdict: verdict.name):
-        lines.append(f"| {name} | {_counted(rows)} | {_failed(rows)} |")
     lines += ["", "### Every failure", ""]
     lines += (
         ["| Verb | Phase | Fault | Seed | Ended | What failed |", "|---|---|---|---|---|---|"] if failed else ["None."]
@@ -819,6 +815,16 @@ def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
         said = "; ".join(row.failures).replace("|", "/")
         lines.append(f"| {row.verb} | {row.phase} | {row.name} | {row.seed} | {row.ended} | {said} |")
     return "\n".join(lines) + "\n"
+
+
+def write_counts(folder: Path, verdicts: Sequence[Verdict]) -> None:
+    """Injections by phase and by fault, each as a table of its own."""
+    for key, named in (("phase", "phase"), ("fault", "name")):
+        rows = _by(verdicts, attrgetter(named))
+        with (folder / f"faults-by-{key}.csv").open("w", newline="", encoding="utf-8") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow([key, "injections", "noticed", "failed"])
+            table.writerows([name, len(of), sum(row.noticed for row in of), _failed(of)] for name, of in rows)
 
 
 def _by(verdicts: Sequence[Verdict], key: Callable[[Verdict], str]) -> list[tuple[str, list[Verdict]]]:
@@ -844,7 +850,9 @@ def main() -> None:
     parser.add_argument("--verbs", default=",".join(VERBS))
     parser.add_argument("--kept", type=Path, help="goes on after an interruption")
     parser.add_argument("--again", action="store_true", help="only what failed in --kept; its verdicts are replaced")
-    parser.add_argument("--docs", type=Path, help="page whose marked part is written anew")
+    parser.add_argument(
+        "--docs", type=Path, help="page whose marked part is written anew, and data/faults-by-*.csv beside it"
+    )
     asked = parser.parse_args()
     lines = asked.kept.read_text().splitlines() if asked.kept and asked.kept.exists() else []
     kept = [Verdict(**json.loads(line)) for line in lines]
@@ -875,6 +883,7 @@ def main() -> None:
         before, rest = asked.docs.read_text().split(BEGIN)
         text = told(kept, f"python benchmarks/faults.py --runs {len(kept)}", git_revision()[:8])
         asked.docs.write_text(f"{before}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}")
+        write_counts(asked.docs.parent / "data", kept)
     failed = sum(bool(verdict.failures) for verdict in kept)
     print(f"{len(kept)} injections, {failed} failed")
 

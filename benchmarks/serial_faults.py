@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import json
 import os
 import re
@@ -350,13 +351,19 @@ def row(layer: str, kind: str, phases: Phases, healthy_s: float, count: int) -> 
     return Row(cells, runs, wrong)
 
 
-def in_virtual_time(layers: Sequence[str], kinds: Sequence[str], count: int, kept: Path | None) -> tuple[str, int, int]:
-    """The whole table, how many runs it took, and how many of them were wrong."""
+ENDINGS = ["layer", "fault", "phase", "ending"]
+TERMINALS = ["layer", "fault", "exit_code", "told", "samples_kept", "wall_s", "wrong"]
+
+
+def in_virtual_time(
+    layers: Sequence[str], kinds: Sequence[str], count: int, kept: Path | None
+) -> tuple[list[list[str]], int, int]:
+    """A row of ``ENDINGS`` for every fault and phase, how many runs it took, and how many of them were wrong."""
     known = json.loads(kept.read_text()) if kept is not None and kept.exists() else {}
-    lines, runs, wrong = [], 0, 0
+    rows: list[list[str]] = []
+    runs, wrong = 0, 0
     for layer in layers:
         phases, healthy_s = phases_of(layer)
-        lines += [f"| {layer} | " + " | ".join(phases) + " |", "|---|" + "---|" * len(phases)]
         for kind in kinds:
             name = f"{layer} {kind} {count}"
             done = Row(**known[name]) if name in known else row(layer, kind, phases, healthy_s, count)
@@ -365,29 +372,24 @@ def in_virtual_time(layers: Sequence[str], kinds: Sequence[str], count: int, kep
                 kept.write_text(json.dumps(known, indent=1))
             runs, wrong = runs + done.runs, wrong + done.wrong
             if done.runs:
-                lines.append(f"| `{kind}` | " + " | ".join(done.cells) + " |")
-                print(lines[-1], flush=True)
-        lines.append("")
-    lines.insert(0, f"{runs} runs, {wrong} of them wrong.\n")
-    return "\n".join(lines), runs, wrong
+                rows += [[layer, kind, phase, cell] for phase, cell in zip(phases, done.cells, strict=True)]
+                print(layer, kind, " | ".join(done.cells), flush=True)
+    return rows, runs, wrong
 
 
 # -- the same on a pseudo terminal -------------------------------------------------------------------------------------
 
 
-def on_terminals() -> tuple[str, int, int]:
+def on_terminals() -> tuple[list[list[str]], int, int]:
     """Twenty of them, each ``frictid-hil emulate`` and ``frictid-hil calibrate`` as a person would start them."""
-    lines = ["| layer | fault | exit code | told | samples kept | wall s |", "|---|---|---|---|---|---|"]
-    bad = 0
+    rows: list[list[str]] = []
     for layer, faults in ON_TERMINALS.items():
         for fault in faults:
             with tempfile.TemporaryDirectory() as folder:
                 cells, wrong = _on_terminal(layer, fault, Path(folder))
-            bad += bool(wrong)
-            lines.append(f"| {layer} | `{fault}` | " + " | ".join([*cells, *(f"**{text}**" for text in wrong)]) + " |")
-            print(lines[-1], flush=True)
-    runs = len(lines) - 2
-    return "\n".join([f"{runs} runs, {bad} of them wrong.\n", *lines, ""]), runs, bad
+            rows.append([layer, fault, *cells, "; ".join(wrong)])
+            print(" | ".join(rows[-1]), flush=True)
+    return rows, len(rows), sum(bool(entry[-1]) for entry in rows)
 
 
 def _on_terminal(layer: str, fault: str, folder: Path) -> tuple[list[str], list[str]]:
@@ -449,14 +451,29 @@ def _stands(bus: str, robot: Path) -> bool:
         driver.close()
 
 
-def write(page: Path, name: str, how: str, text: str) -> None:
-    """Replace what stands between this benchmark's two comments on the page."""
+def counted(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """How often each ending or exit code came in each layer."""
+    column = heads.index("ending" if "ending" in heads else "exit_code")
+    endings = sorted({entry[column] for entry in rows} - {"", "-"})
+    counts = Counter((entry[0], entry[column]) for entry in rows)
+    lines = [f"| layer | {' | '.join(endings)} |", "|" + "---|" * (1 + len(endings))]
+    for layer in dict.fromkeys(entry[0] for entry in rows):
+        lines.append(f"| {layer} | {' | '.join(str(counts[layer, ending]) for ending in endings)} |")
+    return "\n".join(lines)
+
+
+def write(page: Path, name: str, how: str, heads: Sequence[str], rows: Sequence[Sequence[str]], told: str) -> None:
+    """Every row into ``data/serial-NAME.csv``, the counts between this benchmark's two comments on the page."""
+    table = page.parent / "data" / f"serial-{name}.csv"
+    with table.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([heads, *rows])
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     command = f"python benchmarks/serial_faults.py {how}"
     before, _, rest = page.read_text().partition(begin)
     _, _, after = rest.partition(end)
-    page.write_text(f"{before}{begin}\n`{command}` at commit {commit.strip()}: {text}{end}{after}")
+    text = f"`{command}` at commit {commit.strip()}: {told}. [Every one of them](data/{table.name}); in short:"
+    page.write_text(f"{before}{begin}\n{text}\n\n{counted(heads, rows)}\n{end}{after}")
 
 
 def main() -> int:
@@ -467,17 +484,19 @@ def main() -> int:
     parser.add_argument("--kinds", default=",".join(KINDS), help="some of them, separated by commas")
     parser.add_argument("--kept", type=Path, help="rows that are there already, and where new ones go")
     parser.add_argument("--pty", action="store_true")
-    parser.add_argument("--docs", type=Path, help="the page to write the table to")
+    parser.add_argument("--docs", type=Path, help="the page to write to; its table goes to data/ beside it")
     asked = parser.parse_args()
     if asked.pty:
-        text, runs, bad = on_terminals()
+        name, how, heads = "faults-pty", "--pty", TERMINALS
+        rows, runs, bad = on_terminals()
     else:
+        name, how, heads = "faults", f"--places {asked.places}", ENDINGS
         layers, kinds = asked.layers.split(","), asked.kinds.split(",")
-        text, runs, bad = in_virtual_time(layers, kinds, asked.places, asked.kept)
-    print(f"{runs} runs, {bad} wrong")
+        rows, runs, bad = in_virtual_time(layers, kinds, asked.places, asked.kept)
+    told = f"{runs} runs, {bad} of them wrong"
+    print(told)
     if asked.docs:
-        name, how = ("faults-pty", "--pty") if asked.pty else ("faults", f"--places {asked.places}")
-        write(asked.docs, name, how, text)
+        write(asked.docs, name, how, heads, rows, told)
     return 0 if bad == 0 else 1
 
 
