@@ -2,10 +2,11 @@
 
     python benchmarks/store_kills.py [KILLS NIGHTS PROFILES]
 
-A child adds and promotes profiles without end and is killed after a random 1 to 200 ms; after every kill the store must
-open, and the active profile must be whole and one of those that the child was promoting. Then whole nights of
-``recalibrate`` (one joint of the shipped robot, 2 cycles) are killed, each at a moment drawn evenly over how long a
-night takes: the store must open, the active profile must be whole, and either that of before or the one of this night.
+A child adds, promotes and rolls back profiles without end and is killed after a random 1 to 200 ms; after every kill
+the store must open, and the active profile must be whole and one of those that the child was promoting. Then whole
+nights of ``recalibrate`` (one joint of the shipped robot, 2 cycles) are killed, each at a moment drawn evenly over how
+long a night takes: the store must open, the active profile must be whole, and either that of before or the one of this
+night.
 Last, the history and the index page of a robot with 10,000 profiles are timed, each as a program of its own from its
 start to its end.
 """
@@ -79,6 +80,7 @@ def killed(root: Path, kills: int) -> None:
             while True:
                 for number in (1, 2):
                     store.promote("arm", store.add(profile(number)))
+                store.rollback("arm")
         time.sleep(chance.uniform(0.001, 0.200))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)

@@ -327,11 +327,6 @@ def test_fifty_kills_never_spoil_the_store(tmp_path: Path) -> None:
     kill_while_writing(tmp_path, 50)
 
 
-@pytest.mark.slow
-def test_a_thousand_kills_never_spoil_the_store(tmp_path: Path) -> None:
-    kill_while_writing(tmp_path, 1000)
-
-
 def test_a_long_history_opens_no_profile(tmp_path: Path) -> None:
     store = ProfileStore(tmp_path)
     folder = tmp_path / "hp3j"
