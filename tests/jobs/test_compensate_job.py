@@ -61,7 +61,7 @@ def profile(robot: Path) -> Path:
 @pytest.fixture
 def go(robot: Path, profile: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
     def run(task: str = "hand", modes: tuple[str, ...] = ("nc", "mop"), **changes: Any) -> dict[str, Any]:
-        wanted = Wanted(task, modes, duration_s=6.0)
+        wanted = Wanted(task, modes, duration_s=3.0)
         options = CompensateOptions(str(robot), profile, JOINT, wanted, out=tmp_path / "run")
         return compensate(changed(options, **changes), Silent()).to_json()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -21,32 +22,31 @@ from frictid_drivers.motoman.emulator.pty import Terminal, Waits
 from frictid_drivers.motoman.port import SerialPort
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, HardwareBusy, HardwareError, InputFileError, UsageError
+from frictid_hil.jobs.emulate import emulate
 from frictid_hil.plan.plan import Hold, JointPlan, Sine
 from frictid_hil.protocol.driver import Feedback, SetPoint
 from frictid_hil.recording.mcap_reader import read_mcap
+from frictid_hil.simulation.compose import kernel
 
 pytestmark = pytest.mark.slow
 
-SERVE = """
-import sys
-from pathlib import Path
-from frictid_hil.jobs.emulate import emulate
-link = Path(sys.argv[1]) if sys.argv[1] else None
-robot = "hp3j-serial.yaml"
-emulate("motoman", announce=lambda port: print(port, flush=True), robot_name=robot, link=link, faults=sys.argv[2:])
-"""
-
 
 @contextmanager
-def controller(*faults: str, link: str = "") -> Iterator[str]:
-    """An emulated controller; its port."""
-    process = subprocess.Popen([sys.executable, "-c", SERVE, link, *faults], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
+def controller(*faults: str, link: Path | None = None) -> Iterator[str]:
+    """An emulated controller in a process of its own, forked with everything loaded; its port."""
+    kernel()
+    forks = multiprocessing.get_context("fork")
+    ours, theirs = forks.Pipe(duplex=False)
+    settings = {"announce": theirs.send, "robot_name": "hp3j-serial.yaml", "link": link, "faults": faults}
+    process = forks.Process(target=emulate, args=("motoman",), kwargs=settings)
+    process.start()
+    theirs.close()
     try:
-        yield process.stdout.readline().strip()
+        yield ours.recv()
     finally:
         process.terminate()
-        assert process.wait(10) in (0, -15)
+        process.join(10)
+        assert process.exitcode in (0, -15)
 
 
 def driver_on(port: str, **options: object) -> MotomanDriver:
@@ -195,7 +195,7 @@ def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_
     at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
     motion = JointPlan("3", (Sine(at, 0.1, 0.5, 8),), {})
     arrived: list[float] = []
-    with controller(f"unplug@200:{gone_s}", link=str(tmp_path / "port")) as port:
+    with controller(f"unplug@200:{gone_s}", link=tmp_path / "port") as port:
         assert port == str(tmp_path / "port")
         driver = driver_on(port, layer="batch", watchdog_s=1.5)
         driver.open()
@@ -214,7 +214,7 @@ def test_a_job_whose_port_comes_back_is_fetched_to_its_end(tmp_path: Path, gone_
 @pytest.mark.slow
 def test_a_transfer_whose_port_comes_back_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     at = load_robot("hp3j-serial").to_setup().joint("3").locked_position_rad
-    with controller("close@130:2", link=str(tmp_path / "port")) as port:
+    with controller("close@130:2", link=tmp_path / "port") as port:
         driver = driver_on(port, layer="batch")
         driver.open()
         line, reopened = driver._open_line().port, []
