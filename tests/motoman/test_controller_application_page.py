@@ -1,4 +1,4 @@
-"""Every hex example of the page for controller-side authors is what driver and emulator really exchange."""
+"""Every hex example of the pages for controller-side authors is what driver and emulator really exchange."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.table import friction_table
 from frictid_hil.friction.curve import FrictionCurve
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "motoman-controller-application.md"
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
+PAGES = [REFERENCE / f"motoman-{name}.md" for name in ("controller-application", "batch", "streaming")]
+EXCHANGES = REFERENCE / "motoman-exchanges.txt"
 BLOCK = re.compile(r"^```hex (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 ORDER = JobOrder(
@@ -152,15 +154,32 @@ def made() -> dict[str, str]:
     return examples()
 
 
-def test_every_example_of_the_page_is_what_the_code_does(made: dict[str, str]) -> None:
-    shown = dict(BLOCK.findall(PAGE.read_text()))
-    assert set(shown) == set(made)
-    for name, text in shown.items():
-        assert text == made[name], f"example {name} of the page is not what goes over the wire"
+@pytest.fixture(scope="module")
+def text() -> str:
+    """The three pages."""
+    return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 
-def test_every_command_and_frame_of_the_code_is_on_the_page() -> None:
-    text = PAGE.read_text()
+def test_the_file_of_exchanges_is_what_the_code_does(made: dict[str, str]) -> None:
+    shown = dict(re.findall(r"^# (\S+)\n([^#]*)", EXCHANGES.read_text(encoding="utf-8"), re.MULTILINE))
+    assert {name: lines.strip() for name, lines in shown.items()} == {
+        name: lines.strip() for name, lines in made.items()
+    }
+
+
+def test_every_example_of_the_pages_is_what_the_code_does(made: dict[str, str], text: str) -> None:
+    shown = BLOCK.findall(text)
+    assert len(shown) > 8
+    for name, lines in shown:
+        assert lines == made[name], f"example {name} of the page is not what goes over the wire"
+
+
+def test_every_exchange_is_named_on_the_pages(made: dict[str, str], text: str) -> None:
+    for name in made:
+        assert f"`{name}`" in text or f"hex {name}\n" in text, name
+
+
+def test_every_command_and_frame_of_the_code_is_on_the_pages(text: str) -> None:
     emulator = make_bench().emulator
     for command in emulator.batch._commands:
         assert f"### {command}" in text
@@ -173,11 +192,10 @@ def test_every_command_and_frame_of_the_code_is_on_the_page() -> None:
 
 
 def test_every_option_and_fault_is_on_the_page_of_settings() -> None:
-    text = (PAGE.parent / "serial-settings.md").read_text()
+    text = (REFERENCE / "serial-settings.md").read_text(encoding="utf-8")
     for name in [*OCCASIONS, *EMULATOR_OPTIONS, *(entry.name for entry in fields(SerialOptions))]:
         assert f"`{name}`" in text, name
 
 
-def test_the_page_says_what_was_never_tested() -> None:
-    text = PAGE.read_text()
+def test_the_pages_say_what_was_never_tested(text: str) -> None:
     assert "never been run on a controller" in text
