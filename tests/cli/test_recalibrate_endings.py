@@ -36,7 +36,7 @@ UNATTENDED = {
 def robot_file(place: Path, *, friction: float = 1.0, faults: list[Any] | None = None, **policy: Any) -> str:
     """The smallest joint of the shipped robot alone, with a short procedure."""
     values = load_robot("hp3j").values()
-    values |= {"name": ROBOT, "bus": "virtual:endings", "joints": {"5": values["joints"]["5"]}}
+    values |= {"name": ROBOT, "bus": "virtual:endings", "cycle_hz": 500, "joints": {"5": values["joints"]["5"]}}
     values["procedure"] |= {"amplitude_rad": 0.2, "velocity_rad_s": 1.5, "cycles": 3}
     values["policy"] = {"warm_up": {"fixed_s": 0.0}} | policy
     values["joints"]["5"]["simulated"]["friction"]["coulomb_nm"] *= friction

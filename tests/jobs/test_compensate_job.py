@@ -154,7 +154,7 @@ def test_a_run_keeps_its_profile_when_another_is_promoted(robot: Path, profile: 
             if isinstance(event, PhaseStarted):
                 store.promote(name, other)
 
-    options = CompensateOptions(str(robot), store.path(name, first), JOINT, Wanted("hand", ("mop",), duration_s=2.0))
+    options = CompensateOptions(str(robot), store.path(name, first), JOINT, Wanted("track", ("mop",), duration_s=2.0))
     kept = compensate(replace(options, out=tmp_path / "kept"), Promotes()).to_json()
     active = store.active(name)
     assert active is not None and active.id == other
@@ -523,8 +523,8 @@ def test_a_service_runs_until_interrupted_and_leaves_its_figures(robot: Path, pr
 
 @pytest.mark.slow
 def test_on_the_wall_clock_it_reaches_the_same(go: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    lock_step = go("hand", ("nc", "mop"), out=tmp_path / "lock_step")
-    wall = go("hand", ("nc", "mop"), out=tmp_path / "wall", realtime=True)
+    lock_step = go("hand", ("nc", "mop"), out=tmp_path / "lock_step", duration_s=2.0)
+    wall = go("hand", ("nc", "mop"), out=tmp_path / "wall", realtime=True, duration_s=2.0)
     assert wall["outcome"] == "ok", wall
     found, expected = (r["modes"]["mop"]["reduction_inertia_removed_percent"] for r in (wall, lock_step))
     assert found == pytest.approx(expected, abs=1.0)

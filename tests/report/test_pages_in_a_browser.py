@@ -49,11 +49,16 @@ def history(tmp_path: Path) -> ProfileStore:
     return some_history(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Page]:
+    return pages(some_history(tmp_path_factory.mktemp("history")))
+
+
 @pytest.mark.slow
 @needs_browser
 @pytest.mark.parametrize("name", [*PAGES, "compensation by hand without a force sensor"])
-def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: Path) -> None:
-    page = pages(history)[name]
+def test_page_draws_without_errors(name: str, made: dict[str, Page], tmp_path: Path) -> None:
+    page = made[name]
     figures = [figure for section in page.sections for figure in section.figures]
     assert figures
     dom, console = in_browser(with_axe(write_page(page, tmp_path / f"{name}.html")), tmp_path / "browser")
@@ -76,15 +81,15 @@ def test_page_draws_without_errors(name: str, history: ProfileStore, tmp_path: P
 @pytest.mark.slow
 @needs_browser
 @pytest.mark.parametrize("name", ["index", "calibration", "recalibration", "gap"])
-def test_the_contrast_holds_in_the_dark_too(name: str, history: ProfileStore, tmp_path: Path) -> None:
-    path = write_page(pages(history)[name], tmp_path / "page.html")
+def test_the_contrast_holds_in_the_dark_too(name: str, made: dict[str, Page], tmp_path: Path) -> None:
+    path = write_page(made[name], tmp_path / "page.html")
     path.write_text(path.read_text().replace("screen and (prefers-color-scheme: dark)", "screen"))
     dom, _ = in_browser(with_axe(path), tmp_path / "browser")
     assert serious(dom) == []
 
 
-def test_the_calendar_tells_every_night_and_leads_to_its_page(history: ProfileStore, tmp_path: Path) -> None:
-    text = write_page(pages(history)["index"], tmp_path / "index.html").read_text()
+def test_the_calendar_tells_every_night_and_leads_to_its_page(made: dict[str, Page], tmp_path: Path) -> None:
+    text = write_page(made["index"], tmp_path / "index.html").read_text()
     # The first of March 2026 is a Sunday: it stands alone in the first of three weeks.
     assert re.findall(r'<th scope="row">([^<]*)</th>', text) == ["2026-03-01", "2026-03-02", "2026-03-09"]
     days = re.findall(r'class="day (\w*)"[^>]*aria-label="([^"]*)"', text)
@@ -103,23 +108,23 @@ def test_a_long_history_shows_its_newest_year() -> None:
 
 @pytest.mark.slow
 @needs_browser
-def test_a_broken_page_would_be_noticed(history: ProfileStore, tmp_path: Path) -> None:
-    path = write_page(pages(history)["index"], tmp_path / "index.html")
+def test_a_broken_page_would_be_noticed(made: dict[str, Page], tmp_path: Path) -> None:
+    path = write_page(made["index"], tmp_path / "index.html")
     path.write_text(path.read_text().replace("\ndraw();\n", "\ndraw();\nundefinedFunction();\n"))
     _, console = in_browser(path, tmp_path / "browser")
     assert any("undefinedFunction" in line for line in console)
 
 
-def test_pages_are_whole_in_themselves_and_escape_what_people_wrote(history: ProfileStore, tmp_path: Path) -> None:
-    for name, page in pages(history).items():
+def test_pages_are_whole_in_themselves_and_escape_what_people_wrote(made: dict[str, Page], tmp_path: Path) -> None:
+    for name, page in made.items():
         text = write_page(page, tmp_path / f"{name}.html").read_text()
         assert not re.search(r'<(?:script|link|img)[^>]+(?:src|href)="(?!data:)', text), "something from elsewhere"
         assert "night <script>" not in text
         assert "prefers-color-scheme: dark" in text and "@media print" in text
 
 
-def test_a_page_is_small_and_a_thinned_line_keeps_its_peaks(history: ProfileStore, tmp_path: Path) -> None:
-    assert write_page(pages(history)["calibration"], tmp_path / "page.html").stat().st_size < 1_500_000
+def test_a_page_is_small_and_a_thinned_line_keeps_its_peaks(made: dict[str, Page], tmp_path: Path) -> None:
+    assert write_page(made["calibration"], tmp_path / "page.html").stat().st_size < 1_500_000
     y = np.zeros(100_000)
     y[54_321] = 7.0
     drawn = line("spike", np.arange(y.size, dtype=float), y, "#000000")
@@ -145,8 +150,8 @@ def test_its_pdf_is_small(tmp_path: Path) -> None:
     assert 100_000 < (tmp_path / "six.pdf").stat().st_size < 3_000_000
 
 
-def test_all_joints_are_shown_first_with_the_verdict_of_their_gates(history: ProfileStore) -> None:
-    (overview,) = pages(history)["calibration"].sections[0].figures
+def test_all_joints_are_shown_first_with_the_verdict_of_their_gates(made: dict[str, Page]) -> None:
+    (overview,) = made["calibration"].sections[0].figures
     assert [title.rpartition("</span> ")[2] for title in overview.panels] == ["joint 0", "joint 1"]
     assert all("\u2713" in title for title in overview.panels)
     kinds = {(trace["name"], trace["line"].get("dash")) for trace in overview.traces}
@@ -154,8 +159,8 @@ def test_all_joints_are_shown_first_with_the_verdict_of_their_gates(history: Pro
     assert {trace.get("xaxis", "x") for trace in overview.spec()["data"]} == {"x", "x2"}
 
 
-def test_the_loops_tell_apart_what_lies_in_the_windows(history: ProfileStore) -> None:
-    page = pages(history)["calibration"]
+def test_the_loops_tell_apart_what_lies_in_the_windows(made: dict[str, Page]) -> None:
+    page = made["calibration"]
     (loops,) = [
         one for section in page.sections for one in section.figures if one.title == "Joint 0: torque over velocity"
     ]
@@ -169,8 +174,8 @@ def test_the_loops_tell_apart_what_lies_in_the_windows(history: ProfileStore) ->
     assert "4 sinusoidal cycles of 20.05 deg peak to peak" in done and "rise to 114.6 deg/s" in done
 
 
-def test_the_limit_of_the_policy_is_drawn_beside_the_distance(history: ProfileStore) -> None:
-    figures = [one for section in pages(history)["recalibration"].sections for one in section.figures]
+def test_the_limit_of_the_policy_is_drawn_beside_the_distance(made: dict[str, Page]) -> None:
+    figures = [one for section in made["recalibration"].sections for one in section.figures]
     (distance,) = [one for one in figures if one.title.startswith("Distance")]
     assert [trace["y"] for trace in distance.traces if trace["name"] == "limit of the policy"] == [[10.0, 10.0]]
 
@@ -218,9 +223,9 @@ def compare(shot: Path, name: str) -> None:
     ("name", "size"), [*((name, DESKTOP) for name in PAGES), ("calibration", PHONE), ("index", PHONE)]
 )
 def test_the_docs_show_the_page_as_it_is(
-    name: str, size: tuple[int, int], history: ProfileStore, tmp_path: Path
+    name: str, size: tuple[int, int], made: dict[str, Page], tmp_path: Path
 ) -> None:
-    page = write_page(pages(history)[name], tmp_path / "page.html")
+    page = write_page(made[name], tmp_path / "page.html")
     width, height = size
     # The window of a browser is never narrower than 500 px; a frame is.
     frame = tmp_path / "frame.html"

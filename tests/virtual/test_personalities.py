@@ -58,7 +58,7 @@ def robot(family: str, folder: Path, friction_share: float = 1.0, **options: obj
     }  # fmt: skip
     values = {
         "schema": "frictid.robot/1", "name": family, "driver": "virtual", "bus": f"virtual:{family}{os.getpid()}",
-        "cycle_hz": 500,
+        "cycle_hz": 250,
         "procedure": {"amplitude_rad": 0.2, "velocity_rad_s": 0.6, "cycles": 4, "ratio": 0.8},
         "joints": {"0": joint},
         **ROBOT.get(family, {}),

@@ -144,7 +144,7 @@ def merged(first: Quirks, second: Quirks) -> Quirks:
 
 def _entries(path: Path) -> list[tuple[dict[str, int], Quirks]]:
     try:
-        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
+        plain = yaml.load(path.read_text(encoding="utf-8"), yaml.CSafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputFileError(f"cannot be read: {error}", where=str(path)) from error
     if not isinstance(plain, dict) or plain.get("schema") != SCHEMA or not isinstance(plain.get("drives"), list):
