@@ -149,15 +149,20 @@ def put(module: ModuleType, name: str, other: Any) -> Iterator[None]:
 
 
 def table(rows: Mapping[str, Sequence[int]], joints: int) -> str:
-    """One row for each variation, the most telling first."""
+    """One row for each variation that changes an answer, the most telling first, and the other constants by name."""
     lines = [
         f"| constant, of {joints} joints | verdict changes | first cause changes | right |",
         "|---|---|---|---|",
     ]
     first, *others = rows.items()
-    for what, (verdicts, causes, good) in [first, *sorted(others, key=lambda row: -row[1][1])]:
+    loud = sorted((row for row in others if any(row[1][:2])), key=lambda row: -row[1][1])
+    for what, (verdicts, causes, good) in [first, *loud]:
         lines.append(f"| {what} | {verdicts} | {causes} | {good} |")
-    return "\n".join(lines)
+    silent = len(others) - len(loud)
+    heard = {what.partition(" x ")[0] for what, _ in loud}
+    still = dict.fromkeys(name for what, _ in others if (name := what.partition(" x ")[0]) not in heard)
+    lines += ["", f"{silent} of {len(others)} variations change no answer. Neither half nor double of these does:"]
+    return "\n".join([*lines, f"{', '.join(still)}."])
 
 
 if __name__ == "__main__":
