@@ -9,24 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.effect import Channel, Effect, Illustration
+from frictid_hil.simulation.effect import Effect, Illustration
 from frictid_hil.simulation.effects import all_effects
 
 PAGE = "effects.md"
 PICTURES = "effects"
 
-_CHANNELS = {
-    Channel.KINEMATIC: "kinematic (reported velocity against differenced position)",
-    Channel.ACTUATION: "actuation (reported torque against the controller's demand)",
-    Channel.PLANT: "plant (reported torque against the joint's equation of motion)",
-}
 _COLOURS = ("#8a8f98", "#1565c0", "#c62828")
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 480, 250, 64, 16, 28, 44
 
 _INTRODUCTION = """# The effects
 
-Everything beyond the plain joint - inertia, gravity, a friction curve behind a presliding spring - is one of the
-effects below. A robot file's simulated joint may carry any of them, and the diagnosis looks for each of them:
+A plain joint has inertia, gravity, and a friction curve behind a presliding spring. Everything beyond that is one of
+the effects below. A robot file's simulated joint may carry any of them, and the diagnosis looks for each of them:
 
 ```yaml
 simulated:
@@ -36,16 +31,17 @@ simulated:
       stribeck_velocity_rad_s: 0.035
 ```
 
-A parameter left out takes its typical value where it shapes the effect, and is off where it sizes it. F_0 is the
-joint's Coulomb level, phi_0(v) the rate-dependent rest of its friction curve, q the joint's position, v its velocity;
-all on the joint side of the gear. *Off* is the value at which an effect vanishes.
+A parameter that is left out takes its typical value if it shapes the effect, and is off if it sizes it. *Off* is the
+value at which an effect vanishes. F_0 is the joint's Coulomb level, phi_0(v) the part of its friction curve that
+depends on speed, q the joint's position, v its velocity; all on the joint side of the gear.
 
-This page is generated from `frictid_hil/simulation/effects/`, one file each, by
-`python -m frictid_hil.simulation.catalogue docs/reference`. Adding a file there adds the effect to the simulated joint,
-to robot files, to the diagnosis and to this page.
+*Channel* is where an effect shows: P, reported torque against the joint's equation of motion; A, reported torque
+against the controller's demand; K, reported velocity against differenced position. *Region* is the part of the motion
+where it shows.
 
-An effect of your own needs no change of the product: install a package with an entry point of the group
-`frictid_hil.effects`, named like the effect, that leads to an `Effect` as these files hold one.
+`python -m frictid_hil.simulation.catalogue docs/reference` generates this page from `frictid_hil/simulation/effects/`.
+A file that you add there adds the effect to the simulated joint, to robot files, to the diagnosis and to this page. An
+effect of your own may also come in a package, by an entry point that leads to an `Effect`:
 
 ```toml
 [project.entry-points."frictid_hil.effects"]
@@ -82,9 +78,6 @@ def section(effect: Effect) -> str:
             f"![{effect.name}]({PICTURES}/{effect.name}.svg)",
             "",
             effect.documentation,
-            "",
-            f"Shows in: {'; '.join(_CHANNELS[channel] for channel in effect.signature.channels)}.",
-            f"Where: {', '.join(region.value for region in effect.signature.regions)}.",
             "",
             "| parameter | meaning | bounds | off | typical |",
             "|---|---|---|---|---|",
