@@ -278,6 +278,10 @@ def _half_widths(torque_nm: tuple[float, ...], intervals_nm: Any) -> tuple[float
     return tuple(half.tolist()) if np.all(even) else None
 
 
+LOOP_STIFFNESS = "loop_stiffness_nm_per_rad"
+"""Figure of ``quality``: what the drive's own position loop gives per rad, where that loop is proportional alone."""
+
+
 class JointProfile(Strict):
     """One joint; on a linear axis the file says m, m/s, N (see ``linear_axis``) and these names hold them.
 

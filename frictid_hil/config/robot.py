@@ -106,6 +106,7 @@ class JointFile(Strict):
     """One joint; torque and position on the joint side of the gear.
 
     ``continuous`` says that the axis turns without end, or faster than any robot's joint, and that this is meant.
+    ``loop_stiffness_nm_per_rad`` is what a servo's own proportional position loop gives per rad of following error.
     """
 
     node: int | None = Field(default=None, ge=0)
@@ -123,6 +124,7 @@ class JointFile(Strict):
     direction: Literal[-1, 1] = 1
     expected: ExpectedFile | None = None
     procedure: JointProcedureFile = JointProcedureFile()
+    loop_stiffness_nm_per_rad: float = Field(default=0.0, ge=0)
     options: dict[str, Any] = Field(default_factory=dict)
     simulated: dict[str, Any] = Field(default_factory=dict)
     dh: DhFile | None = None

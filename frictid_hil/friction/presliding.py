@@ -25,9 +25,12 @@ from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
 from frictid_hil.errors import IdentificationError
-from frictid_hil.friction.rigid_body import Measured
+from frictid_hil.friction.recording import CycleRecording, synchronised
+from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Array
 
+_SLID = 0.7
+"""Share of F_0: friction between this in the one and in the other direction is counted as presliding."""
 _SMOOTHING_S = 0.02
 _TURN_SHARE = 0.3
 """A turning point is followed by at least this share of the whole travel in the other direction."""
@@ -111,6 +114,39 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
     best = min(shapes, key=lambda fitted: fitted.mean_square)
     gradual = best is gradually and best.largest_misfit < _PLAINLY
     return Presliding(_mean(best.stiffness), _mean(0.5 * best.change), gradual)
+
+
+def least_stiffness(recording: CycleRecording, body: RigidBody, coulomb_nm: float) -> float | None:
+    """The least stiffness that the turning points of the cycles allow, N m/rad; None where they tell nothing.
+
+    For joints whose encoder or position loop hides the passage itself. While friction goes from the one direction to
+    the other, the joint has moved by no more than its position shows and one encoder step.
+
+    Args:
+        recording: of the cycles.
+        body: inertia, gravity and bias, which are taken off the torque.
+        coulomb_nm: F_0.
+    """
+    motion = synchronised(recording)
+    friction = motion.torque_nm - body.torque_nm(motion.position_rad, motion.acceleration_rad_s2)
+    moves = np.abs(np.diff(recording.position_rad))
+    step_rad = float(np.min(moves[moves > 1e-12], initial=np.inf))
+    starts_s = recording.procedure.cycle_starts_s
+    travels = []
+    for begin_s, end_s in pairwise(starts_s.tolist()):
+        quarter_s = (end_s - begin_s) / 4
+        rows = np.flatnonzero(np.abs(motion.time_s - (begin_s + end_s) / 2) <= quarter_s)
+        way = np.sign(np.interp(begin_s + quarter_s, motion.time_s, motion.velocity_rad_s))
+        ahead = np.flatnonzero(way * friction[rows] > _SLID * coulomb_nm)
+        back = np.flatnonzero(way * friction[rows] < -_SLID * coulomb_nm)
+        if ahead.size == 0 or not (back > ahead[-1]).any():
+            continue
+        passage_s = motion.time_s[rows[[ahead[-1], back[back > ahead[-1]][0]]]]
+        during = (recording.time_s >= passage_s[0]) & (recording.time_s <= passage_s[1])
+        travels.append(float(np.ptp(recording.position_rad[during])) + step_rad)
+    if len(travels) < 2 or not np.isfinite(step_rad):
+        return None
+    return 2.0 * _SLID * coulomb_nm / float(np.median(travels))
 
 
 def _mean(values: Array) -> Measured:

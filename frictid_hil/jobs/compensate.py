@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from frictid_hil.config.profile import LOOP_STIFFNESS, JointProfile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
@@ -24,6 +25,7 @@ from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.mode import Mode
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
@@ -68,14 +70,7 @@ def plan_compensation(options: CompensateOptions) -> Asked:
     """
     robot = load_robot(options.robot)
     robot.check_joints([options.joint])
-    kind = robot.kind(options.bus)
-    simulated = kind.simulated
-    if not kind.takes_torque:
-        raise UsageError(
-            f"driver {robot.driver(options.bus)} commands positions only: no torque could compensate friction",
-            where=f"joint {options.joint}",
-            next_step="use the profile where torque is computed: `gap diagnose`, `profile export`, your feed-forward",
-        )
+    simulated = robot.kind(options.bus).simulated
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     joint = setup.joint(options.joint)
     profile, profile_path = named_profile(str(options.profile), robot.name, options.store)
@@ -90,6 +85,7 @@ def plan_compensation(options: CompensateOptions) -> Asked:
             next_step="give it stiffness and damping under `simulated: hand:` in the robot file",
         )
     entry = profile.joint(joint.name)
+    setup = _with_loop_stiffness(setup, joint.name, entry)
     planned = compensation_plan(
         robot.name, setup, joint.name, entry, robot.policy, wanted, Rehearsals(robot, options.bus)
     )
@@ -154,8 +150,25 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
         return result_of(asked, run, progress, error)
 
 
+def _with_loop_stiffness(setup: RobotSetup, name: str, entry: JointProfile) -> RobotSetup:
+    """The robot with the stiffness that was measured together with the friction, in place of a stated one."""
+    measured = entry.quality.get(LOOP_STIFFNESS)
+    if not measured:
+        return setup
+    joints = tuple(
+        replace(one, loop_stiffness_nm_per_rad=measured) if one.name == name else one for one in setup.joints
+    )
+    return replace(setup, joints=joints)
+
+
 def _refuse_mode(mode: Mode, preflight: Preflight) -> None:
     can = preflight.capabilities
+    if mode is Mode.TORQUE and mode not in can.modes and can.torque_offset:
+        raise UsageError(
+            "these drives take no torque by itself, so that nobody can guide the joint by hand",
+            cause="the hand test and a tracking test of ours need torque control; these drives close their own loop",
+            next_step="use --task track --drive-mode position, which compensates on top of that loop",
+        )
     if mode is not Mode.TORQUE and not can.torque_offset:
         other = "use --drive-mode torque" if Mode.TORQUE in can.modes else "they have no torque mode either (6502)"
         raise UsageError("these drives take no torque offset (60B2)", next_step=other)

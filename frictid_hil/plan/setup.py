@@ -31,6 +31,8 @@ class JointSetup:
         simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
         expected_inertia_kg_m2: of the whole joint, as the robot file expects it; 0 where it does not say.
         gates: what quality gates allow here, where other than usual; see ``friction.gate.GateLimits``.
+        loop_stiffness_nm_per_rad: torque that the drive's own position loop gives per rad of following error, where
+            that loop is proportional alone; 0 where it is not known.
         dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
     """
 
@@ -49,6 +51,7 @@ class JointSetup:
     simulated: Mapping[str, Any] = field(default_factory=dict)
     expected_inertia_kg_m2: float = 0.0
     gates: Mapping[str, float] = field(default_factory=dict)
+    loop_stiffness_nm_per_rad: float = 0.0
     dh: Mapping[str, float] = field(default_factory=dict)
 
 

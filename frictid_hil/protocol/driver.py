@@ -103,7 +103,7 @@ class Capabilities:
     Attributes:
         max_cycle_hz: highest cycle rate of the configured layout.
         modes: set-point modes that every joint supports.
-        torque_offset: a torque can be added on top of position or velocity control (60B2).
+        torque_offset: a torque can be added on top of position or velocity control (60B2, or a goal that moves).
         drive_watchdog: the drive stops by itself when the host dies.
         batch_only: no cyclic exchange; the driver is ``Batched`` instead.
         lock_step: virtual time: cycles run as fast as the processor allows and never late.
@@ -144,8 +144,6 @@ class DriverKind:
         addressed_by: key of a joint in the robot file that says where it is found: ``node``, ``axis`` or ``id``.
         addresses: lowest and highest address there is.
         elsewhere: names of the drivers that reach the same robot on another line, by line.
-        takes_torque: a torque can be commanded, in a mode of its own or as an offset; where not, friction is identified
-            and not compensated.
         care: bounds of the supervisor that suit these devices, where other than usual, by name (``runner.care.Care``);
             a robot file overrides them.
         gates: the same of what quality gates allow (``friction.gate.GateLimits``).
@@ -156,7 +154,6 @@ class DriverKind:
     addressed_by: str = "id"
     addresses: tuple[int, int] = (0, 0x7FF)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
-    takes_torque: bool = True
     care: Mapping[str, float] = field(default_factory=dict)
     gates: Mapping[str, float] = field(default_factory=dict)
 
@@ -230,6 +227,11 @@ class Severity(Enum):
 
 OWN_FRICTION_COMPENSATION = "own friction compensation"
 """Topic of the finding that a drive compensates friction by itself."""
+
+
+POSITION_GAIN = "position_p_gain"
+"""Setting in the identity of a drive whose position loop is proportional alone: its gain, in the drive's own steps.
+A calibration then measures the stiffness of that loop."""
 
 
 @dataclass(frozen=True, slots=True)

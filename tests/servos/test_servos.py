@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from servo_bench import Bench, setup_of
 
-from frictid_drivers.servos.driver import ServoDriver
 from frictid_drivers.servos.logs import decoder, number, to_bytes
 from frictid_drivers.servos.models import MODELS
 from frictid_drivers.servos.packets import WIRES, Feetech
-from frictid_drivers.servos.simulated import Chain, VirtualServoDriver
-from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused, SafetyAbort, UsageError
-from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
-from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_drivers.servos.simulated import VirtualServoDriver
+from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
-from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.protocol.driver import Feedback, JointState, SetPoint, Severity
-from frictid_hil.testing.wire import ManualClock
+from frictid_hil.protocol.driver import JointState, Severity
 
 KINDS = ("STS3215", "SCS15", "XL330-M288", "XL430-W250")
 
@@ -89,51 +82,6 @@ def test_load_has_its_sign_in_bit_ten() -> None:
 # -- the driver --------------------------------------------------------------------------------------------------------
 
 
-def setup_of(model: str, joints: int = 2) -> RobotSetup:
-    setup = load_robot("so101.yaml").to_setup()
-    options = {"model": model, "zero_counts": MODELS[model].counts_per_turn // 2}
-    return replace(
-        setup,
-        joints=tuple(
-            replace(joint, options=options, position_min_rad=-1.5, position_max_rad=1.5)
-            for joint in setup.joints[:joints]
-        ),
-    )
-
-
-class Bench:
-    def __init__(self, setup: RobotSetup) -> None:
-        self.setup = setup
-        self.chain = Chain(setup)
-        self.clock = ManualClock(self.chain.advance)
-        self.chain.clock = self.clock
-        self.frames: list[tuple[int, int, bytes]] = []
-        self.driver = ServoDriver(setup, port_factory=lambda: self.chain, clock=self.clock)
-        self.set_points = [SetPoint() for _ in setup.joints]
-
-    def begin(self, cycle_hz: float = 200.0) -> None:
-        self.driver.open(lambda t_ns, can_id, data, sent: self.frames.append((t_ns, can_id, data)))
-        self.driver.configure(cycle_hz, [joint.name for joint in self.setup.joints])
-        self.period_ns = round(1e9 / cycle_hz)
-        self.driver.start_cycling()
-        self.next_ns = self.clock.now_ns()
-
-    def cycles(self, count: int) -> list[Feedback]:
-        for _ in range(count):
-            self.next_ns += self.period_ns
-            self.clock.wait_until(self.next_ns)
-            reports = self.driver.exchange(self.set_points)
-        return list(reports)
-
-    def enabled(self) -> None:
-        for joint in self.setup.joints:
-            self.driver.enable(joint.name, Mode.POSITION)
-        assert all(report.state is JointState.ENABLED for report in self.cycles(4))
-
-    def servo(self, at: int) -> Any:
-        return list(self.chain.servos.values())[at]
-
-
 @pytest.fixture(params=KINDS)
 def bench(request: pytest.FixtureRequest) -> Bench:
     return Bench(setup_of(request.param))
@@ -156,24 +104,24 @@ def test_a_joint_follows_and_reports_in_its_own_units(bench: Bench) -> None:
     assert not bench.servo(0).on
 
 
-@pytest.mark.parametrize("bus", ["virtual:so101", "serial:/dev/null"])
-def test_compensation_is_refused_before_a_bus_is_opened(tmp_path: Path, bus: str) -> None:
-    wanted = Wanted("track", ("nc", "mop"))
-    with pytest.raises(UsageError, match="commands positions only") as caught:
-        plan_compensation(CompensateOptions("so101.yaml", tmp_path / "absent.yaml", "gripper", wanted, bus=bus))
-    assert caught.value.where == "joint gripper" and "profile export" in caught.value.next_step
-
-
 def test_what_torque_means_is_said_with_its_uncertainty(bench: Bench) -> None:
     bench.driver.open()
     findings = bench.driver.check(None)
     assert any("scale error of up to" in f.message and f.severity is Severity.WARNING for f in findings)
     identity = next(iter(bench.driver.identify().values()))
     assert "N m/A" in identity.torque_source or "PWM duty" in identity.torque_source
-    assert identity.torque_resolution_nm > 0 and bench.driver.capabilities().modes == {Mode.POSITION}
+    assert identity.torque_resolution_nm > 0
+
+
+@pytest.mark.parametrize("model", ["STS3215", "SCS15", "XL430-W250"])
+def test_servos_without_a_goal_current_have_no_torque_mode(model: str) -> None:
+    bench = Bench(setup_of(model))
+    bench.driver.open()
+    assert bench.driver.capabilities().modes == {Mode.POSITION}
     bench.driver.configure(100.0, [])
-    with pytest.raises(HardwareError, match="TORQUE refused"):
+    with pytest.raises(HardwareError, match="TORQUE refused") as caught:
         bench.driver.enable("shoulder_pan", Mode.TORQUE)
+    assert "--drive-mode position" in caught.value.next_step
 
 
 def test_a_rate_that_the_line_cannot_carry_is_refused(bench: Bench) -> None:
@@ -193,7 +141,7 @@ def test_the_rate_that_a_line_carries_is_counted_in_bytes(model: str, joints: in
     bench = Bench(setup_of(model, joints))
     bench.driver.open()
     read_bytes = 8 + joints + 21 * joints if model == "STS3215" else 14 + joints + 23 * joints
-    delays_s = sum(delay_s for _, _, delay_s in bench.driver._told.values())
+    delays_s = sum(told.delay_s for told in bench.driver._told.values())
     assert bench.driver.capabilities().max_cycle_hz == most_hz == int(0.45 / (read_bytes * 10e-6 + delays_s))
     with pytest.raises(PlanRefused, match=f"at most {most_hz} Hz"):
         bench.driver.configure(2000.0, [])

@@ -2,6 +2,9 @@
 
 Torque is current (or duty) times a constant of the model, so it bears a scale error that ``check`` states. Goals go out
 at the beginning of a cycle and are followed by the reading half a cycle later (``logs`` says why).
+
+Servos that take currents have torque mode. Where a servo takes positions only, a torque that is to be added is given
+as a distance: its loop is a spring, whose stiffness must be known, and the goal moves by torque / stiffness.
 """
 
 from __future__ import annotations
@@ -11,15 +14,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from frictid_drivers.servos.inspection import Told, joint_findings, meet, torque_source
 from frictid_drivers.servos.line import Line, PortFactory, SerialPort
 from frictid_drivers.servos.logs import SPEED_CYCLES, Reader, frame_map_values, to_bytes
+from frictid_drivers.servos.operating_mode import OperatingMode
 from frictid_drivers.servos.packets import WIRES
-from frictid_drivers.servos.settings import JointSettings, read_settings
+from frictid_drivers.servos.settings import read_settings
 from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import (
+    POSITION_GAIN,
     Capabilities,
     Clock,
     DriverKind,
@@ -34,9 +40,8 @@ from frictid_hil.protocol.driver import (
     WallClock,
 )
 from frictid_hil.protocol.rows import RowDecoder
-from frictid_hil.protocol.wishes import Do, Wish
+from frictid_hil.protocol.wishes import Do, Order, Wish
 
-_TRIES = 3
 _SETTLE_S = 1.5
 _BUSIEST = 0.45
 """Share of a cycle that the line may take: the reading begins in its middle."""
@@ -61,7 +66,6 @@ class ServoDriver:
         addressed_by="id",
         addresses=(0, 252),
         elsewhere={"virtual": "virtual-servos"},
-        takes_torque=False,
         # A servo without integral part stands beside its goal; one step more or less in 40 ms is a speed.
         care={"still_rad": 0.03, "still_rad_s": 0.1},
     )
@@ -81,8 +85,11 @@ class ServoDriver:
         self._registers = self._joints[0].model.registers
         self._port_factory = port_factory or (lambda: SerialPort(path, self._line_settings.baud))
         self._line: Line | None = None
-        self._told: dict[str, tuple[int, int, float]] = {}
+        self._told: dict[str, Told] = {}
         self._reader: Reader | None = None
+        self._modes: dict[int, OperatingMode] = {}
+        self._unwatched: list[str] = []
+        self._ends_rad: dict[str, tuple[float, float]] = {}
         self._rows: RowDecoder | None = None
         self._wishes: list[Wish] = []
         self._powered: list[bool] = []
@@ -99,13 +106,9 @@ class ServoDriver:
             HardwareError: no such port, or a servo does not answer.
         """
         try:
-            self._line = Line(self._port_factory(), self._wire, frame_sink, self.clock)
-            registers = self._registers
+            self._line = Line(self._port_factory(), self._wire, frame_sink, self.clock, self._line_settings.answer_s)
             for joint, mine in zip(self.setup.joints, self._joints, strict=True):
-                model = int.from_bytes(self._ask(mine, registers.model, 2), "little")
-                mode = self._ask(mine, registers.mode, 1)[0]
-                delay_s = self._ask(mine, registers.return_delay, 1)[0] * 2e-6
-                self._told[joint.name] = (model, mode, delay_s)
+                self._told[joint.name] = meet(self._line, mine)
         except BaseException:
             self.close()
             raise
@@ -116,24 +119,31 @@ class ServoDriver:
         return {
             joint.name: JointIdentity(
                 joint=joint.name,
-                product=f"{mine.name} (model number {self._told[joint.name][0]})",
+                product=f"{mine.name} (model number {self._told[joint.name].model})",
                 rated_torque_nm=joint.rated_torque_nm,
                 gear_ratio=joint.gear_ratio,
                 position_resolution_rad=mine.model.count_rad,
                 torque_resolution_nm=mine.torque_nm_per_unit,
-                torque_source=_torque_source(mine),
+                torque_source=torque_source(mine),
                 timing=Timing(uncertainty_s=0.002, velocity_delay_s=self._velocity_delay_s()),
-                settings={"torque_uncertainty_percent": mine.model.uncertainty_percent},
+                settings={
+                    "torque_uncertainty_percent": mine.model.uncertainty_percent,
+                    **({} if self._told[joint.name].i_gain else {POSITION_GAIN: self._told[joint.name].p_gain}),
+                },
             )
             for joint, mine in zip(self.setup.joints, self._joints, strict=True)
         }
 
     def capabilities(self) -> Capabilities:
-        """Position only: there is no torque to command, and no offset."""
+        """Torque mode where all servos take currents and have a bus watchdog, or a person allows it without."""
         self._open_line()
+        torque = all(mine.model.registers.goal_current for mine in self._joints) and (
+            not self._unwatched or self._line_settings.allow_torque_without_watchdog
+        )
         return Capabilities(
             max_cycle_hz=self._highest_rate_hz(),
-            modes=frozenset({Mode.POSITION}),
+            modes=frozenset({Mode.POSITION} | ({Mode.TORQUE} if torque else set())),
+            torque_offset=True,
             drive_watchdog=bool(self._registers.watchdog),
             lock_step=self.clock.lock_step,
             temperature=self._registers.temperature >= 0,
@@ -154,21 +164,7 @@ class ServoDriver:
             )
         ]
         for joint, mine in zip(self.setup.joints, self._joints, strict=True):
-            subject, mode = f"joint {joint.name}", self._told[joint.name][1]
-            findings.append(Finding(Severity.OK, subject, f"{mine.name} answers"))
-            findings.append(
-                Finding(
-                    Severity.WARNING,
-                    subject,
-                    f"torque is {_torque_source(mine)}: every torque of this joint shares a scale error of up to "
-                    f"{mine.model.uncertainty_percent:g} %, which no interval contains",
-                    "weigh it: hang a known mass on a lever and set `torque_constant_nm_per_a` or `stall_nm`",
-                )
-            )
-            if mode != self._registers.position_mode:
-                findings.append(
-                    Finding(Severity.ERROR, subject, f"operating mode is {mode}", "set position mode with its tool")
-                )
+            findings += joint_findings(joint, mine, self._told[joint.name], plan)
         if not self._registers.watchdog:
             findings.append(
                 Finding(
@@ -183,12 +179,13 @@ class ServoDriver:
     # -- configuring --------------------------------------------------------------------------------------------
 
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
-        """Nothing is written but, at the start of cycling, the bus watchdog where there is one.
+        """Servos that take currents are in position mode after it, and have shown that they keep a bus watchdog.
 
         Raises:
             PlanRefused: the line does not carry the rate.
+            HardwareError: a servo does not answer, or does not take position mode.
         """
-        self._open_line()
+        line = self._open_line()
         for name in active:
             self.setup.joint(name)
         most_hz = self._highest_rate_hz()
@@ -205,10 +202,20 @@ class ServoDriver:
             Wish(joint, report) for joint, report in zip(self.setup.joints, self._rows.feedback, strict=True)
         ]
         self._powered, self._holding = [False] * len(self._joints), [None] * len(self._joints)
+        self._ends_rad = {one.name: (one.position_min_rad, one.position_max_rad) for one in self.setup.joints}
+        self._unwatched.clear()
+        for at, mine in enumerate(self._joints):
+            if mine.model.registers.goal_current:
+                self._modes[at] = OperatingMode(line, mine)
+                if self._told[self.setup.joints[at].name].mode != self._registers.position_mode:
+                    self._modes[at].take_positions(None, powered=True)
+                if not line.put(mine.id, self._registers.watchdog, self._watchdog(self._line_settings.watchdog_s)):
+                    self._unwatched.append(self.setup.joints[at].name)
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Kept by the host; a servo's own torque limit stays as its owner set it."""
         self._wish(joint).limit(torque_nm, position_min_rad, position_max_rad)
+        self._ends_rad[joint] = (position_min_rad, position_max_rad)
 
     def frame_map_values(self) -> Mapping[str, Any]:
         """As ``driver.FrameMapped``."""
@@ -228,18 +235,21 @@ class ServoDriver:
         self._arm_watchdog(self._line_settings.watchdog_s)
 
     def enable(self, joint: str, mode: Mode) -> None:
-        """Ask for power; progress is in the feedback.
+        """Ask for power; progress is in the feedback. A change of mode under power begins with the torque of now.
 
         Raises:
-            HardwareError: another mode than position.
+            HardwareError: a mode that there is not, or the servo does not take it.
         """
-        if mode is not Mode.POSITION:
+        if mode not in self.capabilities().modes:
             raise HardwareError(
-                f"mode {mode.name} refused: a servo follows positions only",
+                f"mode {mode.name} refused",
                 where=f"joint {joint}",
-                next_step="identify it; compensation needs a drive that takes torques",
+                cause=self._why_not(mode),
+                next_step="identify it, and let it track: `compensate --task track --drive-mode position`",
             )
-        self._wish(joint).enable(mode)
+        wish = self._wish(joint)
+        wish.enable(mode)
+        self._take_mode(self._wishes.index(wish), mode)
 
     def disable(self, joint: str) -> None:
         """Ask for power off, after standstill."""
@@ -247,7 +257,9 @@ class ServoDriver:
 
     def lock(self, joint: str) -> None:
         """Hold the present goal."""
-        self._wish(joint).lock()
+        wish = self._wish(joint)
+        wish.lock()
+        self._take_mode(self._wishes.index(wish), Mode.POSITION)
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
@@ -266,27 +278,19 @@ class ServoDriver:
         begun_ns, period_ns = self.clock.now_ns(), 1e9 / self._cycle_hz
         for _ in line.received(begun_ns):  # late answers
             pass
-        refused: SafetyAbort | None = None
-        goals: dict[int, bytes] = {}
-        power: dict[int, bytes] = {}
+        registers, refused = self._registers, None
+        # A goal always comes before power, so that power does not pull.
+        told: dict[int, dict[int, bytes]] = {registers.goal: {}, registers.goal_current: {}, registers.torque: {}}
         for at, (wish, set_point) in enumerate(zip(self._wishes, set_points, strict=True)):
             try:
                 order = wish.order(set_point)
             except SafetyAbort as abort:
                 refused, order = abort, wish.order(set_point)
-            on = order.do is not Do.REST
-            counts = self._counts(at, order.position_rad if order.do is Do.FOLLOW else math.nan)
-            mine = self._joints[at]
-            if on and counts is not None:
-                goals[mine.id] = to_bytes(counts, self._registers.goal_bytes, mine.model)
-            if on is not self._powered[at] and (counts is not None or not on):
-                power[mine.id], self._powered[at] = bytes([on]), on
-        # A goal always comes before power, so that power does not pull.
-        for address, told in ((self._registers.goal, goals), (self._registers.torque, power)):
-            if told:
-                line.send(self._wire.sync_write(address, told))
+            self._note(at, order, told)
+        for address, each in told.items():
+            if each:
+                line.tell(address, each)
         self.clock.wait_until(begun_ns + round(period_ns / 2))
-        registers = self._registers
         line.send(self._wire.sync_read([mine.id for mine in self._joints], registers.block, registers.block_bytes))
         for _ in line.received(begun_ns + round(0.95 * period_ns)):
             if not rows.waiting():
@@ -304,12 +308,17 @@ class ServoDriver:
         for at, wish in enumerate(self._wishes):
             wish.stop()
             counts = reader.counts[at]
-            if self._powered[at] and counts is not None:
+            if not self._powered[at]:
+                continue
+            if reader.takes_currents(at):
+                with contextlib.suppress(Exception):
+                    self._modes[at].stop(counts)
+            if counts is not None:
                 self._holding[at] = counts
                 goals[self._joints[at].id] = to_bytes(counts, self._registers.goal_bytes, self._joints[at].model)
         with contextlib.suppress(Exception):
             if goals:
-                line.send(self._wire.sync_write(self._registers.goal, goals))
+                line.tell(self._registers.goal, goals)
 
     def stop_cycling(self) -> None:
         """Bring every joint to rest and off.
@@ -344,6 +353,56 @@ class ServoDriver:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
+    def _why_not(self, mode: Mode) -> str:
+        if mode is not Mode.TORQUE or not self._registers.goal_current:
+            return "these servos follow positions, and no others than Dynamixel with a goal current take torque"
+        return (
+            f"the bus watchdog of joint {', '.join(self._unwatched)} does not keep what is written (XM430: firmware "
+            "38 has it); without it the servo would keep the last current if this program died"
+            if self._unwatched
+            else "not every servo of this line takes a current"
+        )
+
+    def _note(self, at: int, order: Order, told: Mapping[int, dict[int, bytes]]) -> None:
+        """Add what this servo is told in the coming cycle, by register and id."""
+        mine, reader, registers = self._joints[at], self._reader, self._registers
+        assert reader is not None  # configured
+        on = order.do is not Do.REST
+        if on and reader.takes_currents(at):
+            # Whatever else is asked of it in this mode: no current.
+            current = self._current(at, order.torque_nm if order.mode is Mode.TORQUE else 0.0)
+            told[registers.goal_current][mine.id] = to_bytes(current, 2, mine.model)
+        counts = self._counts(at, self._goal_rad(at, order) if order.do is Do.FOLLOW else math.nan)
+        if on and counts is not None and not reader.takes_currents(at):
+            told[registers.goal][mine.id] = to_bytes(counts, registers.goal_bytes, mine.model)
+        if on is not self._powered[at] and (counts is not None or not on):
+            told[registers.torque][mine.id], self._powered[at] = bytes([on]), on
+
+    def _goal_rad(self, at: int, order: Order) -> float:
+        """Where to; a torque that is added is a distance on the spring that the servo's loop is."""
+        joint = self.setup.joints[at]
+        if not order.torque_nm or not joint.loop_stiffness_nm_per_rad or order.mode is not Mode.POSITION:
+            return order.position_rad
+        low_rad, high_rad = self._ends_rad[joint.name]
+        return min(max(order.position_rad + order.torque_nm / joint.loop_stiffness_nm_per_rad, low_rad), high_rad)
+
+    def _current(self, at: int, torque_nm: float) -> int:
+        """The goal current, within the servo's own limit."""
+        mine, most = self._joints[at], self._told[self.setup.joints[at].name].current_limit
+        return min(max(round(mine.direction * torque_nm / mine.torque_nm_per_unit), -most), most)
+
+    def _take_mode(self, at: int, mode: Mode) -> None:
+        """Another operating mode, with the current or at the place of now."""
+        reader, operating = self._reader, self._modes.get(at)
+        if reader is None or operating is None or reader.takes_currents(at) is (mode is Mode.TORQUE):
+            return
+        if mode is Mode.TORQUE:
+            present_nm = reader.feedback[at].torque_nm if self._powered[at] else 0.0
+            operating.take_currents(self._current(at, present_nm), powered=self._powered[at])
+        else:
+            self._holding[at] = reader.counts[at]
+            operating.take_positions(self._holding[at], powered=self._powered[at])
+
     def _open_line(self) -> Line:
         if self._line is None:
             raise HardwareError("the port is not open", where=self.setup.bus)
@@ -366,39 +425,25 @@ class ServoDriver:
             self._holding[at] = self._reader.counts[at]
         return self._holding[at]
 
-    def _ask(self, mine: JointSettings, address: int, count: int) -> bytes:
-        line = self._open_line()
-        for _ in range(_TRIES):
-            line.send(self._wire.read(mine.id, address, count))
-            for packet in line.received(self.clock.now_ns() + round(self._line_settings.answer_s * 1e9)):
-                if packet.id == mine.id and len(packet.data) == count:
-                    return packet.data
-        raise HardwareError(
-            f"no answer to reading register {address}",
-            where=f"servo {mine.id}",
-            cause="no supply, another id or baud, or a cable that is not in",
-            next_step="scan the line with the maker's tool",
-        )
-
     def _highest_rate_hz(self) -> float:
         count, registers, wire = len(self._joints), self._registers, self._wire
         ids = [mine.id for mine in self._joints]
         asked = len(wire.sync_read(ids, registers.block, registers.block_bytes))
         answered = count * (wire.answer_overhead + registers.block_bytes)
-        delays_s = sum(delay_s for _, _, delay_s in self._told.values())
+        delays_s = sum(told.delay_s for told in self._told.values())
         return float(int(_BUSIEST / ((asked + answered) * 10.0 / self._line_settings.baud + delays_s)))
 
     def _velocity_delay_s(self) -> float:
         return SPEED_CYCLES / 2.0 / (self._cycle_hz or self.setup.cycle_hz)
 
+    def _watchdog(self, seconds: float) -> bytes:
+        return bytes([min(127, round(seconds / _WATCHDOG_STEP_S))])
+
     def _arm_watchdog(self, seconds: float) -> None:
         """0 clears what tripped earlier, and ends it."""
-        if not self._registers.watchdog:
-            return
-        line, ids = self._open_line(), [mine.id for mine in self._joints]
-        steps = min(127, round(seconds / _WATCHDOG_STEP_S))
-        for value in dict.fromkeys((0, steps)):
-            line.send(self._wire.sync_write(self._registers.watchdog, dict.fromkeys(ids, bytes([value]))))
+        if self._registers.watchdog:
+            for value in dict.fromkeys((b"\0", self._watchdog(seconds))):
+                self._open_line().tell(self._registers.watchdog, {mine.id: value for mine in self._joints})
 
     def _settle(self) -> list[str]:
         for wish in self._wishes:
@@ -420,18 +465,13 @@ class ServoDriver:
         return powered
 
     def _let_go(self) -> None:
-        """Off, twice: a lost packet must not keep a joint under power."""
-        off = self._wire.sync_write(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
+        """Off, twice: a lost packet must not keep a joint under power. Servos are left in position mode."""
         with contextlib.suppress(FrictidError):
-            self._open_line().send(off)
-            self._open_line().send(off)
+            for _ in range(2):
+                self._open_line().tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
             self._arm_watchdog(0.0)
+            for at, operating in self._modes.items():
+                if self._reader is not None and self._reader.takes_currents(at):
+                    operating.take_positions(None, powered=False)
         if self._line is not None:
             self._line.heard = None
-
-
-def _torque_source(mine: JointSettings) -> str:
-    model = mine.model
-    if model.current_a:
-        return f"present current x {model.torque_constant_nm_per_a:g} N m/A"
-    return f"PWM duty x {model.stall_nm:g} N m at stall (holds back-EMF and supply voltage)"

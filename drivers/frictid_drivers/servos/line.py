@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 import serial
@@ -15,6 +15,9 @@ from frictid_hil.protocol.driver import Clock, FrameSink
 
 LOGGED_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Lengths that a row of a bus log can have; a packet is padded to the next with zeros, which no parser minds."""
+
+
+_TRIES = 3
 
 
 class BytePort(Protocol):
@@ -83,10 +86,14 @@ class Line:
         wire: of the maker.
         sink: told of every packet.
         clock: run time.
+        answer_s: how long an answer may take.
+
+    Attributes:
         heard: told of every packet, with its run time and identifier in the log.
     """
 
-    def __init__(self, port: BytePort, wire: Wire, sink: FrameSink | None, clock: Clock) -> None:
+    def __init__(self, port: BytePort, wire: Wire, sink: FrameSink | None, clock: Clock, answer_s: float) -> None:
+        self._answer_ns = round(answer_s * 1e9)
         self._port = port
         self._wire = wire
         self._sink = sink
@@ -120,6 +127,44 @@ class Line:
                 yield packet
             if not data and (self._clock.lock_step or left_s <= 0):
                 return
+
+    def tell(self, address: int, data: Mapping[int, bytes]) -> None:
+        """Write the same number of bytes to each of these servos; nobody answers.
+
+        Raises:
+            HardwareError: the port is gone.
+        """
+        self.send(self._wire.sync_write(address, data))
+
+    def ask(self, servo: int, address: int, count: int) -> bytes:
+        """Read so many bytes.
+
+        Raises:
+            HardwareError: it does not answer.
+        """
+        for _ in range(_TRIES):
+            self.send(self._wire.read(servo, address, count))
+            for packet in self.received(self._clock.now_ns() + self._answer_ns):
+                if packet.id == servo and len(packet.data) == count:
+                    return packet.data
+        raise HardwareError(
+            f"no answer to reading register {address}",
+            where=f"servo {servo}",
+            cause="no supply, another id or baud, or a cable that is not in",
+            next_step="scan the line with the maker's tool",
+        )
+
+    def put(self, servo: int, address: int, data: bytes) -> bool:
+        """Write and read back; False where the servo does not take it.
+
+        Raises:
+            HardwareError: it does not answer.
+        """
+        for _ in range(_TRIES):
+            self.tell(address, {servo: data})
+            if self.ask(servo, address, len(data)) == data:
+                return True
+        return False
 
     def close(self) -> None:
         """Release the port."""

@@ -49,6 +49,7 @@ class Reader:
         self._at = {joint.id: at for at, joint in enumerate(joints)}
         self._goals_rad = [math.nan] * len(joints)
         self._powered = [False] * len(joints)
+        self._takes_currents = [False] * len(joints)
         self._cycle = 0
         self._track: list[deque[tuple[int, float]]] = [deque(maxlen=SPEED_CYCLES + 1) for _ in joints]
         self.counts: list[int | None] = [None] * len(joints)
@@ -57,6 +58,10 @@ class Reader:
     def rows(self) -> RowDecoder:
         """A decoder of the log's rows."""
         return RowDecoder(self.feedback, self._decode)
+
+    def takes_currents(self, at: int) -> bool:
+        """The servo was put into current mode."""
+        return self._takes_currents[at]
 
     def _decode(self, can_id: int, data: bytes) -> Command | Report | Service | None:
         if can_id not in (SENT_ID, RECEIVED_ID):
@@ -73,23 +78,28 @@ class Reader:
             self._cycle += 1
             others = tuple((at, goal) for at, goal in enumerate(self._goals_rad) if at)
             return Command(0, self._goals_rad[0], others)
-        if packet.instruction == _SYNC_WRITE and address in (registers.goal, registers.torque):
+        if packet.instruction == _SYNC_WRITE and address in (registers.goal, registers.torque, registers.mode):
             each = int.from_bytes(packet.data[size : 2 * size], "little") + 1
             told = packet.data[2 * size :]
             for k in range(0, len(told) - each + 1, each):
-                self._take(told[k], told[k + 1 : k + each], power=address == registers.torque)
+                self._take(told[k], address, told[k + 1 : k + each])
         return Service("packet")
 
-    def _take(self, servo: int, data: bytes, *, power: bool) -> None:
+    def _take(self, servo: int, address: int, data: bytes) -> None:
         at = self._at.get(servo)
         if at is None:
             return
-        if power:
-            self._powered[at] = data[0] == 1
-            self._goals_rad[at] = self._goals_rad[at] if self._powered[at] else math.nan
-        else:
-            joint = self._joints[at]
+        joint = self._joints[at]
+        registers = joint.model.registers
+        if address == registers.goal:
             self._goals_rad[at] = joint.position_rad(number(data, joint.model, 15))
+            return
+        if address == registers.mode:
+            self._takes_currents[at] = bool(registers.goal_current) and data[0] == registers.current_mode
+        else:
+            self._powered[at] = data[0] == 1
+        if self._takes_currents[at] or not self._powered[at]:
+            self._goals_rad[at] = math.nan
 
     def _answered(self, packet: Packet) -> Report | Service:
         at, registers = self._at.get(packet.id), self._registers
@@ -117,7 +127,8 @@ class Reader:
         report.state = (
             JointState.FAULT if report.error_code else JointState.ENABLED if self._powered[at] else JointState.DISABLED
         )
-        report.mode = Mode.POSITION if report.state is JointState.ENABLED else Mode.NONE
+        mode = Mode.TORQUE if self._takes_currents[at] else Mode.POSITION
+        report.mode = mode if report.state is JointState.ENABLED else Mode.NONE
         return Report(at)
 
 

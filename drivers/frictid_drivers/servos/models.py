@@ -9,7 +9,7 @@ torques of a joint, which no interval of a profile contains.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,11 @@ class Registers:
         mode: operating mode.
         position_mode: its value for position.
         return_delay: of answers, in steps of 2 us.
+        p_gain: proportional part of its position loop, and bytes.
+        i_gain: integral part.
+        goal_current: where it takes a current; 0 where it takes none.
+        current_limit: no goal beyond it is taken.
+        current_mode: value of ``mode`` in which the goal current rules.
     """
 
     torque: int
@@ -47,11 +52,16 @@ class Registers:
     mode: int
     position_mode: int
     return_delay: int
+    p_gain: tuple[int, int] = (0, 0)
+    i_gain: tuple[int, int] = (0, 0)
+    goal_current: int = 0
+    current_limit: int = 0
+    current_mode: int = 0
 
 
-FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, 7, 0, 3, 33, 0, 7)
-DYNAMIXEL = Registers(64, 116, 4, 124, 12, (8, 4), -1, 2, -1, 98, 0, 11, 3, 9)
-DYNAMIXEL_LOAD = Registers(64, 116, 4, 124, 12, (8, 4), 2, -1, -1, 98, 0, 11, 3, 9)
+FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, 7, 0, 3, 33, 0, 7, (21, 1), (23, 1))
+DYNAMIXEL_LOAD = Registers(64, 116, 4, 124, 12, (8, 4), 2, -1, -1, 98, 0, 11, 3, 9, (84, 2), (82, 2))
+DYNAMIXEL = replace(DYNAMIXEL_LOAD, load=-1, current=2, goal_current=102, current_limit=38)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +122,13 @@ MODELS = {
         sign_magnitude=True,
         big_endian=True,
     ),
+    "XL330-M077": _x(0.001, 0.146),  # 0.215 N m at 1.47 A
     "XL330-M288": _x(0.001, 0.35),  # 0.52 N m at 1.47 A
     "XC330-M288": _x(0.001, 0.52),
     "XM430-W350": _x(0.00269, 1.78),  # 4.1 N m at 2.3 A
+    "XM540-W150": _x(0.00269, 1.66),  # 7.3 N m at 4.4 A
     "XM540-W270": _x(0.00269, 2.4),
+    "XH430-W350": _x(0.00269, 2.6),  # 3.4 N m at 1.3 A
     "XL430-W250": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.4, uncertainty_percent=50.0),
     "XC430-W150": Model("dynamixel", DYNAMIXEL_LOAD, stall_nm=1.6, uncertainty_percent=50.0),
 }

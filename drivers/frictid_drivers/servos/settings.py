@@ -20,7 +20,7 @@ from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import number_option, unknown_options
 
-BUS_OPTIONS = frozenset({"baud", "watchdog_ms", "answer_ms"})
+BUS_OPTIONS = frozenset({"baud", "watchdog_ms", "answer_ms", "allow_torque_without_watchdog"})
 JOINT_OPTIONS = frozenset(
     {"model", "zero_counts", "torque_constant_nm_per_a", "stall_nm", "torque_uncertainty_percent"}
 )
@@ -36,11 +36,13 @@ class LineSettings:
         baud: bit/s.
         watchdog_s: bus watchdog of servos that have one.
         answer_s: how long an answer may take outside the cycle.
+        allow_torque_without_watchdog: a person takes the place of a bus watchdog that is not there.
     """
 
     baud: int
     watchdog_s: float
     answer_s: float
+    allow_torque_without_watchdog: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,7 @@ def read_settings(setup: RobotSetup) -> tuple[LineSettings, list[JointSettings]]
         baud=int(number_option(setup.options, "baud", 1_000_000, 9600, 4_500_000, ("options",), problems)),
         watchdog_s=number_option(setup.options, "watchdog_ms", 200, 20, 2540, ("options",), problems) / 1000.0,
         answer_s=number_option(setup.options, "answer_ms", 20, 1, 1000, ("options",), problems) / 1000.0,
+        allow_torque_without_watchdog=setup.options.get("allow_torque_without_watchdog") is True,
     )
     joints = [settings for joint in setup.joints if (settings := _joint(joint, problems)) is not None]
     if len({settings.model.wire for settings in joints}) > 1:

@@ -9,6 +9,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 from frictid_drivers.servos.driver import ServoDriver
 from frictid_drivers.servos.packets import WIRES
@@ -21,6 +22,11 @@ from frictid_hil.testing.wire import ManualClock
 
 _LOOP_NS = 500_000
 _TORQUE_MODE = 10
+_EEPROM_END = 64
+_ACCESS, _RANGE, _LIMIT = 7, 4, 6
+"""Errors of protocol 2.0."""
+_P_GAIN = {"feetech": 32, "dynamixel": 400}
+"""With it the loop has the gains of the robot file."""
 
 
 class VirtualServoDriver(ServoDriver):
@@ -61,20 +67,50 @@ class Servo:
         registers = mine.model.registers
         self.memory[registers.model : registers.model + 2] = (777).to_bytes(2, "little")
         self.memory[registers.mode] = registers.position_mode
+        self._number(registers.p_gain, _P_GAIN[mine.model.wire])
+        if registers.goal_current:
+            self._number((registers.current_limit, 2), 1750 if mine.model.current_a < 0.002 else 1193)
         self.error = 0
         self.on = False
         self._goal_rad = joint.locked_position_rad
         self._now_ns = self._heard_ns = 0
 
-    def write(self, address: int, data: bytes) -> None:
-        """Into the control table."""
+    def write(self, address: int, data: bytes) -> int:
+        """Into the control table; returns the error with which it is refused, 0 where it is taken."""
         registers = self.mine.model.registers
+        refused = self._refusal(address, data)
+        if refused:
+            return refused
+        changed = address == registers.mode and data[0] != self.memory[address]
         self.memory[address : address + len(data)] = data
-        if address == registers.goal and not self._tripped():
+        if address == registers.goal:
             self._goal_rad = self.mine.direction * self._angle(self._decode(data))
         elif address == registers.torque:
             self.on = data[0] == 1 and not self.error
             self.plant.power(self.on)
+        elif changed and registers.goal_current:
+            # e-Manual, Operating Mode: gains, profile and goal current are reset.
+            self._number(registers.p_gain, _P_GAIN[self.mine.model.wire])
+            self.memory[registers.goal_current : registers.goal_current + 2] = self._limit()
+            self.memory[108:116] = bytes(8)
+        return 0
+
+    def _refusal(self, address: int, data: bytes) -> int:
+        """EEPROM opens without torque alone, a tripped watchdog keeps goals, a current has a limit."""
+        registers = self.mine.model.registers
+        if self.mine.model.wire != "dynamixel":
+            return 0
+        if address < _EEPROM_END and self.on:
+            return _ACCESS
+        if address in (registers.goal, registers.goal_current) and self._tripped():
+            return _RANGE
+        if registers.goal_current and address == registers.goal_current:
+            return _LIMIT if abs(self._decode(data)) > int.from_bytes(self._limit(), "little") else 0
+        return 0
+
+    def _limit(self) -> bytes:
+        at = self.mine.model.registers.current_limit
+        return bytes(self.memory[at : at + 2])
 
     def heard(self) -> None:
         """A packet on the line."""
@@ -86,12 +122,20 @@ class Servo:
             if self._tripped() and self.on:
                 self.on = False
                 self.plant.power(False)
-            gains, plant = self.plant.model.servo, self.plant
-            # A goal comes in steps: its damping acts on the measured speed alone.
-            torque_nm = gains.kp_nm_per_rad * (self._goal_rad - plant.measured_position_rad)
-            torque_nm -= gains.kd_nm_s_per_rad * plant.velocity_rad_s
-            plant.advance(_LOOP_NS * 1e-9, torque_nm=torque_nm if self.on else 0.0)
+            self.plant.advance(_LOOP_NS * 1e-9, torque_nm=self._asked_nm() if self.on else 0.0)
             self._now_ns += _LOOP_NS
+
+    def _asked_nm(self) -> float:
+        """Its current times its constant in current mode, else what its position loop wants."""
+        registers, gains, plant = self.mine.model.registers, self.plant.model.servo, self.plant
+        if registers.goal_current and self.memory[registers.mode] == registers.current_mode:
+            goal = self._decode(bytes(self.memory[registers.goal_current : registers.goal_current + 2]))
+            return self.mine.direction * goal * self.mine.torque_nm_per_unit
+        at, size = registers.p_gain
+        share = int.from_bytes(self.memory[at : at + size], self._order) / _P_GAIN[self.mine.model.wire]
+        # A goal comes in steps: its damping acts on the measured speed alone.
+        torque_nm = share * gains.kp_nm_per_rad * (self._goal_rad - plant.measured_position_rad)
+        return torque_nm - gains.kd_nm_s_per_rad * plant.velocity_rad_s
 
     def block(self, address: int, count: int) -> bytes:
         """A stretch of the control table, as of now."""
@@ -119,12 +163,21 @@ class Servo:
             self.memory[at] = 255
         return self.memory[at] == 255
 
+    @property
+    def _order(self) -> Literal["big", "little"]:
+        return "big" if self.mine.model.big_endian else "little"
+
+    def _number(self, place: tuple[int, int], value: int) -> None:
+        """Set a register of so many bytes."""
+        at, size = place
+        self.memory[at : at + size] = value.to_bytes(size, self._order)
+
     def _angle(self, steps: int) -> float:
         return (steps - self.mine.zero_counts) * self.mine.model.count_rad
 
     def _decode(self, data: bytes) -> int:
         model = self.mine.model
-        value = int.from_bytes(data, "big" if model.big_endian else "little")
+        value = int.from_bytes(data, self._order)
         if model.sign_magnitude:
             return -(value & 0x7FFF) if value & 0x8000 else value
         return value - (1 << 8 * len(data)) if value >> (8 * len(data) - 1) else value
@@ -133,7 +186,7 @@ class Servo:
         model = self.mine.model
         if value < 0:
             value = -value | 1 << sign_bit if model.sign_magnitude else value + (1 << 8 * size)
-        self.memory[address : address + size] = value.to_bytes(size, "big" if model.big_endian else "little")
+        self.memory[address : address + size] = value.to_bytes(size, self._order)
 
 
 class Chain:
@@ -188,7 +241,7 @@ class Chain:
         elif code == 0x02:
             self._answer(servo, address, count)
         elif code == 0x03 and servo in self._by_id:
-            self._by_id[servo].write(address, body[size:])
+            self._say(servo, self._by_id[servo].write(address, body[size:]), b"")
 
     def read(self, timeout_s: float) -> bytes:
         """Answers to the host."""
@@ -208,8 +261,11 @@ class Chain:
     def _answer(self, servo: int, address: int, count: int) -> None:
         if servo in self._by_id:
             one = self._by_id[servo]
-            data = self._wire.answer(servo, one.error, one.block(address, count))
-            self._out += data if self.fault is None else self.fault(data, True)
+            self._say(servo, one.error, one.block(address, count))
+
+    def _say(self, servo: int, error: int, data: bytes) -> None:
+        packet = self._wire.answer(servo, error, data)
+        self._out += packet if self.fault is None else self.fault(packet, True)
 
     def _instruction(self, data: bytes) -> tuple[int, int, bytes] | None:
         """Id, code and parameters; None for what is damaged."""

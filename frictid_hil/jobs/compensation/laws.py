@@ -12,6 +12,7 @@ import numpy as np
 from frictid_hil.config.profile import Estimate, JointProfile
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.compensation import (
+    COARSE_RATIO,
     OUR_RATIO,
     PAPER_RATIO,
     PAPER_STIFFNESS_NM_PER_RAD,
@@ -82,7 +83,7 @@ def friction_settings(
     """
     presliding = entry.presliding_stiffness_nm_per_rad.value
     ours = wanted.setting == "ours"
-    ratio = wanted.ratio if wanted.ratio is not None else OUR_RATIO if ours else PAPER_RATIO
+    ratio = wanted.ratio if wanted.ratio is not None else _our_ratio(entry) if ours else PAPER_RATIO
     stiffness = wanted.stiffness_nm_per_rad
     if stiffness is None and not ours:
         stiffness = PAPER_STIFFNESS_NM_PER_RAD
@@ -116,6 +117,12 @@ def friction_settings(
         if sentence not in warnings:
             warnings.append(sentence)
     return settings
+
+
+def _our_ratio(entry: JointProfile) -> float:
+    """Lower where presliding was not seen and has only a least stiffness."""
+    stiffness = entry.presliding_stiffness_nm_per_rad
+    return COARSE_RATIO if stiffness.value is not None and stiffness.low is None else OUR_RATIO
 
 
 def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.config.profile import (
+    LOOP_STIFFNESS,
     DriveIdentity,
     JointProfile,
     JudgedGate,
@@ -28,11 +29,12 @@ from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
 from frictid_hil.friction.gate import GateLimits, beside_usual
 from frictid_hil.friction.identify import IdentifiedPairs
+from frictid_hil.friction.loop_stiffness import loop_stiffness
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
-from frictid_hil.friction.presliding import presliding
+from frictid_hil.friction.presliding import least_stiffness, presliding
 from frictid_hil.friction.recording import CycleRecording, Repeat
-from frictid_hil.friction.rigid_body import Measured
+from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.jobs.identification.companions import with_companions
 from frictid_hil.jobs.identification.declared import declared_skew
@@ -40,6 +42,7 @@ from frictid_hil.jobs.identification.path_time import gaps_ns, path_time
 from frictid_hil.jobs.identification.skew_stretch import wanted_note, with_shaking
 from frictid_hil.plan.linear_axis import linear_names
 from frictid_hil.plan.setup import JointSetup
+from frictid_hil.protocol.driver import POSITION_GAIN
 from frictid_hil.recording.samples import Mark, Samples
 
 _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
@@ -166,6 +169,11 @@ def _from_cycles(
     curve = result.curve
     temperature = samples.temperature_c
     stiffness, level, gradual = _presliding(samples, recording)
+    if stiffness.value is None and samples.marked("reversal") and body is not None:
+        stiffness, level = _presliding_at_turns(recording, body, result.coulomb_nm.value, stiffness, level)
+    loop = _loop_stiffness(samples, recording)
+    if loop is not None:
+        notes.append(f"its own position loop is a spring of {loop:.3g} N m/rad at this gain")
     apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
     return JointProfile(
         method=result.method,
@@ -205,6 +213,7 @@ def _from_cycles(
             "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
             "drift_percent": 100 * result.drift.change if result.drift else None,
             "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
+            LOOP_STIFFNESS: loop,
             "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
             "notes": [*notes, *result.notes],
         },
@@ -384,6 +393,24 @@ def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Fi
         nothing = Figure.none(problem.what)
         return nothing, nothing, False
     return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm), found.gradual
+
+
+def _presliding_at_turns(
+    recording: CycleRecording, body: RigidBody, coulomb_nm: float, stiffness: Figure, level: Figure
+) -> tuple[Figure, Figure]:
+    """The least stiffness that the cycles allow, where a slow reversal tells none; else what is given."""
+    least = least_stiffness(recording, body, coulomb_nm)
+    if least is None:
+        return stiffness, level
+    reason = f"at least, by the turning points of the cycles: {stiffness.reason}"
+    return Figure(value=least, reason=reason), Figure(value=coulomb_nm, reason="taken to be F_0")
+
+
+def _loop_stiffness(samples: Samples, recording: CycleRecording) -> float | None:
+    """Of a drive whose position loop is proportional alone, as it says itself."""
+    if POSITION_GAIN not in (samples.meta.get("settings") or {}) or recording.command_rad is None:
+        return None
+    return loop_stiffness(recording.time_s, recording.command_rad, recording.position_rad, recording.torque_nm)
 
 
 def _figure(measured: Measured | None, reason: str = "") -> Figure:

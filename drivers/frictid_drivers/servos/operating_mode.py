@@ -1,0 +1,92 @@
+"""The operating mode of a servo that takes currents, and how it is changed.
+
+Its register lies in EEPROM, which opens while the servo has no torque, and a change resets gains, profile and goal
+current (ROBOTIS e-Manual, "Operating Mode"). So a change under power costs a joint its torque for one question and one
+answer on the line, about 2 ms at 1 Mbit/s. What the change resets is written back.
+"""
+
+from __future__ import annotations
+
+from frictid_drivers.servos.line import Line
+from frictid_drivers.servos.logs import to_bytes
+from frictid_drivers.servos.settings import JointSettings
+from frictid_hil.errors import HardwareError
+
+_RESET = ((80, 6), (88, 4), (108, 8))
+"""Gains of the position loop, its feed-forward, its profile: first byte, and bytes."""
+_OFF, _ON = b"\0", b"\1"
+
+
+class OperatingMode:
+    """The mode of one servo, which is in position mode now.
+
+    Args:
+        line: open.
+        mine: the servo.
+
+    Raises:
+        HardwareError: it does not answer.
+    """
+
+    def __init__(self, line: Line, mine: JointSettings) -> None:
+        self._line = line
+        self._mine = mine
+        self._registers = mine.model.registers
+        self._kept = {address: line.ask(mine.id, address, count) for address, count in _RESET}
+
+    def take_currents(self, goal: int, *, powered: bool) -> None:
+        """Current mode, beginning with this goal; under power if it was.
+
+        Raises:
+            HardwareError: it did not take the mode, and has no power now.
+        """
+        self._change(self._registers.current_mode, powered)
+        self.follow_current(goal)
+        if powered:
+            self._tell(self._registers.torque, _ON)
+
+    def take_positions(self, goal: int | None, *, powered: bool) -> None:
+        """Position mode, beginning with this goal; under power if it was and the goal is known.
+
+        Raises:
+            HardwareError: it did not take the mode, and has no power now.
+        """
+        self._change(self._registers.position_mode, powered)
+        self._restore()
+        if powered and goal is not None:
+            self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
+            self._tell(self._registers.torque, _ON)
+
+    def stop(self, goal: int | None) -> None:
+        """Hold a position at once; waits for no answer.
+
+        Whatever of it is lost on the line, the joint has no current that drives it: the goal current is 0 first.
+        """
+        self.follow_current(0)
+        self._tell(self._registers.torque, _OFF)
+        self._tell(self._registers.mode, bytes([self._registers.position_mode]))
+        self._restore()
+        if goal is not None:
+            self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
+            self._tell(self._registers.torque, _ON)
+
+    def follow_current(self, goal: int) -> None:
+        """Another goal."""
+        self._tell(self._registers.goal_current, to_bytes(goal, 2, self._mine.model))
+
+    def _change(self, mode: int, powered: bool) -> None:
+        if powered:
+            self._tell(self._registers.torque, _OFF)
+        if not self._line.put(self._mine.id, self._registers.mode, bytes([mode])):
+            raise HardwareError(
+                f"does not take operating mode {mode}; it has no torque now",
+                where=f"servo {self._mine.id}",
+                next_step="look at its operating mode with the maker's tool",
+            )
+
+    def _restore(self) -> None:
+        for address, data in self._kept.items():
+            self._tell(address, data)
+
+    def _tell(self, address: int, data: bytes) -> None:
+        self._line.tell(address, {self._mine.id: data})
