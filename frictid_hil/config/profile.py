@@ -296,7 +296,8 @@ class JointProfile(Strict):
         coulomb_nm: F_0.
         presliding_stiffness_nm_per_rad: from a slow small reversal.
         presliding_level_nm: friction of creeping motion, from the same: where presliding yields.
-        presliding_yields: how, from the same; ``at once`` also where it was not plain to see.
+        presliding_yields: how, from the same; ``at once`` also where it was not plain to see. ``unseen``: the encoder
+            hides it, and the stiffness is the least that is possible.
         inertia_kg_m2: of the whole joint.
         gravity_cos_nm: of ``gravity_cos * cos(q) + gravity_sin * sin(q)``.
         gravity_sin_nm: see there.
@@ -329,7 +330,7 @@ class JointProfile(Strict):
     coulomb_nm: Estimate
     presliding_stiffness_nm_per_rad: Estimate = Field(default_factory=_not_identified)
     presliding_level_nm: Estimate = Field(default_factory=_not_identified)
-    presliding_yields: Literal["at once", "gradually"] = "at once"
+    presliding_yields: Literal["at once", "gradually", "unseen"] = "at once"
     inertia_kg_m2: Estimate = Field(default_factory=_not_identified)
     gravity_cos_nm: Estimate = Field(default_factory=_not_identified)
     gravity_sin_nm: Estimate = Field(default_factory=_not_identified)

@@ -120,9 +120,8 @@ def friction_settings(
 
 
 def _our_ratio(entry: JointProfile) -> float:
-    """Lower where presliding was not seen and has only a least stiffness."""
-    stiffness = entry.presliding_stiffness_nm_per_rad
-    return COARSE_RATIO if stiffness.value is not None and stiffness.low is None else OUR_RATIO
+    """Lower where the encoder hides presliding."""
+    return COARSE_RATIO if entry.presliding_yields == "unseen" else OUR_RATIO
 
 
 def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -168,9 +168,7 @@ def _from_cycles(
     body = result.rigid_body
     curve = result.curve
     temperature = samples.temperature_c
-    stiffness, level, gradual = _presliding(samples, recording)
-    if stiffness.value is None and samples.marked("reversal") and body is not None:
-        stiffness, level = _presliding_at_turns(recording, body, result.coulomb_nm.value, stiffness, level)
+    stiffness, level, yields = _presliding(samples, recording, body, curve.coulomb_nm)
     loop = _loop_stiffness(samples, recording)
     if loop is not None:
         notes.append(f"its own position loop is a spring of {loop:.3g} N m/rad at this gain")
@@ -184,7 +182,7 @@ def _from_cycles(
         coulomb_nm=_figure(result.coulomb_nm),
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
-        presliding_yields="gradually" if gradual else "at once",
+        presliding_yields=yields,
         inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, apart),
         gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, apart),
         gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, apart),
@@ -379,31 +377,28 @@ def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
     )
 
 
-def _presliding(samples: Samples, recording: CycleRecording) -> tuple[Figure, Figure, bool]:
-    """Stiffness, level, and whether it yields gradually."""
+_Presliding = tuple[Figure, Figure, Literal["at once", "gradually", "unseen"]]
+"""Stiffness, level, and how it yields."""
+
+
+def _presliding(samples: Samples, recording: CycleRecording, body: RigidBody | None, coulomb_nm: float) -> _Presliding:
+    """From the slow reversal; where an encoder hides it there, the least that the cycles allow."""
     reversals = samples.marked("reversal")
     if not reversals:
         nothing = Figure.none("the recording has no slow reversal")
-        return nothing, nothing, False
+        return nothing, nothing, "at once"
     part = samples.during(reversals[0])
     assert part.torque_nm is not None  # by the caller
     try:
         found = presliding(part.time_s, part.position_rad, part.torque_nm, where=recording.where)
     except IdentificationError as problem:
-        nothing = Figure.none(problem.what)
-        return nothing, nothing, False
-    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm), found.gradual
-
-
-def _presliding_at_turns(
-    recording: CycleRecording, body: RigidBody, coulomb_nm: float, stiffness: Figure, level: Figure
-) -> tuple[Figure, Figure]:
-    """The least stiffness that the cycles allow, where a slow reversal tells none; else what is given."""
-    least = least_stiffness(recording, body, coulomb_nm)
-    if least is None:
-        return stiffness, level
-    reason = f"at least, by the turning points of the cycles: {stiffness.reason}"
-    return Figure(value=least, reason=reason), Figure(value=coulomb_nm, reason="taken to be F_0")
+        least = None if body is None else least_stiffness(recording, body, coulomb_nm)
+        if least is None:
+            nothing = Figure.none(problem.what)
+            return nothing, nothing, "at once"
+        reason = f"at least, by the turning points of the cycles: {problem.what}"
+        return Figure(value=least, reason=reason), Figure(value=coulomb_nm, reason="taken as F_0"), "unseen"
+    return _figure(found.stiffness_nm_per_rad), _figure(found.level_nm), "gradually" if found.gradual else "at once"
 
 
 def _loop_stiffness(samples: Samples, recording: CycleRecording) -> float | None:
