@@ -165,6 +165,29 @@ def test_a_family_that_does_not_exist(tmp_path):
         driver.open()
 
 
+LIARS: dict[str, tuple[dict[str, Any], list[str], str]] = {
+    "an angle in 60A8, counts in 6092": ({"60A8:00": {"default": 0xFD41_0000}}, [], "its units contradict each other"),
+    "whole degrees in 60A8, counts in fact": ({"60A8:00": {"default": 0x0041_0000}}, ["6092"], "absurdly coarse"),
+}
+
+
+@pytest.mark.parametrize("name", LIARS)
+def test_a_drive_whose_units_contradict_each_other_is_refused_before_motion(name, tmp_path):
+    objects, absent, said = LIARS[name]
+    data = {**known_personalities()["copley"], "objects": objects, "absent": ["1019", "18xx:06", "60A9", *absent]}
+    made = from_data(data)
+    (tmp_path / "liar.eds").write_text(eds_text(made.records, made.manner.absent))
+    path = robot("copley", tmp_path, eds="liar.eds")
+    values = yaml.safe_load(path.read_text())
+    del values["joints"]["0"]["options"]["personality"]
+    path.write_text(yaml.safe_dump(values))
+    findings = check(str(path))["findings"]
+    assert [one for one in findings if one["severity"] == "error" and said in one["message"]], findings
+    with pytest.raises(HardwareError, match=said):
+        calibrate(CalibrateOptions(str(path), joints=("0",), out=tmp_path / "run"), Silent())
+    assert not (tmp_path / "run" / "samples.mcap").exists()
+
+
 @pytest.mark.parametrize(
     ("quantity", "factor"), [("position", 10.0), ("position", 0.1), ("velocity", 60.0), ("velocity", 0.1)]
 )

@@ -178,6 +178,7 @@ def _position_units(facts: Facts, joint: JointSetup, shafts_per_joint: float, re
     if given is not None:
         return float(given)
     if facts.position_unit is not None and (angle := unit_rad(facts.position_unit)) is not None:
+        _same_feed(facts, _TURN / angle, report)
         return _TURN / angle * shafts_per_joint
     if facts.quirks.position_unit_deg is not None:
         return 360.0 / facts.quirks.position_unit_deg
@@ -198,6 +199,20 @@ def _position_units(facts: Facts, joint: JointSetup, shafts_per_joint: float, re
         "give `position_units_per_revolution` (of the joint) in the joint's options",
     )
     return 1e6
+
+
+def _same_feed(facts: Facts, units_per_turn: float, report: Report) -> None:
+    """6092 says the same as 60A8, or is as it left the factory."""
+    if facts.feed is None or facts.feed[0] == facts.feed[1]:
+        return
+    fed = facts.feed[0] / facts.feed[1]
+    if abs(fed / units_per_turn - 1.0) > RATIO_TOLERANCE:
+        report(
+            Severity.ERROR,
+            f"its units contradict each other: 60A8 makes {units_per_turn:g} units of one revolution, "
+            f"6092 makes {fed:g} ({facts.feed[0]}:{facts.feed[1]})",
+            "correct one of them with the vendor's tool, or give `position_units_per_revolution` (of the joint)",
+        )
 
 
 def _velocity_unit(
