@@ -59,7 +59,9 @@ class Personality:
         found = {**standard, **self.defaults}
         if not self.knows_gear:
             encoder = standard[key(0x608F, 1)], standard[key(0x608F, 2)]
-            found |= {key(0x6091, 1): 1, key(0x6091, 2): 1, key(0x6092, 1): encoder[0], key(0x6092, 2): encoder[1]}
+            # A drive whose positions are angles leaves 6092h as the factory has it.
+            feed = encoder if self.position_unit_deg is None else (1, 1)
+            found |= {key(0x6091, 1): 1, key(0x6091, 2): 1, key(0x6092, 1): feed[0], key(0x6092, 2): feed[1]}
         return found
 
     def manner_for(self, joint: JointSetup, units_per_joint_turn: float) -> Manner:
