@@ -37,7 +37,13 @@ NEWEST = 1
 
 
 class TimeFile(Strict):
-    """The column of time, or the rate at which rows were taken where there is none."""
+    """The column of time, or the rate at which rows were taken where there is none.
+
+    Attributes:
+        column: its name.
+        unit: of the column.
+        rate_hz: rows a second, in place of a column.
+    """
 
     column: str | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
@@ -100,7 +106,19 @@ class SourceFile(Strict):
 
 
 class JointFile(Strict):
-    """One joint's columns; units decide what is read, so the names here carry none."""
+    """One joint's columns. Each says its own unit. ``torque`` or ``position_command`` is required.
+
+    Attributes:
+        prismatic: a linear axis, in m and N.
+        meta: remarks for the profile, such as ``torque_source``.
+        position: measured.
+        velocity: measured; without it the position is differenced.
+        torque: measured or commanded, or a motor current.
+        position_command: what the position loop was told.
+        external_torque: of a force sensor.
+        rigid_body_torque: what your own model of the rigid bodies explains.
+        torque_demand: what the controller demanded, for the diagnosis.
+    """
 
     prismatic: bool = False
     meta: dict[str, str | float] = Field(default_factory=dict)
@@ -120,7 +138,15 @@ class JointFile(Strict):
 
 
 class ColumnsFile(Strict):
-    """The whole file."""
+    """Which column of a foreign recording is which.
+
+    Attributes:
+        schema: ``frictid.columns/1``.
+        name: of the map.
+        topic: of a bag in which several hold joint states.
+        time: the column of time, or the rate.
+        joints: by name; ``"{joint}"`` stands for all whose columns follow one form.
+    """
 
     schema_: str = Field(alias="schema")
     name: str

@@ -29,7 +29,15 @@ class Open(Strict):
 
 
 class Friction(Open):
-    """Either pairs of the sliding curve, or Coulomb level and viscosity."""
+    """Either pairs of the sliding curve, or Coulomb level and viscosity.
+
+    Attributes:
+        velocity_rad_s: speeds of the pairs, positive.
+        torque_nm: friction at these speeds.
+        coulomb_nm: level, in place of pairs.
+        viscous_nm_s_per_rad: slope over speed, beside ``coulomb_nm``.
+        presliding_stiffness_nm_per_rad: of the spring that holds a standing joint.
+    """
 
     velocity_rad_s: Numbers | None = None
     torque_nm: Numbers | None = None
@@ -56,8 +64,16 @@ class Friction(Open):
 class Joint(Open):
     """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's.
 
-    An inertia of 0 says that logs bring it in their ``rigid_body_torque_nm``; ``continuous``, that the joint may turn
-    on and on.
+    Attributes:
+        inertia_kg_m2: of the whole joint; 0 says that the logs contain it in ``rigid_body_torque_nm``.
+        motor_inertia_share: part of the inertia in front of the gear.
+        gravity_torque_nm: another name of ``gravity_cos_nm``.
+        gravity_cos_nm: gravity torque at q = 0.
+        gravity_sin_nm: gravity torque at q = 90 deg.
+        gear_ratio: motor revolutions per joint revolution.
+        gear: remark.
+        continuous: the joint turns without end.
+        friction: the believed friction.
     """
 
     inertia_kg_m2: NotNegative | None = None
@@ -78,7 +94,12 @@ class Joint(Open):
 
 
 class PayloadFile(Open):
-    """What is mounted on the link where an experiment says so."""
+    """What is mounted on the link where an experiment says so.
+
+    Attributes:
+        inertia_kg_m2: that it adds.
+        gravity_torque_nm: that it adds, at q = 0.
+    """
 
     inertia_kg_m2: NotNegative | None = None
     gravity_torque_nm: float | None = None
@@ -106,6 +127,19 @@ class ControllerFile(Open):
     ``pid``: ``kp*e + integral(ki*e) + kd*(dcommand/dt - v)``. ``cascade``: ``kv*w + integral(ki*w)`` with ``w = kp*e +
     velocity_feedforward*dcommand/dt - v``. ``columns``: each log brings its demand as ``torque_demand_nm``.
     ``unknown``: like no controller at all.
+
+    Attributes:
+        type: the law.
+        rate_hz: at which it is computed; ``pid`` and ``cascade`` need it.
+        kp: gain of the position error.
+        ki: gain of the integral.
+        kd: gain of the velocity error, ``pid``.
+        kv: gain of the inner loop, ``cascade``.
+        velocity_feedforward: share of the command's velocity, ``cascade``.
+        velocity_filter_s: time constant of the low-pass on the velocity that it uses.
+        torque_limit_nm: of its demand.
+        command_rate: difference of the command that makes dcommand/dt.
+        feedforward: what it adds along its command.
     """
 
     type: Annotated[Literal["pid", "cascade", "columns", "unknown"], BeforeValidator(_law)] = "pid"
@@ -141,7 +175,15 @@ class ReportFilter(Strict):
 
 
 class Drive(Open):
-    """What the drive is known to do."""
+    """What the drive is known to do.
+
+    Attributes:
+        rated_torque_nm: at the joint.
+        torque_quantum_nm: step of the reported torque.
+        torque_delay_s: from demand to torque.
+        current_lag_s: time constant from demand to current.
+        torque_report_filter: low-pass on the reported torque.
+    """
 
     rated_torque_nm: Positive | None = None
     torque_quantum_nm: NotNegative | None = None
@@ -151,7 +193,14 @@ class Drive(Open):
 
 
 class Encoder(Open):
-    """What the encoder is known to do."""
+    """What the encoder is known to do.
+
+    Attributes:
+        side: ``motor`` or ``link``.
+        resolution_rad: its step, at the joint.
+        zero_offset_rad: of its zero.
+        velocity_filter_s: time constant of the low-pass on the reported velocity.
+    """
 
     side: str | None = None
     resolution_rad: NotNegative | None = None
@@ -190,7 +239,16 @@ class Tolerance(Strict):
 
 
 class ExperimentFile(Open):
-    """One recording."""
+    """One recording.
+
+    Attributes:
+        name: of the experiment.
+        file: beside ``nominal.yaml``; the name with ``.csv`` unless given.
+        role: whether it is fitted or judged on.
+        payload: whether the payload was mounted.
+        run_order: place in the sequence, for effects of time.
+        duration_s: remark.
+    """
 
     name: str = Field(min_length=1)
     file: str | None = None
@@ -201,7 +259,17 @@ class ExperimentFile(Open):
 
 
 class NominalFile(Open):
-    """The whole file."""
+    """What a simulator believes of one joint, and which recordings test it.
+
+    Attributes:
+        joint: the rigid body and its friction.
+        payload: what some experiments mount.
+        controller: the position loop.
+        drive: what is known of it.
+        encoder: what is known of it.
+        tolerance: how sure the numbers are.
+        experiments: the recordings.
+    """
 
     joint: Joint
     payload: PayloadFile | None = None

@@ -183,10 +183,15 @@ class Ripple(Strict):
 
 
 class ProcedureUsed(Strict):
-    """V, A, N, c that the curve was measured with, and the shares of V of a short programme.
+    """The motion that the curve was measured with; None for recordings that followed no procedure.
 
-    None for recordings that followed no procedure. ``together`` names the joints that moved in phase with this one,
-    itself among them; None where all others were locked.
+    Attributes:
+        amplitude_rad: travel A, peak-to-peak.
+        velocity_rad_s: highest peak speed V.
+        cycles: number of cycles N.
+        ratio: share c of a cycle's peak speed, above which its samples count.
+        shares: peak speeds over V, of a short programme.
+        together: joints that moved in phase with this one, itself among them; None where all others were locked.
     """
 
     amplitude_rad: Number = Field(gt=0)
@@ -238,7 +243,13 @@ class DriveIdentity(Strict):
 
 
 class JudgedGate(Strict):
-    """One question asked of a measurement, and its answer in plain words."""
+    """One question asked of a measurement, and its answer in plain words.
+
+    Attributes:
+        name: of the gate.
+        passed: whether the measurement may be used.
+        message: the figure and its limit, in words.
+    """
 
     name: str
     passed: bool
@@ -293,6 +304,8 @@ class JointProfile(Strict):
         torque_plus_minus_nm: half the width of each F_n's 95 % interval, shape (N,); None without intervals, or where
             they are not symmetric.
         torque_interval_nm: 95 % interval of each F_n, shape (N, 2), or None; not in the file where the former is.
+        measured_range_rad_s: from V_1 to V_N; outside it the curve is an extrapolation.
+        slopes_nm_s_per_rad: of the lines that join the pairs.
         coulomb_nm: F_0.
         presliding_stiffness_nm_per_rad: from a slow small reversal.
         presliding_level_nm: friction of creeping motion, from the same: where presliding yields.

@@ -51,7 +51,15 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class ProcedureFile(Strict):
-    """V, A, N, c of the paper's procedure; A is peak-to-peak. ``measure_skew``: ``calibrate --measure-skew`` always."""
+    """The motion of a calibration.
+
+    Attributes:
+        amplitude_rad: travel A of a cycle, peak-to-peak; 20 deg unless given.
+        velocity_rad_s: peak speed V of the fastest cycle; 115 deg/s unless given.
+        cycles: number of cycles N.
+        ratio: share c of a cycle's peak speed, above which its samples count.
+        measure_skew: measure the delay of the torque in every calibration, as ``calibrate --measure-skew`` does.
+    """
 
     amplitude_rad: Positive = 0.3490658503988659
     velocity_rad_s: Positive = 2.007128639793479
@@ -61,7 +69,14 @@ class ProcedureFile(Strict):
 
 
 class JointProcedureFile(Strict):
-    """What differs for one joint (a shorter travel, a lower speed)."""
+    """What differs for one joint.
+
+    Attributes:
+        amplitude_rad: travel A of a cycle, peak-to-peak.
+        velocity_rad_s: peak speed V of the fastest cycle.
+        cycles: number of cycles N.
+        ratio: share c of a cycle's peak speed, above which its samples count.
+    """
 
     amplitude_rad: Positive | None = None
     velocity_rad_s: Positive | None = None
@@ -105,8 +120,26 @@ class DhFile(Strict):
 class JointFile(Strict):
     """One joint; torque and position on the joint side of the gear.
 
-    ``continuous`` says that the axis turns without end, or faster than any robot's joint, and that this is meant.
-    ``loop_stiffness_nm_per_rad`` is what a servo's own proportional position loop gives per rad of following error.
+    Attributes:
+        node: CANopen node id.
+        axis: number of the axis in a serial controller, from 0.
+        id: of an MIT-mode actuator or a servo on its bus.
+        gear_ratio: motor revolutions per joint revolution.
+        max_velocity_rad_s: highest speed that any plan may ask for.
+        max_torque_nm: highest torque that any plan may ask for.
+        rated_torque_nm: the motor's rated torque times the gear ratio; drives report torque in shares of it.
+        position_min_rad: lower end of the free travel.
+        position_max_rad: upper end of the free travel.
+        start_position_rad: where the travel of the cycles begins; it runs to start + A.
+        locked_position_rad: where the joint stands while others move.
+        continuous: the axis turns without end, or faster than any robot's joint, and that is meant.
+        direction: -1 turns position, velocity and torque of a drive that counts the other way.
+        expected: rough guess of the load, for the plan.
+        procedure: what differs from the robot's procedure.
+        loop_stiffness_nm_per_rad: what a servo's own proportional position loop gives per rad of following error.
+        options: settings of the driver for this joint; see the page of the driver.
+        simulated: the joint that simulated drives move.
+        dh: geometry, for the workspace and for an arm of rigid bodies.
     """
 
     node: int | None = Field(default=None, ge=0)
@@ -156,7 +189,19 @@ class WorkspaceFile(Strict):
 
 
 class CareFile(Strict):
-    """Bounds of the supervisor where this robot needs others than usual; see ``runner.care.Care`` for each."""
+    """Bounds of the supervisor where this robot needs others than usual. A plan prints them beside the usual ones.
+
+    Attributes:
+        reference_tolerance_rad: a joint further than this from its planned locked position is refused; usually 10 deg.
+        approach_rad_s: speed of moves to locked and start positions; usually 20 deg/s.
+        still_rad: how far a joint may move from where it was locked; usually 0.25 deg.
+        still_rad_s: speed below which a joint stands; usually 0.5 deg/s.
+        following_error_rad: largest following error, beyond what the driver's own delay makes; usually 5 deg.
+        velocity_margin: measured speed may exceed the planned peak by this factor; usually 1.25 ...
+        velocity_slack_rad_s: ... plus this; usually 10 deg/s.
+        travel_slack_rad: measured position may leave the planned travel by this; usually 2 deg.
+        silence_s: how long the moving joint may go without a report, never less than three cycles; usually 0.02 s.
+    """
 
     reference_tolerance_rad: Positive | None = None
     approach_rad_s: Positive | None = None
@@ -170,9 +215,20 @@ class CareFile(Strict):
 
 
 class GatesFile(Strict):
-    """What quality gates allow where this robot needs other limits than usual; see ``friction.gate.GateLimits``.
+    """What quality gates allow where this robot needs other limits than usual; plan and profile name them.
 
-    A plan prints them and a profile remarks them. Gates against wrong columns have no key.
+    Attributes:
+        tracking_least: least peak speed of a cycle over the commanded one; usually 0.95.
+        tracking_most: the same, at most; usually 1.3.
+        high_frequency_torque: jitter of the torque over the friction; usually 0.25.
+        samples_per_window: fewest samples that a pair may be the mean of; usually 8.
+        late_cycles: share of control cycles that were late or missed; usually 0.02.
+        direction_asymmetry: how far either direction may lie from the mean of both, over that mean; usually 0.3.
+        straightness: how far a pair may leave the line through its neighbours, over the mean friction; usually 0.1.
+        saturation: share of the samples with torque at its limit; usually 0.005.
+        drift: change of the friction over the run; usually 0.05.
+        link_resonance: frequency of the fastest cycle over the link's resonance; usually 0.2.
+        other_stretches: change of the friction in other stretches of the run, against the curve; usually 0.15.
     """
 
     tracking_least: float | None = Field(default=None, gt=0, le=1)
@@ -189,7 +245,24 @@ class GatesFile(Strict):
 
 
 class RobotFile(Strict):
-    """The whole file."""
+    """What the robot is, where it is reached, and what may be done with it.
+
+    Attributes:
+        schema: ``frictid.robot/1``.
+        extends: another robot file; this one says only what differs.
+        name: of the robot, and of its folder in the profile store.
+        driver: ``cia402``, ``mit``, ``motoman``, ``servos``, ``virtual``, or one that is installed.
+        bus: ``interface:channel``, such as ``socketcan:can0``, ``serial:/dev/ttyUSB0``, ``virtual:NAME``.
+        cycle_hz: set-points a second.
+        options: settings of the driver for the whole bus; see the page of the driver.
+        procedure: the motion of a calibration.
+        policy: what may happen with nobody there.
+        care: bounds of the supervisor.
+        gates: limits of the quality gates.
+        workspace: a box that the arm may not leave.
+        simulated_arm: masses of the links, for simulated drives that move one arm.
+        joints: by name.
+    """
 
     schema_: str = Field(alias="schema")
     extends: str | None = None

@@ -41,6 +41,7 @@ RUN_ELSEWHERE = {
     "replay log.asc": "the tests of foreign bus logs",
     "BAG": "the tests of foreign logs",
     "DATA_EMPS": "needs recordings that others publish; the tests that have them",
+    "--drive-mode position": "the tests of compensated servos",
     "--read": "needs drives; tests with drives on a bench in memory",
 }
 

@@ -2,20 +2,24 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 from frictid_drivers.mit.simulated import VirtualMitDriver
 from frictid_drivers.motoman import MotomanDriver
-from frictid_hil.config.robot import Robot, load_robot
+from frictid_hil.config.robot import CareFile, GatesFile, Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
 from frictid_hil.config.write import dump
 from frictid_hil.errors import ConfigError, FieldProblem, InvalidFields, UsageError
+from frictid_hil.friction.gate import GateLimits
 from frictid_hil.protocol.driver import DriverKind
+from frictid_hil.runner.care import Care
 
 FIXTURE = Path(__file__).with_name("fixture_robot.yaml")
 TEXT = FIXTURE.read_text()
@@ -329,3 +333,13 @@ def test_search_finds_a_name_from_anywhere(tmp_path: Path, monkeypatch: pytest.M
 
 def test_the_shipped_folder_exists() -> None:
     assert (shipped_dir() / "columns").is_dir()
+
+
+@pytest.mark.parametrize(("file", "usual"), [(CareFile, Care()), (GatesFile, GateLimits())])
+def test_the_usual_bounds_that_the_reference_tells_are_those_in_force(file: type[BaseModel], usual: object) -> None:
+    told = dict(re.findall(r"^ +(\w+):.*usually (.+?)(?: \.\.\.)?[.]?$", file.__doc__ or "", re.MULTILINE))
+    assert set(told) == set(file.model_fields)
+    for key, text in told.items():
+        number, _, unit = text.partition(" ")
+        value = math.radians(float(number)) if unit.startswith("deg") else float(number)
+        assert value == pytest.approx(getattr(usual, key)), key
