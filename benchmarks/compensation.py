@@ -1,4 +1,4 @@
-"""What compensation reaches on the virtual HP3J: every figure of docs/evidence/compensation.md comes from here.
+"""What compensation reaches on the virtual HP3J: the figures of docs/evidence/compensation.md come from here.
 
     python benchmarks/compensation.py calibrate --out runs/benchmark          # the profile that the rest uses
     python benchmarks/compensation.py hand  --profile runs/benchmark/profile.yaml [--setting paper]
