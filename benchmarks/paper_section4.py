@@ -300,8 +300,8 @@ def page(
     ]
     return f"""# The paper's section 4, reproduced
 
-The figures of the paper come out in shape and trend. Its curves depend on the travel A because torque and velocity are not
-of one instant; brought to one instant, the same samples give nearly the same curve at every A.
+The figures of the paper come out in shape and trend. Its curves depend on the travel A because torque and velocity are
+not of one instant. Brought to one instant, the same samples give nearly the same curve at every A.
 
 Every figure below is a calibration as a user makes it: `hp3j.yaml`, the CiA-402 driver, six simulated drives on a CAN
 bus, the scheduler with five joints locked, a run folder, a profile. V = 115 deg/s, N = 10, c = 0.8, 1 kHz, seed 0.
