@@ -1,4 +1,7 @@
-"""Every hex example of the pages for controller-side authors is what driver and emulator really exchange."""
+"""Every hex example of the pages for controller-side authors is what driver and emulator really exchange.
+
+``python tests/motoman/test_controller_application_page.py`` writes the file of exchanges anew.
+"""
 
 from __future__ import annotations
 
@@ -199,3 +202,7 @@ def test_every_option_and_fault_is_on_the_page_of_settings() -> None:
 
 def test_the_pages_say_what_was_never_tested(text: str) -> None:
     assert "never been run on a controller" in text
+
+
+if __name__ == "__main__":
+    EXCHANGES.write_text("\n".join(f"# {name}\n{said}" for name, said in examples().items()), encoding="utf-8")
