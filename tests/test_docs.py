@@ -1,5 +1,6 @@
 """Every link between pages leads somewhere, the README's and the changelog's too."""
 
+import csv
 import re
 import subprocess
 import sys
@@ -90,3 +91,14 @@ def test_the_page_of_verbs_is_that_of_the_command_line() -> None:
 def test_the_page_of_stops_is_that_of_the_code() -> None:
     page = (ROOT / "docs" / "reference" / "stops.md").read_text(encoding="utf-8")
     assert page == stop_paths.page(), "python -m frictid_drivers.stop_paths docs/reference/stops.md"
+
+
+def test_every_finding_names_tests_that_exist() -> None:
+    table = (ROOT / "docs" / "evidence" / "data" / "fault-findings.csv").read_text(encoding="utf-8")
+    named = [test for row in csv.DictReader(table.splitlines()) for test in row["tests_below_tests"].split("; ")]
+    missing = []
+    for file, _, name in (test.partition("::") for test in named):
+        path = ROOT / "tests" / file
+        if not path.exists() or (name and f"def {name}(" not in path.read_text(encoding="utf-8")):
+            missing.append(f"{file}::{name}")
+    assert len(named) > 30 and missing == []
