@@ -15,6 +15,7 @@ from frictid_hil.jobs.check import check
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
 from frictid_hil.jobs.compensation.result import CompensationResult
 from frictid_hil.jobs.compensation.wanted import Wanted
+from frictid_hil.jobs.gap.belief import measured_by
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.mode import Mode
 
@@ -49,6 +50,8 @@ def test_every_family_is_checked_calibrated_and_compensated(tmp_path: Path, mode
     assert entry.quality["loop_stiffness_nm_per_rad"] == pytest.approx(SPRING_NM_PER_RAD, rel=0.05)
     least = entry.presliding_stiffness_nm_per_rad
     assert least.value is not None and 50.0 < least.value < 0.3 / 5e-4, "below the simulated joint's"
+    assert entry.presliding_yields == "unseen", "and no figure for a simulator"
+    assert "presliding_stiffness_nm_per_rad" not in measured_by(entry)["friction"]
     tracked = compensated(path, profile, Mode.POSITION).to_json()
     assert tracked["outcome"] == "ok", tracked
     assert tracked["modes"]["mop"]["reduction_percent"] >= 15.0

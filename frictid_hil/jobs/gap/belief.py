@@ -137,7 +137,7 @@ def measured_by(profile: JointProfile) -> dict[str, Any]:
         "velocity_rad_s": list(profile.velocity_rad_s),
         "torque_nm": list(profile.torque_nm),
     }
-    if profile.presliding_stiffness_nm_per_rad.value is not None:
+    if profile.presliding_stiffness_nm_per_rad.value is not None and profile.presliding_yields != "unseen":
         friction["presliding_stiffness_nm_per_rad"] = profile.presliding_stiffness_nm_per_rad.value
     values = {name: getattr(profile, name).value for name in ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm")}
     return {name: value for name, value in values.items() if value is not None} | {"friction": friction}

@@ -169,6 +169,8 @@ def _from_cycles(
     curve = result.curve
     temperature = samples.temperature_c
     stiffness, level, yields = _presliding(samples, recording, body, curve.coulomb_nm)
+    if yields == "unseen":
+        notes.append(f"the encoder hides presliding; its stiffness is {stiffness.value:.3g} N m/rad at least")
     loop = _loop_stiffness(samples, recording)
     if loop is not None:
         notes.append(f"its own position loop is a spring of {loop:.3g} N m/rad at this gain")
