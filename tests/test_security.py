@@ -137,6 +137,7 @@ def test_no_name_leads_out_of_a_folder(name):
         part_of_path(name)
 
 
+@pytest.mark.slow
 def test_what_is_notified_comes_on_standard_input_and_through_no_shell(tmp_path):
     heard, planted = tmp_path / "heard", tmp_path / "planted"
     script = f"import sys; open({str(heard)!r}, 'w').write(sys.stdin.read() + repr(sys.argv[1:]))"

@@ -36,6 +36,7 @@ def test_the_refusal_lists_the_units_there_are() -> None:
         parse_quantity("20", "angle")
 
 
+@pytest.mark.slow
 @given(st.text(max_size=20))
 def test_any_text_gives_a_finite_number_or_a_usage_error(text: str) -> None:
     with contextlib.suppress(UsageError):

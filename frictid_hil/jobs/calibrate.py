@@ -165,20 +165,8 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         raise UsageError("--out and --resume both name a folder", next_step="leave --out out: a run stays in its own")
     options = restored(options, _CONTINUED)
     robot = load_robot(options.robot)
-    chosen = programme(options.program or "thorough")
-    method = options.method or chosen.method
-    if method not in METHODS:
-        raise UsageError(f"no estimator {method!r}; there are {', '.join(METHODS)}")
-    if chosen.shares and options.cycles is not None:
-        raise UsageError(f"programme {chosen.name} has {len(chosen.shares)} cycles; leave --cycles out")
-    together = bool(options.together)
-    setup = robot.to_setup(options.bus, realtime=bool(options.realtime), seed=options.seed or 0)
-    if options.rate_hz is not None:
-        setup = replace(setup, cycle_hz=options.rate_hz)
-    if options.interlock is not None:
-        setup = _reporting_inputs(setup, options.interlock.joint)
-    wanted = options.joints or robot.joint_names
-    robot.check_joints(wanted)
+    chosen, method = _estimated_by(options)
+    setup = _setup(robot, options)
     kept = {}
     if options.resume is not None:
         manifest_of(options.resume, robot)
@@ -187,31 +175,30 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
         quantum_s = planned_quantum_s(robot.driver(options.bus), setup)
     procedures = {
         name: _procedure(robot, setup, name, options, chosen, quantum_s)
-        for name in dict.fromkeys(wanted)
+        for name in dict.fromkeys(options.joints or robot.joint_names)
         if name not in kept
     }
     expected = expected_of(robot)
+    together = bool(options.together)
     measure_skew = robot.file.procedure.measure_skew if options.measure_skew is None else options.measure_skew
     if measure_skew:
         refuse_where_the_bus_is_too_slow(setup, quantum_s, together=together)
     rehearse = _unseen(Rehearsals(robot, options.bus), setup, procedures, together=together)
-    first = list(procedures.values())[:1]
-    notes = [chosen.note(procedure, setup.cycle_hz, quantum_s) for procedure in first]
-    if quantum_s:
-        notes += [_tick_note(procedure, quantum_s) for procedure in first]
-    notes += [*_notes(procedures, expected, rehearse), *inherited_notes(robot, list(procedures))]
-    notes += [*care_notes(robot, setup), *gate_notes(robot, setup)]
-    if together:
-        notes += _together_notes(setup)
-    if measure_skew:
-        notes.append(shaking_note())
     plan = calibration_plan(
         robot,
         setup,
         procedures,
         expected,
         rehearse=rehearse,
-        notes=notes,
+        notes=[
+            *_programme_notes(chosen, procedures, setup, quantum_s),
+            *_joint_notes(procedures, expected, rehearse),
+            *inherited_notes(robot, list(procedures)),
+            *care_notes(robot, setup),
+            *gate_notes(robot, setup),
+            *(_together_notes(setup) if together else ()),
+            *([shaking_note()] if measure_skew else ()),
+        ],
         warm_up=options.warm_up,
         together=together,
         measure_skew=measure_skew,
@@ -354,6 +341,36 @@ def _refuse_without_watchdog(preflight: Preflight) -> None:
         )
 
 
+def _estimated_by(options: CalibrateOptions) -> tuple[Programme, str]:
+    """The programme and the estimator.
+
+    Raises:
+        UsageError: there is no such estimator, or the programme has cycles of its own.
+    """
+    chosen = programme(options.program or "thorough")
+    method = options.method or chosen.method
+    if method not in METHODS:
+        raise UsageError(f"no estimator {method!r}; there are {', '.join(METHODS)}")
+    if chosen.shares and options.cycles is not None:
+        raise UsageError(f"programme {chosen.name} has {len(chosen.shares)} cycles; leave --cycles out")
+    return chosen, method
+
+
+def _setup(robot: Robot, options: CalibrateOptions) -> RobotSetup:
+    """The robot as its driver is told it.
+
+    Raises:
+        UsageError: the robot has no such joint.
+    """
+    setup = robot.to_setup(options.bus, realtime=bool(options.realtime), seed=options.seed or 0)
+    if options.rate_hz is not None:
+        setup = replace(setup, cycle_hz=options.rate_hz)
+    if options.interlock is not None:
+        setup = _reporting_inputs(setup, options.interlock.joint)
+    robot.check_joints(options.joints)
+    return setup
+
+
 def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:
     """The robot with one drive that reports its digital inputs."""
     joints = tuple(
@@ -391,12 +408,21 @@ def _procedure(
         raise UsageError(str(error), where=f"joint {name}") from None
 
 
-def _tick_note(procedure: Procedure, quantum_s: float) -> str:
-    ticks = np.rint(np.diff(procedure.cycle_starts_s) / quantum_s).astype(int)
-    return (
-        f"cycles last {', '.join(map(str, ticks))} ticks of {quantum_s * 1e3:g} ms, so that their peaks fall on ticks; "
-        f"speeds up to {format_velocity(procedure.velocity_rad_s)}"
-    )
+def _programme_notes(
+    chosen: Programme, procedures: Mapping[str, Procedure], setup: RobotSetup, quantum_s: float
+) -> list[str]:
+    """What the programme promises, and how cycles fit the ticks of a controller that cycles by itself."""
+    if not procedures:
+        return []
+    first = next(iter(procedures.values()))
+    notes = [chosen.note(first, setup.cycle_hz, quantum_s)]
+    if quantum_s:
+        ticks = np.rint(np.diff(first.cycle_starts_s) / quantum_s).astype(int)
+        notes.append(
+            f"cycles last {', '.join(map(str, ticks))} ticks of {quantum_s * 1e3:g} ms, so that their peaks fall on "
+            f"ticks; speeds up to {format_velocity(first.velocity_rad_s)}"
+        )
+    return notes
 
 
 def _unseen(
@@ -424,7 +450,7 @@ def _together_notes(setup: RobotSetup) -> list[str]:
     return notes
 
 
-def _notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
+def _joint_notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
     notes = []
     if rehearse:
         notes.append(rehearsal_note(rehearse))

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import multiprocessing
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from frictid_hil.config.robot import load_robot
+from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import PlanRefused
 from frictid_hil.jobs.plans import calibration_plan, expected_of
 from frictid_hil.plan.limits import refuse_beyond_limits
-from frictid_hil.protocol.driver import Finding, Severity, new_driver
+from frictid_hil.plan.plan import Plan
+from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol.driver import Finding, JointIdentity, Severity, new_driver
 from frictid_hil.runner.realtime import Latency, measure_latency
 
 
@@ -28,30 +31,10 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
     """
     robot = load_robot(robot_name)
     setup = robot.to_setup(bus)
-    procedures = {name: robot.procedure(name) for name in robot.joint_names}
-    expected = expected_of(robot)
-    plan = calibration_plan(robot, setup, procedures, expected)
-    findings: list[Finding] = []
-    try:
-        refuse_beyond_limits(plan, setup, expected)
-        findings.append(
-            Finding(Severity.OK, "plan", f"{len(plan.joints)} joints, {plan.duration_s:.0f} s, within limits")
-        )
-    except PlanRefused as refused:
-        findings.append(Finding(Severity.ERROR, "plan", refused.what, refused.next_step))
-    for name in procedures:
-        if name not in expected:
-            findings.append(
-                Finding(
-                    Severity.WARNING,
-                    f"joint {name}",
-                    "no `expected` inertia, gravity and friction: peak torque cannot be predicted before the first run",
-                    "add `expected:` to the joint in the robot file",
-                )
-            )
+    plan, findings = _planned(robot, setup)
     with robot.document.locating():
         driver = new_driver(robot.driver(bus), setup)
-    identities = {}
+    identities: Mapping[str, JointIdentity] = {}
     try:
         with robot.document.locating():
             driver.open()
@@ -59,9 +42,8 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
         identities = driver.identify()
     finally:
         driver.close()
-    measured = None
-    if latency_s:
-        measured = _measured(latency_s)
+    measured = _measured(latency_s) if latency_s else None
+    if measured is not None:
         findings.extend(_told(measured, setup.cycle_hz))
     ok = all(finding.severity is not Severity.ERROR for finding in findings)
     return {
@@ -72,28 +54,42 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
         "bus": setup.bus,
         "ok": ok,
         "latency": None if measured is None else asdict(measured),
-        "findings": [
-            {
-                "severity": finding.severity.value,
-                "subject": finding.subject,
-                "message": finding.message,
-                "next_step": finding.next_step,
-            }
-            for finding in findings
-        ],
+        "findings": [{**_values(finding, _FINDING), "severity": finding.severity.value} for finding in findings],
         "joints": {
-            name: {
-                "serial": identity.serial,
-                "firmware": identity.firmware,
-                "product": identity.product,
-                "rated_torque_nm": identity.rated_torque_nm,
-                "gear_ratio": identity.gear_ratio,
-                "torque_source": identity.torque_source,
-                "settings": dict(identity.settings),
-            }
+            name: {**_values(identity, _IDENTITY), "settings": dict(identity.settings)}
             for name, identity in identities.items()
         },
     }
+
+
+_FINDING = ("severity", "subject", "message", "next_step")
+_IDENTITY = ("serial", "firmware", "product", "rated_torque_nm", "gear_ratio", "torque_source")
+
+
+def _values(told: object, names: Sequence[str]) -> dict[str, Any]:
+    return {name: getattr(told, name) for name in names}
+
+
+def _planned(robot: Robot, setup: RobotSetup) -> tuple[Plan, list[Finding]]:
+    """The standard plan, and what is to be said of it before any hardware is read."""
+    expected = expected_of(robot)
+    plan = calibration_plan(robot, setup, {name: robot.procedure(name) for name in robot.joint_names}, expected)
+    try:
+        refuse_beyond_limits(plan, setup, expected)
+        judged = Finding(Severity.OK, "plan", f"{len(plan.joints)} joints, {plan.duration_s:.0f} s, within limits")
+    except PlanRefused as refused:
+        judged = Finding(Severity.ERROR, "plan", refused.what, refused.next_step)
+    unknown = [
+        Finding(
+            Severity.WARNING,
+            f"joint {name}",
+            "no `expected` inertia, gravity and friction: peak torque cannot be predicted before the first run",
+            "add `expected:` to the joint in the robot file",
+        )
+        for name in robot.joint_names
+        if name not in expected
+    ]
+    return plan, [judged, *unknown]
 
 
 def _measured(latency_s: float) -> Latency:

@@ -16,6 +16,8 @@ import numpy as np
 
 from frictid_hil.errors import Interrupted, SafetyAbort
 from frictid_hil.protocol.driver import Driver, Feedback, SetPoint
+from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.events import JointRun
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.stopping import cycles_ahead, stopping_path
 from frictid_hil.runner.supervisor import Supervisor
@@ -92,6 +94,20 @@ class CycleCount:
         """Cycles per second that were achieved."""
         span_ns = self.last_ns - self.first_ns
         return (self.cycles - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+
+    def joint_run(self, joint: str, session: int, marks: Sequence[Mark]) -> JointRun:
+        """The same, as what is told of one joint."""
+        return JointRun(
+            joint=joint,
+            session=session,
+            marks=tuple(marks),
+            rate_hz=self.rate_hz,
+            cycles=self.cycles,
+            late_cycles=self.late,
+            missed_cycles=self.missed,
+            worst_lateness_s=self.worst_ns * 1e-9,
+            duration_s=(self.last_ns - self.first_ns) * 1e-9,
+        )
 
 
 class CyclicLoop:

@@ -84,6 +84,45 @@ class _Life:
         return self._silent_s < (_SILENT_STOPPING_S if stop_asked else _SILENT_S) and self._asked_s < _ENDING_S
 
 
+@dataclass(slots=True)
+class _Listener:
+    """This end of the pipe.
+
+    Attributes:
+        outcome: error that ended the run in the child.
+        finished: the child has said how it ended.
+        powered: drives may have power.
+    """
+
+    pipe: Connection
+    notify: Callable[[Event], None]
+    proceed: Callable[[Preflight], bool]
+    stop: StopSignals
+    drain: Callable[[], None]
+    outcome: FrictidError | None = None
+    finished: bool = False
+    powered: bool = False
+
+    def hear(self) -> bool:
+        """Deal with one message; False where the child has closed its end."""
+        try:
+            message = self.pipe.recv()
+        except EOFError:
+            return False
+        if isinstance(message, tuple):
+            (self.outcome,) = message
+            self.finished = True
+        elif isinstance(message, Preflight):
+            self.notify(message)
+            self.pipe.send(self.stop.while_asking(lambda: self.proceed(message)))
+        else:
+            if isinstance(message, PhaseStarted | JointRun):
+                self.powered = isinstance(message, PhaseStarted) and message.phase not in _WITHOUT_POWER
+            self.drain()
+            self.notify(message)
+        return True
+
+
 def run_in_own_process(
     driver: str,
     setup: RobotSetup,
@@ -118,47 +157,31 @@ def run_in_own_process(
     heard, wire = context.Pipe(duplex=False)
     order = _Order(driver, setup, plan, care, recorder.samples.name, recorder.frames.name, os.getpid())
     child = context.Process(target=_child, args=(order, theirs, heard), name="frictid-hil-cycle")
-    outcome: FrictidError | None = None
-    finished = hangs = powered = False
-    life = _Life()
+    listener = _Listener(ours, notify, proceed, stop, drain)
+    life, hangs = _Life(), False
     with stop.written_to(wire.fileno()):
         child.start()
         theirs.close()
         heard.close()
         try:
-            while not finished:
+            while not listener.finished:
                 told = ours.poll(_POLL_S)
-                if told:
-                    try:
-                        message = ours.recv()
-                    except EOFError:
-                        break
-                    if isinstance(message, Preflight):
-                        notify(message)
-                        answer = stop.while_asking(lambda preflight=message: proceed(preflight))  # type: ignore[misc]
-                        ours.send(answer)
-                    elif isinstance(message, tuple):
-                        (outcome,) = message
-                        finished = True
-                    else:
-                        if isinstance(message, PhaseStarted | JointRun):
-                            powered = isinstance(message, PhaseStarted) and message.phase not in _WITHOUT_POWER
-                        drain()
-                        notify(message)
+                if told and not listener.hear():
+                    break
                 drain()
                 if not life.look(recorder.samples.drained, heard=told, stop_asked=stop.level > 0):
                     hangs = True
                     break
-            child.join(_ENDING_S if finished else 0.0)
+            child.join(_ENDING_S if listener.finished else 0.0)
         finally:
             _end(child, hangs=hangs)
             drain()
             ours.close()
             wire.close()
-    if outcome is not None:
-        raise outcome
-    if not finished:
-        raise _lost(child.exitcode, setup, hangs=hangs, powered=powered)
+    if listener.outcome is not None:
+        raise listener.outcome
+    if not listener.finished:
+        raise _lost(child.exitcode, setup, hangs=hangs, powered=listener.powered)
 
 
 def _end(child: SpawnProcess, *, hangs: bool) -> None:

@@ -19,7 +19,7 @@ The order is always the same, and no step of it is optional::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import cast
 
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
@@ -168,26 +168,9 @@ class Scheduler:
         moving = {self._names.index(plan.joint): plan for plan in plans}
         name = stretch_name(plans)
         self._notify(PhaseStarted(name, "configure", 0.0))
-        driver.configure(self._plan.cycle_hz, [plan.joint for plan in plans])
-        if session == 0 and isinstance(driver, Remarking):
-            for remark in driver.remarks():
-                self._notify(Warned(f"{remark.subject}: {remark.message}"))
-        if session == 0 and isinstance(driver, FrameMapped):
-            self._notify(Configured(driver.frame_map_values()))
-        for joint in self._setup.joints:
-            driver.set_limits(
-                joint.name,
-                torque_nm=joint.max_torque_nm,
-                position_min_rad=joint.position_min_rad,
-                position_max_rad=joint.position_max_rad,
-            )
+        self._configure(session, plans)
         limits = [self._limits(joint, moving.get(at, plans[0])) for at, joint in enumerate(self._setup.joints)]
-        box = self._setup.workspace
-        watch = None if box is None else WorkspaceWatch(box, self._names, self._plan.cycle_hz)
-        supervisor = Supervisor(self._names, limits, self._plan.cycle_hz, self._care.interlock, watch)
-        for index in range(len(self._names)):
-            if index not in moving:
-                supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * self._plan.cycle_hz))
+        supervisor = self._supervisor(limits, moving)
         if driver.capabilities().batch_only:
             return [self._run_in_batch(session, plans[0], supervisor, limits)]
         driver.start_cycling()
@@ -220,21 +203,33 @@ class Scheduler:
             raise
         driver.stop_cycling()
         self._recorder.offset_ns = loop.now_ns() + _SESSION_GAP_NS
-        count = loop.count
-        return [
-            JointRun(
-                joint=plan.joint,
-                session=session,
-                marks=tuple(marks[index]),
-                rate_hz=count.rate_hz,
-                cycles=count.cycles,
-                late_cycles=count.late,
-                missed_cycles=count.missed,
-                worst_lateness_s=count.worst_ns * 1e-9,
-                duration_s=(count.last_ns - count.first_ns) * 1e-9,
+        return [loop.count.joint_run(plan.joint, session, marks[index]) for index, plan in moving.items()]
+
+    def _configure(self, session: int, plans: Sequence[JointPlan]) -> None:
+        """Write what the motion needs into the drives, and tell once what they remark."""
+        driver = self._driver
+        driver.configure(self._plan.cycle_hz, [plan.joint for plan in plans])
+        if session == 0 and isinstance(driver, Remarking):
+            for remark in driver.remarks():
+                self._notify(Warned(f"{remark.subject}: {remark.message}"))
+        if session == 0 and isinstance(driver, FrameMapped):
+            self._notify(Configured(driver.frame_map_values()))
+        for joint in self._setup.joints:
+            driver.set_limits(
+                joint.name,
+                torque_nm=joint.max_torque_nm,
+                position_min_rad=joint.position_min_rad,
+                position_max_rad=joint.position_max_rad,
             )
-            for index, plan in moving.items()
-        ]
+
+    def _supervisor(self, limits: Sequence[JointLimits], moving: Collection[int]) -> Supervisor:
+        box, rate_hz = self._setup.workspace, self._plan.cycle_hz
+        watch = None if box is None else WorkspaceWatch(box, self._names, rate_hz)
+        supervisor = Supervisor(self._names, limits, rate_hz, self._care.interlock, watch)
+        for index in range(len(self._names)):
+            if index not in moving:
+                supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * rate_hz))
+        return supervisor
 
     def _run_in_batch(
         self, session: int, plan: JointPlan, supervisor: Supervisor, limits: Sequence[JointLimits]

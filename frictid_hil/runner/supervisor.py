@@ -218,14 +218,7 @@ class Supervisor:
                 index, f"speed {format_velocity(velocity)} above the bound {format_velocity(limits.velocity_rad_s)}"
             )
         if not abs(torque) <= limits.torque_nm:
-            self._torque_high[index] += 1
-            if math.isnan(torque) or self._torque_high[index] > limits.torque_s * self._cycle_hz:
-                raise self._abort(
-                    index,
-                    f"torque {format_torque(torque)} above the bound {format_torque(limits.torque_nm)} for "
-                    f"{self._torque_high[index] / self._cycle_hz:.3g} s",
-                    cause="a collision, a wrong travel, or a heavier load than planned",
-                )
+            self._count_high_torque(index, torque)
         else:
             self._torque_high[index] = 0
         if abs(torque * velocity) > limits.power_w:
@@ -251,15 +244,29 @@ class Supervisor:
                     next_step="check the encoder, its cable, and what the drive knows of its gear (608F, 6091, 6092)",
                 )
         if in_position:
-            # Judged against what is in force, where the driver tells: a set-point may be due many ticks later.
-            in_force = report.position_command_rad
-            error = (set_point.position_rad if math.isnan(in_force) else in_force) - position
-            if not abs(error) <= limits.following_error_rad:
-                raise self._abort(
-                    index,
-                    f"following error {format_angle(error)} above the bound {format_angle(limits.following_error_rad)}",
-                    cause="a blocked joint, saturated torque, or too weak a position loop",
-                )
+            self._check_following(index, set_point, report)
+
+    def _count_high_torque(self, index: int, torque: float) -> None:
+        limits = self._limits[index]
+        self._torque_high[index] += 1
+        if math.isnan(torque) or self._torque_high[index] > limits.torque_s * self._cycle_hz:
+            raise self._abort(
+                index,
+                f"torque {format_torque(torque)} above the bound {format_torque(limits.torque_nm)} for "
+                f"{self._torque_high[index] / self._cycle_hz:.3g} s",
+                cause="a collision, a wrong travel, or a heavier load than planned",
+            )
+
+    def _check_following(self, index: int, set_point: SetPoint, report: Feedback) -> None:
+        # Judged against what is in force, where the driver tells: a set-point may be due many ticks later.
+        in_force, bound = report.position_command_rad, self._limits[index].following_error_rad
+        error = (set_point.position_rad if math.isnan(in_force) else in_force) - report.position_rad
+        if not abs(error) <= bound:
+            raise self._abort(
+                index,
+                f"following error {format_angle(error)} above the bound {format_angle(bound)}",
+                cause="a blocked joint, saturated torque, or too weak a position loop",
+            )
 
     def _check_health(self, index: int, report: Feedback) -> None:
         if not report.valid:

@@ -198,19 +198,19 @@ class Run:
         self.state = State.PREFLIGHT
         keeper: RowKeeper | None = None
         ended: FrictidError | None = None
+
+        def proceed(preflight: Preflight) -> bool:
+            asked(preflight)
+            return self._follower.confirm(plan, preflight)
+
+        def notice(event: Event) -> None:
+            self._notice(event, plan)
+            noticed(event)
+            if isinstance(event, JointRun):
+                each(event)
+
         try:
             keeper = self._opened()
-
-            def proceed(preflight: Preflight) -> bool:
-                asked(preflight)
-                return self._follower.confirm(plan, preflight)
-
-            def notice(event: Event) -> None:
-                self._notice(event, plan)
-                noticed(event)
-                if isinstance(event, JointRun):
-                    each(event)
-
             with order.robot.document.locating():
                 lost = run_plan(
                     order.driver,

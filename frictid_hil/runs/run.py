@@ -69,12 +69,10 @@ def run_plan(
         recorder = Recorder(samples, frames)
 
         def drain() -> None:
-            rows = samples.drain()
-            if rows.size:
-                keeper.samples(rows)
-            rows = frames.drain()
-            if rows.size:
-                keeper.frames(rows)
+            for ring, keep in ((samples, keeper.samples), (frames, keeper.frames)):
+                rows = ring.drain()
+                if rows.size:
+                    keep(rows)
 
         def after_draining(event: Event) -> None:
             drain()

@@ -51,6 +51,7 @@ def test_what_is_withheld_is_there_and_the_largest(drawn: tuple[Any, Any, dict[s
         assert name in wide.FORMS or wide.NOTHING <= sizes[name] < wide.PRESENT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", range(4))
 def test_every_presliding_family_is_a_loop_that_saturates(family: int) -> None:
     p = BARE._replace(slip_family=family)

@@ -141,6 +141,7 @@ def session(options, cycles=200, cycle_hz=500.0, **changes):
     return log, rows, frame_map
 
 
+@pytest.mark.slow
 def test_pdos_are_fd_frames_and_nothing_else_is():
     log, rows, frame_map = session(FD)
     kinds = {}
@@ -158,6 +159,7 @@ def test_pdos_are_fd_frames_and_nothing_else_is():
     assert decoded[: len(rows)] == rows
 
 
+@pytest.mark.slow
 def test_fd_frames_change_no_figure():
     """The kind of frame is a matter of the wire: at a rate that both carry, the same joints report the same."""
     (_, classical, _), (_, fd, _) = (session(options, cycles=60, cycle_hz=200.0) for options in ({}, FD))
@@ -178,6 +180,7 @@ def test_what_the_wire_cannot_carry_is_refused(options, cycle_hz):
     assert "CAN FD" in caught.value.what or not options
 
 
+@pytest.mark.slow
 def test_faults_of_the_wire_meet_fd_frames_too():
     fault = {"kind": "drop", "frames": "tpdo1", "joint": "2", "at_s": 0.1, "count": 3}
     (whole, *_), (lossy, *_) = (session({**FD, "faults": faults}, cycles=100) for faults in ([], [fault]))

@@ -156,6 +156,7 @@ def test_garbage_is_refused_not_fatal(key, value):
         assert error.problems
 
 
+@pytest.mark.slow
 @given(st.sampled_from(["node", "reports", "commands", "position_rad_per_unit"]), plain)
 def test_garbage_in_a_joint_is_refused_not_fatal(key, value):
     mapping = hand_written()

@@ -26,6 +26,7 @@ def mapping_with_values(draw):
     return types, [draw(st.integers(kind.low, kind.high)) for kind in types]
 
 
+@pytest.mark.slow
 @given(mapping_with_values())
 def test_round_trip(case):
     types, values = case

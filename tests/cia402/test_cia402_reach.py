@@ -225,6 +225,7 @@ def test_options_of_an_interface_are_passed_on(monkeypatch):
     assert seen["tcp_tune"] is True and seen["host"] == "10.0.0.2" and "watchdog_ms" not in seen
 
 
+@pytest.mark.slow
 def test_what_canopen_logs_stays_off_a_persons_screen():
     code = "import logging, frictid_drivers.cia402; logging.getLogger('canopen.sdo').error('transfer aborted')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -162,6 +162,7 @@ def test_force_sensor_and_temperature_where_the_robot_file_maps_them():
         session.driver.close()
 
 
+@pytest.mark.slow
 def test_two_runs_are_bit_identical_and_the_log_replays_to_the_same_rows():
     def run():
         session = Session(hp3j())

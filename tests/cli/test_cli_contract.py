@@ -37,6 +37,7 @@ def test_every_verb_explains_itself(verb: str) -> None:
     assert "Usage" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_installed_command_starts_and_tells_its_exit_code() -> None:
     asked = [PROGRAM, "compare", "no-such.yaml", "--truth", "hp3j", "--json"]
     result = subprocess.run(asked, capture_output=True, text=True, timeout=200, check=False)
@@ -176,6 +177,7 @@ def test_a_misspelt_option_is_told_with_its_place(tmp_path: Path, driver: str, o
     assert f"did you mean {meant}?" in result.stderr
 
 
+@pytest.mark.slow
 def test_what_a_driver_misses_is_told_with_its_place() -> None:
     result = run("check", "--robot", "hp3j.yaml", "--bus", "serial:/dev/nowhere")
     assert result.returncode == 2

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.testing import CliRunner
 
 from frictid_hil.cli.app import app
@@ -39,6 +40,7 @@ def planned(store: Path, *arguments: str) -> dict[str, Any]:
     return told
 
 
+@pytest.mark.slow
 def test_the_profile_in_force_is_the_default(tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert "no profile of hp3j is active" in planned(store)["error"]["what"]

@@ -29,6 +29,7 @@ def test_a_sound_recording_fails_nothing(sound):
     assert failed(sound) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_s", [0.006, 0.02])
 def test_a_torque_that_is_late(sound, by_s):
     assert failed(late(sound, "torque_nm", by_s)) & {"seen_delay", "inertia"}
@@ -49,6 +50,7 @@ def test_a_position_that_is_late_from_the_middle_on(sound):
     assert "velocity" in failed(spoilt)
 
 
+@pytest.mark.slow
 def test_a_position_of_another_scale_than_the_velocity(sound):
     spoilt = replace(sound, velocity_rad_s=1.1 * sound.velocity_rad_s)
     assert "velocity" in failed(spoilt)
@@ -57,12 +59,14 @@ def test_a_position_of_another_scale_than_the_velocity(sound):
     assert all(word in told.reason for word in ("60A9", "6091", "replay --eds"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 0.6])
 def test_a_torque_that_is_cut_off(sound, share):
     most = share * np.abs(sound.torque_nm).max()
     assert "flat_tops" in failed(replace(sound, torque_nm=np.clip(sound.torque_nm, -most, most)))
 
 
+@pytest.mark.slow
 def test_a_coarse_torque_is_not_cut_off(sound):
     quantum = 0.02 * float(np.abs(sound.torque_nm).max())
     coarse = replace(sound, torque_nm=np.round(sound.torque_nm / quantum) * quantum, torque_quantum_nm=quantum)
@@ -88,6 +92,7 @@ def test_friction_that_was_another_in_the_rehearsal(sound):
     assert "other_stretches" in failed(replace(sound, elsewhere=(("rehearsal", velocity, wrong),)))
 
 
+@pytest.mark.slow
 def test_a_late_half_cycle_of_joints_that_move_together_is_not_excused_by_doubt(sound):
     doubtful = replace(estimate(sound), figures={"seen_delay_s": 0.01, "seen_delay_deviation_s": 0.005})
     told = {

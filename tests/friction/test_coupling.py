@@ -125,6 +125,7 @@ def test_shaking_keeps_to_the_travel_and_never_reverses(amplitude_deg: float, pl
     assert np.abs(np.gradient(speed, time_s)).max() < 0.75 * fastest
 
 
+@pytest.mark.slow
 def test_least_squares_follows_an_inertia_that_changes_along_the_travel() -> None:
     """As of the swing axis while the arm folds; a joint that moves alone has no such thing."""
     lone = cycles(np.diag(np.diag(INERTIA)))["0"]
@@ -142,6 +143,7 @@ def test_least_squares_follows_an_inertia_that_changes_along_the_travel() -> Non
     assert off(folding) < 0.3 * off(replace(folding, coupled=False))
 
 
+@pytest.mark.slow
 def test_gravity_does_not_stay_in_windows_that_cover_unlike_positions() -> None:
     """A servo that stays behind by friction passes the same places at other speeds forwards than backwards."""
     time_s = np.arange(-0.4, PROCEDURE.duration_s + 0.4, STEP_S)

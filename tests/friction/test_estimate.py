@@ -44,6 +44,7 @@ def test_at_5_degrees_least_squares_keeps_one_percent(plants):
     assert errors(plants, joint, plants.record(joint, plants.procedure(5)), "least-squares")[1] <= 1.0
 
 
+@pytest.mark.slow
 def test_small_travel_error_of_the_published_algorithm_is_a_timing_artefact(plants):
     """The rise at small A in the paper's Fig. 8 goes away when torque and velocity are simultaneous."""
     joint = plants.arm[3]
@@ -89,6 +90,7 @@ def test_a_declared_low_pass_is_undone_where_a_shift_would_not_do(plants):
     assert shifted[1] > undone[1] + 1
 
 
+@pytest.mark.slow
 def test_undeclared_skew_is_not_fitted_away(plants, heavy):
     """Only the declared timing counts: the same torque 4 ms late, undeclared, must show."""
     joint, recording = heavy
@@ -125,6 +127,7 @@ def test_rigid_body_lies_in_its_intervals(plants, index):
         assert body.inertia_kg_m2.half_width < 0.05 * joint.inertia
 
 
+@pytest.mark.slow
 def test_gravity_over_the_travel_is_known_better_than_its_parts(plants, heavy):
     joint, recording = heavy
     body = estimate(recording).rigid_body
@@ -133,6 +136,7 @@ def test_gravity_over_the_travel_is_known_better_than_its_parts(plants, heavy):
     assert np.max(np.abs(body.torque_nm(q, np.zeros_like(q)) - truth)) < 0.01 * joint.gravity_cos
 
 
+@pytest.mark.slow
 def test_asymmetry_is_the_even_part_without_its_constant(plants, heavy):
     joint, recording = heavy
     result = estimate(recording, "least-squares")
@@ -141,6 +145,7 @@ def test_asymmetry_is_the_even_part_without_its_constant(plants, heavy):
     assert np.allclose(result.asymmetry_nm, truth, atol=0.01 * joint.coulomb)
 
 
+@pytest.mark.slow
 def test_ripple_is_found_where_there_is_some(plants):
     joint = replace(plants.arm[0], ripple=0.1)
     table = estimate(plants.record(joint, plants.procedure(20))).ripple
@@ -156,6 +161,7 @@ def test_slow_speeds_that_were_not_observed_are_said(plants):
     assert any("too few samples at" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_without_a_drive_velocity_only_the_published_algorithm_is_lost(heavy):
     _, recording = heavy
     silent = replace(recording, velocity_rad_s=None)
@@ -184,6 +190,7 @@ def test_a_prismatic_axis_has_no_gravity_of_position(plants):
     assert result.ripple is None
 
 
+@pytest.mark.slow
 def test_jitter_of_the_clock_does_not_matter(plants, heavy):
     joint, recording = heavy
     rng = np.random.default_rng(0)

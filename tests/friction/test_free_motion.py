@@ -29,6 +29,7 @@ def friction(speed: np.ndarray) -> np.ndarray:
     return 1.5 + 0.8 * speed / (1.0 + 0.4 * speed)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_and_are_narrow() -> None:
     held = of = 0
     for seed in range(15):

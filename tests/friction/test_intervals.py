@@ -48,6 +48,7 @@ def test_nine_of_ten_knots_are_covered_and_the_intervals_are_not_useless(plants,
     assert np.sqrt(np.mean(width**2)) <= 5 * np.sqrt(np.mean(error**2))
 
 
+@pytest.mark.slow
 def test_a_drifting_joint_gets_wide_intervals(plants):
     error, width = outcome(plants, replace(plants.arm[1], drift=-0.05), 1, "aligned")
     assert np.mean(np.abs(error) <= width) >= 0.9

@@ -30,6 +30,7 @@ def test_a_soft_joint_at_10_degrees_keeps_the_bar_of_a_rigid_one(plants, effects
     assert error(joint, recording, "least-squares") <= 0.5
 
 
+@pytest.mark.slow
 def test_without_the_link_the_same_windows_are_several_times_worse(plants, monkeypatch):
     joint = replace(plants.arm[1], **SOFT)
     recording = plants.record(joint, plants.procedure(10))
@@ -38,6 +39,7 @@ def test_without_the_link_the_same_windows_are_several_times_worse(plants, monke
     assert error(joint, recording, "aligned") > 3 * with_link
 
 
+@pytest.mark.slow
 def test_at_5_degrees_a_soft_joint_is_flagged_even_where_it_is_right(plants):
     joint = replace(plants.arm[2], **SOFT)
     recording = plants.record(joint, plants.procedure(5))
@@ -100,6 +102,7 @@ def test_a_soft_joint_is_found_in_every_programme_at_any_rate(plants, name, step
     assert found.resonance_hz.value == pytest.approx(frequency_hz, rel=0.04)
 
 
+@pytest.mark.slow
 def test_undeclared_delay_is_not_taken_for_a_link(plants):
     recording = plants.record(plants.arm[1], plants.procedure(20))
     assert estimate(replace(recording, skew=Skew(torque_delay_s=-0.0015))).link_resonance_hz is None
@@ -114,6 +117,7 @@ def test_the_link_of_a_slow_motion_follows_the_motor(plants):
     assert np.allclose(moved[5000:], sine[5000:] / (20.0**2 - 1), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_joint_jerked_by_missing_set_points_is_not_searched_for_a_link(plants):
     """A joint that catches up after a gap swings like a soft one; a rigid one would lose torque to that link."""
     recording = plants.record(replace(plants.arm[1], **SOFT), plants.procedure(10))

@@ -19,6 +19,7 @@ def sound(plants):
     return plants.record(plants.arm[2], plants.procedure(20))
 
 
+@pytest.mark.slow
 def test_a_sound_recording_passes_every_gate_and_says_why(sound):
     found = asked(sound)
     assert set(found) == {
@@ -39,6 +40,7 @@ def test_one_jerk_is_no_peak_and_hunting_is(sound):
     assert not asked(replace(sound, position_rad=swinging))["tracking"].passed
 
 
+@pytest.mark.slow
 def test_drift_of_five_percent_over_the_run_is_caught(plants):
     """Friction falling 5 % over the 16 s is 4.9 % of error: one cycle run again at the end shows it."""
     gate = asked(plants.record(replace(plants.arm[2], drift=-0.06), plants.procedure(20)))["drift"]
@@ -47,6 +49,7 @@ def test_drift_of_five_percent_over_the_run_is_caught(plants):
     assert "ran again" in gate.reason
 
 
+@pytest.mark.slow
 def test_an_oscillating_loop_is_caught(plants):
     """A slow velocity filter in a fast loop: the curve would be nonsense without complaint."""
     joint = replace(plants.arm[2], velocity_filter_s=0.008, bandwidth=160)
@@ -58,6 +61,7 @@ def test_an_oscillating_loop_is_caught(plants):
     assert not found["high_frequency_torque"].passed or not found["tracking"].passed
 
 
+@pytest.mark.slow
 def test_saturation_is_caught(plants):
     recording = plants.record(replace(plants.arm[2], max_torque=43.0), plants.procedure(20))
     gate = asked(recording)["saturation"]
@@ -72,6 +76,7 @@ def test_a_resonance_near_the_fastest_cycle_is_caught(plants):
     assert not asked(plants.record(soft, plants.procedure(5)))["link_resonance"].passed
 
 
+@pytest.mark.slow
 def test_a_machine_may_have_limits_of_its_own(sound):
     late = replace(sound, late_cycles=len(sound.time_s) // 20)
     found = {gate.name: gate for gate in gates(late, estimate(late), GateLimits(late_cycles=0.1, straightness=1e-4))}
@@ -79,6 +84,7 @@ def test_a_machine_may_have_limits_of_its_own(sound):
     assert not found["straightness"].passed and found["straightness"].limit == 1e-4
 
 
+@pytest.mark.slow
 def test_late_cycles_and_thin_windows_are_counted(sound):
     found = asked(replace(sound, late_cycles=len(sound.time_s) // 20))
     assert not found["late_cycles"].passed
@@ -105,6 +111,7 @@ def test_a_disturbed_cycle_and_a_one_sided_load_are_caught(sound):
     assert not found.passed and "to either side" in found.reason
 
 
+@pytest.mark.slow
 def test_a_drive_that_says_its_limit_was_active_fails_the_gate(sound):
     found = asked(replace(sound, torque_limit_nm=math.inf, limited_share=0.02))["saturation"]
     assert not found.passed and "bit 11" in found.reason

@@ -54,6 +54,7 @@ def test_ripple_that_multiplies_the_friction_drags_it_little(plants):
     assert measured_skew(shaken(plants, joint, recording)).delay_s == pytest.approx(PLANT_S, abs=5e-5)
 
 
+@pytest.mark.slow
 def test_a_soft_link_is_taken_off_first(plants):
     joint = replace(plants.arm[2], link_share=0.5, link_frequency_hz=24.0)
     recording = declared(plants.record(joint, plants.procedure(20)), 0.0)
@@ -89,6 +90,7 @@ def test_a_curve_that_a_wrong_declaration_bends_is_straightened_and_flagged(plan
     assert measured.time_skew.used_s == measured.time_skew.measured_s
 
 
+@pytest.mark.slow
 def test_a_right_declaration_gives_narrower_intervals_and_passes(plants):
     joint = plants.arm[1]
     recording = declared(plants.record(joint, plants.procedure(5)), 0.0)

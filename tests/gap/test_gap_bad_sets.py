@@ -97,6 +97,7 @@ def test_what_cannot_be_right_is_refused_with_its_reason(asymmetric: ExperimentS
     assert told.value.where
 
 
+@pytest.mark.slow
 def test_a_joint_that_rests_in_its_dead_band_is_not_refused() -> None:
     """Command and position alone, as a hobby arm tells them: it stays where it is while a small command travels."""
     time_s = 0.02 * np.arange(2000)

@@ -60,6 +60,7 @@ def test_traces_below_the_floor_are_not_reported() -> None:
     assert d.verdict == "none" and not d.causes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gravity_error", pytest.param("torque_delay", marks=pytest.mark.slow)])
 def test_single_effect_is_named_and_closed(name: str) -> None:
     d = diagnose(gap_sets.make({name: SINGLES[name]}))

@@ -37,6 +37,7 @@ def made(cogging_nm: float) -> ExperimentSet:
     return ExperimentSet("one way", Nominal(gear_ratio=1.0, curve=CURVE, continuous=True), logs)
 
 
+@pytest.mark.slow
 def test_cogging_comes_before_an_offset_that_may_be_friction() -> None:
     found = diagnose(made(0.03))
     assert found.causes[0].effect == "torque_ripple" and found.causes[0].confidence > 0.9
@@ -58,6 +59,7 @@ def test_a_torque_goes_with_the_rigid_body_column_of_its_own_row() -> None:
     np.testing.assert_array_equal(view.torque_nm, log.torque_nm)
 
 
+@pytest.mark.slow
 @pytest.mark.real_data
 @pytest.mark.skipif(REAL_MORE is None, reason="no real recordings (FRICTID_REAL_MORE_DATA)")
 @pytest.mark.parametrize("name", ["odri_off_a", "odri_on_a"])

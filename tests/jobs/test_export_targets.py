@@ -40,6 +40,7 @@ def test_words_are_read_and_refused() -> None:
             Wanted.of(words, samples)
 
 
+@pytest.mark.slow
 def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: ArmSet, tmp_path: Path) -> None:
     cause = Cause("friction_level_error", 0.9, {"error_share": Value(0.5, 0.4, 0.6)})
     found = {"lift": Diagnosis("lift", "explained", (cause,), (), Figures(), Figures(), Figures())}
@@ -55,6 +56,7 @@ def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: Ar
         write_targets(arm, found, wanted, apply=False, force=False)
 
 
+@pytest.mark.slow
 def test_numbers_of_a_sample_come_from_one_draw_of_the_posterior(arm: ArmSet, tmp_path: Path) -> None:
     causes = (
         Cause("friction_level_error", 0.9, {"error_share": Value(0.5, 0.1, 0.9)}),

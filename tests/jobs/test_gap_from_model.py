@@ -105,6 +105,7 @@ def test_joints_are_paired_by_name_or_as_told(tmp_path: Path) -> None:
         sets_from_model(ModelLogs(asked.model, asked.logs, ["hip"], asked.columns))
 
 
+@pytest.mark.slow
 def test_more_can_be_said_than_the_model_says(tmp_path: Path) -> None:
     asked = _case(tmp_path)
     (tmp_path / "more.yaml").write_text(

@@ -100,6 +100,7 @@ def test_names_of_profiles_come_from_whole_paths(tmp_path: Path, monkeypatch: py
     assert profile_names([Path("a.csv")]) == ["profile.yaml"]
 
 
+@pytest.mark.slow
 def test_a_damaged_recording_is_told(tmp_path: Path) -> None:
     time_s = np.arange(0.0, P.duration_s + 1.0, 0.001)
     v, a, path = (of(P, time_s - 0.5) for of in (trajectory.velocity, trajectory.acceleration, trajectory.position))
@@ -130,6 +131,7 @@ def test_a_killed_worker_of_a_cluster_costs_its_own_task_alone(cluster: str) -> 
     assert isinstance(got[2], FrictidError) and "no answer" in got[2].what
 
 
+@pytest.mark.slow
 def test_no_cluster_there(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("frictid_hil.jobs.identification.executors.CONNECT_TIMEOUT", "0.3s")

@@ -91,6 +91,7 @@ def test_the_environment_adds_to_the_file_and_mistakes_are_named(
         Running(tmp_path, "damiao")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("at_s", [None, 0.05])
 def test_every_kind_ends_in_a_report_or_in_one_of_our_errors(tmp_path: Path, kind: str, at_s: float | None) -> None:

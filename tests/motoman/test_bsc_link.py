@@ -328,6 +328,7 @@ def test_a_text_cut_short_by_a_false_etx_is_no_block_even_with_a_matching_sum() 
     assert _read(raw) is None
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 760), st.integers(1, 255), st.booleans(), st.booleans())
 def test_damage_to_a_long_message_is_detected_or_retried(

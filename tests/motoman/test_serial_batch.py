@@ -64,6 +64,7 @@ MOTIONS = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(MOTIONS)
 def test_both_sides_make_the_same_command_of_the_same_segments(motions: list[Motion]) -> None:

@@ -87,6 +87,7 @@ def test_any_frame_survives_and_python_can_reads_the_same(
         assert round(theirs[k].timestamp * 1e9) == t_ns
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(
@@ -247,6 +248,7 @@ def test_a_damaged_log_is_read_or_refused_never_worse(
         assert name in error.where
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400), st.sampled_from(["a.blf", "a.asc", "a.log", "a.trc", "a.db", "a.xyz", "a.log.gz"]))
 def test_garbage_is_refused(tmp_path_factory: pytest.TempPathFactory, garbage: bytes, name: str) -> None:
@@ -276,6 +278,7 @@ for k in range(10**9):
 """
 
 
+@pytest.mark.slow
 def test_what_was_flushed_survives_sigkill_and_python_can_reads_it_too(tmp_path: Path) -> None:
     path = tmp_path / "killed.blf"
     child = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True)

@@ -161,6 +161,7 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not (tmp_path / "out.csv").exists()
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from(["log.csv", "log.csv.gz"]))
 def test_a_damaged_file_is_read_or_refused_never_worse(
@@ -179,6 +180,7 @@ def test_a_damaged_file_is_read_or_refused_never_worse(
         assert "log.csv" in error.where
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.text(alphabet=st.sampled_from('01.,eE+-_ "\n\r#nai\x00\t;é'), max_size=60))
 def test_any_rows_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, rows: str) -> None:

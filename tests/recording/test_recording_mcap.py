@@ -193,6 +193,7 @@ def test_a_flipped_bit_in_a_chunk_ends_the_reading_there(tmp_path: Path) -> None
     assert "checksum" in one.meta["damage"]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 2**32))
 def test_a_damaged_file_is_read_or_refused_never_worse(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:

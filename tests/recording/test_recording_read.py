@@ -101,6 +101,7 @@ def test_mat_files_that_cannot_be_read(tmp_path: Path) -> None:
         read(mat(tmp_path, EMPS))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 2**32))
 def test_a_damaged_mat_file_is_read_or_refused_never_worse(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
@@ -155,6 +156,7 @@ def test_a_resumed_run_takes_each_joint_from_where_it_moved(tmp_path: Path) -> N
         read(tmp_path, joint="7")
 
 
+@pytest.mark.slow
 @real_data
 @pytest.mark.real_data
 @pytest.mark.parametrize(

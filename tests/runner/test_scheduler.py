@@ -164,6 +164,7 @@ def test_a_lost_position_reference_is_refused_before_power() -> None:
     assert "enable" not in [event.phase for event in events if isinstance(event, PhaseStarted)]
 
 
+@pytest.mark.slow
 def test_what_was_reported_instead_is_told() -> None:
     def powerless(driver: Any, phase: str) -> None:
         driver.enable = lambda joint, mode: None
@@ -173,6 +174,7 @@ def test_what_was_reported_instead_is_told() -> None:
     assert ended is not None and "joint 3 disabled, mode " in ended.cause and "status 0x" in ended.cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lie", "said"),
     [
@@ -350,6 +352,7 @@ class TimedStop(Stop):
         return level
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_stop_at_any_moment_with_power_on_ends_in_time_and_within_the_plan(seed: int) -> None:
     """While power comes, on the way, in a rehearsal: half a second, which holds the longest planned deceleration."""

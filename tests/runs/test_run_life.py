@@ -201,6 +201,7 @@ def meet(fault: Callable[[], None], order: Order, plan: Plan, at: int, monkeypat
     return "ok" if error is None else error.outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_was_in_a_folder_before_is_there_after_every_fault_at_every_step(
     fault: Callable[[], None], robot: Robot, plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -239,6 +240,7 @@ def begun(robot: Robot, plan: Plan, tmp_path_factory: pytest.TempPathFactory) ->
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [*FAULTS, nothing])
 def test_a_continued_run_adds_a_part_and_takes_nothing_from_the_others(
     fault: Callable[[], None],

@@ -84,6 +84,7 @@ def practice_cases_without_effect() -> list[str]:
     return [path.stem for path in truths if yaml.safe_load(path.read_text(encoding="utf-8"))["kind"] == "none"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PRACTICE.is_dir(), reason="FRICTID_PRACTICE_DATA names no folder with practice cases")
 @pytest.mark.parametrize("case", practice_cases_without_effect() or ["absent"])
 def test_a_healthy_practice_joint_is_simulated_down_to_its_noise(case: str) -> None:

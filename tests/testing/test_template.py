@@ -178,6 +178,7 @@ def test_every_planted_defect_is_found(package: Path, defect: str) -> None:
     assert failing(package, planted), defect
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("importing")
 def test_nothing_is_found_where_nothing_was_planted(package: Path) -> None:
     assert not failing(package, (package / "frictid_acme" / "driver.py").read_text())

@@ -227,6 +227,7 @@ EDGES = st.sampled_from([0, 1, 2, 7, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFF
 MAPPINGS = st.sampled_from([0x60400010, 0x60410010, 0x60640020, 0x607A0020, 0x60600008, 0x00050008, 0x60FE0120])
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(
     writes=st.lists(

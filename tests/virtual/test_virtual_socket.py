@@ -135,6 +135,7 @@ def test_a_hub_that_ends_late_leaves_its_successor_alone(runtime_folder):
     assert not (runtime_folder / "heir.sock").exists()
 
 
+@pytest.mark.slow
 def test_slow_reader_loses_frames_and_holds_up_nobody(hub):
     hub, _ = hub
     slow, quick = connected(hub, 2)

@@ -158,22 +158,10 @@ class Axis:
         Raises:
             SafetyAbort: the set-point is not a finite number.
         """
-        state = self.state
         shown = self.feedback.mode
         mode = self.mode
-        if state in _FAULTS:
-            controlword = self._in_fault()
-        else:
-            self._resetting = 0
-            controlword = next_controlword(
-                state,
-                self.target,
-                standing=self.standing,
-                may_enable=healthy and (shown is mode or self._mode_when_enabled),
-            )
-            if controlword == QUICK_STOP and self._runs_on():
-                controlword = DISABLE_VOLTAGE
-        enabled = state is DriveState.ENABLED
+        controlword = self._controlword(healthy)
+        enabled = self.state is DriveState.ENABLED
         if enabled:
             self._reset_wanted = False
         follows = enabled and self.target is Target.ENABLED and shown is mode
@@ -211,6 +199,18 @@ class Axis:
             for meaning, value in zip(_SECONDARY, told, strict=True):
                 secondary.set(meaning, value)
             secondary.pack()
+
+    def _controlword(self, healthy: bool) -> int:
+        if self.state in _FAULTS:
+            return self._in_fault()
+        self._resetting = 0
+        controlword = next_controlword(
+            self.state,
+            self.target,
+            standing=self.standing,
+            may_enable=healthy and (self.feedback.mode is self.mode or self._mode_when_enabled),
+        )
+        return DISABLE_VOLTAGE if controlword == QUICK_STOP and self._runs_on() else controlword
 
     def sent(self) -> None:
         """The primary command went out: its target is in force from the next SYNC on, in the mode that follows it."""

@@ -25,6 +25,7 @@ from frictid_hil.config.profile import (
 from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
+from frictid_hil.friction.estimate import Estimate as Estimated
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
 from frictid_hil.friction.gate import GateLimits, beside_usual
@@ -143,21 +144,7 @@ def _from_cycles(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> JointProfile:
-    notes = _damage(samples)
-    path = path_time(samples, procedure, round(start_s * 1e9))
-    if path is not None:
-        samples, *company = (path.applied(one) for one in (samples, *company))
-        notes.append(path.said)
-    recording = _recording(samples, procedure, start_s, joint, late_cycles)
-    if path is not None:
-        recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
-    recording = with_shaking(recording, samples)
-    if len(together) > 1:
-        recording = replace(recording, coupled=True)
-        try:
-            recording = with_companions(recording, samples, company, start_s)
-        except IdentificationError as problem:
-            notes.append(problem.what)
+    samples, recording, notes = _prepared(samples, procedure, start_s, joint, late_cycles, together, company)
     result = estimate(recording, method)
     limits = {} if joint is None else joint.gates
     if limits:
@@ -165,9 +152,7 @@ def _from_cycles(
     gates = quality.gates(recording, result, GateLimits(**limits))
     if recording.shaken is None and not recording.coupled and result.terms is not None:
         notes += filter(None, [wanted_note(result.terms, float(np.mean(result.curve.torque_nm)))])
-    body = result.rigid_body
-    curve = result.curve
-    temperature = samples.temperature_c
+    body, curve, skew = result.rigid_body, result.curve, recording.skew
     stiffness, level, yields = _presliding(samples, recording, body, curve.coulomb_nm)
     if yields == "unseen":
         notes.append(f"the encoder hides presliding; its stiffness is {stiffness.value:.3g} N m/rad at least")
@@ -194,11 +179,9 @@ def _from_cycles(
         published=_published(result.published),
         ripple=Ripple.of_table(result.ripple.period_rad, result.ripple.torque_nm) if result.ripple else None,
         torque_source=str(samples.meta.get("torque_source", "")),
-        time_skew_s=recording.skew.torque_delay_s - recording.skew.position_delay_s
-        if result.time_skew is None
-        else result.time_skew.used_s,
+        time_skew_s=result.time_skew.used_s if result.time_skew else skew.torque_delay_s - skew.position_delay_s,
         time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
-        temperature_c=None if temperature is None else round(float(np.nanmean(temperature)), 2),
+        temperature_c=_mean_temperature_c(samples),
         procedure=ProcedureUsed(
             amplitude_rad=procedure.amplitude_rad,
             velocity_rad_s=procedure.velocity_rad_s,
@@ -208,17 +191,53 @@ def _from_cycles(
             together=together or None,
         ),
         drive=_drive(samples.meta),
-        quality={
-            **{name: float(value) for name, value in result.figures.items()},
-            "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
-            "drift_percent": 100 * result.drift.change if result.drift else None,
-            "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
-            LOOP_STIFFNESS: loop,
-            "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
-            "notes": [*notes, *result.notes],
-        },
+        quality={**_quality(recording, result, notes), LOOP_STIFFNESS: loop},
         gates=tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
     )
+
+
+def _prepared(
+    samples: Samples,
+    procedure: Procedure,
+    start_s: float,
+    joint: JointSetup | None,
+    late_cycles: int,
+    together: tuple[str, ...],
+    company: Sequence[Samples],
+) -> tuple[Samples, CycleRecording, list[str]]:
+    """Samples on the time of the path, what the estimator is given of them, and what is to be said of both."""
+    notes = _damage(samples)
+    path = path_time(samples, procedure, round(start_s * 1e9))
+    if path is not None:
+        samples, *company = (path.applied(one) for one in (samples, *company))
+        notes.append(path.said)
+    recording = _recording(samples, procedure, start_s, joint, late_cycles)
+    if path is not None:
+        recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
+    recording = with_shaking(recording, samples)
+    if len(together) > 1:
+        recording = replace(recording, coupled=True)
+        try:
+            recording = with_companions(recording, samples, company, start_s)
+        except IdentificationError as problem:
+            notes.append(problem.what)
+    return samples, recording, notes
+
+
+def _quality(recording: CycleRecording, result: Estimated, notes: Sequence[str]) -> dict[str, Any]:
+    return {
+        **{name: float(value) for name, value in result.figures.items()},
+        "asymmetry_nm": [float(value) for value in result.asymmetry_nm],
+        "drift_percent": 100 * result.drift.change if result.drift else None,
+        "link_resonance_hz": result.link_resonance_hz.value if result.link_resonance_hz else None,
+        "coupling_kg_m2": {other.name: other.inertia_kg_m2 for other in recording.companions} or None,
+        "notes": [*notes, *result.notes],
+    }
+
+
+def _mean_temperature_c(samples: Samples) -> float | None:
+    measured = samples.temperature_c
+    return None if measured is None else round(float(np.nanmean(measured)), 2)
 
 
 def _from_plateaus(samples: Samples) -> JointProfile:
