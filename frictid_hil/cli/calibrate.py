@@ -112,6 +112,34 @@ def reset(
     output.run("reset", lambda: job(robot, bus=bus, ask=ask), show)
 
 
+ProgramOption = Annotated[
+    str | None,
+    typer.Option(
+        "--program",
+        metavar="PROGRAM",
+        autocompletion=one_of("thorough", "standard", "quick"),
+        help="thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
+    ),
+]
+TogetherOption = Annotated[
+    bool,
+    typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
+]
+MeasureSkewOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--measure-skew/--declared-skew",
+        help="Each joint also shakes for 8 s, which measures by how much its torque is late; without, the declared "
+        "timing alone counts. Default: the robot file's `procedure: measure_skew`, else declared.",
+        show_default=False,
+    ),
+]
+RateOption = Annotated[
+    float | None,
+    typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
+]
+
+
 def calibrate(
     robot: RobotOption = "",
     joint: JointOption = None,
@@ -120,32 +148,10 @@ def calibrate(
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
     method: MethodOption = None,
-    program: Annotated[
-        str | None,
-        typer.Option(
-            "--program",
-            metavar="PROGRAM",
-            autocompletion=one_of("thorough", "standard", "quick"),
-            help="thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
-        ),
-    ] = None,
-    together: Annotated[
-        bool,
-        typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
-    ] = False,
-    measure_skew: Annotated[
-        bool | None,
-        typer.Option(
-            "--measure-skew/--declared-skew",
-            help="Each joint also shakes for 8 s, which measures by how much its torque is late; without, the declared "
-            "timing alone counts. Default: the robot file's `procedure: measure_skew`, else declared.",
-            show_default=False,
-        ),
-    ] = None,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
-    ] = None,
+    program: ProgramOption = None,
+    together: TogetherOption = False,
+    measure_skew: MeasureSkewOption = None,
+    rate: RateOption = None,
     bus: BusOption = None,
     dry_run: DryRunOption = False,
     realtime: RealtimeOption = False,
@@ -160,10 +166,9 @@ def calibrate(
     quiet: QuietOption = False,
 ) -> None:
     """Identify the friction of every joint, one at a time or all --together, and write a friction profile."""
-    from frictid_hil.cli.progress import print_plan, watching
+    from frictid_hil.cli.progress import answer_dry_run, watching
     from frictid_hil.jobs.calibrate import CalibrateOptions, plan_calibration
     from frictid_hil.jobs.calibrate import calibrate as job
-    from frictid_hil.plan.plan import described
 
     output = Output(as_json, quiet, notify)
     options = CalibrateOptions(
@@ -185,13 +190,7 @@ def calibrate(
         out=out,
     )
     if dry_run:
-
-        def plan_only() -> Result:
-            planned = plan_calibration(options)
-            print_plan(output.out, planned.plan, planned.setup)
-            return {"outcome": "ok", "dry_run": True, "plan": described(planned.plan)}
-
-        output.run("calibrate", plan_only)
+        answer_dry_run(output, "calibrate", lambda: plan_calibration(options))
 
     def run() -> Told:
         with watching(output, yes=yes, live=live, live_at=live_at) as watcher:

@@ -38,84 +38,102 @@ def register(app: typer.Typer) -> None:
     app.command("compensate")(compensate)
 
 
+def _drive_mode(name: str) -> Mode:
+    if name not in _DRIVE_MODES:
+        raise UsageError(f"no drive mode {name!r}; there are {', '.join(_DRIVE_MODES)}")
+    return _DRIVE_MODES[name]
+
+
 def _duration(text: str) -> float:
     return 0.0 if text.strip() == "0" else quantity("duration")(text)
+
+
+TaskOption = Annotated[
+    str,
+    typer.Option(
+        "--task",
+        metavar="TASK",
+        autocompletion=one_of("hand", "track"),
+        help="hand (a person guides the joint), track (a triangle under a weak PD).",
+    ),
+]
+ProfileOption = Annotated[
+    str,
+    typer.Option(
+        "--profile",
+        "-p",
+        metavar="PROFILE",
+        autocompletion=profiles,
+        help="Profile, run folder, or id of the store. Default: the robot's active profile.",
+    ),
+]
+ModeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--mode",
+        metavar="MODES",
+        help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task.",
+    ),
+]
+SettingOption = Annotated[
+    str,
+    typer.Option(
+        "--setting",
+        metavar="SETTING",
+        autocompletion=one_of("ours", "paper"),
+        help="ours, or paper (R = 0.9, K = 10000 N m/rad).",
+    ),
+]
+StiffnessOption = Annotated[
+    float | None, typer.Option("--stiffness", metavar="K", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
+]
+ViscosityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--viscosity", metavar="B_C", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0
+    ),
+]
+SpeedOption = Annotated[
+    float | None,
+    typer.Option("--speed", metavar="SPEED", parser=quantity("angular velocity"), help="Peak speed of the task."),
+]
+DurationOption = Annotated[
+    float | None,
+    typer.Option(
+        "--duration",
+        metavar="TIME",
+        parser=_duration,
+        help="Of each mode, 10s unless told; 0 runs until interrupted.",
+    ),
+]
+CentreOption = Annotated[
+    float | None, typer.Option("--centre", metavar="ANGLE", parser=quantity("angle"), help="Middle of the travel.")
+]
+DriveModeOption = Annotated[
+    str,
+    typer.Option(
+        "--drive-mode",
+        metavar="MODE",
+        autocompletion=one_of("torque", "position", "velocity"),
+        help="torque; position or velocity with the torque as offset (60B2).",
+    ),
+]
 
 
 def compensate(
     robot: RobotOption,
     joint: OneJointOption,
-    task: Annotated[
-        str,
-        typer.Option(
-            "--task",
-            metavar="TASK",
-            autocompletion=one_of("hand", "track"),
-            help="hand (a person guides the joint), track (a triangle under a weak PD).",
-        ),
-    ],
-    profile: Annotated[
-        str,
-        typer.Option(
-            "--profile",
-            "-p",
-            metavar="PROFILE",
-            autocompletion=profiles,
-            help="Profile, run folder, or id of the store. Default: the robot's active profile.",
-        ),
-    ] = "active",
-    mode: Annotated[
-        str | None,
-        typer.Option(
-            "--mode",
-            metavar="MODES",
-            help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task.",
-        ),
-    ] = None,
-    setting: Annotated[
-        str,
-        typer.Option(
-            "--setting",
-            metavar="SETTING",
-            autocompletion=one_of("ours", "paper"),
-            help="ours, or paper (R = 0.9, K = 10000 N m/rad).",
-        ),
-    ] = "ours",
+    task: TaskOption,
+    profile: ProfileOption = "active",
+    mode: ModeOption = None,
+    setting: SettingOption = "ours",
     ratio: Annotated[float | None, typer.Option("--compensation-ratio", metavar="R", help="R, below 1.")] = None,
-    stiffness: Annotated[
-        float | None, typer.Option("--stiffness", metavar="K", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
-    ] = None,
-    viscosity: Annotated[
-        float | None,
-        typer.Option(
-            "--viscosity", metavar="B_C", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0
-        ),
-    ] = None,
-    speed: Annotated[
-        float | None,
-        typer.Option("--speed", metavar="SPEED", parser=quantity("angular velocity"), help="Peak speed of the task."),
-    ] = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            "--duration",
-            metavar="TIME",
-            parser=_duration,
-            help="Of each mode, 10s unless told; 0 runs until interrupted.",
-        ),
-    ] = None,
-    centre: Annotated[
-        float | None, typer.Option("--centre", metavar="ANGLE", parser=quantity("angle"), help="Middle of the travel.")
-    ] = None,
-    drive_mode: Annotated[
-        str,
-        typer.Option(
-            "--drive-mode",
-            metavar="MODE",
-            autocompletion=one_of("torque", "position", "velocity"),
-            help="torque; position or velocity with the torque as offset (60B2).",
-        ),
-    ] = "torque",
+    stiffness: StiffnessOption = None,
+    viscosity: ViscosityOption = None,
+    speed: SpeedOption = None,
+    duration: DurationOption = None,
+    centre: CentreOption = None,
+    drive_mode: DriveModeOption = "torque",
     force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
     dry_run: DryRunOption = False,
     bus: BusOption = None,
@@ -130,17 +148,14 @@ def compensate(
     quiet: QuietOption = False,
 ) -> None:
     """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
-    from frictid_hil.cli.progress import print_plan, watching
+    from frictid_hil.cli.progress import answer_dry_run, watching
     from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
     from frictid_hil.jobs.compensate import compensate as job
     from frictid_hil.jobs.compensation.wanted import Wanted
-    from frictid_hil.plan.plan import described
 
     output = Output(as_json, quiet)
 
     def options() -> CompensateOptions:
-        if drive_mode not in _DRIVE_MODES:
-            raise UsageError(f"no drive mode {drive_mode!r}; there are {', '.join(_DRIVE_MODES)}")
         wanted = Wanted(
             task=task,
             modes=tuple(part.strip() for part in mode.split(",")) if mode else (),
@@ -151,19 +166,13 @@ def compensate(
             speed_rad_s=speed,
             duration_s=10.0 if duration is None else duration,
             centre_rad=centre,
-            drive_mode=_DRIVE_MODES[drive_mode],
+            drive_mode=_drive_mode(drive_mode),
             force=force,
         )
         return CompensateOptions(robot, profile, joint, wanted, bus, realtime, seed, out, store)
 
     if dry_run:
-
-        def plan_only() -> Result:
-            asked = plan_compensation(options())
-            print_plan(output.out, asked.plan, asked.setup)
-            return {"outcome": "ok", "dry_run": True, "plan": described(asked.plan)}
-
-        output.run("compensate", plan_only)
+        answer_dry_run(output, "compensate", lambda: plan_compensation(options()))
 
     def run() -> Told:
         with watching(output, yes=yes, live=live, live_at=live_at) as watcher:

@@ -41,107 +41,122 @@ JointNameOption = Annotated[
 ]
 
 
+DiagnoseLogsArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="[SET | LOG...]", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
+    ),
+]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="FILE", help="Your own robot model, MJCF or URDF: every joint is diagnosed."),
+]
+MoreLogsOption = Annotated[
+    list[Path] | None, typer.Option("--log", metavar="LOG", help="A recording; as those without an option.")
+]
+NominalOption = Annotated[
+    Path | None, typer.Option("--nominal", metavar="FILE", help="What the simulator believes (nominal.yaml).")
+]
+ProfileOption = Annotated[
+    Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
+]
+JointOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--joint",
+        "-j",
+        metavar="JOINT",
+        help="The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
+    ),
+]
+HoldOption = Annotated[
+    list[str] | None,
+    typer.Option("--hold", metavar="JOINT=20deg", help="Where a joint of the model stood that no log has."),
+]
+ToleranceOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tolerance",
+        metavar="NUMBER=SIGMA",
+        help="One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
+    ),
+]
+ExecutorOption = Annotated[
+    str | None,
+    typer.Option("--executor", metavar="WHERE", help="processes:N, or dask://host:port, for the joints of a model."),
+]
+ValidationOption = Annotated[
+    list[str] | None,
+    typer.Option("--validation", metavar="LOG", help="Log to judge on, by name; unless told, what was recorded last."),
+]
+SplitOption = Annotated[
+    str,
+    typer.Option(
+        "--split", metavar="HOW", help="Judge on the end of every log, 30% or 20s of it; or on whole logs: log."
+    ),
+]
+NegligibleOption = Annotated[
+    float | None,
+    typer.Option(
+        "--negligible",
+        metavar="PERCENT",
+        min=0.0,
+        max=100.0,
+        help="Gap that means nothing to you, in percent of the friction level; 5 unless told.",
+    ),
+]
+WriteModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--write-model",
+        metavar="FILE",
+        help="Write the improved joint as a robot file; with --model, your own file with the causes added.",
+    ),
+]
+MujocoOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--export-mujoco",
+        metavar="FILE.xml",
+        help="Export the improved joint to MuJoCo, and FILE.py with its callback.",
+    ),
+]
+ExportOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--export",
+        metavar="TARGET=FILE",
+        help="Also write the joints of a model as isaaclab or mjlab (.py), bam (.json), c (.h), samples (.json).",
+    ),
+]
+RandomiseOption = Annotated[
+    int, typer.Option("--randomise", metavar="N", min=0, help="Posterior samples to draw for --export.")
+]
+ApplyOption = Annotated[
+    bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
+]
+
+
 @app.command("diagnose")
 def diagnose(
-    logs: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="[SET | LOG...]", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
-        ),
-    ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option("--model", metavar="FILE", help="Your own robot model, MJCF or URDF: every joint is diagnosed."),
-    ] = None,
-    more_logs: Annotated[
-        list[Path] | None, typer.Option("--log", metavar="LOG", help="A recording; as those without an option.")
-    ] = None,
+    logs: DiagnoseLogsArgument = None,
+    model: ModelOption = None,
+    more_logs: MoreLogsOption = None,
     columns: ColumnsOption = None,
-    nominal: Annotated[
-        Path | None, typer.Option("--nominal", metavar="FILE", help="What the simulator believes (nominal.yaml).")
-    ] = None,
-    profile: Annotated[
-        Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
-    ] = None,
-    joint: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--joint",
-            "-j",
-            metavar="JOINT",
-            help="The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
-        ),
-    ] = None,
-    hold: Annotated[
-        list[str] | None,
-        typer.Option("--hold", metavar="JOINT=20deg", help="Where a joint of the model stood that no log has."),
-    ] = None,
-    tolerance: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--tolerance",
-            metavar="NUMBER=SIGMA",
-            help="One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
-        ),
-    ] = None,
-    executor: Annotated[
-        str | None,
-        typer.Option(
-            "--executor", metavar="WHERE", help="processes:N, or dask://host:port, for the joints of a model."
-        ),
-    ] = None,
-    validation: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--validation", metavar="LOG", help="Log to judge on, by name; unless told, what was recorded last."
-        ),
-    ] = None,
-    split: Annotated[
-        str,
-        typer.Option(
-            "--split", metavar="HOW", help="Judge on the end of every log, 30% or 20s of it; or on whole logs: log."
-        ),
-    ] = "",
-    negligible: Annotated[
-        float | None,
-        typer.Option(
-            "--negligible",
-            metavar="PERCENT",
-            min=0.0,
-            max=100.0,
-            help="Gap that means nothing to you, in percent of the friction level; 5 unless told.",
-        ),
-    ] = None,
-    write_model: Annotated[
-        Path | None,
-        typer.Option(
-            "--write-model",
-            metavar="FILE",
-            help="Write the improved joint as a robot file; with --model, your own file with the causes added.",
-        ),
-    ] = None,
-    mujoco: Annotated[
-        Path | None,
-        typer.Option(
-            "--export-mujoco",
-            metavar="FILE.xml",
-            help="Export the improved joint to MuJoCo, and FILE.py with its callback.",
-        ),
-    ] = None,
-    export: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--export",
-            metavar="TARGET=FILE",
-            help="Also write the joints of a model as isaaclab or mjlab (.py), bam (.json), c (.h), samples (.json).",
-        ),
-    ] = None,
-    randomise: Annotated[
-        int, typer.Option("--randomise", metavar="N", min=0, help="Posterior samples to draw for --export.")
-    ] = 0,
-    apply: Annotated[
-        bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
-    ] = False,
+    nominal: NominalOption = None,
+    profile: ProfileOption = None,
+    joint: JointOption = None,
+    hold: HoldOption = None,
+    tolerance: ToleranceOption = None,
+    executor: ExecutorOption = None,
+    validation: ValidationOption = None,
+    split: SplitOption = "",
+    negligible: NegligibleOption = None,
+    write_model: WriteModelOption = None,
+    mujoco: MujocoOption = None,
+    export: ExportOption = None,
+    randomise: RandomiseOption = 0,
+    apply: ApplyOption = False,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -156,8 +171,9 @@ def diagnose(
 
     output = Output(as_json, quiet)
     every = [*(logs or ()), *(more_logs or ())]
-    if model is not None and negligible is not None:
-        output.refuse("gap_diagnose", UsageError("--negligible is of one joint; it does not go with --model"))
+    of_a_model = hold or tolerance or executor or export or randomise or len(joint or ()) > 1
+    if why := _contradiction(every, model, negligible, bool(of_a_model)):
+        output.refuse("gap_diagnose", UsageError(why))
     if model is not None:
         output.run(
             "gap_diagnose",
@@ -172,27 +188,24 @@ def diagnose(
             ),
             lambda result: print_arm(output, result),
         )
-    if hold or tolerance or executor or export or randomise or len(joint or ()) > 1 or not every:
-        why = (
-            "needs a set or logs"
-            if not every
-            else "--hold, --tolerance, --executor, --export and several joints need --model"
-        )
-        output.refuse("gap_diagnose", UsageError(why))
     source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or (), split)
+    share = None if negligible is None else 0.01 * negligible
     output.run(
         "gap_diagnose",
         lambda: job(
-            source,
-            write_model=write_model,
-            mujoco=mujoco,
-            apply=apply,
-            out=out,
-            force=force,
-            negligible=None if negligible is None else 0.01 * negligible,
+            source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force, negligible=share
         ),
         lambda result: _print_diagnosis(output, result),
     )
+
+
+def _contradiction(every: list[Path], model: Path | None, negligible: float | None, of_a_model: bool) -> str:
+    """Why these options do not go together; "" where they do."""
+    if model is not None:
+        return "" if negligible is None else "--negligible is of one joint; it does not go with --model"
+    if not every:
+        return "needs a set or logs"
+    return "--hold, --tolerance, --executor, --export and several joints need --model" if of_a_model else ""
 
 
 @app.command("draft")
@@ -308,41 +321,45 @@ def check(
     )
 
 
+PlanOption = Annotated[
+    Path | None, typer.Option("--plan", metavar="FILE", help="Record just what an ambiguous diagnosis asked for.")
+]
+UntilDecidedOption = Annotated[
+    float | None,
+    typer.Option(
+        "--until-decided",
+        metavar="SECONDS",
+        help="Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
+    ),
+]
+PayloadOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--payload/--no-payload",
+        help="Payload steps too; you are asked to mount it. A simulated robot mounts its own.",
+        show_default=False,
+    ),
+]
+RecordedOption = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="RUN", help="Make a set of what this run has recorded; nothing moves."),
+]
+
+
 @app.command("record")
 def record(
     robot: RobotOption = "",
     joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")] = "",
     bus: BusOption = None,
     short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
-    plan: Annotated[
-        Path | None, typer.Option("--plan", metavar="FILE", help="Record just what an ambiguous diagnosis asked for.")
-    ] = None,
-    until_decided: Annotated[
-        float | None,
-        typer.Option(
-            "--until-decided",
-            metavar="SECONDS",
-            help="Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
-        ),
-    ] = None,
-    profile: Annotated[
-        Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
-    ] = None,
-    payload: Annotated[
-        bool | None,
-        typer.Option(
-            "--payload/--no-payload",
-            help="Payload steps too; you are asked to mount it. A simulated robot mounts its own.",
-            show_default=False,
-        ),
-    ] = None,
+    plan: PlanOption = None,
+    until_decided: UntilDecidedOption = None,
+    profile: ProfileOption = None,
+    payload: PayloadOption = None,
     realtime: RealtimeOption = False,
     seed: SeedOption = 0,
     resume: ResumeOption = None,
-    recorded: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="RUN", help="Make a set of what this run has recorded; nothing moves."),
-    ] = None,
+    recorded: RecordedOption = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
     yes: YesOption = False,
     as_json: JsonOption = False,

@@ -74,37 +74,46 @@ def _asked(question: str, option: str, parse: Callable[[str], _Value], *, asks: 
     return answer
 
 
+JointOption = Annotated[
+    list[Any] | None,
+    typer.Option("--joint", "-j", metavar="NAME=ADDRESS", parser=_named, help="A joint and its address; repeat."),
+]
+BusOption = Annotated[
+    str | None, typer.Option("--bus", metavar="BUS", parser=_bus, help="interface:channel, e.g. socketcan:can0.")
+]
+TravelOption = Annotated[
+    Any,
+    typer.Option("--travel", metavar="LOW..HIGH", parser=_travel, help="Travel of the joints: -90deg..90deg."),
+]
+MaxVelocityOption = Annotated[
+    float | None,
+    typer.Option("--max-velocity", metavar="SPEED", parser=quantity("angular velocity"), help="E.g. 115deg/s."),
+]
+MaxTorqueOption = Annotated[
+    float | None,
+    typer.Option("--max-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint, e.g. 60Nm."),
+]
+GearRatioOption = Annotated[
+    float | None,
+    typer.Option("--gear-ratio", metavar="RATIO", parser=_ratio, help="Motor revolutions per joint revolution."),
+]
+RatedTorqueOption = Annotated[
+    float | None,
+    typer.Option("--rated-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint: motor x gear."),
+]
+
+
 @app.command("robot")
 def robot(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="Robot file to write; the robot is named after it.")],
-    joint: Annotated[
-        list[Any] | None,
-        typer.Option("--joint", "-j", metavar="NAME=ADDRESS", parser=_named, help="A joint and its address; repeat."),
-    ] = None,
-    bus: Annotated[
-        str | None, typer.Option("--bus", metavar="BUS", parser=_bus, help="interface:channel, e.g. socketcan:can0.")
-    ] = None,
+    joint: JointOption = None,
+    bus: BusOption = None,
     driver: Annotated[str, typer.Option("--driver", metavar="DRIVER", help="Driver of the bus.")] = "cia402",
-    travel: Annotated[
-        Any,
-        typer.Option("--travel", metavar="LOW..HIGH", parser=_travel, help="Travel of the joints: -90deg..90deg."),
-    ] = None,
-    max_velocity: Annotated[
-        float | None,
-        typer.Option("--max-velocity", metavar="SPEED", parser=quantity("angular velocity"), help="E.g. 115deg/s."),
-    ] = None,
-    max_torque: Annotated[
-        float | None,
-        typer.Option("--max-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint, e.g. 60Nm."),
-    ] = None,
-    gear_ratio: Annotated[
-        float | None,
-        typer.Option("--gear-ratio", metavar="RATIO", parser=_ratio, help="Motor revolutions per joint revolution."),
-    ] = None,
-    rated_torque: Annotated[
-        float | None,
-        typer.Option("--rated-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint: motor x gear."),
-    ] = None,
+    travel: TravelOption = None,
+    max_velocity: MaxVelocityOption = None,
+    max_torque: MaxTorqueOption = None,
+    gear_ratio: GearRatioOption = None,
+    rated_torque: RatedTorqueOption = None,
     cycle_hz: Annotated[float, typer.Option("--rate", min=1.0, help="Set-points per second.")] = 1000.0,
     read: Annotated[bool, typer.Option("--read", help="Ask the drives for gear and rated torque; nothing moves.")] = (
         False

@@ -9,23 +9,49 @@ import sys
 import termios
 import threading
 from collections.abc import Callable, Iterator
+from typing import NoReturn, Protocol
 
 import typer
 from rich.console import Console
 
 from frictid_hil.cli.joint_view import JointView
-from frictid_hil.cli.output import Output
+from frictid_hil.cli.output import Output, Result
 from frictid_hil.cli.tables import folding
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.live import DEFAULT_ADDRESS
 from frictid_hil.jobs.live import live as live_watcher
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan.plan import Plan, stretch_name
+from frictid_hil.plan.plan import Plan, described, stretch_name
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Severity
 from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import Rows
 from frictid_hil.units import degrees, format_duration
+
+
+class Planned(Protocol):
+    """What a job that moves has planned and not yet begun."""
+
+    @property
+    def plan(self) -> Plan:
+        """Within every limit."""
+        ...
+
+    @property
+    def setup(self) -> RobotSetup:
+        """The robot as its driver knows it."""
+        ...
+
+
+def answer_dry_run(output: Output, verb: str, planned: Callable[[], Planned]) -> NoReturn:
+    """Print the plan and leave; no bus is opened."""
+
+    def plan_only() -> Result:
+        asked = planned()
+        print_plan(output.out, asked.plan, asked.setup)
+        return {"outcome": "ok", "dry_run": True, "plan": described(asked.plan)}
+
+    output.run(verb, plan_only)
 
 
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:

@@ -30,36 +30,44 @@ def register(app: typer.Typer) -> None:
     app.command("replay")(replay)
 
 
+SourceArgument = Annotated[
+    Path, typer.Argument(metavar="RUN_OR_LOG", help="Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")
+]
+FramesOption = Annotated[
+    Path | None,
+    typer.Option("--frames", metavar="FILE", help="Mapping file of a foreign log: which frame is what."),
+]
+EdsOption = Annotated[
+    Path | None, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of the drives of a foreign log.")
+]
+ProfileOption = Annotated[
+    Path | None,
+    typer.Option("--profile", metavar="PROFILE", help="Profile to compare with; default: the run's own."),
+]
+EchoOption = Annotated[
+    str | None,
+    typer.Option("--echo", metavar="BUS", help="interface:channel of a bus on which every frame is sent again."),
+]
+SimulateOption = Annotated[
+    bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
+]
+
+
 def replay(
-    source: Annotated[
-        Path, typer.Argument(metavar="RUN_OR_LOG", help="Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")
-    ],
+    source: SourceArgument,
     robot: RobotOption,
     joint: JointOption = None,
-    frames: Annotated[
-        Path | None,
-        typer.Option("--frames", metavar="FILE", help="Mapping file of a foreign log: which frame is what."),
-    ] = None,
-    eds: Annotated[
-        Path | None, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of the drives of a foreign log.")
-    ] = None,
-    profile: Annotated[
-        Path | None,
-        typer.Option("--profile", metavar="PROFILE", help="Profile to compare with; default: the run's own."),
-    ] = None,
+    frames: FramesOption = None,
+    eds: EdsOption = None,
+    profile: ProfileOption = None,
     amplitude: AmplitudeOption = None,
     velocity: VelocityOption = None,
     cycles: CyclesOption = None,
     ratio: RatioOption = None,
     method: MethodOption = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
-    echo: Annotated[
-        str | None,
-        typer.Option("--echo", metavar="BUS", help="interface:channel of a bus on which every frame is sent again."),
-    ] = None,
-    simulate: Annotated[
-        bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
-    ] = True,
+    echo: EchoOption = None,
+    simulate: SimulateOption = True,
     out: OutOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
