@@ -66,18 +66,7 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
         HardwareError: interface unknown or without CAN FD where that is wanted, channel absent, or no permission.
     """
     interface, channel = split_bus(bus)
-    settings = {key: options[key] for key in FORWARDED if key in options}
-    if interface not in ("socketcan", "virtual"):
-        # A SocketCAN link carries its bitrate already; everybody else must be told.
-        settings.setdefault("bitrate", DEFAULT_BITRATE)
-    if interface == "faulty":
-        settings["faults"] = options.get("faults")
-    elif "faults" in options:
-        raise UsageError(
-            "`options: faults` spoil a bus that says so in its name, and this one does not",
-            where=bus,
-            next_step=f"leave `faults` out, or write the bus as faulty:{bus}",
-        )
+    settings = _settings(bus, interface, options)
     fd = bool(options.get("fd"))
     try:
         if fd:
@@ -124,6 +113,22 @@ def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
             ),
         )
     return opened
+
+
+def _settings(bus: str, interface: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    settings = {key: options[key] for key in FORWARDED if key in options}
+    if interface not in ("socketcan", "virtual"):
+        # A SocketCAN link carries its bitrate already; everybody else must be told.
+        settings.setdefault("bitrate", DEFAULT_BITRATE)
+    if interface == "faulty":
+        settings["faults"] = options.get("faults")
+    elif "faults" in options:
+        raise UsageError(
+            "`options: faults` spoil a bus that says so in its name, and this one does not",
+            where=bus,
+            next_step=f"leave `faults` out, or write the bus as faulty:{bus}",
+        )
+    return settings
 
 
 def _fd_settings(bus: str, interface: str, settings: dict[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -64,7 +64,6 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     functions.begin(parameters, state, STEP_S)
     motor, link = float(state[plant.MOTOR_INERTIA]), float(state[plant.LINK_INERTIA])
     stiffness, damping = float(state[plant.COUPLING]), float(state[plant.COUPLING_DAMPING])
-    play = float(state[plant.PLAY])
     cos_nm = functions.gravity_torque(parameters, 0.0)
     sin_nm = functions.gravity_torque(parameters, 0.5 * math.pi)
     # A ripple has an element of its own.
@@ -76,16 +75,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     own = _own_friction(model)
     on_joint = f'armature="{motor:.9g}" ' + " ".join(f'{key}="{value}"' for key, value in own.joint.items())
     body = _body(link, cos_nm, sin_nm)
-    if soft and play > 0.0:
-        # A play is a limit on either side of the gap that yields like a spring: with an impedance near 0 a constraint's
-        # force depends on its depth and speed alone, as stiffness and damping over the inertia that it sees.
-        reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
-        twist = (
-            f'limited="true" range="{-0.5 * play:.9g} {0.5 * play:.9g}" solimplimit="0.001 0.001 0.001" '
-            f'solreflimit="{-stiffness / reduced:.9g} {-max(damping, 1e-9) / reduced:.9g}"'
-        )
-    else:
-        twist = f'stiffness="{stiffness:.9g}" damping="{damping:.9g}"'
+    twist = _twist(stiffness, damping, float(state[plant.PLAY]), motor, link)
     inner = (
         f'<body name="link"><joint name="twist" type="hinge" axis="0 -1 0" {twist}/>{body}</body>'
         f'<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
@@ -118,6 +108,21 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
 </mujoco>
 """
     return Exported(xml, *_accounts(model, soft, own))
+
+
+def _twist(stiffness: float, damping: float, play: float, motor: float, link: float) -> str:
+    """The spring between motor and link; with a play, limits on either side of the gap that yield like one.
+
+    With an impedance near 0 a constraint's force depends on its depth and speed alone, as stiffness and damping over
+    the inertia that it sees.
+    """
+    if play <= 0.0:
+        return f'stiffness="{stiffness:.9g}" damping="{damping:.9g}"'
+    reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
+    return (
+        f'limited="true" range="{-0.5 * play:.9g} {0.5 * play:.9g}" solimplimit="0.001 0.001 0.001" '
+        f'solreflimit="{-stiffness / reduced:.9g} {-max(damping, 1e-9) / reduced:.9g}"'
+    )
 
 
 def _limits(limit_nm: float) -> str:

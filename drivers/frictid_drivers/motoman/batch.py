@@ -172,12 +172,7 @@ class BatchClient:
                     raise wrong or _why_stopped(state, number, asked=stopping)
                 if self.now_s() > until_s:
                     self.stop(number)
-                    raise HardwareError(
-                        f"not over after {patience_s:.0f} s, planned {duration_s:.0f} s",
-                        where=f"job {number}",
-                        cause="the controller ticks more slowly than it says, or the job hangs",
-                        next_step="look at the pendant; compare `check` with the controller's interpolation clock",
-                    )
+                    raise _not_over(number, patience_s, duration_s)
                 pause_until_s = self.now_s() + min(_POLL_S, watchdog_s / 10)
                 while self.now_s() < pause_until_s and (stopping or not stop()):
                     if not follow(state, within_s):
@@ -197,6 +192,15 @@ class BatchClient:
     def compensate(self, axis_mask: int) -> None:
         """FCOMP: apply the tables of these axes from now on; 0 ends it."""
         self._host.order(f"FCOMP 1,{axis_mask}")
+
+
+def _not_over(number: int, patience_s: float, planned_s: float) -> HardwareError:
+    return HardwareError(
+        f"not over after {patience_s:.0f} s, planned {planned_s:.0f} s",
+        where=f"job {number}",
+        cause="the controller ticks more slowly than it says, or the job hangs",
+        next_step="look at the pendant; compare `check` with the controller's interpolation clock",
+    )
 
 
 def _why_stopped(state: JobState, number: int, *, asked: bool) -> FrictidError:

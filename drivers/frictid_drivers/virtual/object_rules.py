@@ -63,8 +63,13 @@ class Reactions:
 
 def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
     """Put guards and effects on a node's objects."""
+    dictionary.guards.update(_guards(dictionary, reactions))
+    dictionary.effects.update(_effects(dictionary, reactions))
+
+
+def _guards(dictionary: ObjectDictionary, reactions: Reactions) -> dict[Key, Guard]:
+    """What refuses a value that is to be written."""
     number = dictionary.number
-    guards, effects = dictionary.guards, dictionary.effects
 
     def while_off(value: int) -> None:
         if reactions.powered():
@@ -90,6 +95,23 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         if value == 1:
             raise SdoAbort(INVALID_VALUE)
 
+    return dict.fromkeys(_UNITS, while_off) | {
+        key(0x1003): _one_of(0),
+        key(0x1005): sync_cob_id,
+        key(0x1010, 1): _signature(_SAVE),
+        key(0x1011, 1): _signature(_LOAD),
+        key(0x1016, 1): _consumer(dictionary, key(0x1016, 2)),
+        key(0x1016, 2): _consumer(dictionary, key(0x1016, 1)),
+        key(0x1019): sync_counter,
+        key(0x2023): while_off,
+        key(0x6060): mode,
+        key(0x60A9): velocity_unit,
+    }
+
+
+def _effects(dictionary: ObjectDictionary, reactions: Reactions) -> dict[Key, Effect]:
+    """What follows from a value that was written."""
+
     def clear_history() -> None:
         for sub in range(1, ERROR_HISTORY + 1):
             dictionary.values[key(0x1003, sub)] = 0
@@ -102,20 +124,9 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         dictionary.values[key(0x1011, 1)] = 1
         dictionary.forget()
 
-    guards |= {
-        key(0x1003): _one_of(0),
-        key(0x1005): sync_cob_id,
-        key(0x1010, 1): _signature(_SAVE),
-        key(0x1011, 1): _signature(_LOAD),
-        key(0x1016, 1): _consumer(dictionary, key(0x1016, 2)),
-        key(0x1016, 2): _consumer(dictionary, key(0x1016, 1)),
-        key(0x1019): sync_counter,
-        key(0x2023): while_off,
-        key(0x6060): mode,
-        key(0x60A9): velocity_unit,
-    }
-    guards |= dict.fromkeys(_UNITS, while_off)
-    effects |= {
+    network = (key(0x1005), key(0x1006), key(0x1016, 1), key(0x1016, 2), key(0x2010, 1), key(0x2010, 2))
+    hand = (key(0x2040, sub) for sub in (1, 2, 3, 4))
+    return {
         key(0x1003): clear_history,
         key(0x1010, 1): store,
         key(0x1011, 1): restore,
@@ -125,12 +136,11 @@ def install_rules(dictionary: ObjectDictionary, reactions: Reactions) -> None:
         key(0x2041): reactions.payload,
         key(0x60A9): reactions.units,
         key(0x60FE, 2): reactions.brake,
+        **dict.fromkeys(network, reactions.network),
+        **dict.fromkeys(hand, reactions.hand),
+        **dict.fromkeys(_UNITS + _HELPERS, reactions.units),
+        **dict.fromkeys(_COMMANDS, reactions.commands),
     }
-    network = (key(0x1005), key(0x1006), key(0x1016, 1), key(0x1016, 2), key(0x2010, 1), key(0x2010, 2))
-    effects |= dict.fromkeys(network, reactions.network)
-    effects |= dict.fromkeys((key(0x2040, sub) for sub in (1, 2, 3, 4)), reactions.hand)
-    effects |= dict.fromkeys(_UNITS + _HELPERS, reactions.units)
-    effects |= dict.fromkeys(_COMMANDS, reactions.commands)
 
 
 def _one_of(*allowed: int) -> Guard:
