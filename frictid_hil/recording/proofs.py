@@ -54,11 +54,6 @@ def doubts_of(samples: Samples, *, where: str = "") -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def velocity_factor(samples: Samples) -> tuple[float, float] | None:
-    """Velocity over differenced position, and their correlation; None where nothing moves or nothing is recorded."""
-    return _velocity_factor(samples, _parts(samples))
-
-
 def _parts(samples: Samples) -> list[slice]:
     """The whole recording, or ten stretches of a long one."""
     n = len(samples)
@@ -67,7 +62,13 @@ def _parts(samples: Samples) -> list[slice]:
     return [slice(at, at + _BLOCK) for at in np.linspace(0, n - _BLOCK, _BLOCKS).astype(int).tolist()]
 
 
-def _velocity_factor(samples: Samples, parts: list[slice]) -> tuple[float, float] | None:
+def velocity_factor(samples: Samples, parts: list[slice]) -> tuple[float, float] | None:
+    """Velocity over differenced position, and their correlation; None where nothing moves or nothing is recorded.
+
+    Args:
+        samples: of one joint.
+        parts: stretches of it that are looked at.
+    """
     if samples.velocity_rad_s is None:
         return None
     travelled, integrated = [], []
@@ -89,7 +90,7 @@ def _velocity_factor(samples: Samples, parts: list[slice]) -> tuple[float, float
 
 
 def _of_velocity(samples: Samples, parts: list[slice], where: str) -> list[str]:
-    found = _velocity_factor(samples, parts)
+    found = velocity_factor(samples, parts)
     if found is None:
         return []
     factor, correlation = found

@@ -78,8 +78,6 @@ class InverseForm:
         first_coefficient: range of the first coefficient that makes physical sense; outside it is another effect.
         continuous: shapes between the grid's points make sense, so that a replay may refine them.
         shapes_for: the grid where it depends on the joint's size (a resonance, say); ``shapes`` where None.
-        swings: lets the link swing by itself, so that columns along a measured motion may lose its phase; replays then
-            search the grid too. A joint has one such effect at a time.
     """
 
     shapes: tuple[Shape, ...]
@@ -87,7 +85,6 @@ class InverseForm:
     parameters: Callable[[Shape, Array], dict[str, float]]
     first_coefficient: tuple[float, float] = (-math.inf, math.inf)
     continuous: bool = True
-    swings: bool = False
     shapes_for: Callable[[Sequence[View]], tuple[Shape, ...]] | None = None
 
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:

@@ -56,11 +56,6 @@ class BusLoad:
         return 100.0 * self.average_bits * self.cycle_hz / self.rates.nominal
 
     @property
-    def least_percent(self) -> float:
-        """Of the bus, no stuffing."""
-        return 100.0 * self.least_bits * self.cycle_hz / self.rates.nominal
-
-    @property
     def peak_percent(self) -> float:
         """Of one cycle period, the fullest cycle."""
         return 100.0 * self.peak_bits * self.cycle_hz / self.rates.nominal
