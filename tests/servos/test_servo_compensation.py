@@ -59,6 +59,9 @@ def test_every_family_is_checked_calibrated_and_compensated(tmp_path: Path, mode
         tracked = compensated(path, profile, Mode.TORQUE).to_json()
         assert tracked["outcome"] == "ok", tracked
         assert tracked["modes"]["mop"]["reduction_percent"] >= 40.0
+        guided = compensated(with_hand(path), profile, Mode.TORQUE, "hand").to_json()
+        assert guided["outcome"] == "ok", guided
+        assert guided["modes"]["mop"]["velocity_rms_rad_s"] > 0.5, "the hand moves it"
         return
     for task in ("track", "hand"):
         with pytest.raises(UsageError) as refused:
@@ -71,7 +74,7 @@ def test_every_family_is_checked_calibrated_and_compensated(tmp_path: Path, mode
 def with_hand(path: Path) -> Path:
     """The robot with a simulated person, as the hand test asks for before the drives are asked."""
     values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    values["joints"]["0"]["simulated"]["hand"] = {"stiffness_nm_per_rad": 50.0, "damping_nm_s_per_rad": 1.0}
+    values["joints"]["0"]["simulated"]["hand"] = {"stiffness_nm_per_rad": 10.0, "damping_nm_s_per_rad": 0.5}
     path.write_text(yaml.safe_dump(values, sort_keys=False))
     return path
 

@@ -1,6 +1,6 @@
 """The template that `new driver` writes: an outsider's driver, short, public names only, that passes and calibrates.
 
-Ten defects are planted in it, each of which the conformance suite must find.
+Fifteen defects are planted in it, each of which the conformance suite must find.
 """
 
 from __future__ import annotations

@@ -40,6 +40,16 @@ class VirtualServoDriver(ServoDriver):
         self.chain.clock = clock
         super().__init__(setup, port_factory=lambda: self.chain, clock=clock)
 
+    def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
+        """Let a person guide a joint along centre + amplitude sin(2 pi f t), t from now; frequency 0 lets go."""
+        plant = self.chain.servos[joint].plant
+        plant.hold_hand(
+            plant.model.hand if frequency_hz > 0.0 else None,
+            centre_rad=centre_rad,
+            amplitude_rad=amplitude_rad,
+            frequency_hz=frequency_hz,
+        )
+
 
 class Servo:
     """One servo: memory, loop and plant.
