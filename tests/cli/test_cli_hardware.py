@@ -55,8 +55,8 @@ def test_a_drive_that_falls_silent_while_moving_ends_in_a_safety_stop_and_keeps_
 def test_two_processes_on_one_bus(tmp_path: Path) -> None:
     first = subprocess.Popen(
         [PROGRAM, "calibrate", "--robot", "hp3j", *SHORT, "--realtime", "--out", str(tmp_path / "first")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     try:
         frames = tmp_path / "first" / "bus.blf"
@@ -68,7 +68,7 @@ def test_two_processes_on_one_bus(tmp_path: Path) -> None:
         assert "in use" in second.stderr
     finally:
         first.kill()
-        first.communicate()
+        first.wait()
 
 
 @pytest.mark.slow
