@@ -129,7 +129,7 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What a calibration came to.
+    """The result of a calibration.
 
     Attributes:
         ended: how the run ended.
@@ -218,7 +218,7 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
 
 
 def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
-    """Plan, check, ask, run, identify, write.
+    """Calibrate a robot: plan, check, ask, run, identify and write.
 
     Raises:
         UsageError: refused before anything moved (arguments, files, limits, the person said no).
@@ -278,7 +278,7 @@ class _Measured:
         self._watcher.joint(moved.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
 
     def concluded(self, error: FrictidError | None) -> Calibrated:
-        """Profile, manifest and page."""
+        """Write profile, manifest and page, and return the result."""
         robot, folder = self._planned.robot, self._run.folder
         joints = {name: self._results[name] for name in robot.joint_names if name in self._results}
         failed = [name for name, result in joints.items() if result["outcome"] != "ok"]
@@ -428,7 +428,7 @@ def _programme_notes(
 def _unseen(
     rehearsals: Rehearsals, setup: RobotSetup, procedures: Mapping[str, Procedure], *, together: bool
 ) -> list[str]:
-    """The joints whose travel has not been rehearsed yet."""
+    """Name the joints whose travel has not been rehearsed yet."""
     moving = tuple(procedures) if together else ()
     starts = {name: setup.joint(name).start_position_rad for name in procedures}
     return [

@@ -18,7 +18,7 @@ from frictid_hil.runner.realtime import Latency, measure_latency
 
 
 def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) -> dict[str, Any]:
-    """Reach the hardware, read it, compare it with the robot file and with the standard plan.
+    """Read the hardware, and compare it with the robot file and with the standard plan.
 
     Args:
         robot_name: robot file.
@@ -71,7 +71,7 @@ def _values(told: object, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _planned(robot: Robot, setup: RobotSetup) -> tuple[Plan, list[Finding]]:
-    """The standard plan, and what is to be said of it before any hardware is read."""
+    """Make the standard plan, and the findings about it that need no hardware."""
     expected = expected_of(robot)
     plan = calibration_plan(robot, setup, {name: robot.procedure(name) for name in robot.joint_names}, expected)
     try:

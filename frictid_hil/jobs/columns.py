@@ -16,7 +16,7 @@ from frictid_hil.recording.samples import Samples
 
 
 def columns(log: Path, *, columns: str | None = None, out: Path | None = None, force: bool = False) -> dict[str, Any]:
-    """Look at a log.
+    """Show what a log holds, column by column.
 
     Args:
         log: file or folder.

@@ -22,7 +22,7 @@ _TRUTH_POINTS = 4000
 
 
 def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> dict[str, Any]:
-    """Distances of every joint that both sides have.
+    """Compute how far apart the curves are, for every joint that both sides have.
 
     Args:
         profile_path: a profile, or a run folder that holds one.
@@ -96,6 +96,6 @@ def _true_curves(robot: Robot, profile: FrictionProfile) -> dict[str, FrictionCu
 
 
 def _upper_velocity(joint: JointProfile) -> float:
-    """V of the procedure, or the highest identified velocity."""
+    """Return V of the procedure; where a profile has none, the highest velocity that was identified."""
     velocity = joint.procedure.velocity_rad_s if joint.procedure else joint.velocity_rad_s[-1]
     return velocity if math.isfinite(velocity) else joint.velocity_rad_s[-1]

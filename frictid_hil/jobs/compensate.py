@@ -63,7 +63,7 @@ class CompensateOptions:
 
 
 def plan_compensation(options: CompensateOptions) -> Asked:
-    """Everything that is decided before a bus is opened.
+    """Decide everything that can be decided before a bus is opened.
 
     Raises:
         UsageError: arguments, files, a profile that does not fit, limits.
@@ -98,7 +98,7 @@ def plan_compensation(options: CompensateOptions) -> Asked:
 
 
 def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> CompensationResult:
-    """Check, plan, ask, rehearse, probe, compensate, compare.
+    """Compensate a joint in each mode that is asked for, and compare the modes.
 
     Raises:
         UsageError: refused before anything moved (arguments, files, limits, another drive's profile, the person said

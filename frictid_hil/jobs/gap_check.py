@@ -101,7 +101,7 @@ def _claim(folder: Path, asked: tuple[str, int, int], *, force: bool) -> None:
 
 
 def _told(world: str, tell: Callable[[str], None]) -> Callable[[str, int, int], None]:
-    """A line at every tenth of a phase."""
+    """Return a progress function that prints a line at every tenth of a phase."""
 
     def progress(phase: str, done: int, of: int) -> None:
         if done == of or 10 * done // of > 10 * (done - 1) // of:

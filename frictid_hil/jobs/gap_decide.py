@@ -25,7 +25,7 @@ DECIDED = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """The result.
+    """The result of recording until the cause is decided.
 
     Attributes:
         recorded: the last recording; its set holds all experiments.
@@ -57,7 +57,7 @@ class Decided:
 
 
 def record_until_decided(options: GapRecordOptions, watcher: Watcher, budget_s: float) -> Decided:
-    """Record and diagnose by turns.
+    """Record and diagnose in turn until the cause is decided or the time is used up.
 
     Args:
         options: as of a recording; neither a plan nor the short set.

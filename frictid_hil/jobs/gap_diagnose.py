@@ -49,7 +49,7 @@ class Source:
     split: str = ""
 
     def load(self) -> ExperimentSet:
-        """The set.
+        """Read the set.
 
         Raises:
             UsageError: a folder beside other paths or with options of single logs.

@@ -150,7 +150,7 @@ class _Planned:
 
 
 def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) -> Recorded:
-    """Plan, check, ask, run, write the set.
+    """Record diagnostic experiments: plan, check, ask, run, and write the set.
 
     Args:
         options: what a person asked for.
@@ -434,7 +434,7 @@ class _Recording:
         return None
 
     def concluded(self, error: FrictidError | None) -> Recorded:
-        """The set, and how the run ended."""
+        """Write the set, and return how the run ended."""
         planned, folder = self._planned, self._run.folder
         experiments = {e.name: e for payload in (False, True) for e in planned.experiments if e.payload == payload}
         done = [e for name, e in experiments.items() if name in self._logs]
@@ -477,7 +477,7 @@ class _Recording:
             self._mount()
 
     def _keep_whole_experiments(self) -> None:
-        """Of a stretch that was ended early."""
+        """Keep the experiments of a stretch that were finished before it was ended early."""
         half = self._run.so_far(self._planned.joint.name)
         if half is not None:
             self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
@@ -509,7 +509,7 @@ class _Recording:
 
 
 def _joined(plans: Sequence[Plan]) -> Plan:
-    """All plans as one, joint entries in order."""
+    """Join all plans to one plan; the entries of joints keep their order."""
     return dataclasses.replace(
         plans[0],
         joints=tuple(entry for plan in plans for entry in plan.joints),

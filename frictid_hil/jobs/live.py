@@ -71,15 +71,15 @@ class LiveWatcher:
         self._watcher.plan(plan, setup)
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
-        """The other watcher's answer."""
+        """Return the other watcher's answer."""
         return self._watcher.confirm(plan, preflight)
 
     def ask(self, question: str) -> bool:
-        """The other watcher's answer."""
+        """Return the other watcher's answer."""
         return self._watcher.ask(question)
 
     def event(self, event: Event) -> None:
-        """Pass on."""
+        """Pass it on to the other watcher."""
         self._watcher.event(event)
 
     def rows(self, rows: Rows) -> None:
@@ -94,11 +94,11 @@ class LiveWatcher:
         self._watcher.rows(rows)
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
-        """Pass on."""
+        """Pass it on to the other watcher."""
         self._watcher.joint(joint, summary, ok)
 
     def note(self, message: str) -> None:
-        """Pass on."""
+        """Pass it on to the other watcher."""
         self._watcher.note(message)
 
 

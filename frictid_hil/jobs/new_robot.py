@@ -101,7 +101,7 @@ def new_robot(
 def _read(
     name: str, driver: str, bus: str, joints: Sequence[JointAnswers], cycle_hz: float
 ) -> dict[str, dict[str, float]]:
-    """What each drive says of its gear and rated torque."""
+    """Ask each drive for its gear ratio and its rated torque."""
     setup = RobotSetup(name, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))
     drives = new_driver(driver, setup)
     try:

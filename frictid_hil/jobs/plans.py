@@ -101,12 +101,12 @@ def rehearsal_note(joints: Sequence[str]) -> str:
 
 
 def care_notes(robot: Robot, setup: RobotSetup) -> list[str]:
-    """Bounds of the supervisor that are not the usual ones, each beside it and with who set it; [] where all are."""
+    """Return notes on bounds of the supervisor that are not the usual ones, and on who set them; [] where all are."""
     return _set_by("bounds of care", setup.care, Care(), robot.file.care.model_fields_set)
 
 
 def gate_notes(robot: Robot, setup: RobotSetup) -> list[str]:
-    """The same of what quality gates allow."""
+    """Return notes on limits of quality gates that are not the usual ones, and on who set them; [] where all are."""
     return _set_by("limits of quality gates", setup.joints[0].gates, GateLimits(), robot.file.gates.model_fields_set)
 
 
@@ -219,7 +219,7 @@ def _in_step(motions: Mapping[str, Sequence[Motion]]) -> dict[str, list[Motion]]
 
 
 def _lasting(motion: Motion, duration_s: float) -> Motion:
-    """The same motion, slowed down where it would end earlier."""
+    """Return the motion, slowed down so that it lasts as long as the others."""
     if isinstance(motion, Move):
         return replace(motion, duration_s=duration_s)
     if isinstance(motion, Sine) and motion.duration_s < duration_s:

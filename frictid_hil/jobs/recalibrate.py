@@ -71,7 +71,7 @@ class RecalibrateOptions:
 
 
 def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]:
-    """The whole night.
+    """Run one unattended recalibration from its lock to its journal.
 
     Raises:
         UsageError: the robot file is wrong, or gives no permission to move a real robot unattended.
@@ -203,7 +203,7 @@ def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot:
 
 
 def _promote_by_hand(run: str, store: Path | None) -> str:
-    """The command that a person can type next morning."""
+    """Return the command by which a person can promote the profile later."""
     return shlex.join(["frictid-hil", "profile", "promote", run, *(["--store", str(store.resolve())] if store else [])])
 
 

@@ -46,24 +46,24 @@ class Silent:
     """Watches nothing and says yes; for scheduled jobs and tests."""
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
-        """Ignore."""
+        """Ignore it."""
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
-        """Yes."""
+        """Answer yes."""
         return True
 
     def ask(self, question: str) -> bool:
-        """No: nobody is there."""
+        """Answer no, because nobody is there."""
         return False
 
     def event(self, event: Event) -> None:
-        """Ignore."""
+        """Ignore it."""
 
     def rows(self, rows: Rows) -> None:
-        """Ignore."""
+        """Ignore it."""
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
-        """Ignore."""
+        """Ignore it."""
 
     def note(self, message: str) -> None:
-        """Ignore."""
+        """Ignore it."""

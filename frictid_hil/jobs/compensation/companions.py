@@ -97,7 +97,7 @@ class LiveFigures:
         self.counting = False
 
     def before(self, keeper: RowKeeper) -> LiveFigures:
-        """Stand between the rows and their keeper."""
+        """Pass rows on to ``keeper`` from now on, after looking at them."""
         self._keeper = keeper
         return self
 
@@ -123,7 +123,7 @@ class LiveFigures:
         self._keeper.frames(rows)
 
     def mark(self) -> Mark:
-        """The sums of a service, as a mark of its own."""
+        """Return the sums over a service as a mark, so that they are kept with the recording."""
         return Mark("service", 0, self._seen_ns, {"count_v2_t2": self._sums.tolist()})
 
 

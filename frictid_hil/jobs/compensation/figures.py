@@ -25,7 +25,7 @@ _WIDTH_S = 0.004
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeRun:
-    """One mode's whole cycles, the first left out.
+    """The samples of one mode: its whole cycles without the first one.
 
     Attributes:
         mode: name.
@@ -163,7 +163,7 @@ def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:
 
 
 def _velocity_delay_s(meta: Mapping[str, object]) -> float:
-    """As the drive or its robot file declares it."""
+    """Return the delay of the velocity, as the drive or its robot file declares it."""
     timing = meta.get("timing")
     delay_s = timing.get("velocity_delay_s") if isinstance(timing, Mapping) else None
     return float(delay_s) if isinstance(delay_s, int | float) else 0.0

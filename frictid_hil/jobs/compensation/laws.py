@@ -120,7 +120,7 @@ def friction_settings(
 
 
 def _our_ratio(entry: JointProfile) -> float:
-    """Lower where the encoder hides presliding."""
+    """Return R of our setting; it is lower where the encoder hides presliding."""
     return COARSE_RATIO if entry.presliding_yields == "unseen" else OUR_RATIO
 
 
@@ -130,7 +130,7 @@ def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:
 
 
 def speed_bound_rad_s(wanted: Wanted, joint: JointSetup) -> float:
-    """What the supervisor allows during the task."""
+    """Return the highest speed that the supervisor allows during the task."""
     return min(joint.max_velocity_rad_s, _SPEED_MARGIN * wanted.peak_rad_s + _SPEED_SLACK_RAD_S)
 
 

@@ -35,7 +35,7 @@ _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
 
 @dataclass(frozen=True, slots=True)
 class CompensationPlan:
-    """A plan and what it was made of.
+    """A plan of a compensation, with the laws and figures that it was made from.
 
     Attributes:
         plan: frozen.

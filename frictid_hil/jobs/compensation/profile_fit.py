@@ -68,7 +68,7 @@ def doubts_of_drive(entry: JointProfile, identity: JointIdentity) -> list[str]:
 
 
 def refuse(doubts: list[str], joint: str) -> None:
-    """All doubts in one error.
+    """Refuse a profile, with all doubts in one error.
 
     Raises:
         ProfileMismatch: where there is one.

@@ -67,7 +67,7 @@ class Asked:
 
 @dataclass(slots=True)
 class Progress:
-    """What a run has come to, so that an error halfway loses nothing.
+    """What a run has measured so far; an error halfway loses nothing of it.
 
     Attributes:
         runs: by mode.
@@ -224,7 +224,7 @@ def _service_figures(wanted: Wanted, service: Mark | None) -> dict[str, Any]:
 
 
 def _facts(result: dict[str, Any]) -> dict[str, str]:
-    """Provenance in words."""
+    """Describe how the joint was compensated, for the page."""
     inertia, rate = result["inertia_kg_m2"], result["rate_hz"]
     facts = {
         "setting": str(result["setting"]),

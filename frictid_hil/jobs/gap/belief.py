@@ -41,7 +41,7 @@ class Belief:
 def belief_of(
     joint: JointSetup, profile: JointProfile | None, *, profile_name: str = "", simulated_drive: bool = False
 ) -> Belief:
-    """The belief about one joint.
+    """Form what is believed about one joint before its logs are looked at.
 
     Args:
         joint: with its ``simulated`` mapping, which may be empty.

@@ -37,7 +37,7 @@ class Wanted:
 
     @staticmethod
     def of(words: Sequence[str], samples: int) -> Wanted:
-        """From ``TARGET=FILE`` words.
+        """Read what is wanted from words of the form ``TARGET=FILE``.
 
         Raises:
             UsageError: no such target, no file, or samples asked for that nobody writes.

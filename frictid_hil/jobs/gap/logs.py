@@ -77,7 +77,7 @@ def set_from_logs(
 def parted(
     logs: Sequence[tuple[str, Samples]], validation: Sequence[str] = (), split: str = ""
 ) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
-    """What is fitted and what is judged on.
+    """Divide the recordings into those that are fitted and those that the result is judged on.
 
     Unless told: the last third of one log, else the last logs that make up a quarter or more.
 
@@ -120,7 +120,7 @@ def parted(
 
 
 def _by_time(name: str, samples: Samples, split: str, called: str) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
-    """The beginning and the end of one log."""
+    """Divide one log into its beginning and its end."""
     length = float(samples.time_s[-1] - samples.time_s[0])
     try:
         end_s = float(split[:-1]) * {"%": 0.01 * length, "s": 1.0}[split[-1:]]

@@ -22,7 +22,7 @@ _AMPLITUDE, _CYCLES, _RATE_HZ = 20.0, 10, 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """One way to spend the time.
+    """A choice of speeds and of the estimator that goes with them.
 
     Attributes:
         name: as typed.

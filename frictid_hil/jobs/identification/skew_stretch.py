@@ -54,7 +54,7 @@ def _beside(periods: int, turns: int) -> int:
 
 
 def shaking_note() -> str:
-    """For the plan of joints that shake."""
+    """Return the note that a plan carries whose joints shake."""
     return (
         f"every joint shakes at {_SLOW_HZ:g} and {_FAST_HZ:g} Hz for {4 * _DURATION_S:g} s, within travel, speed and "
         "acceleration of its cycles: that measures by how much its torque is late"

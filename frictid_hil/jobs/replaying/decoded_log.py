@@ -102,7 +102,7 @@ def ordered(frames: Frames) -> tuple[Frames, int]:
 
 
 def decoder_for(frame_map: Mapping[str, Any]) -> LogDecoder:
-    """A fresh decoder.
+    """Create a decoder for the frames of a log.
 
     Raises:
         InvalidFields: nobody understands this map, or a field of it is wrong.
