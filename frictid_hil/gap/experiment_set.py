@@ -121,6 +121,7 @@ class Nominal:
         gear_ratio: motor turns per joint turn.
         curve: friction over speed.
         presliding_stiffness_nm_per_rad: of the friction's spring before it slips.
+        bristle: friction builds up exponentially (Dahl, LuGre) and not as a spring that slips.
         payload: what is mounted where an experiment says so.
         controller: of the position loop.
         rated_torque_nm: of the drive, joint side.
@@ -141,6 +142,7 @@ class Nominal:
     gear_ratio: float | None = None
     curve: FrictionCurve | None = None
     presliding_stiffness_nm_per_rad: float | None = None
+    bristle: bool = False
     payload: Payload | None = None
     controller: Controller | None = None
     rated_torque_nm: float | None = None

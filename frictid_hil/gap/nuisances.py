@@ -10,7 +10,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Term
 from frictid_hil.gap.experiment_set import Nominal
-from frictid_hil.gap.residuals import Recording, friction_scales, slip_state
+from frictid_hil.gap.residuals import Recording, friction_scales, presliding_state
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View
@@ -106,17 +106,20 @@ def _timing(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[T
 
 
 def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -> list[Term]:
-    """Presliding stiffness, and the curve below its first pair."""
+    """Presliding stiffness, the damping of a bristle up to half of the critical one, the curve below its first pair."""
     _, stiffness = friction_scales(nominal)
     stiffer = []
     for v in views:
-        slip = slip_state(v.position_rad, (1.0 + STIFFER) * v.stiffness_nm_per_rad / v.coulomb_nm)
+        slip = presliding_state(nominal, v.position_rad, 1.0 + STIFFER)
         stiffer.append((v.coulomb_nm * (slip - v.slip) / STIFFER)[:, None])
     stated = nominal.presliding_stiffness_nm_per_rad is not None
     deviation = nominal.tolerances.presliding_stiffness.of(stiffness) / stiffness if stated else 1.0
     numbers = builder.add(stiffer)
     name = "presliding_hysteresis" if stated else ""
     terms = [Term(name, {"stiffness": 1.0}, numbers, np.zeros(1), np.array([deviation]))]
+    if nominal.bristle and nominal.inertia_kg_m2:
+        bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
+        terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))
     bend_nm = _unmeasured_nm(nominal)
     if bend_nm > 0.0 and nominal.curve is not None:
         first = nominal.curve.measured_range_rad_s[0]

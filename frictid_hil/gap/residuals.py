@@ -23,7 +23,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal, ReportFilter
 from frictid_hil.simulation.inverse import View
-from frictid_hil.simulation.inverse_loops import lagged
+from frictid_hil.simulation.inverse_loops import lagged, soft_spring
 
 CUTOFF_HZ = 20.0
 """Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
@@ -278,7 +278,7 @@ def view_of(
         velocity_rad_s=velocity,
         acceleration_rad_s2=acceleration,
         torque_nm=torque,
-        slip=slip_state(q, stiffness / coulomb),
+        slip=presliding_state(nominal, q),
         rate_nm=nominal.curve.rate_part(velocity) if nominal.curve is not None else np.zeros_like(q),
         gravity_nm=gravity,
         payload_gravity_nm=payload_cos * cos,
@@ -319,6 +319,22 @@ def friction_scales(nominal: Nominal) -> tuple[float, float]:
     """(F_0 in N m, presliding stiffness in N m/rad), with a stiff default where the file does not say."""
     coulomb = nominal.curve.coulomb_nm if nominal.curve is not None else 1.0
     return coulomb, nominal.presliding_stiffness_nm_per_rad or coulomb / 2e-4
+
+
+def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0) -> Array:
+    """State of the believed friction along a measured position, -1..1, from a relaxed start, shape (n,).
+
+    Args:
+        nominal: the believed joint; its form of presliding counts.
+        position_rad: measured.
+        stiffer: factor of its stiffness.
+    """
+    coulomb, stiffness = friction_scales(nominal)
+    slip_per_rad = stiffer * stiffness / coulomb
+    if nominal.bristle:
+        state: Array = soft_spring(position_rad, 1.0 / slip_per_rad, 1.0, 1.0)
+        return state
+    return slip_state(position_rad, slip_per_rad)
 
 
 def nominal_torque(nominal: Nominal, experiment: Experiment, view: View) -> Array:

@@ -89,7 +89,7 @@ EFFECT = Effect(
         "J. Swevers, 'A generalized Maxwell-slip friction model', IEEE Conf. Physics and Control 2003."
     ),
     parameters=(
-        Parameter("share", 0.0, 0.9, 0.15, "part of the Coulomb level that builds up slowly", off=0.0),
+        Parameter("share", 0.0, 1.0, 0.15, "part of the Coulomb level that builds up slowly", off=0.0),
         Parameter("distance_rad", 2e-4, 0.1, 0.01, "travel over which it builds up"),
         Parameter("loop_exponent", 0.5, 8.0, 1.0, "n: sharpness of the knee"),
         Parameter(
