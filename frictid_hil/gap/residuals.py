@@ -292,6 +292,7 @@ def view_of(
         gear_ratio=nominal.gear_ratio or 1.0,
         gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
         gravity_sin_nm=nominal.gravity_sin_nm,
+        bristle_rad=coulomb / stiffness if nominal.bristle else 0.0,
     )
 
 

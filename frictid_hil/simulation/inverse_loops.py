@@ -50,6 +50,18 @@ def soft_spring(position_rad: Array, distance_rad: float, loop_exponent: float, 
 
 
 @njit(cache=True)
+def followed(values: Array, position_rad: Array, travel_rad: float) -> Array:
+    """Values as a bristle follows them that bends anew over ``travel_rad``, from 0; as they are without one, (n,)."""
+    if travel_rad <= 0.0:
+        return values
+    out = np.zeros_like(values)
+    for k in range(1, values.shape[0]):
+        kept = math.exp(-abs(position_rad[k] - position_rad[k - 1]) / travel_rad)
+        out[k] = values[k] + (out[k - 1] - values[k]) * kept
+    return out
+
+
+@njit(cache=True)
 def rest_memory(velocity_rad_s: Array, step_s: float, dwell_time_s: float, travel_rad: float) -> Array:
     """State of stiction_breakaway: filled at rest, wiped out by travel, shape (n,)."""
     state = np.zeros(velocity_rad_s.shape[0])

@@ -32,18 +32,15 @@ def level(
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The raised level along the motion, per share."""
-    return [
-        np.stack(
-            [
-                v.coulomb_nm
-                * v.slip
-                * np.exp(-((np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]) ** shape["exponent"]))
-            ],
-            axis=1,
-        )
-        for v in views
-    ]
+    """The raised level along the motion, per share; a bristle follows it over some travel."""
+    from frictid_hil.simulation.inverse_loops import followed
+
+    columns = []
+    for v in views:
+        speed = np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]
+        raised = v.coulomb_nm * v.slip * np.exp(-(speed ** shape["exponent"]))
+        columns.append(followed(raised, v.position_rad, v.bristle_rad)[:, None])
+    return columns
 
 
 # -- the effect ---------------------------------------------------------------------------------------------------
