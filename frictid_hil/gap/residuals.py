@@ -23,7 +23,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Controller, Experiment, ExperimentSet, Nominal, ReportFilter
 from frictid_hil.simulation.inverse import View
-from frictid_hil.simulation.inverse_loops import lagged, soft_spring
+from frictid_hil.simulation.inverse_loops import bent, lagged
 
 CUTOFF_HZ = 20.0
 """Low-pass of everything that is compared (zero phase, fourth order); lower where the sampling is slow."""
@@ -333,7 +333,7 @@ def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
     if nominal.bristle:
-        state: Array = soft_spring(position_rad, 1.0 / slip_per_rad, 1.0, 1.0)
+        state: Array = bent(position_rad, 1.0 / slip_per_rad)
         return state
     return slip_state(position_rad, slip_per_rad)
 

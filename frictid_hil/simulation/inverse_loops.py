@@ -42,9 +42,13 @@ def soft_spring(position_rad: Array, distance_rad: float, loop_exponent: float, 
         parts = int(abs(travel) / distance_rad * 4.0) + 1
         turn = travel / distance_rad / parts
         for _ in range(parts):
-            towards = 1.0 if loop * turn > 0.0 else (-1.0 if loop * turn < 0.0 else 0.0)
-            loop += turn * (1.0 - abs(loop) ** loop_exponent * (loop_beta * towards + 1.0 - loop_beta))
-            loop = min(1.0, max(-1.0, loop))
+            # Midpoint rule: the slope halfway moves the loop.
+            halfway = loop
+            for share in (0.5, 1.0):
+                towards = 1.0 if halfway * turn > 0.0 else (-1.0 if halfway * turn < 0.0 else 0.0)
+                slope = 1.0 - abs(halfway) ** loop_exponent * (loop_beta * towards + 1.0 - loop_beta)
+                halfway = min(1.0, max(-1.0, loop + share * turn * slope))
+            loop = halfway
         state[k] = loop
     return state
 
@@ -59,6 +63,17 @@ def followed(values: Array, position_rad: Array, travel_rad: float) -> Array:
         kept = math.exp(-abs(position_rad[k] - position_rad[k - 1]) / travel_rad)
         out[k] = values[k] + (out[k - 1] - values[k]) * kept
     return out
+
+
+@njit(cache=True)
+def bent(position_rad: Array, travel_rad: float) -> Array:
+    """State of a bristle (Dahl's element), exact between rows, from a relaxed start, shape (n,)."""
+    state = np.zeros(position_rad.shape[0])
+    for k in range(1, position_rad.shape[0]):
+        moved = position_rad[k] - position_rad[k - 1]
+        end = 1.0 if moved > 0.0 else -1.0
+        state[k] = end + (state[k - 1] - end) * math.exp(-abs(moved) / travel_rad)
+    return state
 
 
 @njit(cache=True)

@@ -1,0 +1,87 @@
+"""The form of presliding that a file does not state: told from recordings whose friction was integrated here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gap_sets
+import numpy as np
+import pytest
+
+from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
+from frictid_hil.gap.presliding import as_it_builds_up
+
+STEP_S, FINE = 0.002, 20
+LEVEL_NM, VISCOUS, STIFFNESS = 3.0, 0.5, 4000.0
+SPEEDS = np.array([0.25, 0.5, 1.0, 1.5])
+BELIEF = replace(
+    gap_sets.NOMINAL,
+    controller=None,
+    curve=FrictionCurve.through(SPEEDS, LEVEL_NM + VISCOUS * SPEEDS),
+    presliding_stiffness_nm_per_rad=STIFFNESS,
+)
+
+
+def friction(position: np.ndarray, step_s: float, bristle: bool, rise_nm: float) -> np.ndarray:
+    """LuGre without micro-damping, or a spring that slips, integrated along a motion; explicit steps."""
+    state, force = 0.0, np.empty(position.size)
+    for k, v in enumerate(np.gradient(position, step_s)):
+        level = LEVEL_NM + rise_nm * np.exp(-((v / 0.08) ** 2))
+        bent = STIFFNESS * abs(state) / level * (1.0 if state * v > 0.0 else -1.0) if bristle else 0.0
+        state += v * step_s * (1.0 - bent)
+        if not bristle:
+            state = float(np.clip(state, -level / STIFFNESS, level / STIFFNESS))
+        force[k] = STIFFNESS * state + VISCOUS * v
+    return force
+
+
+def recorded(nominal: Nominal, bristle: bool, rise_nm: float = 0.0) -> ExperimentSet:
+    """Two motions with many reversals, the torque of a joint that is otherwise as believed."""
+    rng, experiments = np.random.default_rng(4), []
+    for order, phases in enumerate((rng.uniform(0.0, 6.28, 4), rng.uniform(0.0, 6.28, 4))):
+        t = np.arange(0.0, 16.0, STEP_S / FINE)
+        waves = zip((0.17, 0.41, 0.73, 1.3), (0.5, 0.3, 0.12, 0.05), phases, strict=True)
+        q = sum((a * np.sin(2.0 * np.pi * f * t + p) for f, a, p in waves), np.zeros_like(t))
+        acceleration = np.gradient(np.gradient(q, t), t)
+        assert nominal.inertia_kg_m2 is not None
+        torque = nominal.inertia_kg_m2 * acceleration + nominal.gravity_cos_nm * np.cos(q)
+        torque += friction(q, STEP_S / FINE, bristle, rise_nm)
+        mean = torque[: torque.size // FINE * FINE].reshape(-1, FINE).mean(axis=1)
+        rows = slice(FINE, None, FINE)
+        time, position = t[rows], q[rows]
+        experiments.append(
+            Experiment(
+                name=f"log_{order}",
+                validation=bool(order),
+                payload=False,
+                run_order=order,
+                time_s=time,
+                position_rad=position,
+                velocity_rad_s=None,
+                torque_nm=mean[: time.size] + 0.02 * rng.standard_normal(time.size),
+                position_command_rad=None,
+            )
+        )
+    return ExperimentSet("integrated", nominal, tuple(experiments))
+
+
+@pytest.mark.parametrize("bristle", [True, False])
+def test_the_form_is_read_off_the_recordings(bristle: bool) -> None:
+    experiments, told = as_it_builds_up(recorded(BELIEF, bristle))
+    assert experiments.nominal.bristle is bristle
+    assert (told is not None) is bristle
+
+
+def test_a_stiffness_that_nobody_states_has_no_form() -> None:
+    experiments, told = as_it_builds_up(recorded(replace(BELIEF, presliding_stiffness_nm_per_rad=None), bristle=True))
+    assert not experiments.nominal.bristle and told is None
+
+
+def test_a_bristle_is_no_gap_and_its_falling_level_is_named() -> None:
+    healthy = diagnose(recorded(BELIEF, bristle=True))
+    assert healthy.verdict == "none", healthy.summary
+    assert "bristle" in healthy.reasons["presliding"]
+    falling = diagnose(recorded(BELIEF, bristle=True, rise_nm=0.9))
+    assert falling.causes[0].effect == "stribeck", falling.summary
