@@ -55,7 +55,7 @@ def draw_spoilt(index: int, seed: int, folder: Path) -> tuple[dict[str, Any], tu
         v = np.gradient(q, log["time_s"])
         if effect == "torque_bias":
             added = np.full_like(q, sign * TIMES * scale)
-            parameters = [{"effect": effect, "parameter": "bias_nm", "value": -sign * TIMES * scale}]
+            parameters = [{"effect": effect, "parameter": "bias_nm", "value": sign * TIMES * scale}]
         elif effect == "torque_ripple":
             added = math.sqrt(2.0) * TIMES * scale * np.cos(cycles * gear * q + phase)
         elif effect == "direction_asymmetry":

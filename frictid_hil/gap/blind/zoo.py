@@ -42,7 +42,7 @@ class Model:
         gain: torque that comes out over torque that is asked for.
         lag: of the current.
         delay: of the command, s.
-        bias: constant torque.
+        bias: constant torque that pushes the joint.
         limit: of the torque; 0 for none.
         twist: stiffness of the gear; 0 for a stiff one.
         spring: of a cable about angle 0 (nobody's library).
@@ -217,7 +217,7 @@ def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
     if m.lag:
         data.act[0] = holding
     late = round(m.delay / TICK_S)
-    asked = [holding] * (late + 1)
+    asked = [holding] * late
     integral, filtered, last = holding, 0.0, float(command[0])
     keep = math.exp(-TICK_S / gains.filter_s)
     position, torque = np.empty(command.size), np.empty(command.size)
@@ -231,9 +231,7 @@ def run(m: Model, gains: Gains, command: Array) -> tuple[Array, Array]:
         behind = command[k] - q
         asked.append(gains.kp * behind + integral + gains.kd * (rate - filtered))
         integral += gains.ki * behind * TICK_S
-        data.ctrl[0] = asked.pop(0) if late else asked[-1]
-        if not late:
-            asked.pop(0)
+        data.ctrl[0] = asked.pop(0)
         given = 0.0
         for _ in range(steps):
             data.qfrc_applied[0] = m.bias + m.shake * math.sin(2 * math.pi * m.shake_hz * data.time)
@@ -310,7 +308,7 @@ def _truth(case: str, kind: str, name: str, size: float, b: Model, real: Model) 
         "friction_level_error": ("error_share", real.level / b.level - 1.0),
         "viscous_error": ("error_share", real.viscous / b.viscous - 1.0),
         "torque_constant_error": ("error_share", real.gain - 1.0),
-        "torque_bias": ("bias_nm", real.bias),
+        "torque_bias": ("bias_nm", -real.bias),
         "torque_delay": ("delay_s", real.delay),
     }
     parameters = [{"effect": name, "parameter": known[name][0], "value": known[name][1]}] if name in known else []
