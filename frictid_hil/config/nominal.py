@@ -36,7 +36,9 @@ class Friction(Open):
         torque_nm: friction at these speeds.
         coulomb_nm: level, in place of pairs.
         viscous_nm_s_per_rad: slope over speed, beside ``coulomb_nm``.
-        presliding_stiffness_nm_per_rad: of the spring that holds a standing joint.
+        presliding_stiffness_nm_per_rad: slope of friction over position where friction passes zero.
+        presliding_yields: ``at once`` as a spring that slips, ``gradually`` as Dahl's and the LuGre model; read off the
+            recordings unless stated.
     """
 
     velocity_rad_s: Numbers | None = None
@@ -44,6 +46,7 @@ class Friction(Open):
     coulomb_nm: float | None = None
     viscous_nm_s_per_rad: float | None = None
     presliding_stiffness_nm_per_rad: Positive | None = None
+    presliding_yields: Literal["at once", "gradually"] | None = None
 
     @model_validator(mode="after")
     def _one_curve(self) -> Friction:

@@ -26,7 +26,7 @@ from frictid_hil.gap.next_experiment import next_experiment
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.position_noise import white_rms
 from frictid_hil.gap.posterior import Posterior
-from frictid_hil.gap.presliding import as_it_builds_up
+from frictid_hil.gap.presliding import as_it_yields
 from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
@@ -61,7 +61,7 @@ def diagnose(
     """
     allowed = tuple(n for n in all_effects() if library is None or n in library)
     experiments, reasons = completed(in_force(as_meant(checked(experiments))))
-    experiments, form = as_it_builds_up(experiments)
+    experiments, form = as_it_yields(experiments)
     reasons = {**reasons, **({} if form is None else {"presliding": form})}
     if (open_question := one_sided(experiments)) is not None:
         reasons["motion"] = open_question

@@ -121,7 +121,7 @@ class Nominal:
         gear_ratio: motor turns per joint turn.
         curve: friction over speed.
         presliding_stiffness_nm_per_rad: of the friction's spring before it slips.
-        bristle: friction builds up exponentially (Dahl, LuGre) and not as a spring that slips.
+        yields_gradually: friction builds up as Dahl's and the LuGre model, and not as a spring that slips.
         payload: what is mounted where an experiment says so.
         controller: of the position loop.
         rated_torque_nm: of the drive, joint side.
@@ -142,7 +142,7 @@ class Nominal:
     gear_ratio: float | None = None
     curve: FrictionCurve | None = None
     presliding_stiffness_nm_per_rad: float | None = None
-    bristle: bool = False
+    yields_gradually: bool | None = None
     payload: Payload | None = None
     controller: Controller | None = None
     rated_torque_nm: float | None = None
@@ -298,6 +298,9 @@ def _without_long_gaps(log: Experiment, samples: Samples) -> list[Experiment]:
 _LOG_COLUMNS = ("time_s", *Samples.COLUMNS[:4], "rigid_body_torque_nm", "temperature_c", "torque_demand_nm")
 
 
+_YIELDS = {"gradually": True, "at once": False, None: None}
+
+
 def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nominal:
     """The belief of a checked file."""
     joint, drive, encoder = file.joint, file.drive, file.encoder
@@ -310,6 +313,7 @@ def _nominal(file: NominalFile, document: Mapping[str, Any], where: str) -> Nomi
         gear_ratio=joint.gear_ratio,
         curve=_curve(joint.friction, where),
         presliding_stiffness_nm_per_rad=joint.friction.presliding_stiffness_nm_per_rad if joint.friction else None,
+        yields_gradually=_YIELDS[joint.friction.presliding_yields] if joint.friction else None,
         payload=None
         if file.payload is None
         else Payload(file.payload.inertia_kg_m2 or 0.0, file.payload.gravity_torque_nm or 0.0),

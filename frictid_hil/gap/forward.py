@@ -83,12 +83,12 @@ def nominal_model(nominal: Nominal) -> JointModel:
             nominal.controller.kp_nm_per_rad, nominal.controller.ki_nm_per_rad_s, nominal.controller.kd_nm_s_per_rad
         ),
         payload=None if payload is None else Payload(payload.inertia_kg_m2, payload.gravity_cos_nm),
-    ).with_effects({**nominal.believed_effects, **_bristle(nominal)})
+    ).with_effects({**nominal.believed_effects, **_gradual(nominal)})
 
 
-def _bristle(nominal: Nominal) -> dict[str, dict[str, float]]:
-    """The effect by which friction builds up as a bristle; none where it builds up as a spring."""
-    if not nominal.bristle:
+def _gradual(nominal: Nominal) -> dict[str, dict[str, float]]:
+    """The effect by which friction builds up gradually; none where it builds up as a spring."""
+    if not nominal.yields_gradually:
         return {}
     coulomb, stiffness = friction_scales(nominal)
     values = {"share": 1.0, "distance_rad": coulomb / stiffness, "loop_exponent": 1.0, "loop_beta": 1.0}

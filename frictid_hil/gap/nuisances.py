@@ -117,7 +117,7 @@ def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -
     numbers = builder.add(stiffer)
     name = "presliding_hysteresis" if stated else ""
     terms = [Term(name, {"stiffness": 1.0}, numbers, np.zeros(1), np.array([deviation]))]
-    if nominal.bristle and nominal.inertia_kg_m2:
+    if nominal.yields_gradually and nominal.inertia_kg_m2:
         bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))
     bend_nm = _unmeasured_nm(nominal)

@@ -1,8 +1,8 @@
-"""How believed friction builds up after a reversal: as a spring that slips, or as a bristle that bends.
+"""How believed friction builds up after a reversal: at once, as a spring that slips, or gradually, as a bristle bends.
 
-A file states the stiffness of presliding, and not the form. The slip spring of the paper follows a straight line up to
-its slip; Dahl's and the LuGre model approach it exponentially, MuJoCo's DC motor among them. Both are in common use,
-so that taking one for the other is a matter of reading the file, and no gap of the joint.
+A file often states the stiffness of presliding, and not the form. The slip spring of the paper follows a straight line
+up to its slip; Dahl's and the LuGre model approach it exponentially, MuJoCo's DC motor among them. Both are in common
+use, so that taking one for the other is a matter of reading the file, and no gap of the joint.
 """
 
 from __future__ import annotations
@@ -16,31 +16,32 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, Recording, presliding_state, recordings
 
-BRISTLE = (
-    "the stated presliding stiffness is read as that of a bristle (Dahl, LuGre), which fits these recordings better "
-    "than a spring that slips"
+GRADUALLY = (
+    "the file states a presliding stiffness and not how presliding yields: 'gradually' (Dahl, LuGre) fits these "
+    "recordings better than 'at once'"
 )
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
 
 
-def as_it_builds_up(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
+def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
     """(the set with the form of presliding that fits its recordings better, what to tell of it).
 
-    A stiffness that is not stated has no form; a spring it stays, too, where no log has a torque.
+    A stiffness that is not stated has no form, and a form that is stated stays.
     """
     nominal = experiments.nominal
-    if nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
+    stated = nominal.yields_gradually is not None
+    if stated or nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
         return experiments, None
     logs = [r for r in recordings(experiments) if r.view is not None]
-    if not logs or _left(logs, nominal, bristle=True) >= _left(logs, nominal, bristle=False):
+    if not logs or _left(logs, nominal, gradually=True) >= _left(logs, nominal, gradually=False):
         return experiments, None
-    return replace(experiments, nominal=replace(nominal, bristle=True)), BRISTLE
+    return replace(experiments, nominal=replace(nominal, yields_gradually=True)), GRADUALLY
 
 
-def _left(logs: Sequence[Recording], nominal: Nominal, *, bristle: bool) -> float:
+def _left(logs: Sequence[Recording], nominal: Nominal, *, gradually: bool) -> float:
     """Squares of the torque that remain with one form, numbers of the belief and a Stribeck effect fitted along."""
-    form = replace(nominal, bristle=bristle)
+    form = replace(nominal, yields_gradually=gradually)
     x, y = [], []
     for log in logs:
         v, low_pass = log.view, LowPass.at(1.0 / log.step_s)

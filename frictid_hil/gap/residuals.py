@@ -292,7 +292,7 @@ def view_of(
         gear_ratio=nominal.gear_ratio or 1.0,
         gravity_cos_nm=nominal.gravity_cos_nm + payload_cos,
         gravity_sin_nm=nominal.gravity_sin_nm,
-        bristle_rad=coulomb / stiffness if nominal.bristle else 0.0,
+        gradual_rad=coulomb / stiffness if nominal.yields_gradually else 0.0,
     )
 
 
@@ -332,7 +332,7 @@ def presliding_state(nominal: Nominal, position_rad: Array, stiffer: float = 1.0
     """
     coulomb, stiffness = friction_scales(nominal)
     slip_per_rad = stiffer * stiffness / coulomb
-    if nominal.bristle:
+    if nominal.yields_gradually:
         state: Array = bent(position_rad, 1.0 / slip_per_rad)
         return state
     return slip_state(position_rad, slip_per_rad)

@@ -43,7 +43,7 @@ class View:
         gear_ratio: motor turns per joint turn; 1 where unknown.
         gravity_cos_nm: of joint and payload: gravity is ``cos*cos(q) + sin*sin(q)``.
         gravity_sin_nm: see there.
-        bristle_rad: travel over which a bristle follows a changing level; 0 where friction builds up as a spring.
+        gradual_rad: travel over which friction follows a changing level where it builds up gradually; else 0.
     """
 
     step_s: float
@@ -66,7 +66,7 @@ class View:
     gear_ratio: float
     gravity_cos_nm: float
     gravity_sin_nm: float
-    bristle_rad: float = 0.0
+    gradual_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

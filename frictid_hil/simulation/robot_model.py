@@ -69,6 +69,7 @@ class ModelJoint:
         damping: (a, b, c) of a v + b v abs(v) + c v**3.
         stribeck: (rise above the dry level in N m, speed in rad/s) of exp(-(v/vs)**2); zeros where there is none.
         presliding_nm_per_rad: stiffness before friction slips; None where the file has none.
+        yields_gradually: friction is a LuGre element's.
         spring_nm_per_rad: of the joint's own spring.
         motor: None where nothing drives it.
     """
@@ -81,6 +82,7 @@ class ModelJoint:
     damping: tuple[float, float, float]
     stribeck: tuple[float, float]
     presliding_nm_per_rad: float | None
+    yields_gradually: bool
     spring_nm_per_rad: float
     motor: Motor | None
 
@@ -172,10 +174,12 @@ class RobotModel:
         if yields > 0.0:
             dry, presliding = dry + stiffness * yields, stiffness
         rise = at = 0.0
+        gradually = False
         for a in self._actuators(k):
             if (lugre := self._lugre(a)) is not None:
                 sigma, coulomb, static, speed = lugre
                 dry, presliding, rise, at = dry + coulomb, sigma, static - coulomb, speed
+                gradually = True
         return ModelJoint(
             name=name,
             prismatic=int(m.jnt_type[k]) == self._slide,
@@ -185,6 +189,7 @@ class RobotModel:
             damping=(float(m.dof_damping[dof]), float(polynomial[0]), float(polynomial[1])),
             stribeck=(rise, at),
             presliding_nm_per_rad=presliding,
+            yields_gradually=gradually,
             spring_nm_per_rad=0.0 if yields > 0.0 else stiffness,
             motor=self._motor(k),
         )

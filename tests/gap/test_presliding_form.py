@@ -11,7 +11,7 @@ import pytest
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
-from frictid_hil.gap.presliding import as_it_builds_up
+from frictid_hil.gap.presliding import as_it_yields
 
 STEP_S, FINE = 0.002, 20
 LEVEL_NM, VISCOUS, STIFFNESS = 3.0, 0.5, 4000.0
@@ -69,19 +69,19 @@ def recorded(nominal: Nominal, bristle: bool, rise_nm: float = 0.0) -> Experimen
 
 @pytest.mark.parametrize("bristle", [True, False])
 def test_the_form_is_read_off_the_recordings(bristle: bool) -> None:
-    experiments, told = as_it_builds_up(recorded(BELIEF, bristle))
-    assert experiments.nominal.bristle is bristle
+    experiments, told = as_it_yields(recorded(BELIEF, bristle))
+    assert (experiments.nominal.yields_gradually is True) is bristle
     assert (told is not None) is bristle
 
 
 def test_a_stiffness_that_nobody_states_has_no_form() -> None:
-    experiments, told = as_it_builds_up(recorded(replace(BELIEF, presliding_stiffness_nm_per_rad=None), bristle=True))
-    assert not experiments.nominal.bristle and told is None
+    experiments, told = as_it_yields(recorded(replace(BELIEF, presliding_stiffness_nm_per_rad=None), bristle=True))
+    assert not experiments.nominal.yields_gradually and told is None
 
 
 def test_a_bristle_is_no_gap_and_its_falling_level_is_named() -> None:
     healthy = diagnose(recorded(BELIEF, bristle=True))
     assert healthy.verdict == "none", healthy.summary
-    assert "bristle" in healthy.reasons["presliding"]
+    assert "gradually" in healthy.reasons["presliding"]
     falling = diagnose(recorded(BELIEF, bristle=True, rise_nm=0.9))
     assert falling.causes[0].effect == "stribeck", falling.summary

@@ -18,7 +18,7 @@ from frictid_hil.simulation.robot_model import ModelJoint, Motor
 from frictid_hil.simulation.targets import Numbers, friction_nm, numbers_of, written_as
 
 SERVO = Motor(("servo",), "position", 900.0, 30.0, 1.0, 40.0, 0.004, 0.0)
-BELIEVED = ModelJoint("lift", False, None, 0.2, 3.0, (1.0, 0.0, 0.0), (0.0, 0.0), None, 0.0, SERVO)
+BELIEVED = ModelJoint("lift", False, None, 0.2, 3.0, (1.0, 0.0, 0.0), (0.0, 0.0), None, False, 0.0, SERVO)
 BARE = JointModel.from_mapping(
     {"inertia_kg_m2": 0.5, "motor_inertia_share": 0.4, "friction": {"coulomb_nm": 3.0, "viscous_nm_s_per_rad": 1.0}},
     gear_ratio=1.0, rated_torque_nm=40.0, max_torque_nm=40.0,

@@ -139,5 +139,7 @@ def measured_by(profile: JointProfile) -> dict[str, Any]:
     }
     if profile.presliding_stiffness_nm_per_rad.value is not None and profile.presliding_yields != "unseen":
         friction["presliding_stiffness_nm_per_rad"] = profile.presliding_stiffness_nm_per_rad.value
+        if profile.presliding_yields == "gradually":
+            friction["presliding_yields"] = profile.presliding_yields
     values = {name: getattr(profile, name).value for name in ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm")}
     return {name: value for name, value in values.items() if value is not None} | {"friction": friction}

@@ -424,6 +424,7 @@ def _friction(believed: ModelJoint, logs: Sequence[Samples]) -> dict[str, Any] |
     }
     if believed.presliding_nm_per_rad is not None:
         told["presliding_stiffness_nm_per_rad"] = believed.presliding_nm_per_rad
+        told |= {"presliding_yields": "gradually"} if believed.yields_gradually else {}
     return told
 
 

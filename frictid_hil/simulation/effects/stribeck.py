@@ -39,7 +39,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     for v in views:
         speed = np.abs(v.velocity_rad_s) / shape["stribeck_velocity_rad_s"]
         raised = v.coulomb_nm * v.slip * np.exp(-(speed ** shape["exponent"]))
-        columns.append(followed(raised, v.position_rad, v.bristle_rad)[:, None])
+        columns.append(followed(raised, v.position_rad, v.gradual_rad)[:, None])
     return columns
 
 
