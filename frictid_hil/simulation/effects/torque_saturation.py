@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy import ndimage
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
@@ -13,9 +14,10 @@ from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, P
 
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
-
 HARD = 60.0
 """Exponent from which a knee is a corner."""
+LASTS_S = 0.01
+"""Time for which a demand beyond the limit lasts at least where a flat top can be told."""
 
 
 def current(current_nm: float, limit_nm: float, limit_share: float, exponent: float) -> float:
@@ -41,9 +43,15 @@ def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: floa
 
 
 def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
-    """Around the highest torque reported, where more was asked for; none without a stated limit to share."""
+    """Around the highest torque reported, where more was asked for; none without a stated limit to share.
+
+    A shorter peak than ``LASTS_S`` is how a jump of the command meets the controller's ticks, and no flat top.
+    """
     limit = views[0].limit_nm
-    asked = max(float(np.max(np.abs(v.demand_nm))) for v in views)
+    asked = 0.0
+    for v in views:
+        lasting = ndimage.minimum_filter1d(np.abs(v.demand_nm), max(2, math.ceil(LASTS_S / v.step_s)))
+        asked = max(asked, float(np.max(lasting)))
     given = max(float(np.quantile(np.abs(v.torque_nm), 0.999)) for v in views)
     if not math.isfinite(limit) or given > 0.995 * asked:
         return np.empty(0)
