@@ -19,6 +19,9 @@ from frictid_hil.simulation.inverse import Shape
 FAMILY = "family "
 """Prefix of generic functions: they compete like a cause, and have no name that anybody could repair."""
 
+STIFFNESS = "stiffness"
+"""Shape of the term that is an error of a stated presliding stiffness."""
+
 
 @dataclass(frozen=True, slots=True)
 class Term:

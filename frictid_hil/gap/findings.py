@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, Term
+from frictid_hil.gap.channel import FAMILY, STIFFNESS, Term
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.posterior import FORM, Draw, Posterior
 from frictid_hil.gap.residuals import rms
@@ -226,7 +226,7 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     for term in terms:
         values = draw.values[at : at + len(term.columns)]
         at += len(term.columns)
-        if term.effect == effect and "stiffness" not in term.shape:
+        if term.effect == effect and STIFFNESS not in term.shape:
             found.append((term, values))
     if not found:
         return {}

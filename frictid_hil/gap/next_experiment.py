@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.channel import STIFFNESS
 from frictid_hil.gap.diagnosis import NextExperiment
 from frictid_hil.gap.experiment_set import Experiment, Nominal
 from frictid_hil.gap.experiments import Envelope, catalogue, plan_document
@@ -147,7 +148,7 @@ def _columns(known: Known, view: View, low_pass: LowPass) -> Array:
     columns: list[Array] = []
     for term in known.terms:
         form = all_effects()[term.effect].inverse if term.effect in all_effects() else None
-        own = None if form is None or "stiffness" in term.shape else form.regressors([view], term.shape)[0]
+        own = None if form is None or STIFFNESS in term.shape else form.regressors([view], term.shape)[0]
         columns.append(own if own is not None else np.zeros((view.position_rad.size, len(term.columns))))
     return thinned(np.concatenate(columns, axis=1), low_pass)
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import Builder, Term
+from frictid_hil.gap.channel import STIFFNESS, Builder, Term
 from frictid_hil.gap.experiment_set import Nominal
 from frictid_hil.gap.residuals import Recording, friction_scales, presliding_state
 from frictid_hil.gap.tolerances import Sigma
@@ -115,8 +115,7 @@ def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -
     stated = nominal.presliding_stiffness_nm_per_rad is not None
     deviation = nominal.tolerances.presliding_stiffness.of(stiffness) / stiffness if stated else 1.0
     numbers = builder.add(stiffer)
-    name = "presliding_hysteresis" if stated else ""
-    terms = [Term(name, {"stiffness": 1.0}, numbers, np.zeros(1), np.array([deviation]))]
+    terms = [Term("", {STIFFNESS: 1.0} if stated else {}, numbers, np.zeros(1), np.array([deviation]))]
     if nominal.yields_gradually and nominal.inertia_kg_m2:
         bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.channel import FAMILY, Builder, Channel, Rows, Term, effect_prior
+from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import families
 from frictid_hil.gap.nuisances import nuisances
@@ -77,7 +77,7 @@ def plant_channel(
         form = all_effects()[name].inverse
         if form is None:
             continue
-        told = [t for t in known if t.effect == name and name not in ("presliding_hysteresis",)]
+        told = [t for t in known if t.effect == name]
         for term in told:
             least, largest = form.first_coefficient
             _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
@@ -89,6 +89,9 @@ def plant_channel(
             columns = form.regressors(views, shape)
             mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
             candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
+    if "presliding_hysteresis" in library:
+        wrong = [t for t in known if STIFFNESS in t.shape]
+        candidates += [replace(t, effect="presliding_hysteresis", deviation=BEYOND * t.deviation) for t in wrong]
     generic = families(views)
     if sum(not r.experiment.validation for r in logs) >= SEVERAL:
         generic[EACH_LOG] = _by_log(views)

@@ -17,8 +17,10 @@ FLOORS = 2.0
 """A gap below so many noise floors is none, by promise."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
-UNNAMED = 0.25
-"""Size of what has no name over that of all causes, from which on their names do not tell the gap: 6 % of its power."""
+UNNAMED = 0.33
+"""Size of what has no name over that of all causes, from which on their names do not tell the gap: 11 % of power."""
+REMAINS = 0.2
+"""Part of a gap that stays, from which on it may hold another cause: 4 % of its power."""
 DOUBTED = 0.8
 """Most that is claimed of causes that close the gap although functions without a name would describe it as well."""
 HALF = 0.5
@@ -86,13 +88,12 @@ def verdict(
     tiny = tiny and not told and not (shows and any(_needed(f, channels) for f in named))
     if tiny or (quiet and not told and (nothing or generic_wins)):
         return Verdict("none", ())
-    new = any(gap.appeared is not None and _stays(gap) for gap in gaps)
-    if unnamed and not any(_stays(gap) for gap in gaps):
-        unnamed, named = False, tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
-    if nothing or unnamed or new or any(_open(gap, negligible) for gap in gaps):
+    new = any(gap.appeared is not None and _stays(gap, REMAINS) for gap in gaps)
+    untold = unnamed and any(_stays(gap, UNNAMED) for gap in gaps)
+    if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
-    if any(_open(gap, 0.0) for gap in gaps):
-        # What stays means nothing in practice; it may still be of another cause.
+    if unnamed or any(_stays(gap, REMAINS) for gap in gaps):
+        # What stays may be of another cause.
         named = tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     first = named[0]
     rivals = [f for f in named[1:] if f.effect in first.rivals or first.effect in f.rivals]
@@ -126,13 +127,13 @@ def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
 def _unnamed(loud: Sequence[Sampled]) -> bool:
     """Whether what has no name is a fair part of what channels with a gap hold."""
     generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
-    return float(np.mean(generic > np.maximum(VISIBLE, UNNAMED * explained))) > 0.5
+    return float(np.mean(generic > np.maximum(VISIBLE, REMAINS * explained))) > 0.5
 
 
-def _stays(gap: Closed) -> bool:
-    """Whether the named causes leave as much of a channel's visible gap as what has no name may make."""
+def _stays(gap: Closed, part: float) -> bool:
+    """Whether the named causes leave more than a part of a channel's visible gap."""
     visible = max(0.0, gap.before**2 - gap.floor**2)
-    return gap.before > FLOORS * gap.floor and gap.after**2 - gap.floor**2 > UNNAMED**2 * visible
+    return gap.before > FLOORS * gap.floor and gap.after**2 - gap.floor**2 > part**2 * visible
 
 
 def _faint(channel: Sampled, gap: Closed) -> bool:
