@@ -72,26 +72,7 @@ def plant_channel(
     friction_nm = rms(np.concatenate([v.coulomb_nm * v.slip + v.rate_nm for v in views]))
     scale = min(friction_nm / 3.0, _gap_nm(residuals, logs[0].step_s))
     known = nuisances(nominal, views, logs, builder, estimated)
-    candidates = []
-    for name in (n for n in all_effects() if n in library):
-        form = all_effects()[name].inverse
-        if form is None:
-            continue
-        told = [t for t in known if t.effect == name]
-        for term in told:
-            least, largest = form.first_coefficient
-            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
-            deviation = np.maximum(BEYOND * term.deviation, visible)
-            candidates.append(replace(term, deviation=deviation, least=least, largest=largest))
-        if told:
-            continue
-        for shape in form.grid_for(measured):
-            columns = form.regressors(views, shape)
-            mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
-            candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
-    if "presliding_hysteresis" in library:
-        wrong = [t for t in known if STIFFNESS in t.shape]
-        candidates += [replace(t, effect="presliding_hysteresis", deviation=BEYOND * t.deviation) for t in wrong]
+    candidates = _causes(library, views, measured, known, scale, builder)
     generic = families(views)
     if sum(not r.experiment.validation for r in logs) >= SEVERAL:
         generic[EACH_LOG] = _by_log(views)
@@ -105,6 +86,36 @@ def plant_channel(
     step_s = logs[0].step_s * stride_of(low_pass)
     raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
     return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
+
+
+def _causes(
+    library: Collection[str],
+    views: Sequence[View],
+    measured: Sequence[View],
+    known: Sequence[Term],
+    scale: float,
+    builder: Builder,
+) -> list[Term]:
+    """Every effect of the library: beliefs that are plainly wrong, and what no belief speaks of."""
+    candidates = []
+    for name in (n for n in all_effects() if n in library):
+        form = all_effects()[name].inverse
+        if form is None:
+            continue
+        told = [t for t in known if t.effect == name]
+        for term in told:
+            least, largest = form.first_coefficient
+            _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
+            deviation = np.maximum(BEYOND * term.deviation, visible)
+            candidates.append(replace(term, deviation=deviation, least=least, largest=largest))
+        for shape in () if told else form.grid_for(measured):
+            columns = form.regressors(views, shape)
+            mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
+            candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
+    if "presliding_hysteresis" in library:
+        wrong = [t for t in known if STIFFNESS in t.shape]
+        candidates += [replace(t, effect="presliding_hysteresis", deviation=BEYOND * t.deviation) for t in wrong]
+    return candidates
 
 
 def family(name: str, size: float, numbers: tuple[int, ...], columns: Sequence[Array]) -> Term:

@@ -293,6 +293,12 @@ def _coupling(p: Physics, twist: float, twist_rate: float) -> float:
     return p.stiffness * stretch * (1.0 + p.hardening * stretch * stretch) + contact * p.coupling_damping * twist_rate
 
 
+Q, V, LINK_Q, LINK_V, PENDULUM_Q, PENDULUM_V, ACCELERATION, REMEMBERED, DRAG, AGE, HEAT, MIDDLE, APPLIED = range(13)
+"""Places of a state: motor, link and pendulum, link acceleration, memories of friction, current behind each lag."""
+FILTERED, INTEGRAL, STAGE_1, STAGE_2 = range(4)
+"""Places of the controller's state: filtered velocity, integral, stages of the velocity estimate."""
+
+
 @njit(cache=True)
 def run(
     command: Array, control: Controller, p: Physics, heat: float, clock: float, chance: Array
@@ -311,81 +317,28 @@ def run(
         Reported position, the drive's velocity, the torque applied (before sensor noise), each shape (n,), and the
         thermal state at the end.
     """
-    n = command.size
-    period = control.tick
+    n, period = command.size, control.tick
     h = period / control.substeps
-    two_masses = p.stiffness > 0.0
-    pendulum = p.pendulum_inertia > 0.0
-    link_inertia = p.link_inertia - p.pendulum_inertia
-    pendulum_rate = 2.0 * math.pi * p.pendulum_hz
-    pendulum_spring = p.pendulum_inertia * pendulum_rate * pendulum_rate
-    pendulum_damper = 2.0 * p.pendulum_damping * p.pendulum_inertia * pendulum_rate
-
-    position, velocity, torque = np.empty(n), np.empty(n), np.empty(n)
-    sent = np.empty(n)
-
-    # Equilibrium at the first set-point without friction: what the drive holds.
-    q = ql = qp = command[0]
-    holding = _static(p, q) - p.bias
-    if two_masses and holding != 0.0:
-        ql = qp = q - holding / p.stiffness - math.copysign(0.5 * p.play, holding)
-        holding = _static(p, ql) - p.bias
-    applied = holding / p.gain
-    for _ in range(20):
-        applied = holding / (p.gain * (1.0 - p.droop * abs(applied) / p.torque_limit))
-    first = applied + math.copysign(p.dead_zone, applied)
-    middle = applied
-
-    v = vl = vp = remembered = 0.0
-    acceleration = 0.0
-    network = np.zeros(_NETWORK_REACH.size)
-    soft = np.zeros(_SOFT_REACH.size)
-    drag = 0.0
-    age = 1.0
-    integral = first - control.kp * (control.command_weight - 1.0) * command[0]
-    filtered = 0.0
-    blend = 1.0 - math.exp(-period / control.velocity_filter)
+    position, velocity, torque, sent = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    state, first = _held(p, command[0])
+    state[HEAT] = heat
+    network, soft = np.zeros(_NETWORK_REACH.size), np.zeros(_SOFT_REACH.size)
+    law = np.zeros(4)
+    law[INTEGRAL] = first - control.kp * (control.command_weight - 1.0) * command[0]
     lag_blend = 1.0 - math.exp(-h / p.lag) if p.lag > 0.0 else 1.0
     second_blend = 1.0 - math.exp(-h / p.second_lag) if p.second_lag > 0.0 else 1.0
-    pole = math.exp(-2.0 * period / p.estimate_lag) if p.estimate_lag > 0.0 else 0.0
-    stage1 = stage2 = 0.0
-    window = round(2.0 * p.estimate_lag / period) + 1
     half_step = 0.5 * p.encoder_step
-    last = math.floor(q / p.encoder_step + 0.5) * p.encoder_step
+    last = math.floor(state[Q] / p.encoder_step + 0.5) * p.encoder_step
     target = _amplified(p, first)
     taken = -2
 
     for k in range(n):
-        count = math.floor((q + half_step) / p.encoder_step) * p.encoder_step
-        raw = (count - last) / period
-        last = count
-        position[k] = count
-        estimate = raw
-        if p.estimate_lag > 0.0:
-            if p.estimate_kind == ESTIMATE_TWO_POLES:
-                stage1 += (1.0 - pole) * (raw - stage1)
-                stage2 += (1.0 - pole) * (stage1 - stage2)
-                estimate = stage2
-            else:
-                oldest = max(0, k - window)
-                estimate = (count - position[oldest]) / (period * window)
-        velocity[k] = estimate
-        torque[k] = applied
-
-        before, after = max(k - 1, 0), min(k + 1, n - 1)
-        rate = (command[after] - command[before]) / (2.0 * period)
-        if control.backward:
-            rate = (command[k] - command[before]) / period
-        bend = (command[after] - 2.0 * command[k] + command[before]) / (period * period)
-        filtered += blend * (estimate - filtered)
-        error = command[k] - count
-        demand = control.kp * error + integral + control.kd * (control.rate_weight * rate - filtered)
-        demand += control.kp * (control.command_weight - 1.0) * command[k] + control.inertia_ahead * bend
-        limited = min(max(demand, -control.torque_limit), control.torque_limit)
-        if limited == demand:
-            integral += control.ki * error * period
+        position[k] = math.floor((state[Q] + half_step) / p.encoder_step) * p.encoder_step
+        velocity[k] = _estimated(p, law, position, k, (position[k] - last) / period, period)
+        last = position[k]
+        torque[k] = state[APPLIED]
+        limited = _demanded(control, law, command, k, position[k], velocity[k])
         sent[k] = sent[k - 1] if k > 0 and chance[k] < p.missed else limited
-
         for j in range(control.substeps):
             now = k * period + j * h
             # The newest command that has had time to arrive.
@@ -393,79 +346,158 @@ def run(
             if due != taken:
                 target = _amplified(p, sent[due] if due >= 0 else first)
                 taken = due
-            middle += lag_blend * (target - middle)
-            applied += second_blend * (middle - applied)
+            state[MIDDLE] += lag_blend * (target - state[MIDDLE])
+            state[APPLIED] += second_blend * (state[MIDDLE] - state[APPLIED])
+            _moved(p, state, network, soft, h, clock, now)
+    return position, velocity, torque, float(state[HEAT])
 
-            # Leapfrog: positions by the velocity half a step on, then velocities by the torque at the new position.
-            dq = h * v
-            q += dq
-            slip = _slipped(p, network, dq, h)
-            level = p.coulomb * slip
-            if p.soft_share != 0.0:
-                give = 0.0
-                for i in range(soft.size):
-                    reach = p.soft_length * _SOFT_REACH[i]
-                    soft[i] = min(max(soft[i] + dq, -reach), reach)
-                    give += _SOFT_SHARE[i] * soft[i] / reach
-                level += p.soft_share * p.coulomb * (give - slip)
 
-            seen = v
-            if p.memory > 0.0:
-                remembered += h / p.memory * (v - remembered)
-                seen = remembered
-            speed = abs(seen)
-            rate_torque = rate_part(p, speed)
-            friction = math.copysign(rate_torque, seen) if speed > 0.0 else 0.0
-            if p.memory > 0.0:
-                friction += 0.35 * p.coulomb * (math.tanh(seen / 0.08) - math.tanh(v / 0.08))
-            friction += level + p.asymmetry_viscous * rate_torque + p.asymmetry_coulomb * p.coulomb * slip * slip
-            if p.weakening != 0.0:
-                friction += slip * _weakening(p, speed)
-            if p.ageing != 0.0:
-                age = (age + h) / (1.0 + h * abs(v) / p.ageing_length)
-                friction += slip * p.ageing * math.log1p(age / p.ageing_time) / math.log1p(2.0 / p.ageing_time)
-            if p.load_share != 0.0 or p.driving_loss != 0.0 or p.backdriving_loss != 0.0 or p.kinematic != 0.0:
-                load = _static(p, ql) + link_inertia * acceleration
-                friction += slip * _load_part(p, load) + _by_quadrant(p, load, slip)
-                friction += _kinematic(p, q, v, acceleration, load, link_inertia)
-            if p.patch != 0.0:
-                aside = (q - p.patch_position) / p.patch_width
-                friction += slip * p.patch * math.exp(-aside * aside)
-            if p.bursts != 0.0:
-                beat = math.sin(p.bursts_pace * (clock + now)) * math.sin(0.37 * p.bursts_pace * (clock + now) + 1.0)
-                friction *= 1.0 + p.bursts * max(0.0, beat - 0.25)
-            if p.cooling != 0.0:
-                friction *= math.exp(-p.cooling * heat)
-                heat += h * (p.heating * abs(friction * v) - heat / p.heat_time)
+@njit(cache=True)
+def _held(p: Physics, start: float) -> tuple[Array, float]:
+    """(state, torque asked for) in equilibrium at a position without friction: what the drive holds."""
+    q = link = start
+    holding = _static(p, q) - p.bias
+    if p.stiffness > 0.0 and holding != 0.0:
+        link = q - holding / p.stiffness - math.copysign(0.5 * p.play, holding)
+        holding = _static(p, link) - p.bias
+    applied = holding / p.gain
+    for _ in range(20):
+        applied = holding / (p.gain * (1.0 - p.droop * abs(applied) / p.torque_limit))
+    state = np.zeros(13)
+    state[Q], state[LINK_Q], state[PENDULUM_Q] = q, link, link
+    state[MIDDLE] = state[APPLIED] = applied
+    state[AGE] = 1.0
+    return state, applied + math.copysign(p.dead_zone, applied)
 
-            motor = p.gain * applied * (1.0 - p.droop * abs(applied) / p.torque_limit) + p.bias - friction
-            if p.ripple != 0.0:
-                motor -= _ripple(p, q)
-            if p.wander != 0.0:
-                motor += p.wander * math.sin(
-                    p.wander_pace * (clock + now) + 0.6 * math.sin(0.31 * p.wander_pace * (clock + now))
-                )
-            link = 0.0
-            if p.vibration != 0.0:
-                link += p.vibration * math.sin(2.0 * math.pi * p.vibration_hz * (clock + now))
-            if p.drag != 0.0:
-                drag = min(max(drag + h * vl if two_masses else drag + dq, -p.drag_length), p.drag_length)
-                link -= p.drag * (1.5 * drag / p.drag_length - 0.5 * (drag / p.drag_length) ** 3)
-            if pendulum:
-                qp += h * vp
-                through = pendulum_spring * (ql - qp) + pendulum_damper * (vl - vp)
-                vp += h * through / p.pendulum_inertia
-                link -= through
 
-            if two_masses:
-                ql += h * vl
-                through = _coupling(p, q - ql, v - vl)
-                acceleration = (through + link - _static(p, ql)) / link_inertia
-                v += h * (motor - through) / p.motor_inertia
-                vl += h * acceleration
-            else:
-                ql = q
-                acceleration = (motor + link - _static(p, q)) / (p.motor_inertia + link_inertia)
-                v += h * acceleration
-                vl = v
-    return position, velocity, torque, heat
+@njit(cache=True)
+def _estimated(p: Physics, law: Array, position: Array, k: int, raw: float, period: float) -> float:
+    """The drive's velocity at a tick: differenced counts, low-passed or averaged over a window."""
+    if p.estimate_lag <= 0.0:
+        return raw
+    if p.estimate_kind == ESTIMATE_TWO_POLES:
+        pole = math.exp(-2.0 * period / p.estimate_lag)
+        law[STAGE_1] += (1.0 - pole) * (raw - law[STAGE_1])
+        law[STAGE_2] += (1.0 - pole) * (law[STAGE_1] - law[STAGE_2])
+        return float(law[STAGE_2])
+    window = round(2.0 * p.estimate_lag / period) + 1
+    return float((position[k] - position[max(0, k - window)]) / (period * window))
+
+
+@njit(cache=True)
+def _demanded(control: Controller, law: Array, command: Array, k: int, count: float, estimate: float) -> float:
+    """Torque that the controller asks for at a tick, within its limit."""
+    period = control.tick
+    before, after = max(k - 1, 0), min(k + 1, command.size - 1)
+    rate = (command[after] - command[before]) / (2.0 * period)
+    if control.backward:
+        rate = (command[k] - command[before]) / period
+    bend = (command[after] - 2.0 * command[k] + command[before]) / (period * period)
+    law[FILTERED] += (1.0 - math.exp(-period / control.velocity_filter)) * (estimate - law[FILTERED])
+    error = command[k] - count
+    demand = control.kp * error + law[INTEGRAL] + control.kd * (control.rate_weight * rate - law[FILTERED])
+    demand += control.kp * (control.command_weight - 1.0) * command[k] + control.inertia_ahead * bend
+    limited: float = min(max(demand, -control.torque_limit), control.torque_limit)
+    if limited == demand:
+        law[INTEGRAL] += control.ki * error * period
+    return limited
+
+
+@njit(cache=True)
+def _moved(p: Physics, s: Array, network: Array, soft: Array, h: float, clock: float, now: float) -> None:
+    """One sub-step, leapfrog: positions by the velocity half a step on, then velocities by torque at the new ones."""
+    dq = h * s[V]
+    s[Q] += dq
+    link_inertia = p.link_inertia - p.pendulum_inertia
+    friction = _friction(p, s, network, soft, dq, h, clock + now)
+    applied = s[APPLIED]
+    motor = p.gain * applied * (1.0 - p.droop * abs(applied) / p.torque_limit) + p.bias - friction
+    if p.ripple != 0.0:
+        motor -= _ripple(p, s[Q])
+    if p.wander != 0.0:
+        pace = p.wander_pace * (clock + now)
+        motor += p.wander * math.sin(pace + 0.6 * math.sin(0.31 * pace))
+    link = _pushed(p, s, dq, h, clock + now)
+    if p.stiffness > 0.0:
+        s[LINK_Q] += h * s[LINK_V]
+        through = _coupling(p, s[Q] - s[LINK_Q], s[V] - s[LINK_V])
+        s[ACCELERATION] = (through + link - _static(p, s[LINK_Q])) / link_inertia
+        s[V] += h * (motor - through) / p.motor_inertia
+        s[LINK_V] += h * s[ACCELERATION]
+    else:
+        s[LINK_Q] = s[Q]
+        s[ACCELERATION] = (motor + link - _static(p, s[Q])) / (p.motor_inertia + link_inertia)
+        s[V] += h * s[ACCELERATION]
+        s[LINK_V] = s[V]
+
+
+@njit(cache=True)
+def _friction(p: Physics, s: Array, network: Array, soft: Array, dq: float, h: float, clock: float) -> float:
+    """Torque that friction takes from the motor, its memories moved by one sub-step."""
+    v = s[V]
+    slip = _slipped(p, network, dq, h)
+    level = p.coulomb * slip
+    if p.soft_share != 0.0:
+        level += p.soft_share * p.coulomb * (_given(p, soft, dq) - slip)
+    seen = v
+    if p.memory > 0.0:
+        s[REMEMBERED] += h / p.memory * (v - s[REMEMBERED])
+        seen = s[REMEMBERED]
+    speed = abs(seen)
+    rate_torque = rate_part(p, speed)
+    friction = math.copysign(rate_torque, seen) if speed > 0.0 else 0.0
+    if p.memory > 0.0:
+        friction += 0.35 * p.coulomb * (math.tanh(seen / 0.08) - math.tanh(v / 0.08))
+    friction += level + p.asymmetry_viscous * rate_torque + p.asymmetry_coulomb * p.coulomb * slip * slip
+    if p.weakening != 0.0:
+        friction += slip * _weakening(p, speed)
+    if p.ageing != 0.0:
+        s[AGE] = (s[AGE] + h) / (1.0 + h * abs(v) / p.ageing_length)
+        friction += slip * p.ageing * math.log1p(s[AGE] / p.ageing_time) / math.log1p(2.0 / p.ageing_time)
+    if p.load_share != 0.0 or p.driving_loss != 0.0 or p.backdriving_loss != 0.0 or p.kinematic != 0.0:
+        link_inertia = p.link_inertia - p.pendulum_inertia
+        load = _static(p, s[LINK_Q]) + link_inertia * s[ACCELERATION]
+        friction += slip * _load_part(p, load) + _by_quadrant(p, load, slip)
+        friction += _kinematic(p, s[Q], v, s[ACCELERATION], load, link_inertia)
+    if p.patch != 0.0:
+        aside = (s[Q] - p.patch_position) / p.patch_width
+        friction += slip * p.patch * math.exp(-aside * aside)
+    if p.bursts != 0.0:
+        beat = math.sin(p.bursts_pace * clock) * math.sin(0.37 * p.bursts_pace * clock + 1.0)
+        friction *= 1.0 + p.bursts * max(0.0, beat - 0.25)
+    if p.cooling != 0.0:
+        friction *= math.exp(-p.cooling * s[HEAT])
+        s[HEAT] += h * (p.heating * abs(friction * v) - s[HEAT] / p.heat_time)
+    return friction
+
+
+@njit(cache=True)
+def _given(p: Physics, soft: Array, dq: float) -> float:
+    """State of the soft part of friction, moved by one sub-step."""
+    give = 0.0
+    for i in range(soft.size):
+        reach = p.soft_length * _SOFT_REACH[i]
+        soft[i] = min(max(soft[i] + dq, -reach), reach)
+        give += _SOFT_SHARE[i] * soft[i] / reach
+    return give
+
+
+@njit(cache=True)
+def _pushed(p: Physics, s: Array, dq: float, h: float, clock: float) -> float:
+    """Torque of what nobody's library knows on the link: a machine nearby, a dragged hose, a body that swings."""
+    link = 0.0
+    if p.vibration != 0.0:
+        link += p.vibration * math.sin(2.0 * math.pi * p.vibration_hz * clock)
+    if p.drag != 0.0:
+        moved = s[DRAG] + h * s[LINK_V] if p.stiffness > 0.0 else s[DRAG] + dq
+        s[DRAG] = min(max(moved, -p.drag_length), p.drag_length)
+        link -= p.drag * (1.5 * s[DRAG] / p.drag_length - 0.5 * (s[DRAG] / p.drag_length) ** 3)
+    if p.pendulum_inertia > 0.0:
+        rate = 2.0 * math.pi * p.pendulum_hz
+        spring = p.pendulum_inertia * rate * rate
+        damper = 2.0 * p.pendulum_damping * p.pendulum_inertia * rate
+        s[PENDULUM_Q] += h * s[PENDULUM_V]
+        through = spring * (s[LINK_Q] - s[PENDULUM_Q]) + damper * (s[LINK_V] - s[PENDULUM_V])
+        s[PENDULUM_V] += h * through / p.pendulum_inertia
+        link -= through
+    return link

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import signal
@@ -184,8 +184,17 @@ def draw_wide(index: int, seed: int, kind: str) -> tuple[dict[str, Any], tuple[R
 # -- the joint ----------------------------------------------------------------------------------------------------
 
 
-def _setting(rng: np.random.Generator) -> Setting:
-    size = str(rng.choice(list(_SIZES)))
+class _Sized(NamedTuple):
+    """A joint of some size: its inertia and physics, what it may carry, its rated torque and its highest speed."""
+
+    inertia: float
+    physics: Physics
+    payload: Payload
+    rated_nm: float
+    speed: float
+
+
+def _sized(rng: np.random.Generator, size: str) -> _Sized:
     (lightest, heaviest), gears, (slow, fast) = _SIZES[size]
     inertia, gear, speed = log_uniform(rng, lightest, heaviest), float(rng.choice(gears)), rng.uniform(slow, fast)
     scale = 8.0 * inertia**0.75 * (0.15 if gear == 1 else 0.5 if gear <= 10 else 1.0)
@@ -217,6 +226,13 @@ def _setting(rng: np.random.Generator) -> Setting:
         rate_family=family,
         slip_family=int(rng.choice(4, p=[0.4, 0.2, 0.2, 0.2])),
     )
+    return _Sized(inertia, physics, payload, rated, speed)
+
+
+def _setting(rng: np.random.Generator) -> Setting:
+    size = str(rng.choice(list(_SIZES)))
+    inertia, physics, payload, rated, speed = _sized(rng, size)
+    gear, gravity = physics.gear_ratio, physics.gravity
     tick = float(rng.choice([0.001, 0.002, 0.004]))
     law = str(rng.choice(["pid", "cascade", "pid_feedforward"], p=[0.5, 0.35, 0.15]))
     control, believed = _control(rng, law, inertia, physics, tick, 3.0 * rated, fast=size in ("hobby", "direct"))
