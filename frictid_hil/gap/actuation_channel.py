@@ -16,8 +16,6 @@ from frictid_hil.gap.plant_channel import (
     BEYOND,
     SIZES,
     family,
-    stride_of,
-    thinned,
     without_nuisances,
 )
 from frictid_hil.gap.residuals import (
@@ -128,7 +126,7 @@ def actuation_channel(
     rows = without_nuisances(rows, nuisances, candidates)
     return Channel(
         "actuation",
-        logs[0].step_s * stride_of(low_pass),
+        logs[0].step_s * low_pass.stride,
         rows,
         tuple(nuisances),
         tuple(candidates),
@@ -296,11 +294,11 @@ def _rows(
     columns = np.concatenate(parts, axis=1)
     if report is not None:
         columns = reported(columns, report, recording.step_s)
-    table = thinned(np.concatenate([columns, residual_nm[:, None]], axis=1), low_pass)[1:-2]
+    table = low_pass.thinned(np.concatenate([columns, residual_nm[:, None]], axis=1))[1:-2]
     return Rows(
         e.name,
         e.validation,
-        recording.step_s * stride_of(low_pass),
+        recording.step_s * low_pass.stride,
         table[:, -1],
         table[:, :-1],
         np.zeros(table.shape[0]),

@@ -20,7 +20,6 @@ from frictid_hil.gap.diagnosis import NextExperiment
 from frictid_hil.gap.experiment_set import Experiment, Nominal
 from frictid_hil.gap.experiments import Envelope, catalogue, plan_document
 from frictid_hil.gap.findings import Sampled
-from frictid_hil.gap.plant_channel import thinned
 from frictid_hil.gap.posterior import Known
 from frictid_hil.gap.residuals import LowPass, Recording, nominal_torque, view_of
 from frictid_hil.simulation.effects import all_effects
@@ -150,7 +149,7 @@ def _columns(known: Known, view: View, low_pass: LowPass) -> Array:
         form = all_effects()[term.effect].inverse if term.effect in all_effects() else None
         own = None if form is None or STIFFNESS in term.shape else form.regressors([view], term.shape)[0]
         columns.append(own if own is not None else np.zeros((view.position_rad.size, len(term.columns))))
-    return thinned(np.concatenate(columns, axis=1), low_pass)
+    return low_pass.thinned(np.concatenate(columns, axis=1))
 
 
 def _evidence(x_first: Array, first: Known, x_second: Array, second: Known, floor: float) -> float:

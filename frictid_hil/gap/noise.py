@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import linalg, signal
+from numba import njit
+from scipy import linalg
 
 from frictid_hil.friction.trajectory import Array
 
@@ -52,8 +53,20 @@ def whitening(covariance: Array) -> tuple[Array, float]:
 def whitened(table: Array, covariance: Array) -> tuple[Array, float]:
     """(rows of unit, white noise; standard deviation of one row's prediction error); the first ``ORDER`` rows go."""
     taps, deviation = whitening(covariance)
-    rows: Array = signal.lfilter(taps, [1.0], table, axis=0)[ORDER:] / deviation
+    rows: Array = _filtered(np.ascontiguousarray(table), taps / deviation)
     return rows, deviation
+
+
+@njit(cache=True, fastmath=True)
+def _filtered(table: Array, taps: Array) -> Array:
+    """Each row less what the rows before it predict, from the first row on that has all of them."""
+    before = taps.size - 1
+    out = np.zeros((max(table.shape[0] - before, 0), table.shape[1]))
+    for row in range(out.shape[0]):
+        for lag in range(taps.size):
+            for column in range(table.shape[1]):
+                out[row, column] += taps[lag] * table[row + before - lag, column]
+    return out
 
 
 def local_size(residuals: Sequence[Array], rows: int) -> list[Array]:

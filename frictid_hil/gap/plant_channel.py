@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior
@@ -19,7 +18,6 @@ from frictid_hil.gap.residuals import (
     LowPass,
     Recording,
     first_slide,
-    impulse_response,
     reported,
     rms,
 )
@@ -83,7 +81,7 @@ def plant_channel(
     low_pass = band(residuals, logs[0].step_s, candidates, builder.parts)
     rows = tuple(_rows(r, residuals[k], builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, known, candidates)
-    step_s = logs[0].step_s * stride_of(low_pass)
+    step_s = logs[0].step_s * low_pass.stride
     raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
     return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
 
@@ -227,31 +225,6 @@ def _described(residuals: Sequence[Array], tables: Sequence[Array], low_pass: Lo
     return 1.0 - float(left @ left) / max(float(unseen[:, -1] @ unseen[:, -1]), 1e-300)
 
 
-def stride_of(low_pass: LowPass) -> int:
-    """Thinning to 2.5 rows per period of the cut-off: what is above half that rate is 2 % of its power."""
-    return max(1, int(low_pass.rate_hz / (2.5 * low_pass.cutoff_hz)))
-
-
-def thinned(columns: Array, low_pass: LowPass) -> Array:
-    """Low-passed columns at the thinned rows alone, shape (m, k)."""
-    taps = impulse_response(low_pass.rate_hz, low_pass.cutoff_hz)
-    half = min(taps.size // 2, columns.shape[0] - 1)
-    taps = taps[taps.size // 2 - half : taps.size // 2 + half + 1]
-    padded = np.concatenate(
-        [2.0 * columns[0] - columns[half:0:-1], columns, 2.0 * columns[-1] - columns[-2 : -half - 2 : -1]]
-    )
-    down = stride_of(low_pass)
-    every = signal.upfirdn(taps, padded.T, 1, down, axis=-1).T if down == 1 else None
-    if every is None:
-        first = np.concatenate([np.zeros((-2 * half % down, padded.shape[1])), padded])
-        every = signal.upfirdn(taps, np.ascontiguousarray(first.T), 1, down, axis=-1).T
-        start = (2 * half + (-2 * half % down)) // down
-    else:
-        start = 2 * half
-    rows = (columns.shape[0] - 1) // down + 1
-    return np.ascontiguousarray(every[start : start + rows])
-
-
 def plant_residual(recording: Recording, report: ReportFilter | None) -> Array:
     """Reported torque less what the believed joint asks for, as the drive reports it, N m, shape (n,)."""
     view, plant = recording.view, recording.plant_nm
@@ -275,14 +248,14 @@ def _rows(
     columns = np.concatenate([*parts, noise_nm[:, None]], axis=1)
     if report is not None:
         columns = reported(columns, report, recording.step_s)
-    table = thinned(np.concatenate([columns, residual_nm[:, None]], axis=1), low_pass)
+    table = low_pass.thinned(np.concatenate([columns, residual_nm[:, None]], axis=1))
     held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
-    first = min(held // stride_of(low_pass) + 1, table.shape[0] // 3)
+    first = min(held // low_pass.stride + 1, table.shape[0] // 3)
     table = table[first:-2]
     return Rows(
         recording.experiment.name,
         recording.experiment.validation,
-        first * stride_of(low_pass) * recording.step_s,
+        first * low_pass.stride * recording.step_s,
         table[:, -1],
         table[:, :-2],
         table[:, -2],

@@ -9,7 +9,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Rows, Term
-from frictid_hil.gap.plant_channel import SIZES, family, stride_of, thinned
+from frictid_hil.gap.plant_channel import SIZES, family
 from frictid_hil.gap.residuals import LowPass, Recording, rms
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.tracking_form import Link, TrackingForm
@@ -54,12 +54,12 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
     rows = []
     for k, (log, command) in enumerate(zip(logs, commands, strict=True)):
         residual = (log.experiment.position_rad - command)[:, None]
-        table = thinned(np.concatenate([*builder.parts[k], residual], axis=1), low_pass)[1:-2]
+        table = low_pass.thinned(np.concatenate([*builder.parts[k], residual], axis=1))[1:-2]
         e = log.experiment
         rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], np.zeros(table.shape[0])))
     return Channel(
         "tracking",
-        logs[0].step_s * stride_of(low_pass),
+        logs[0].step_s * low_pass.stride,
         tuple(rows),
         (start,),
         tuple(candidates),
