@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from frictid_hil.gap.actuation_channel import actuation_channel, why_not_replayed
+from frictid_hil.gap.borne_out import Loop, borne_out
 from frictid_hil.gap.cautions import ALIKE_ON_A_SINUSOID, ALIKE_ONE_WAY, ONE_SINUSOID, below_first_pair, one_sinusoid
 from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
@@ -43,8 +44,6 @@ READ = 0.97
 """Chance of what is read from reported positions and velocities themselves."""
 TIED = 0.45
 """Chance of each of two causes that a motion makes alike, a little left for a third."""
-WORSE = 2.0
-"""Gap of the closed loop with the causes over that without, from which on they are no explanation."""
 UNDECIDED = 0.5
 """Most that is claimed of causes that a motion or the lack of a second log cannot tell apart."""
 
@@ -82,6 +81,10 @@ def diagnose(
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
+    if replay is not None and runs is not None and said.named:
+        noise_nm = max([_white_nm(logs), *(g.floor for g in gaps if g.channel == "actuation")])
+        said, told = borne_out(said, Loop(replay, _judged_role(logs), settled_nm(runs), noise_nm))
+        reasons |= {} if told is None else {"closed_loop": told}
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
     return _told(experiments, logs, channels, gaps, said, reasons, replay, runs)
 
@@ -219,17 +222,14 @@ def _told(
     bare: Mapping[str, Replayed] | None,
 ) -> Diagnosis:
     """The result as a value."""
-    effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.chance >= UNDECIDED}
     if replay is None:
         reasons["forward_torque_nm"] = why_not(experiments) or ""
         reasons.setdefault("forward_position_rad", reasons["forward_torque_nm"])
+    effects = {f.effect: {n: v.value for n, v in f.parameters.items()} for f in said.named if f.chance >= UNDECIDED}
+    applied = said.word == "explained"
     runs = None
     if replay is not None and bare is not None:
-        runs = simulated(replay, bare, effects if said.word == "explained" else {}, _judged_role(logs))
-        said = _borne_out(said, runs, reasons)
-        if said.word == "unknown":
-            runs = simulated(replay, bare, {}, _judged_role(logs))
-    applied = said.word == "explained"
+        runs = simulated(replay, bare, effects if applied else {}, _judged_role(logs))
     before, after, floor = _figures(gaps, runs, applied)
     gain = experiments.nominal.controller.kd_nm_s_per_rad if experiments.nominal.controller is not None else None
     places = where(logs, floor.inverse_nm or 0.0, velocity_gain_nm_s_per_rad=gain)
@@ -254,17 +254,6 @@ def _told(
         samples=whole_draws(list(effects), channels) if effects and channels else (),
         raw=None if plant is None else Raw(*plant.posterior.channel.raw, plant.posterior.channel.cutoff_hz),
     )
-
-
-def _borne_out(said: Verdict, runs: Simulated, reasons: dict[str, str]) -> Verdict:
-    """The verdict; causes with which the simulated loop is much further from the recording explain nothing."""
-    before, after = (runs.figures(when)[0] for when in ("before", "after"))
-    if said.word != "explained" or after <= WORSE * before:
-        return said
-    reasons["closed_loop"] = (
-        f"with these causes the simulated torque of the validation logs is {after:.3g} N m off, without {before:.3g}"
-    )
-    return Verdict("unknown", said.named, "closed loop: the causes describe the torque along the motion alone")
 
 
 def _figures(gaps: Sequence[Closed], runs: Simulated | None, applied: bool) -> tuple[Figures, Figures, Figures]:

@@ -1,0 +1,124 @@
+"""Which causes the simulated closed loop bears out: with them, the joint comes nearer to its recording.
+
+Along the measured motion causes can describe a gap by cancelling one another. In the simulator each of them moves the
+joint; what brings it no nearer, alone or beside the others, is no cause of the gap, however well it describes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.findings import Finding
+from frictid_hil.gap.forward import Effects, Replay, settled_nm
+from frictid_hil.gap.verdict import DOUBTED, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
+from frictid_hil.simulation.effects import all_effects
+
+FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
+"""Factors of a parameter that are tried where a motion alone could not tell it."""
+REFUTED = 0.4
+"""Most that is claimed of a cause that the closed loop does not bear out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """The closed loop of one set.
+
+    Attributes:
+        replay: simulates the recordings again.
+        validation: which of them; see ``Replay``.
+        before_nm: RMS of its torque gap with nothing added.
+        floor_nm: RMS that noise alone leaves of it.
+    """
+
+    replay: Replay
+    validation: bool | None
+    before_nm: float
+    floor_nm: float
+
+    def gap_nm(self, effects: Effects) -> float:
+        """RMS of the torque gap with effects added."""
+        return settled_nm(self.replay(effects, validation=self.validation))
+
+    @property
+    def visible(self) -> float:
+        """Square of the gap beyond noise; noise itself where the gap is no larger, N^2 m^2."""
+        return max(self.before_nm**2 - self.floor_nm**2, self.floor_nm**2)
+
+
+def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
+    """The verdict as far as the closed loop bears it out, and what to tell of that.
+
+    Causes are added one by one, the one that helps most first. A cause counts as helping, or as doing harm, where it
+    moves the visible gap by ``REMAINS`` or more.
+    """
+    values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
+    kept, gap_nm, beside = _chosen(values, loop)
+    least = REMAINS**2 * loop.visible
+    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > least}
+    refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY}
+    if not refuted:
+        return said, None
+    stands = [f for f in said.named if f.effect not in refuted]
+    falls = [replace(f, chance=min(f.chance, REFUTED)) for f in said.named if f.effect in refuted]
+    if said.word != "unknown" and said.named[0].effect not in refuted:
+        return replace(said, named=(*stands, *falls)), _told(kept, refuted, loop, gap_nm)
+    stands.sort(key=lambda f: kept.index(f.effect) if f.effect in kept else len(kept))
+    stands = [replace(f, chance=min(f.chance, DOUBTED)) for f in stands]
+    if kept:
+        stands[0], gap_nm = _refined(stands[0], {name: values[name] for name in kept}, loop, gap_nm)
+    told = _told(kept, refuted, loop, gap_nm)
+    left = max(0.0, gap_nm**2 - loop.floor_nm**2)
+    if kept and left <= UNNAMED**2 * loop.visible:
+        return Verdict("explained", (*stands, *falls)), told
+    word = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
+    return Verdict("unknown", (*stands, *falls), said.place or word), told
+
+
+def _chosen(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float, dict[str, float]]:
+    """(causes that help, in that order; the gap with them; the gap with each of the others beside them)."""
+    kept: list[str] = []
+    gap_nm = loop.before_nm
+    while True:
+        own = {name: values[name] for name in kept}
+        beside = {name: loop.gap_nm({**own, name: values[name]}) for name in values if name not in kept}
+        best = min(beside, key=lambda name: beside[name], default=None)
+        if best is None or gap_nm**2 - beside[best] ** 2 < REMAINS**2 * loop.visible:
+            return kept, gap_nm, beside
+        kept.append(best)
+        gap_nm = beside[best]
+
+
+def _refined(first: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[Finding, float]:
+    """(the first cause with the numbers that bring the simulated joint nearest, its gap), if it lets the link swing.
+
+    Columns along the measured motion lose the phase of a link that swings, so that they tell too little of it.
+    """
+    form = all_effects()[first.effect].inverse
+    if form is None or not form.swings:
+        return first, gap_nm
+    values = dict(kept[first.effect])
+    for name in (*values, *values):
+        tried = {f * values[name]: {**values, name: f * values[name]} for f in FACTORS}
+        gaps = {value: loop.gap_nm({**kept, first.effect: numbers}) for value, numbers in tried.items()}
+        best = min(gaps, key=lambda value: gaps[value])
+        if gaps[best] < gap_nm:
+            gap_nm, values[name] = gaps[best], best
+    spread = {name: _spread(first.parameters[name], value) for name, value in values.items()}
+    return replace(first, parameters=spread), gap_nm
+
+
+def _spread(told: Value, value: float) -> Value:
+    """A number found in closed loop, its interval as wide as the change and as the one it had."""
+    assert told.low is not None and told.high is not None
+    half = max(abs(value - told.value), 0.5 * (told.high - told.low))
+    return Value(value, value - half, value + half)
+
+
+def _told(kept: Sequence[str], refuted: set[str], loop: Loop, gap_nm: float) -> str:
+    helps = f"{gap_nm:.3g} with {' and '.join(kept)}" if kept else "and no cause helps"
+    return (
+        f"the simulated torque of the validation logs is {loop.before_nm:.3g} N m off, {helps}; "
+        f"{', '.join(sorted(refuted))} would take it further off"
+    )
