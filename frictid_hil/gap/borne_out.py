@@ -6,12 +6,12 @@ joint; what brings it no nearer, alone or beside the others, is no cause of the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
-from frictid_hil.gap.forward import Effects, Replay, settled_nm
+from frictid_hil.gap.forward import Effects
 from frictid_hil.gap.verdict import DOUBTED, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
 from frictid_hil.simulation.effects import all_effects
 
@@ -26,20 +26,14 @@ class Loop:
     """The closed loop of one set.
 
     Attributes:
-        replay: simulates the recordings again.
-        validation: which of them; see ``Replay``.
-        before_nm: RMS of its torque gap with nothing added.
+        gap_nm: RMS of its torque gap with effects added to the believed joint.
+        before_nm: the same with none.
         floor_nm: RMS that noise alone leaves of it.
     """
 
-    replay: Replay
-    validation: bool | None
+    gap_nm: Callable[[Effects], float]
     before_nm: float
     floor_nm: float
-
-    def gap_nm(self, effects: Effects) -> float:
-        """RMS of the torque gap with effects added."""
-        return settled_nm(self.replay(effects, validation=self.validation))
 
     @property
     def visible(self) -> float:

@@ -82,8 +82,7 @@ def diagnose(
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
-        noise_nm = max([_white_nm(logs), *(g.floor for g in gaps if g.channel == "actuation")])
-        said, told = borne_out(said, Loop(replay, _judged_role(logs), settled_nm(runs), noise_nm))
+        said, told = borne_out(said, _loop(replay, logs, runs, gaps))
         reasons |= {} if told is None else {"closed_loop": told}
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
     return _told(experiments, logs, channels, gaps, said, reasons, replay, runs)
@@ -186,6 +185,13 @@ def _loop_quiet(
     if runs is None or noise is None:
         return True
     return settled_nm(runs) <= min(FLOORS * max(noise, white_nm), max(LOUD * white_nm, negligible_nm))
+
+
+def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed], gaps: Sequence[Closed]) -> Loop:
+    """The closed loop on the logs a gap is told of, as it judges causes."""
+    role = _judged_role(logs)
+    noise_nm = max([_white_nm(logs), *(gap.floor for gap in gaps if gap.channel == "actuation")])
+    return Loop(lambda effects: settled_nm(replay(effects, validation=role)), settled_nm(bare), noise_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
-from frictid_hil.gap.diagnose import _borne_out, diagnose
+from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import Finding, findings, sampled
-from frictid_hil.gap.forward import Replayed
-from frictid_hil.gap.how_far import Simulated
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior, _put_inside
 from frictid_hil.gap.residuals import recordings
 from frictid_hil.gap.tolerances import Sigma
-from frictid_hil.gap.verdict import Verdict
 from frictid_hil.simulation.effects import all_effects
 
 
@@ -75,19 +72,6 @@ def test_a_healthy_joint_is_none_and_a_payload_in_validation_alone_is_no_cause_o
     ]
     found = diagnose(replace(made, experiments=tuple(heavier)))
     assert found.verdict == "unknown" and "moves_payload" in found.reasons["validation"]
-
-
-def test_causes_that_double_the_gap_of_the_simulated_loop_explain_nothing() -> None:
-    cause = Finding("backlash", 0.99, 5.0, 1.0)
-    said = Verdict("explained", (cause,))
-
-    def loop(torque_nm: float) -> dict[str, Replayed]:
-        return {"log": Replayed(np.full(9, torque_nm), np.zeros(9))}
-
-    reasons: dict[str, str] = {}
-    assert _borne_out(said, Simulated(loop(1.0), loop(1.9)), reasons) is said and not reasons
-    refused = _borne_out(said, Simulated(loop(1.0), loop(2.1)), reasons)
-    assert refused.word == "unknown" and refused.named == (cause,) and "without 1" in reasons["closed_loop"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,79 @@
+"""The closed loop as a judge: what takes the simulated joint further off is refuted, what brings it nearer leads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import gap_sets
+import pytest
+
+from frictid_hil.gap.borne_out import REFUTED, Loop, borne_out
+from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.findings import Finding
+from frictid_hil.gap.forward import Effects, Replay, settled_nm
+from frictid_hil.gap.verdict import DOUBTED, READ_DIRECTLY, Verdict
+
+BACKLASH = {"gap_rad": 0.004, "contact_stiffness_nm_per_rad": 20000.0, "contact_relaxation_s": 0.004}
+
+
+def cause(effect: str, where: str = "plant", chance: float = 0.99, **values: float) -> Finding:
+    told = {name: Value(value, 0.9 * value, 1.1 * value) for name, value in values.items()}
+    return Finding(effect, chance, 5.0, 1.0, told, (), where)
+
+
+def loop(gaps_nm: Mapping[str, float], before_nm: float = 1.0) -> Loop:
+    """A loop whose gaps are told by a table; causes joined by "+" in the order of the alphabet."""
+
+    def gap_nm(effects: Effects) -> float:
+        return gaps_nm["+".join(sorted(effects))]
+
+    return Loop(gap_nm, before_nm, 0.02)
+
+
+def test_a_pair_that_cancels_falls_and_the_cause_that_helps_leads() -> None:
+    named = (cause("stribeck"), cause("viscous_error"), cause("inertia_error"))
+    gaps = {"inertia_error": 0.1, "stribeck": 3.0, "viscous_error": 2.0}
+    gaps |= {"inertia_error+stribeck": 2.9, "inertia_error+viscous_error": 1.9}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert said.word == "explained" and [f.effect for f in said.named] == ["inertia_error", "stribeck", "viscous_error"]
+    assert said.named[0].chance == DOUBTED and said.named[1].chance == said.named[2].chance == REFUTED
+    assert told is not None and "1 N m off, 0.1 with inertia_error" in told
+
+
+def test_where_nothing_helps_the_gap_is_unknown() -> None:
+    said, told = borne_out(Verdict("explained", (cause("joint_elasticity"),)), loop({"joint_elasticity": 1.3}))
+    assert said.word == "unknown" and said.named[0].chance == REFUTED
+    assert told is not None and "no cause helps" in told
+
+
+def test_a_cause_that_helps_too_little_leaves_an_unknown() -> None:
+    named = (cause("torque_bias"), cause("inertia_error"))
+    gaps = {"torque_bias": 9.0, "inertia_error": 0.5, "inertia_error+torque_bias": 9.0}
+    said, _ = borne_out(Verdict("explained", named), loop(gaps))
+    assert said.word == "unknown" and said.named[0].effect == "inertia_error"
+
+
+@pytest.mark.parametrize("where", ["plant", READ_DIRECTLY])
+def test_what_is_read_directly_needs_no_loop(where: str) -> None:
+    said, _ = borne_out(Verdict("explained", (cause("velocity_lag", where),)), loop({"velocity_lag": 2.0}))
+    assert (said.word == "explained") is (where == READ_DIRECTLY)
+
+
+def test_causes_that_the_loop_hardly_feels_stay_as_they_are() -> None:
+    verdict = Verdict("explained", (cause("friction_level_error"),))
+    assert borne_out(verdict, loop({"friction_level_error": 0.99})) == (verdict, None)
+
+
+def test_play_leads_where_the_motion_told_half_of_it() -> None:
+    experiments = gap_sets.make({"backlash": BACKLASH}, only=("sines_small", "sines_large", "moves_payload"))
+    replay = Replay(experiments)
+
+    def gap_nm(effects: Effects) -> float:
+        return settled_nm(replay(effects, validation=True))
+
+    half = cause("backlash", "plant", 0.99, **{**BACKLASH, "gap_rad": 0.5 * BACKLASH["gap_rad"]})
+    wrong = cause("torque_constant_error", error_share=0.3)
+    said, _ = borne_out(Verdict("unknown", (wrong, half)), Loop(gap_nm, gap_nm({}), 0.01))
+    assert said.word == "explained" and said.named[0].effect == "backlash"
+    told = {name: value.value for name, value in said.named[0].parameters.items()}
+    assert gap_nm({"backlash": told}) < gap_nm({"backlash": {**BACKLASH, "gap_rad": 0.5 * BACKLASH["gap_rad"]}})
