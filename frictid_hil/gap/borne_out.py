@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects
-from frictid_hil.gap.verdict import DOUBTED, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
+from frictid_hil.gap.verdict import DOUBTED, HALF, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
 from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
@@ -44,13 +44,13 @@ class Loop:
 def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     """The verdict as far as the closed loop bears it out, and what to tell of that.
 
-    Causes are added one by one, the one that helps most first. A cause counts as helping, or as doing harm, where it
-    moves the visible gap by ``REMAINS`` or more.
+    Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
+    more. A cause is refuted that adds ``HALF`` of it or more to what they leave.
     """
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
     kept, gap_nm, beside = _chosen(values, loop)
-    least = REMAINS**2 * loop.visible
-    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > least}
+    worse = HALF**2 * loop.visible
+    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > worse}
     refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY}
     if not refuted:
         return said, None
