@@ -24,6 +24,8 @@ ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
+UNTOLD = 0.8
+"""Most that is claimed of a cause of which the recordings tell a size and no number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,14 +143,15 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             continue
         blur = np.maximum(blurs[row], FORM)
         chance = float(np.mean(special.ndtr((table[row] - VISIBLE) / blur) * (table[row] > 0.0)))
+        values = _values(name, channels)
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
             Finding(
                 name,
-                min(SURE, chance),
+                min(SURE if values else UNTOLD, chance),
                 math.sqrt(float(np.mean(shown[row] ** 2))),
                 float(leads[row]),
-                _values(name, channels),
+                values,
                 _rivals(row, names, there, shown),
                 home.posterior.channel.name,
             )

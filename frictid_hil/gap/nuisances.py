@@ -115,7 +115,9 @@ def _friction_shape(nominal: Nominal, views: Sequence[View], builder: Builder) -
     stated = nominal.presliding_stiffness_nm_per_rad is not None
     deviation = nominal.tolerances.presliding_stiffness.of(stiffness) / stiffness if stated else 1.0
     numbers = builder.add(stiffer)
-    terms = [Term("", {STIFFNESS: 1.0} if stated else {}, numbers, np.zeros(1), np.array([deviation]))]
+    terms = [
+        Term("presliding_hysteresis" if stated else "", {STIFFNESS: 1.0}, numbers, np.zeros(1), np.array([deviation]))
+    ]
     if nominal.yields_gradually and nominal.inertia_kg_m2:
         bent = [v.coulomb_nm / v.stiffness_nm_per_rad * np.gradient(v.slip, v.step_s)[:, None] for v in views]
         terms.append(_term("", builder.add(bent), math.sqrt(stiffness * nominal.inertia_kg_m2)))

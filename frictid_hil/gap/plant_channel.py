@@ -100,7 +100,7 @@ def _causes(
         form = all_effects()[name].inverse
         if form is None:
             continue
-        told = [t for t in known if t.effect == name]
+        told = [t for t in known if t.effect == name and STIFFNESS not in t.shape]
         for term in told:
             least, largest = form.first_coefficient
             _, visible = effect_prior(name, {}, form.regressors(views, {}), scale, form.first_coefficient)
@@ -111,8 +111,8 @@ def _causes(
             mean, deviation = effect_prior(name, shape, columns, scale, form.first_coefficient)
             candidates.append(Term(name, shape, builder.add(columns), mean, deviation, *form.first_coefficient))
     if "presliding_hysteresis" in library:
-        wrong = [t for t in known if STIFFNESS in t.shape]
-        candidates += [replace(t, effect="presliding_hysteresis", deviation=BEYOND * t.deviation) for t in wrong]
+        wrong = [t for t in known if t.effect == "presliding_hysteresis"]
+        candidates += [replace(t, deviation=BEYOND * t.deviation) for t in wrong]
     return candidates
 
 

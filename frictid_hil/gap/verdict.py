@@ -33,6 +33,8 @@ LISTED = 0.25
 """Chance from which a cause is listed."""
 NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
+EVEN = 0.5
+"""Chance below which a cause is likelier not there: no reason to call a gap within noise anything but none."""
 LEADS = 0.6
 """Chance of being the largest cause below which a rival makes the answer ambiguous."""
 
@@ -86,7 +88,8 @@ def verdict(
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     told = any(f in unreached for f in named)
     tiny = tiny and not told and not (shows and any(_needed(f, channels) for f in named))
-    if tiny or (quiet and not told and (nothing or generic_wins)):
+    doubtful = all(f.chance < EVEN for f in named)
+    if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     new = any(gap.appeared is not None and _stays(gap, REMAINS) for gap in gaps)
     untold = unnamed and any(_stays(gap, UNNAMED) for gap in gaps)
