@@ -80,6 +80,8 @@ class InverseForm:
         first_coefficient: range of the first coefficient that makes physical sense; outside it is another effect.
         continuous: shapes between the grid's points make sense, so that a replay may refine them.
         shapes_for: the grid where it depends on the joint's size (a resonance, say); ``shapes`` where None.
+        swings: lets the link swing by itself, so that columns along a measured motion may lose its phase; the closed
+            loop then tries other numbers.
     """
 
     shapes: tuple[Shape, ...]
@@ -88,6 +90,7 @@ class InverseForm:
     first_coefficient: tuple[float, float] = (-math.inf, math.inf)
     continuous: bool = True
     shapes_for: Callable[[Sequence[View]], tuple[Shape, ...]] | None = None
+    swings: bool = False
 
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:
         """The shapes to try on these recordings."""

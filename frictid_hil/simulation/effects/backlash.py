@@ -159,6 +159,7 @@ EFFECT = Effect(
     inverse=InverseForm(
         shapes=SHAPES,
         shapes_for=shapes_for,
+        swings=True,
         regressors=regressors,
         parameters=lambda shape, coefficients: {
             **shape,

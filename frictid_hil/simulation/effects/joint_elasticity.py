@@ -121,6 +121,7 @@ EFFECT = Effect(
     inverse=InverseForm(
         shapes=SHAPES,
         shapes_for=shapes_for,
+        swings=True,
         regressors=regressors,
         parameters=lambda shape, coefficients: {
             "compliance_rad_per_nm": shape["compliance_rad_per_nm"] * max(0.05, float(coefficients[0])),
