@@ -17,8 +17,6 @@ from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors of a parameter that are tried where a motion alone could not tell it."""
-MEASURED = (READ_DIRECTLY, "actuation")
-"""Where a cause is seen by itself: between demand and torque, position and velocity. No other there takes it back."""
 REFUTED = 0.4
 """Most that is claimed of a cause that the closed loop does not bear out."""
 
@@ -53,7 +51,7 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     kept, gap_nm, beside = _chosen(values, loop)
     worse = HALF**2 * loop.visible
     refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > worse}
-    refuted -= {f.effect for f in said.named if f.where in MEASURED}
+    refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     if not refuted:
         return said, None
     stands = [f for f in said.named if f.effect not in refuted]
@@ -70,6 +68,11 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
         return Verdict("explained", (*stands, *falls)), told
     word = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
     return Verdict("unknown", (*stands, *falls), said.place or word), told
+
+
+def _of_the_drive(cause: Finding) -> bool:
+    """Whether a cause acts between demand and torque: it is seen by itself, and where a drive reports may differ."""
+    return all_effects()[cause.effect].actuation is not None
 
 
 def _chosen(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float, dict[str, float]]:

@@ -55,7 +55,7 @@ def test_a_cause_that_helps_too_little_leaves_an_unknown() -> None:
 
 @pytest.mark.parametrize("where", ["plant", READ_DIRECTLY])
 def test_what_is_read_directly_needs_no_loop(where: str) -> None:
-    said, _ = borne_out(Verdict("explained", (cause("velocity_lag", where),)), loop({"velocity_lag": 2.0}))
+    said, _ = borne_out(Verdict("explained", (cause("stribeck", where),)), loop({"stribeck": 2.0}))
     assert (said.word == "explained") is (where == READ_DIRECTLY)
 
 
