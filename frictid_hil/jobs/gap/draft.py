@@ -23,6 +23,8 @@ SPEEDS = 8
 """Points of the drafted friction curve."""
 SHORT_RAD = 0.3
 """Travel below which gravity's shape over the position is not told from a constant; so too of a linear axis."""
+LEAST_LEVEL = 2e-3
+"""Friction level written at least, over the viscous torque at top speed: four digits still hold it."""
 LEAST_TOLERANCE = 0.005
 """No number of a least-squares draft is worth more than this share."""
 LARGEST_TOLERANCE = 0.5
@@ -101,7 +103,8 @@ def _document(
 ) -> dict[str, Any]:
     speed = np.abs(columns[:, _VISCOUS])
     fastest = float(np.quantile(speed, 0.99))
-    level, slope = max(float(weights[_COULOMB]), 1e-9), max(float(weights[_VISCOUS]), 0.0)
+    slope = max(float(weights[_VISCOUS]), 0.0)
+    level = max(float(weights[_COULOMB]), LEAST_LEVEL * slope * fastest, 1e-9)
     speeds = fastest * np.arange(1, SPEEDS + 1) / SPEEDS
     typical = level + slope * float(np.median(speed[speed > 0.05 * fastest]))
     joint: dict[str, Any] = {"inertia_kg_m2": 0 if rigid else max(0.0, _rounded(weights[_INERTIA]))}
