@@ -74,7 +74,7 @@ def diagnose(
     found_in = _channels(nominal, logs, allowed, reasons, kinematic, believed)
     channels = [sampled(Posterior(c, len(allowed))) for c in found_in]
     found = _with_readings(findings(channels), kinematic, logs, channels, nominal)
-    gaps = [closed(c, [f.effect for f in found if f.chance >= UNDECIDED]) for c in channels]
+    gaps = _closed(channels, found)
     runs = None if replay is None else replay({}, validation=_judged_role(logs))
     nothing_nm = _negligible(nominal, channels, negligible)
     quiet = _raw_quiet(channels, negligible) and _loop_quiet(gaps, runs, _white_nm(logs), nothing_nm)
@@ -83,9 +83,16 @@ def diagnose(
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
         said, told = borne_out(said, _loop(replay, logs, runs, gaps))
-        reasons |= {} if told is None else {"closed_loop": told}
+        if told is not None:
+            reasons["closed_loop"] = told
+            gaps = _closed(channels, said.named)
     said = _cautious(said, reasons, any(r.experiment.validation for r in logs))
     return _told(experiments, logs, channels, gaps, said, reasons, replay, runs)
+
+
+def _closed(channels: Sequence[Sampled], named: Sequence[Finding]) -> list[Closed]:
+    """The gap of each channel without and with the causes that are likelier there than not."""
+    return [closed(c, [f.effect for f in named if f.chance >= UNDECIDED]) for c in channels]
 
 
 def _channels(
@@ -253,7 +260,7 @@ def _told(
         per_log=runs.per_log() if runs is not None else {},
         next_experiment=_next(said, experiments.nominal, logs, plant),
         reasons=reasons,
-        summary=_summary(experiments.name, said, lives(places), gaps),
+        summary=_summary(experiments.name, said, lives(places), gaps, reasons.get("closed_loop")),
         model=replay.model(effects if applied else {}) if replay is not None else None,
         candidate=replay.model(effects) if replay is not None else None,
         held_out=held_out(plant) if plant is not None else {},
@@ -325,16 +332,19 @@ def _next(said: Verdict, nominal: Nominal, logs: Sequence[Recording], plant: Sam
     return next_experiment(first.effect, others[0], nominal, logs, of_torque)
 
 
-def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed]) -> str:
+def _summary(name: str, said: Verdict, there: str, gaps: Sequence[Closed], loop: str | None) -> str:
     if said.word == "none":
         return f"{name}: no gap beyond noise and what counts as none."
-    effects = ", ".join(f"{f.effect} ({f.chance:.2f})" for f in said.named)
+    likely = [f for f in said.named if f.chance >= UNDECIDED] or said.named
+    effects = ", ".join(f"{f.effect} ({f.chance:.2f})" for f in likely)
     place = f"{there}; " if there else ""
     if said.word == "unknown":
         part = f"{effects} explain a part, the rest " if effects else "it "
         return f"{name}: {place}{part}lives in {said.place}, and no known effect explains it."
     if said.word == "ambiguous":
         return f"{name}: {place}{effects}; these recordings cannot decide."
+    if loop is not None:
+        return f"{name}: {place}{effects}; {loop}."
     told = max(gaps, key=lambda gap: gap.before / gap.floor)
     return (
         f"{name}: {place}{effects}; the gap of the {told.channel} falls from {told.before:.3g} to {told.after:.3g} "

@@ -29,11 +29,11 @@ _LABELS = {
 
 
 AIMS = {
-    "singles_top_1": 0.95,
+    "singles_top_1": 0.97,
     "singles_top_2": 0.98,
-    "none_answered_none": 0.96,
-    "outside_answered_unknown": 0.93,
-    "doubles_both_in_top_2": 0.80,
+    "none_answered_none": 0.97,
+    "outside_answered_unknown": 0.95,
+    "doubles_both_in_top_2": 0.85,
     "confident_right": 0.95,
 }
 """Rates that the diagnosis is to reach."""
