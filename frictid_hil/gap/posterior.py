@@ -46,6 +46,8 @@ FORM = 0.1
 """One-sigma of what a cause makes of the residual beyond its form, over its size: no gear is quite as its formula."""
 MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
+ROUNDING = 1e-12
+"""Share of a matrix' largest entry that rounding may leave in the others."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -508,7 +510,9 @@ def _integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[A
     left = gram[np.ix_(outside, outside)].copy()
     if inside.size == 0:
         return left, 0.0
-    lower = np.linalg.cholesky(gram[np.ix_(inside, inside)] + np.eye(inside.size))
+    known = gram[np.ix_(inside, inside)]
+    # Columns that are alike and very well known leave rounding below zero.
+    lower = np.linalg.cholesky(known + max(1.0, ROUNDING * float(np.max(np.diag(known)))) * np.eye(inside.size))
     solved = np.linalg.solve(lower, gram[np.ix_(inside, outside)])
     left -= solved.T @ solved
     gain = 0.5 * float(solved[:, -1] @ solved[:, -1])

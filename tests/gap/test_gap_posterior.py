@@ -12,7 +12,7 @@ from frictid_hil.gap import noise
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import Finding, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import Posterior, _put_inside
+from frictid_hil.gap.posterior import Posterior, _integrated, _put_inside
 from frictid_hil.gap.residuals import recordings
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
@@ -80,3 +80,12 @@ def test_a_limit_that_validation_logs_never_reach_is_no_all_clear() -> None:
     judged = [replace(e, validation=e.name == "triangle_slow") for e in made.experiments]
     found = diagnose(replace(made, experiments=tuple(judged)))
     assert found.verdict != "none" and found.causes[0].effect == "torque_saturation"
+
+
+def test_columns_that_are_alike_and_very_well_known_are_integrated_out() -> None:
+    random = np.random.default_rng(0)
+    wide = 1e9 * random.standard_normal((400, 5))
+    alike = wide[:, :3] + 1e-4 * random.standard_normal((400, 3))
+    table = np.concatenate([wide, alike, random.standard_normal((400, 2))], axis=1)
+    left, gain = _integrated(table.T @ table, np.arange(8), np.array([8, 9]))
+    assert np.isfinite(gain) and np.all(np.diag(left) > 0.0)
