@@ -62,6 +62,7 @@ class Sampled:
         blurs: by cause, one-sigma of what the forms of the others may have put on it, in the same unit.
         generic: the same of all generic functions together.
         explained: the same of all causes together.
+        gram: mean products of the channel's columns over all its rows, shape (m, m).
     """
 
     posterior: Posterior
@@ -70,6 +71,7 @@ class Sampled:
     blurs: Mapping[str, Array]
     generic: Array
     explained: Array
+    gram: Array
 
 
 def sampled(posterior: Posterior) -> Sampled:
@@ -100,7 +102,7 @@ def sampled(posterior: Posterior) -> Sampled:
             blurs.setdefault(effect, np.zeros(len(draws)))[k] = blur / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
-    return Sampled(posterior, draws, sizes, blurs, generic, explained)
+    return Sampled(posterior, draws, sizes, blurs, generic, explained, gram)
 
 
 def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
@@ -233,9 +235,30 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
             found.append((term, values))
     if not found:
         return {}
+    if _opposed([(term, values) for term, values in found if term.shape]):
+        return _read(effect, posterior.channel.name, *_nearest(effect, channel, found))
     width = found[-1][1].size
     total = np.sum([values for _, values in found if values.size == width], axis=0)
     return _read(effect, posterior.channel.name, _between(found), total)
+
+
+def _opposed(shaped: Sequence[tuple[Term, Array]]) -> bool:
+    """Whether shapes of one cause, of a column each, take part of one another back."""
+    weights = [float(values[0]) for _, values in shaped if values.size == 1]
+    return len(weights) == len(shaped) > 1 and min(weights) * max(weights) < 0.0
+
+
+def _nearest(effect: str, channel: Sampled, found: Sequence[tuple[Term, Array]]) -> tuple[Term, Array]:
+    """The one shape of a cause, and its coefficient, that comes nearest to what several make together."""
+    together = np.zeros(channel.gram.shape[0])
+    for term, values in found:
+        np.add.at(together, np.array(term.columns), values)
+    made = channel.gram @ together
+    shapes = [t for t in channel.posterior.channel.candidates if t.effect == effect and len(t.columns) == 1]
+    at = np.array([t.columns[0] for t in shapes])
+    own = np.maximum(channel.gram[at, at], 1e-300)
+    best = int(np.argmax(made[at] ** 2 / own))
+    return shapes[best], np.array([made[at[best]] / own[best]])
 
 
 def _between(found: Sequence[tuple[Term, Array]]) -> Term:
