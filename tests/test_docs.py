@@ -81,6 +81,16 @@ def test_the_page_of_files_is_that_of_the_schemas() -> None:
     assert page == reference.page(), "python -m frictid_hil.config.reference docs/reference"
 
 
+def test_every_key_of_every_file_has_a_meaning_in_its_schema() -> None:
+    silent = []
+    for title, model in reference.FILES.values():
+        whole = reference.schema(model)
+        for definition in (whole, *whole.get("$defs", {}).values()):
+            fields = definition.get("properties", {})
+            silent += [f"{title}: {key}" for key, field in fields.items() if not field["description"]]
+    assert silent == []
+
+
 def test_the_page_of_verbs_is_that_of_the_command_line() -> None:
     command = [sys.executable, "-m", "typer", "frictid_hil.cli.app", "utils", "docs", "--name", "frictid-hil"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -109,7 +109,15 @@ class PayloadFile(Open):
 
 
 class FeedForward(Strict):
-    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``."""
+    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``.
+
+    Attributes:
+        inertia_kg_m2: that multiplies the command's acceleration.
+        gravity_cos_nm: at the command's cosine.
+        gravity_sin_nm: at the command's sine.
+        coulomb_nm: in the direction of the command's velocity.
+        viscous_nm_s_per_rad: that multiplies the command's velocity.
+    """
 
     inertia_kg_m2: float = 0.0
     gravity_cos_nm: float = 0.0
@@ -171,7 +179,12 @@ class ControllerFile(Open):
 
 
 class ReportFilter(Strict):
-    """A low-pass that the drive's reported torque has passed: ``order`` first-order lags in a row."""
+    """A low-pass that the drive's reported torque has passed.
+
+    Attributes:
+        order: first-order lags in a row.
+        time_constant_s: of each lag; 0 is no filter.
+    """
 
     order: Annotated[int, Field(ge=1, le=8)] = 1
     time_constant_s: NotNegative
@@ -219,7 +232,19 @@ Share = NotNegative | Literal["data_sheet", "cad", "profile"]
 
 
 class Tolerance(Strict):
-    """One-sigma beliefs: relative here, in the number's own unit under ``absolute``."""
+    """One-sigma beliefs: relative here, in the number's own unit under ``absolute``.
+
+    Attributes:
+        inertia_kg_m2: of the joint's inertia.
+        gravity_torque_nm: of the gravity torque.
+        friction_torque: of the whole friction curve.
+        viscous: of the part of friction that depends on speed.
+        presliding_stiffness: of the stiffness before friction slips.
+        torque_constant: of the torque that the drive reports.
+        controller_gains: of each gain.
+        rigid_body_torque: of the column that the logs bring.
+        absolute: the same, and those of zero offset, delay, lag and filter, in N m, kg m2, rad and s.
+    """
 
     inertia_kg_m2: Share | None = None
     gravity_torque_nm: Share | None = None

@@ -49,26 +49,38 @@ def page() -> str:
     return "\n".join(sections)
 
 
+def schema(model: type[BaseModel]) -> dict[str, Any]:
+    """JSON schema of a file, with what its docstrings say of each model and key: an editor shows it."""
+    whole = model.model_json_schema(by_alias=True)
+    classes = _classes(model)
+    for name, definition in ((model.__name__, whole), *whole.get("$defs", {}).items()):
+        if name not in classes:
+            continue
+        definition["description"], meanings = _documented(classes[name])
+        for key, field in definition.get("properties", {}).items():
+            field.setdefault("description", "")
+            field["description"] = meanings.get(key, field["description"])
+    return whole
+
+
 def _tables(model: type[BaseModel]) -> Iterator[str]:
     """The table of a model, then those of the models that it holds, each once."""
-    schema = model.model_json_schema(by_alias=True)
-    inner: Mapping[str, Any] = schema.get("$defs", {})
-    classes = _classes(model)
-    yield _table(model, schema)
-    for name, definition in inner.items():
+    whole = schema(model)
+    of = model.__name__.lower()
+    yield _table(whole, of)
+    for name, definition in whole.get("$defs", {}).items():
         if "properties" in definition:
-            yield f"### {name} {{ #{model.__name__.lower()}-{name.lower()} }}\n"
-            yield _table(classes[name], definition, of=model.__name__.lower())
+            yield f"### {name} {{ #{of}-{name.lower()} }}\n"
+            yield _table(definition, of)
 
 
-def _table(model: type[BaseModel], schema: Mapping[str, Any], of: str = "") -> str:
-    words, attributes = _documented(model)
-    required = schema.get("required", ())
-    rows = [f"{words}\n", "| Key | Type | Default | Meaning |", "|---|---|---|---|"]
-    for key, field in schema["properties"].items():
+def _table(definition: Mapping[str, Any], of: str) -> str:
+    required = definition.get("required", ())
+    rows = [f"{definition['description']}\n", "| Key | Type | Default | Meaning |", "|---|---|---|---|"]
+    for key, field in definition["properties"].items():
         default = "required" if key in required else _default(field.get("default"))
-        meaning = attributes.get(key, field.get("description", "")).replace("|", "\\|")
-        rows.append(f"| `{key}` | {_type(field, of or model.__name__.lower())} | {default} | {meaning} |")
+        meaning = field["description"].replace("|", "\\|")
+        rows.append(f"| `{key}` | {_type(field, of)} | {default} | {meaning} |")
     return "\n".join(rows) + "\n"
 
 
@@ -120,7 +132,7 @@ def _classes(kind: Any) -> dict[str, type[BaseModel]]:
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["--json", kind] if kind in FILES:
-            print(json.dumps(FILES[kind][1].model_json_schema(by_alias=True), indent=1))
+            print(json.dumps(schema(FILES[kind][1]), indent=1))
         case [folder]:
             (Path(folder) / "files.md").write_text(page(), encoding="utf-8")
         case _:
