@@ -26,7 +26,7 @@ class Loop:
     """The closed loop of one set.
 
     Attributes:
-        gap_nm: RMS of its torque gap with effects added to the believed joint.
+        gap_nm: RMS of its torque gap with effects added to the believed joint; infinite where it runs away.
         before_nm: the same with none.
         floor_nm: RMS that noise alone leaves of it.
     """

@@ -20,7 +20,7 @@ from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
 from frictid_hil.gap.findings import Finding, Sampled, findings, sampled, whole_draws
-from frictid_hil.gap.forward import Replay, Replayed, settled_nm, why_not
+from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
 from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulated
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
 from frictid_hil.gap.next_experiment import next_experiment
@@ -198,7 +198,13 @@ def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed
     """The closed loop on the logs a gap is told of, as it judges causes."""
     role = _judged_role(logs)
     noise_nm = max([_white_nm(logs), *(gap.floor for gap in gaps if gap.channel == "actuation")])
-    return Loop(lambda effects: settled_nm(replay(effects, validation=role)), settled_nm(bare), noise_nm)
+
+    def gap_nm(effects: Effects) -> float:
+        gap = settled_nm(replay(effects, validation=role))
+        # A joint that no controller holds is as far off as can be.
+        return gap if math.isfinite(gap) else math.inf
+
+    return Loop(gap_nm, settled_nm(bare), noise_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:
