@@ -200,7 +200,8 @@ def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed
     noise_nm = max([_white_nm(logs), *(gap.floor for gap in gaps if gap.channel == "actuation")])
 
     def gap_nm(effects: Effects) -> float:
-        gap = settled_nm(replay(effects, validation=role))
+        with np.errstate(over="ignore", invalid="ignore"):
+            gap = settled_nm(replay(effects, validation=role))
         # A joint that no controller holds is as far off as can be.
         return gap if math.isfinite(gap) else math.inf
 
