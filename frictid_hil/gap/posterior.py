@@ -510,9 +510,12 @@ def _integrated(gram: Array, inside: np.ndarray, outside: np.ndarray) -> tuple[A
     left = gram[np.ix_(outside, outside)].copy()
     if inside.size == 0:
         return left, 0.0
-    known = gram[np.ix_(inside, inside)]
-    # Columns that are alike and very well known leave rounding below zero.
-    lower = np.linalg.cholesky(known + max(1.0, ROUNDING * float(np.max(np.diag(known)))) * np.eye(inside.size))
+    known = gram[np.ix_(inside, inside)] + np.eye(inside.size)
+    try:
+        lower = np.linalg.cholesky(known)
+    except np.linalg.LinAlgError:
+        # Columns that are alike and very well known leave rounding below zero.
+        lower = np.linalg.cholesky(known + ROUNDING * float(np.max(np.diag(known))) * np.eye(inside.size))
     solved = np.linalg.solve(lower, gram[np.ix_(inside, outside)])
     left -= solved.T @ solved
     gain = 0.5 * float(solved[:, -1] @ solved[:, -1])
