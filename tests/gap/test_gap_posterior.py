@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import gap_sets
 import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
+from frictid_hil.gap.channel import Term
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.findings import Finding, findings, sampled
+from frictid_hil.gap.findings import Finding, _nearest, _opposed, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior, _integrated, _put_inside
 from frictid_hil.gap.residuals import recordings
@@ -89,3 +92,19 @@ def test_columns_that_are_alike_and_very_well_known_are_integrated_out() -> None
     table = np.concatenate([wide, alike, random.standard_normal((400, 2))], axis=1)
     left, gain = _integrated(table.T @ table, np.arange(8), np.array([8, 9]))
     assert np.isfinite(gain) and np.all(np.diag(left) > 0.0)
+
+
+def test_shapes_that_oppose_each_other_are_told_as_the_one_nearest_to_their_sum() -> None:
+    speed = np.linspace(0.01, 1.0, 400)
+    shapes = [{"knee_rad_s": knee, "bend": 0.0} for knee in (0.05, 0.1, 0.2, 0.4)]
+    table = np.stack([np.log1p(speed / shape["knee_rad_s"]) for shape in shapes], axis=1)
+    terms = [Term("viscous_nonlinearity", shape, (k,), np.zeros(1), np.ones(1)) for k, shape in enumerate(shapes)]
+    channel: Any = SimpleNamespace(
+        gram=table.T @ table / speed.size, posterior=SimpleNamespace(channel=SimpleNamespace(candidates=terms))
+    )
+    found = [(terms[0], np.array([2.0])), (terms[3], np.array([-0.5]))]
+    assert _opposed(found) and not _opposed(found[:1])
+    term, values = _nearest("viscous_nonlinearity", channel, found)
+    together = table[:, 0] * 2.0 - table[:, 3] * 0.5
+    told = table[:, terms.index(term)] * values[0]
+    assert np.std(together - told) < 0.1 * np.std(together)
