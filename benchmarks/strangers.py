@@ -11,6 +11,7 @@ is answered before the next one is sent (``stranger_wire``), so a loaded machine
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import shutil
@@ -236,14 +237,17 @@ def _said(note: str, foreseen: set[str]) -> bool:
 
 def main(arguments: Sequence[str]) -> int:
     """Print a line per family; 1 where one fails."""
-    families = [one for one in arguments if one != "--npm"]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("families", nargs="*", metavar="FAMILY", help=", ".join(sorted(known_personalities())))
+    parser.add_argument("--npm", action="store_true", help="the npm package `canopen` instead of durand")
+    wanted = parser.parse_args(arguments)
     os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp())
     failed = 0
     print(f"{'family':12} {'outcome':12} {'F_0 off %':>9} {'frames':>7} {'malformed':>9} surprises")
     with tempfile.TemporaryDirectory() as home:
         register(Path(home))
-        stack = npm_canopen(Path(home) / "npm") if "--npm" in arguments else DURAND
-        for family in families or sorted(known_personalities()):
+        stack = npm_canopen(Path(home) / "npm") if wanted.npm else DURAND
+        for family in wanted.families or sorted(known_personalities()):
             with tempfile.TemporaryDirectory() as folder:
                 found = calibrated(Path(folder), family, stack)
                 frames, bad = dissected(found.log) or ("-", "-")
