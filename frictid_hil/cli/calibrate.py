@@ -53,6 +53,7 @@ def register(app: typer.Typer) -> None:
 def check(
     robot: RobotOption,
     bus: BusOption = None,
+    dry: Annotated[bool, typer.Option("--dry", help="Check the robot file and its plan alone; open no bus.")] = False,
     latency: Annotated[
         float,
         typer.Option(
@@ -78,9 +79,10 @@ def check(
                 marks[finding["severity"]], finding["subject"], finding["message"], finding.get("next_step", "")
             )
         output.out.print(table)
-        output.out.print("ready" if result["ok"] else "not ready: see the errors above")
+        ready = "ready for a check of the drives, without --dry" if dry else "ready"
+        output.out.print(ready if result["ok"] else "not ready: see the errors above")
 
-    output.run("check", lambda: job(robot, bus=bus, latency_s=latency), show)
+    output.run("check", lambda: job(robot, bus=bus, latency_s=latency, dry=dry), show)
 
 
 def reset(

@@ -150,9 +150,7 @@ def robot(
         ).to_json()
 
     def show(result: Mapping[str, Any]) -> None:
-        output.out.print(
-            f"{path}: look at every line, then `frictid-hil calibrate --robot {path} --dry-run`", soft_wrap=True
-        )
+        output.out.print(f"{path}: look at every line, then `frictid-hil check --robot {path} --dry`", soft_wrap=True)
 
     output.run("new_robot", written, show)
 

@@ -17,13 +17,14 @@ from frictid_hil.protocol.driver import Finding, JointIdentity, Severity, new_dr
 from frictid_hil.runner.realtime import Latency, measure_latency
 
 
-def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) -> dict[str, Any]:
+def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0, dry: bool = False) -> dict[str, Any]:
     """Read the hardware, and compare it with the robot file and with the standard plan.
 
     Args:
         robot_name: robot file.
         bus: ``interface:channel`` instead of the file's own.
         latency_s: for so long this computer's punctuality is measured; 0 not at all.
+        dry: the robot file, all it refers to and the plan alone; the bus is not opened.
 
     Raises:
         HardwareError: the bus or a drive cannot be reached at all.
@@ -35,13 +36,14 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
     with robot.document.locating():
         driver = new_driver(robot.driver(bus), setup)
     identities: Mapping[str, JointIdentity] = {}
-    try:
-        with robot.document.locating():
-            driver.open()
-        findings.extend(driver.check(plan))
-        identities = driver.identify()
-    finally:
-        driver.close()
+    if not dry:
+        try:
+            with robot.document.locating():
+                driver.open()
+            findings.extend(driver.check(plan))
+            identities = driver.identify()
+        finally:
+            driver.close()
     measured = _measured(latency_s) if latency_s else None
     if measured is not None:
         findings.extend(_told(measured, setup.cycle_hz))
@@ -53,6 +55,7 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0) ->
         "driver": robot.driver(bus),
         "bus": setup.bus,
         "ok": ok,
+        "dry": dry,
         "latency": None if measured is None else asdict(measured),
         "findings": [{**_values(finding, _FINDING), "severity": finding.severity.value} for finding in findings],
         "joints": {

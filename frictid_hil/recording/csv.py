@@ -2,8 +2,9 @@
 
 Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
 command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
-guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines
-before the header and text in Windows-1252 are found out and told. A file may have up to 10,000,000 rows and 2 GB.
+guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines before
+the header, a row of units under it and text in Windows-1252 are found out and told. A file may have up to 10,000,000 rows
+and 2 GB.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from frictid_hil.files import write_whole
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.bounds import MAX_BYTES, MAX_ROWS, check_expansion, check_rows
+from frictid_hil.recording.draft import UNITS, without_unit
 from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped, samples_of
 
@@ -147,7 +149,7 @@ class CsvTable:
         with _reading(path):
             self._encoding = _encoding(path)
             with _open(path, self._encoding) as file:
-                header, first, self._header_lines, titles = _header(file, str(path))
+                header, units, first, self._header_lines, titles = _header(file, str(path))
         self.dialect = Dialect.of(header, first)
         self.told = self.dialect.told()
         if titles:
@@ -155,6 +157,9 @@ class CsvTable:
         if self._encoding == _WESTERN:
             self.told += ("the text is not UTF-8 and is read as Windows-1252",)
         self.names = [name.strip() for name in _cells(header, self.dialect.separator)]
+        if units:
+            self.names = list(map(_with_unit, self.names, _cells(units, self.dialect.separator)))
+            self.told += (f"line {self._header_lines} holds the units of the columns: {', '.join(self.names)}",)
         where = f"{path}, line {self._header_lines}"
         if all(_is_number(name) for name in self.names):
             raise InputFileError("no header: the first line holds numbers", where=where)
@@ -333,11 +338,11 @@ def _encoding(path: Path) -> str:
     return _UNICODE
 
 
-def _header(file: IO[str], where: str) -> tuple[str, str, int, int]:
-    """Header, first row, the header's line number, and how many lines of a title stand above it.
+def _header(file: IO[str], where: str) -> tuple[str, str, str, int, int]:
+    """Names, units, first row, the number of the header's last line, and how many lines of a title stand above it.
 
     The header is the first line of words whose cells are as many as those of the row of numbers that follows; where
-    there is none, the first line that is no remark.
+    there is none, the first line that is no remark. If it holds units, the names stand in the line above it.
     """
     lines: list[tuple[int, str]] = []
     for number in range(1, _MOST_REMARKS + 1):
@@ -349,13 +354,16 @@ def _header(file: IO[str], where: str) -> tuple[str, str, int, int]:
             if len(lines) > _MOST_TITLES:
                 break
             if len(lines) > 1 and _heads(lines[-2][1], line):
-                return lines[-2][1], line, lines[-2][0], len(lines) - 2
+                names, header = lines[-3][1] if len(lines) > 2 else "", lines[-2][1]
+                if _units_under(names, header):
+                    return names, header, line, lines[-2][0], len(lines) - 3
+                return header, "", line, lines[-2][0], len(lines) - 2
     else:
         if not lines:
             raise InputFileError(f"no header within {_MOST_REMARKS:,} lines", where=where)
     if not lines:
         raise InputFileError("the file is empty", where=where)
-    return lines[0][1], lines[1][1] if len(lines) > 1 else "", lines[0][0], 0
+    return lines[0][1], "", lines[1][1] if len(lines) > 1 else "", lines[0][0], 0
 
 
 def _heads(header: str, row: str) -> bool:
@@ -366,6 +374,26 @@ def _heads(header: str, row: str) -> bool:
             if all(_is_number(cell) for cell in numbers):
                 return True
     return False
+
+
+def _units_under(header: str, row: str) -> bool:
+    """At least half of the row's cells are units, and each has a name above it."""
+    for separator in ",;\t|":
+        names, cells = _cells(header, separator), _cells(row, separator)
+        if len(names) == len(cells) > 1 and 2 * sum(_unit(cell).lower() in UNITS for cell in cells) >= len(cells):
+            return not any(_unit(name).lower() in UNITS or _is_number(name) for name in names)
+    return False
+
+
+def _unit(cell: str) -> str:
+    return cell.strip(" \t\r\n[]()")
+
+
+def _with_unit(name: str, cell: str) -> str:
+    """``pos [deg]``; a name that says the unit itself stays as it is."""
+    unit = _unit(cell)
+    said = without_unit(name)[1]
+    return name if unit in ("", "-") or (said and said == UNITS.get(unit.lower())) else f"{name} [{unit}]"
 
 
 def _open_bytes(path: Path) -> io.BufferedReader:

@@ -30,7 +30,7 @@ _WORDS: dict[str, str] = {
     "time": r"(time|t|stamp|timestamp|times|zeit)",
     "temperature": r"(temp|temperature)",
 }
-_UNITS = {
+UNITS = {
     "deg/s": "deg/s", "deg": "deg", "rad/s": "rad/s", "rad": "rad", "rpm": "rpm", "nm": "N m", "n_m": "N m",
     "n m": "N m", "mnm": "mNm", "ms": "ms", "us": "us", "ns": "ns", "s": "s", "a": "A", "ma": "mA", "grad": "deg",
     "degree": "deg", "degrees": "deg", "deg_s": "deg/s", "rad_s": "rad/s", "dps": "deg/s", "sec": "s", "msec": "ms",
@@ -81,7 +81,7 @@ class Draft:
 
 def guessed(name: str) -> Guess | None:
     """What a column's name says; None where it says nothing."""
-    text, unit = _without_unit(name)
+    text, unit = without_unit(name)
     best: tuple[int, Guess] | None = None
     for quantity, words in _WORDS.items():
         form = rf"(?:(?P<before>.+?)[ _./:-]+)?(?P<word>{words})(?:[ _./:-]*(?P<after>\d+|(?<=[ _./:-]).+))?"
@@ -95,15 +95,15 @@ def guessed(name: str) -> Guess | None:
     return best[1] if best else None
 
 
-def _without_unit(name: str) -> tuple[str, str]:
+def without_unit(name: str) -> tuple[str, str]:
     """The name without its unit, and the unit: ``pos [deg]``, ``pos_deg``, ``tau(Nm)``."""
     bracket = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*", name)
-    if bracket and bracket[2].lower() in _UNITS:
-        return bracket[1].strip(), _UNITS[bracket[2].lower()]
+    if bracket and bracket[2].lower() in UNITS:
+        return bracket[1].strip(), UNITS[bracket[2].lower()]
     lowered = name.lower()
-    for unit in sorted(_UNITS, key=len, reverse=True):
+    for unit in sorted(UNITS, key=len, reverse=True):
         if lowered.endswith("_" + unit.replace("/", "_")) and len(name) > len(unit) + 1:
-            return name[: -len(unit) - 1], _UNITS[unit]
+            return name[: -len(unit) - 1], UNITS[unit]
     return name, ""
 
 

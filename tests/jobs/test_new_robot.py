@@ -63,8 +63,8 @@ def test_the_verb_names_what_is_missing_and_writes_what_is_whole(tmp_path: Path)
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["robot_file"] == str(path)
     assert load_robot(path).file.joints["b"].max_velocity_rad_s == pytest.approx(math.radians(115))
-    dry = CliRunner().invoke(app, ["calibrate", "--robot", str(path), "--dry-run"])
-    assert dry.exit_code == 0, dry.output
+    dry = CliRunner().invoke(app, ["check", "--robot", str(path), "--dry"])
+    assert dry.exit_code == 0 and "ready for a check of the drives" in dry.output, "opens no bus: there is no can0 here"
     checked = CliRunner().invoke(app, ["check", "--robot", str(path), "--bus", "virtual:new-bench"])
     assert checked.exit_code == 0, "its simulated drives stand for the real ones"
 
@@ -90,3 +90,12 @@ def test_on_a_terminal_a_mistyped_answer_is_asked_for_again(tmp_path: Path, monk
     assert load_robot(path).file.joints["elbow"].rated_torque_nm == 24.0
     given_up = CliRunner().invoke(app, ["new", "robot", str(tmp_path / "b.yaml")], input="elbow=2\n")
     assert given_up.exit_code == 130 and "no file was written" in given_up.output
+
+
+def test_a_dry_check_refuses_a_plan_beyond_the_limits(tmp_path: Path) -> None:
+    path = new_robot(tmp_path / "bench.yaml", driver="cia402", bus="socketcan:can0", joints=[ELBOW]).path
+    path.write_text(path.read_text().replace("velocity_rad_s: 57.2958deg/s", "velocity_rad_s: 150deg/s"))
+    dry = CliRunner().invoke(app, ["check", "--robot", str(path), "--dry", "--json"])
+    said = json.loads(dry.stdout)
+    assert dry.exit_code == 2 and said["dry"] and not said["ok"]
+    assert [finding["subject"] for finding in said["findings"] if finding["severity"] == "error"] == ["plan"]

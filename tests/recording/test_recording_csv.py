@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from frictid_hil.columns import ColumnMap, JointColumns, Source
 from frictid_hil.errors import FrictidError, InputFileError
 from frictid_hil.recording import bounds
-from frictid_hil.recording.csv import read_csv, write_csv
+from frictid_hil.recording.csv import CsvTable, read_csv, write_csv
+from frictid_hil.recording.draft import draft
 from frictid_hil.recording.samples import Samples
 
 HEADER = "time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad\n"
@@ -137,6 +138,24 @@ def test_a_title_above_the_header_and_a_western_text_are_passed_over_and_told(tm
     assert "the header is line 4" in told and "Windows-1252" in told and "semicolons" in told
     path.write_text(path.read_text(encoding="cp1252").replace("8.6", "fast"), encoding="cp1252")
     assert "line 6, column torque_nm: 'fast' is not a number" in refused(path)
+
+
+def test_a_row_of_units_under_the_names_says_the_units(tmp_path: Path) -> None:
+    rows = "".join(f"{k},0;{10 * k},5;{100 / 60};{-k % 7}\n".replace(".", ",") for k in range(60))
+    table = CsvTable(written(tmp_path, f"Prüfstand 2\nZeit;Winkel;Drehzahl;Moment\nms;°;1/min;Nm\n{rows}"))
+    assert table.names == ["Zeit [ms]", "Winkel [°]", "Drehzahl [1/min]", "Moment [Nm]"]
+    assert "line 3 holds the units" in " ".join(table.told)
+    joint = draft(table, "bench").document["joints"]["0"]
+    assert {key: source["unit"] for key, source in joint.items()} == {
+        "position": "deg", "velocity": "rpm", "torque": "N m",
+    }  # fmt: skip
+    assert table.numbers(["Winkel [°]"])[0][:3].tolist() == [0.5, 10.5, 20.5]
+
+
+def test_a_row_of_units_may_repeat_the_standard_header_and_not_contradict_it(tmp_path: Path) -> None:
+    (samples,) = read_csv(written(tmp_path, f"{HEADER}s,rad,rad/s,Nm,rad\n{ROWS}"))
+    assert samples.columns()["torque_nm"].tolist() == [8.5, 8.6, -8.7]
+    assert "time_s [ms]" in refused(written(tmp_path, f"{HEADER}ms,rad,rad/s,Nm,rad\n{ROWS}"))
 
 
 def test_too_many_rows_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
