@@ -2,9 +2,9 @@
 
 Header ``time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad``; time, position and one of torque and
 command must be there. A linear axis writes ``position_m,velocity_m_s,force_n,position_command_m``. Units are never
-guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines before
-the header, a row of units under it and text in Windows-1252 are found out and told. A file may have up to 10,000,000 rows
-and 2 GB.
+guessed: a header in other words needs a column map. Separators (comma, semicolon, tab, bar), decimal commas, lines
+before the header, a row of units under it and text in Windows-1252 are found out and told. A file may have up to
+10,000,000 rows and 2 GB.
 """
 
 from __future__ import annotations
