@@ -4,12 +4,13 @@
 
 Figure 6: torque over velocity of joint 1 for several travels A. Figure 7: curves of every joint for A in 5, 10, 20,
 30, 40, 50 deg. Figure 8: E(A, 50) of (15). Figure 9: joint 1 in five postures. V = 115 deg/s, N = 10, c = 0.8. Run
-folders that are complete in FOLDER are read, not repeated. Tables are printed; the page and its pictures are written.
+folders that are complete in FOLDER are read, not repeated. The table and the pictures of the page are written.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 import tempfile
 from dataclasses import dataclass
@@ -21,7 +22,6 @@ from on_the_bus import V_RAD_S, Variant, calibrated, shipped, variant
 from svg import PALETTE, Chart, Line, svg
 
 from frictid_hil.config.profile import JointProfile
-from frictid_hil.config.provenance import git_revision
 from frictid_hil.errors import PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.metrics import curve_distance, curve_mean
@@ -30,7 +30,6 @@ from frictid_hil.recording.read import read
 
 AMPLITUDES = (5, 10, 20, 30, 40, 50)
 JOINTS = ("0", "1", "2", "3", "4", "5")
-CROSS = "×"
 COLOURS = dict(zip(AMPLITUDES, PALETTE, strict=True))
 POSTURES = {
     "a": (2.20, 42.0, 6.0),
@@ -40,6 +39,7 @@ POSTURES = {
     "e": (2.40, 8.0, 48.0),
 }
 """Inertia [kg m2], gravity_cos and gravity_sin [N m] of joint 1 as the arm beyond it folds and turns."""
+HEADS = ("figure", "curve", "joint", "posture", "amplitude_deg", "value", "value_measured_range")
 SPEED = np.linspace(0.0, V_RAD_S, 120)
 
 
@@ -169,7 +169,7 @@ def figure_8(e: dict[str, dict[int, float | None]], e_aligned: dict[str, dict[in
         refused = np.array([amplitude for amplitude, value in e[joint].items() if value is None], dtype=float)
         if refused.size:
             top = np.full(refused.size, max(float(np.max(line.y)) for line in lines))
-            lines.append(Line(f"{CROSS} not obtained: refused", refused, top, PALETTE[5], 0.0, "cross"))
+            lines.append(Line("× not obtained: refused", refused, top, PALETTE[5], 0.0, "cross"))
         charts.append(Chart(f"joint {joint}", "A [deg]", "E(A, 50) [N m]", tuple(lines), from_zero=True))
     return svg(charts, columns=3)
 
@@ -203,17 +203,12 @@ def _apart(title: str, runs: dict[str, Run]) -> Chart:
     return Chart(title, "velocity [deg/s]", "from their mean [%]", tuple(lines))
 
 
-def table(headings: list[str], rows: list[list[str]]) -> str:
-    lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+Row = tuple[str, str, str, str, int, str, str]
+"""Figure, curve, joint, posture, A [deg], value, value over the measured range."""
 
 
-def cell(value: float | None) -> str:
-    return CROSS if value is None else f"{value:.3f}"
-
-
-def pair(values: tuple[float, float] | None) -> str:
-    return CROSS if values is None else f"{values[0]:.2f} / {values[1]:.2f}"
+def pair(values: tuple[float, float] | None) -> tuple[str, str]:
+    return ("refused", "refused") if values is None else (f"{values[0]:.2f}", f"{values[1]:.2f}")
 
 
 def load_nm(joint: JointProfile, start_rad: float) -> float:
@@ -227,9 +222,8 @@ def load_nm(joint: JointProfile, start_rad: float) -> float:
     return float(np.mean(np.abs(cos * np.cos(position) + sin * np.sin(position) + bias)))
 
 
-def loaded_postures(runs: dict[str, Run], truths: dict[str, FrictionCurve], start_rad: float) -> str:
-    """What friction that grows with the load makes of the five postures, and how much of it is seen."""
-    own = {name: errors(run, truths[name], published=False) for name, run in runs.items()}
+def loaded_rows(runs: dict[str, Run], truths: dict[str, FrictionCurve], start_rad: float) -> list[Row]:
+    """What friction that grows with the load makes of the five postures; prints how much of it is seen."""
     mean_nm = {name: curve_mean(truth, 0.0, V_RAD_S) for name, truth in truths.items()}
     found = {name: curve for name, run in runs.items() if (curve := run.curve(published=False)) is not None}
     found_nm = {name: curve_mean(curve, 0.0, V_RAD_S) for name, curve in found.items()}
@@ -239,142 +233,47 @@ def loaded_postures(runs: dict[str, Run], truths: dict[str, FrictionCurve], star
         FrictionCurve.through(SPEED[1:], curve.magnitude(SPEED[1:]) - share * load[name])
         for name, curve in found.items()
     ]
-    rows = [
-        [name, f"{mean_nm[name]:.2f}", f"{found_nm[name]:.2f}", pair(own[name]), f"{load[name]:.1f}"] for name in found
-    ]
-    seen, true, left = spread_of(list(found.values())), spread_of(list(truths.values())), spread_of(freed)
-    headings = [
-        "posture",
-        "true mean friction [N m]",
-        "identified",
-        "error to its own truth [%]",
-        "gravity found [N m]",
-    ]
-    differs = f"by {true[0]:.2f} % on average and {true[1]:.2f} % at most"
-    return f"""The same five postures with friction that grows by 5 % of the load torque (right panel). Here friction
-itself differs from posture to posture, {differs}, and that is what is found: {seen[0]:.2f} %
-and {seen[1]:.2f} %. A spread beyond the intervals of single curves is the joint's, not the method's.
-
-{table(headings, rows)}
-
-The five profiles tell the reason, without the truth: over the gravity torque that each of them found in
-its windows (last column), mean friction rises by {100 * share:.1f} % of it. With that one load term taken off,
-the spread is {left[0]:.2f} % on average and {left[1]:.2f} % at most."""
-
-
-def page(
-    runs: dict[str, dict[int, Run]],
-    postures: dict[str, Run],
-    loaded: dict[str, Run],
-    loaded_truths: dict[str, FrictionCurve],
-    robot: Variant,
-) -> str:
-    """The page in Markdown."""
-    truths = {joint: robot.truth(joint, math.radians(20.0)) for joint in JOINTS}
-    headings = ["joint", *(f"A = {amplitude}" for amplitude in AMPLITUDES)]
-
-    def of(published: bool) -> tuple[str, str]:
-        e = table(
-            headings,
-            [[j, *map(cell, distances(runs[j], published=published).values())] for j in JOINTS],
-        )
-        error = table(
-            headings,
-            [[j, *(pair(errors(run, truths[j], published=published)) for run in runs[j].values())] for j in JOINTS],
-        )
-        return e, error
-
-    published_e, published_error = of(True)
-    aligned_e, aligned_error = of(False)
-    told = []
-    for name, is_published in (("as published", True), ("aligned", False)):
-        mean, most = spread(postures, published=is_published)
-        told.append(f"{name} {mean:.2f} % on average and {most:.2f} % at most")
-    rows = [
-        [
-            name,
-            *(f"{value:g}" for value in POSTURES[name]),
-            *(pair(errors(run, truths["1"], published=published)) for published in (True, False)),
+    for what, curves in (("truth", truths.values()), ("found", found.values()), ("without load", freed)):
+        mean, most = spread_of(list(curves))
+        print(f"postures with load, {what}: {mean:.2f} % on average, {most:.2f} % at most")
+    print(f"mean friction rises by {100 * share:.1f} % of gravity")
+    rows: list[Row] = []
+    for name in found:
+        error = pair(errors(runs[name], truths[name], published=False))
+        rows += [
+            ("five postures with load, error to the truth, percent", "aligned", "1", name, 20, *error),
+            ("five postures with load, true mean friction [N m]", "truth", "1", name, 20, f"{mean_nm[name]:.2f}", ""),
+            ("five postures with load, mean friction [N m]", "aligned", "1", name, 20, f"{found_nm[name]:.2f}", ""),
+            ("five postures with load, gravity found [N m]", "aligned", "1", name, 20, f"{load[name]:.1f}", ""),
         ]
-        for name, run in postures.items()
-    ]
-    return f"""# The paper's section 4, reproduced
+    return rows
 
-The figures of the paper come out in shape and trend. Its curves depend on the travel A because torque and velocity are
-not of one instant. Brought to one instant, the same samples give nearly the same curve at every A.
 
-Every figure below is a calibration as a user makes it: `hp3j.yaml`, the CiA-402 driver, six simulated drives on a CAN
-bus, the scheduler with five joints locked, a run folder, a profile. V = 115 deg/s, N = 10, c = 0.8, 1 kHz, seed 0.
-*As published* is Function A on the drive's own velocity and torque; *aligned*, this tool's default, uses the same
-windows after bringing both to one instant by the declared timing of the drive. The simulated joints are not the
-authors' robot: their friction and inertia are plausible, not measured, so shapes and trends are to be compared, not
-values.
+def joint_rows(runs: dict[str, dict[int, Run]], robot: Variant) -> list[Row]:
+    """Every joint at every travel: how far from its curve at 50 deg, and from the truth."""
+    rows: list[Row] = []
+    for joint in JOINTS:
+        truth = robot.truth(joint, math.radians(20.0))
+        for name, published in (("as published", True), ("aligned", False)):
+            for amplitude, e_nm in distances(runs[joint], published=published).items():
+                said = "refused" if e_nm is None else f"{e_nm:.3f}"
+                rows.append(("E(A, 50) [N m]", name, joint, "", amplitude, said, ""))
+            for amplitude, run in runs[joint].items():
+                error = pair(errors(run, truth, published=published))
+                rows.append(("error to the truth, percent", name, joint, "", amplitude, *error))
+    return rows
 
-Written by `python benchmarks/paper_section4.py`.
 
-## Fig. 6: torque over velocity, joint 1
-
-![loops of joint 1](../images/paper-fig6.svg)
-
-## Fig. 7: curves of every joint for A = 5 ... 50 deg
-
-As published:
-
-![curves as published](../images/paper-fig7-published.svg)
-
-Aligned:
-
-![aligned curves](../images/paper-fig7-aligned.svg)
-
-A = 5 deg on joint 1 is missing, as it is in the paper ("not obtained due to the limit of the servo controller"). Here
-the plan is refused before anything moves:
-
-> {runs["1"][5].refused}
-
-## Fig. 8: E(A, 50) of (15), N m
-
-![distance from the curve at 50 deg](../images/paper-fig8.svg)
-
-As published ({CROSS}: refused):
-
-{published_e}
-
-Aligned:
-
-{aligned_e}
-
-The published rise towards small A is no property of the joint: half a sample and a filter between torque and velocity
-add -0.93 I v_n w_n^2 tau to F_n, which grows as V^3 / A^2. Brought to one instant, the same samples give nearly the
-same curve at every A.
-
-## What the paper could not measure: the error to the truth
-
-Percent of the truth's mean, over [0, V] / over the measured range [V_1, V_N]. As published:
-
-{published_error}
-
-Aligned:
-
-{aligned_error}
-
-Over [0, V] about 1 % remains at any A: the Stribeck dip below V_1, where the curve is extrapolated.
-
-## Fig. 9: five postures, joint 1, A = 20 deg
-
-![five postures](../images/paper-fig9.svg)
-
-A posture is what it makes of joint 1: its inertia and its gravity torque gravity_cos cos q + gravity_sin sin q. The
-gains of the position loop stay the same.
-
-{table(["posture", "inertia [kg m2]", "gravity_cos [N m]", "gravity_sin [N m]", "as published", "aligned"], rows)}
-
-Spread over the postures (left and middle panel), distance of each curve from their mean curve in percent of its mean
-over [0, V]: {told[0]}; {told[1]}.
-
-{loaded_postures(loaded, loaded_truths, robot.values["joints"]["1"]["start_position_rad"])}
-
-All of this page was measured at commit {git_revision()[:7]}.
-"""
+def posture_rows(postures: dict[str, Run], truth: FrictionCurve) -> list[Row]:
+    """Joint 1 in five postures; prints how far the curves lie apart."""
+    rows: list[Row] = []
+    for name, published in (("as published", True), ("aligned", False)):
+        mean, most = spread(postures, published=published)
+        print(f"postures {name}: {mean:.2f} % on average, {most:.2f} % at most")
+        for posture_name, run in postures.items():
+            error = pair(errors(run, truth, published=published))
+            rows.append(("five postures, error to the truth, percent", name, "1", posture_name, 20, *error))
+    return rows
 
 
 def spread(postures: dict[str, Run], *, published: bool) -> tuple[float, float]:
@@ -417,13 +316,18 @@ def main() -> None:
     }
     loaded = {name: measured(heavy[name], "1", 20, arguments.runs / f"posture-load-{name}") for name in POSTURES}
     truths = {name: heavy[name].truth("1", math.radians(20.0)) for name in POSTURES}
-    text = page(runs, postures, loaded, truths, robot)
-    print(text)
+    start_rad = robot.values["joints"]["1"]["start_position_rad"]
+    rows = [
+        *joint_rows(runs, robot),
+        *posture_rows(postures, robot.truth("1", math.radians(20.0))),
+        *loaded_rows(loaded, truths, start_rad),
+    ]
     e = {joint: distances(runs[joint], published=True) for joint in JOINTS}
     e_aligned = {joint: distances(runs[joint], published=False) for joint in JOINTS}
     images = arguments.docs / "images"
     images.mkdir(parents=True, exist_ok=True)
-    (arguments.docs / "evidence" / "paper-section4.md").write_text(text, encoding="utf-8")
+    with (arguments.docs / "evidence" / "data" / "paper-section4.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([HEADS, *rows])
     for name, picture in {
         "fig6": figure_6(runs["1"]),
         "fig7-published": figure_7(runs, published=True),

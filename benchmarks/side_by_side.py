@@ -4,7 +4,7 @@
 
 Plants: rigid; flexible (link resonance 28 Hz); load (friction grows by 5 % of the load torque). The servo loop is
 advanced without a bus, cycle by cycle, so that every method meets exactly the same joint. Prints every row, those that
-we lose included, and writes the page and ``evidence/data/side-by-side.csv`` into the folder of ``--docs``.
+we lose included, and writes ``evidence/data/side-by-side.csv`` into the folder of ``--docs``.
 """
 
 from __future__ import annotations
@@ -12,16 +12,14 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import estimators
 import numpy as np
-import why_lost
 from other_methods import TORQUE_SHARE, Outcome, Task, constant_velocity, fourier, torque_sine
 
-from frictid_hil.config.provenance import git_revision
 from frictid_hil.errors import FrictidError
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.estimate import estimate
@@ -148,16 +146,6 @@ COLUMNS = [
     "highest_speed_deg_s",
     "setting_remark",
 ]
-SHOWN = {
-    "least-squares": "least-squares",
-    "least-squares, --program standard": "the same, `standard`",
-    "aligned": "aligned",
-    "function-a (as published)": "Function A",
-    "constant velocity": "constant velocity",
-    "Fourier + Coulomb/viscous": "Fourier",
-    "torque sine": "torque sine",
-}
-"""Methods on the page, by the heading of their column."""
 
 
 def by_case(cells: Sequence[Sequence[str]]) -> dict[tuple[str, ...], dict[str, dict[str, str]]]:
@@ -167,20 +155,6 @@ def by_case(cells: Sequence[Sequence[str]]) -> dict[tuple[str, ...], dict[str, d
         row = dict(zip(COLUMNS, entry, strict=True))
         cases.setdefault(tuple(entry[:3]), {})[row["method"]] = row
     return cases
-
-
-def summary(cells: Sequence[Sequence[str]]) -> str:
-    """One line per case: the error of each method over [0, V], percent; starred where a gate refuses the result."""
-
-    def error(row: Mapping[str, str]) -> str:
-        return (row[TOLD] or "-") + ("*" if "flagged" in row["setting_remark"] else "")
-
-    lines = [f"| plant | A [deg] | joint | {' | '.join(SHOWN.values())} |", "|" + "---|" * (3 + len(SHOWN))]
-    lines += [
-        f"| {' | '.join(case)} | {' | '.join(error(methods[name]) for name in SHOWN)} |"
-        for case, methods in by_case(cells).items()
-    ]
-    return "\n".join(lines)
 
 
 def ahead(cells: Sequence[Sequence[str]], method: str) -> str:
@@ -193,46 +167,13 @@ def ahead(cells: Sequence[Sequence[str]], method: str) -> str:
     return f"{sum(wins)} of {len(wins)} cases"
 
 
-PAGE = """# Side by side with what one would pick instead
-
-With one setting for all joints, `least-squares` is ahead of every method of others in {best}, the default `aligned` in
-{default}. The others had settings that only somebody who knows the truth can choose.
-
-All methods meet the same simulated joints of `hp3j.yaml`, with the same servo loop, noise, torque limit and travel;
-V = 115 deg/s. There is no bus; [the paper's section 4](paper-section4.md) shows what it adds. The others were also
-given the true inertia and gravity for feed-forward and gravity compensation:
-
-- *Constant velocity*: ten speeds n V / 10 to and fro, trapezoidal. Accelerations of 3 to 80 rad/s2 as far as torque
-  allows, with and without feed-forward, 5 to 80 ms to settle.
-- *Fourier*: five harmonics of 0.1 to 2 Hz, three draws, 16 s, scaled to the travel, V and the torque limit. Coulomb and
-  viscous friction, inertia, gravity and bias by least squares; speeds below 0.02, 0.1 or 0.3 rad/s left out.
-- *Torque sine*: 0.5 to 4 Hz, six sizes, begun gently in the middle of the travel, with perfect gravity compensation. It
-  ends where the joint leaves the travel.
-
-## Every case
-
-    python benchmarks/side_by_side.py --docs docs
-
-Commit {commit}. The table has the error of the curve over [0, V] in percent of its mean. A star marks a measurement
-that a quality gate refuses. The errors over the measured range, times, travels, speeds, settings and the `quick`
-programme stand in [the whole table](data/side-by-side.csv).
-
-{table}
-
-Where another method is ahead:
-
-{lost}
-
-"""
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--joints", default="1,4")
     parser.add_argument("--plants", default=",".join(PLANTS))
     parser.add_argument("--amplitudes", default="20,5")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--docs", type=Path, help="Folder whose evidence/side-by-side.md and its table are written.")
+    parser.add_argument("--docs", type=Path, help="Folder whose evidence/data/side-by-side.csv is written.")
     arguments = parser.parse_args()
     models = estimators.joints()
     cells: list[list[str]] = []
@@ -252,23 +193,15 @@ def main() -> None:
                 cells += here
                 for said in lost(rows, kind, amplitude):
                     losses.setdefault(said, []).append(f"{PLANTS[kind]}, A = {amplitude:g} deg, joint {joint}")
+    for what, where in losses.items():
+        print(f"{what}: {'; '.join(where)}")
+    for method in ("least-squares", "aligned"):
+        print(f"{method}: ahead of every method of others in {ahead(cells, method)}")
     if arguments.docs:
-        write(arguments.docs / "evidence", cells, losses)
-
-
-def write(folder: Path, cells: list[list[str]], losses: Mapping[str, Sequence[str]]) -> None:
-    """The page, and the table of every method beside it."""
-    with (folder / "data" / "side-by-side.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *cells])
-    said = [f"- {what}: {'; '.join(where)}." for what, where in losses.items()]
-    page = PAGE.format(
-        commit=git_revision()[:7],
-        best=ahead(cells, "least-squares"),
-        default=ahead(cells, "aligned"),
-        table=summary(cells),
-        lost="\n".join(said) or "Nowhere.",
-    )
-    (folder / "side-by-side.md").write_text(page + why_lost.text(), encoding="utf-8")
+        with (arguments.docs / "evidence" / "data" / "side-by-side.csv").open(
+            "w", newline="", encoding="utf-8"
+        ) as file:
+            csv.writer(file, lineterminator="\n").writerows([COLUMNS, *cells])
 
 
 if __name__ == "__main__":

@@ -103,12 +103,13 @@ def test_the_page_of_stops_is_that_of_the_code() -> None:
     assert page == stop_paths.page(), "python -m frictid_drivers.stop_paths docs/reference/stops.md"
 
 
-def test_every_finding_names_tests_that_exist() -> None:
-    table = (ROOT / "docs" / "evidence" / "data" / "fault-findings.csv").read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["fault-findings.csv", "drive-findings.csv"])
+def test_every_finding_names_tests_that_exist(name: str) -> None:
+    table = (ROOT / "docs" / "evidence" / "data" / name).read_text(encoding="utf-8")
     named = [test for row in csv.DictReader(table.splitlines()) for test in row["tests_below_tests"].split("; ")]
     missing = []
-    for file, _, name in (test.partition("::") for test in named):
+    for file, _, test in (one.partition("::") for one in named):
         path = ROOT / "tests" / file
-        if not path.exists() or (name and f"def {name}(" not in path.read_text(encoding="utf-8")):
-            missing.append(f"{file}::{name}")
+        if not path.exists() or (test and f"def {test}(" not in path.read_text(encoding="utf-8")):
+            missing.append(f"{file}::{test}")
     assert len(named) > 30 and missing == []
