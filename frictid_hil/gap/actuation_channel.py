@@ -110,11 +110,14 @@ def actuation_channel(
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
     nuisances += _timing(nominal, base, logs, builder)
+    # A drive acts on what the controller asks for, and that on the velocity it sees: the one that was read to lag.
+    lags = any(form.torque is None and name in seen for name, form in forms().items())
+    asking = [_Drive.of(d.recording, nominal, limit_nm, as_reported=True) for d in drives] if lags else drives
     scale = rms(np.concatenate(residuals))
     for name, form in forms().items():
         if name not in library:
             continue
-        for value, columns in _shapes(name, form, views, drives, nominal, base, seen):
+        for value, columns in _shapes(name, form, views, drives, asking, nominal, seen):
             numbers = builder.add(columns)
             spread, ends = (0.3, NEAREST) if form.late else (0.1, (-math.inf, math.inf))
             candidates.append(Term(name, value, numbers, np.ones(1), np.full(1, spread), *ends))
@@ -205,12 +208,13 @@ def _shapes(
     form: ActuationForm,
     views: Sequence[DriveView],
     drives: Sequence[_Drive],
+    asking: Sequence[_Drive],
     nominal: Nominal,
-    base: Sequence[Array],
     seen: Mapping[str, float],
 ) -> list[tuple[dict[str, float], list[Array]]]:
     """(parameters, columns) of one effect at every value worth trying."""
     believed = nominal.believed_effects
+    base = [drive.torque(believed) for drive in asking]
     result: list[tuple[dict[str, float], list[Array]]] = []
     if form.torque is None and nominal.controller is None:
         return result
@@ -218,12 +222,11 @@ def _shapes(
         for detail in form.details or (0.0,):
             values = {form.parameter: float(value), **({form.detail: detail} if form.detail else {})}
             if form.torque is None:
-                late = [_Drive.of(d.recording, nominal, d.limit_nm, float(value)) for d in drives]
-                changed = [drive.torque(believed) for drive in late]
+                base, changed = [drive.torque(believed) for drive in drives], base
             else:
                 held_by = believed.get(name, {}).get(form.parameter, 0.0) if form.late else 0.0
                 effects = {**believed, name: {**values, form.parameter: held_by + float(value)}}
-                changed = [drive.torque(effects) for drive in drives]
+                changed = [drive.torque(effects) for drive in asking]
             result.append((values, [(c - b)[:, None] for c, b in zip(changed, base, strict=True)]))
     return result
 
@@ -264,13 +267,14 @@ class _Drive:
     limit_nm: float
 
     @staticmethod
-    def of(recording: Recording, nominal: Nominal, limit_nm: float, velocity_lag_s: float = 0.0) -> _Drive:
-        """The drive of one recording; its controller sees a velocity that lags so much more than is believed."""
+    def of(recording: Recording, nominal: Nominal, limit_nm: float, *, as_reported: bool = False) -> _Drive:
+        """The drive of one recording; its controller may see the reported velocity instead of the believed one."""
         controller, e = nominal.controller, recording.experiment
         assert recording.demand_nm is not None
         if controller is None or e.torque_demand_nm is not None:
             return _Drive(recording, recording.demand_nm, 1, limit_nm)
-        demand = demand_of(controller, e, recording.step_s, velocity_lag_s, every_tick=True)
+        seen = e.velocity_rad_s if as_reported else None
+        demand = demand_of(controller, e, recording.step_s, velocity_rad_s=seen, every_tick=True)
         return _Drive(recording, demand, ticks_of(controller, recording.step_s), limit_nm)
 
     def torque(self, effects: Mapping[str, Mapping[str, float]]) -> Array:

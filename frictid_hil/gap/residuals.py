@@ -375,6 +375,7 @@ def controller_demand(
     step_s: float,
     *,
     integral_nm: float = 0.0,
+    velocity_rad_s: Array | None = None,
     velocity_lag_s: float = 0.0,
     every_tick: bool = False,
 ) -> Array:
@@ -388,14 +389,18 @@ def controller_demand(
         command_rad: commanded.
         step_s: sampling step.
         integral_nm: level of the integral at the start.
+        velocity_rad_s: what the controller takes as the velocity; the differenced position unless given.
         velocity_lag_s: an extra first-order lag of the velocity that the controller sees.
         every_tick: the demand of every tick of the controller, not of the last one before each row.
     """
     ticks = ticks_of(controller, step_s)
     position, command = between(position_rad, ticks), between(command_rad, ticks)
     tick_s = step_s / ticks
-    difference = np.diff(position, prepend=position[0]) / tick_s
-    velocity = lagged(lagged(difference, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
+    if velocity_rad_s is None:
+        seen = np.diff(position, prepend=position[0]) / tick_s
+    else:
+        seen = between(velocity_rad_s, ticks)
+    velocity = lagged(lagged(seen, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
     if controller.command_rate == "backward":
         feed = np.diff(command, prepend=command[0]) / tick_s
     else:
@@ -482,6 +487,7 @@ def demand_of(
     step_s: float,
     velocity_lag_s: float = 0.0,
     *,
+    velocity_rad_s: Array | None = None,
     every_tick: bool = False,
 ) -> Array:
     """The controller's demand along a recording; its integral starts where the reported torque says."""
@@ -497,6 +503,7 @@ def demand_of(
             q[:rows],
             command[:rows],
             step_s,
+            velocity_rad_s=None if velocity_rad_s is None else velocity_rad_s[:rows],
             velocity_lag_s=velocity_lag_s,
         )
         level = float(np.median(experiment.torque_nm[1:rows] - held(free)[1:]))
@@ -506,6 +513,7 @@ def demand_of(
         command,
         step_s,
         integral_nm=level,
+        velocity_rad_s=velocity_rad_s,
         velocity_lag_s=velocity_lag_s,
         every_tick=every_tick,
     )

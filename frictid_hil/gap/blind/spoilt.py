@@ -23,8 +23,8 @@ from frictid_hil.gap.blind.zoo import truth_of
 SOURCES = {"FRICTID_REAL_MORE_DATA": "real-more"}
 """Environment variables that name folders of recordings with ``cases/``; else beside the repository, in shared/data."""
 ADDED = ("torque_bias", "torque_ripple", "direction_asymmetry", "torque_constant_error")
-TIMES = 3.0
-"""Size of what is added over what the slow part of the torque shows."""
+TIMES = (4.0, 12.0)
+"""Size of what is added over what the slow part of the torque shows: of a gap that stays by a third nothing is named."""
 
 
 def recorded_sets() -> tuple[Path, ...]:
@@ -44,7 +44,8 @@ def draw_spoilt(index: int, seed: int, folder: Path) -> tuple[dict[str, Any], tu
     logs = [_read(folder, entry) for entry in nominal["experiments"]]
     one_way = min(min(np.mean(v > 0), np.mean(v < 0)) for v in (np.diff(log["position_rad"]) for log in logs)) < 0.03
     scale = float(np.sqrt(np.mean([np.mean(_missing(log, nominal) ** 2) for log in logs])))
-    share = TIMES * scale / max(float(np.std(np.concatenate([log["torque_nm"] for log in logs]))), 1e-12)
+    times = math.exp(rng.uniform(*np.log(TIMES)))
+    share = times * scale / max(float(np.std(np.concatenate([log["torque_nm"] for log in logs]))), 1e-12)
     # A drive that reports twice the torque is no torque constant.
     effect = str(rng.choice(("torque_ripple",) if one_way else ADDED if share < 0.4 else ADDED[:-1]))
     gear = float(nominal["joint"].get("gear_ratio") or 1.0)
@@ -54,12 +55,12 @@ def draw_spoilt(index: int, seed: int, folder: Path) -> tuple[dict[str, Any], tu
         q, torque = log["position_rad"], log["torque_nm"]
         v = np.gradient(q, log["time_s"])
         if effect == "torque_bias":
-            added = np.full_like(q, sign * TIMES * scale)
-            parameters = [{"effect": effect, "parameter": "bias_nm", "value": sign * TIMES * scale}]
+            added = np.full_like(q, sign * times * scale)
+            parameters = [{"effect": effect, "parameter": "bias_nm", "value": sign * times * scale}]
         elif effect == "torque_ripple":
-            added = math.sqrt(2.0) * TIMES * scale * np.cos(cycles * gear * q + phase)
+            added = math.sqrt(2.0) * times * scale * np.cos(cycles * gear * q + phase)
         elif effect == "direction_asymmetry":
-            added = sign * TIMES * scale * np.tanh(np.abs(v) / (0.02 * np.abs(v).max()))
+            added = sign * times * scale * np.tanh(np.abs(v) / (0.02 * np.abs(v).max()))
         else:
             # The drive reports more than the joint gets.
             added = torque * share
@@ -70,7 +71,7 @@ def draw_spoilt(index: int, seed: int, folder: Path) -> tuple[dict[str, Any], tu
     for entry in nominal["experiments"]:
         entry["file"] = f"{entry['name']}.csv.gz"
     nominal["case"] = name
-    return nominal, rows, truth_of(name, "zoo", "single", effect, TIMES, parameters)
+    return nominal, rows, truth_of(name, "zoo", "single", effect, times, parameters)
 
 
 def _header(folder: Path) -> str:
