@@ -21,7 +21,7 @@ from typing import Any
 
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.gap import diagnose as diagnosis
-from frictid_hil.gap import findings, how_far, plant_channel, posterior, verdict
+from frictid_hil.gap import findings, how_far, noise, plant_channel, posterior, verdict
 from frictid_hil.gap.blind.check import draw_sealed
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.verdict import Verdict
@@ -35,7 +35,7 @@ OF_VERDICT: tuple[tuple[ModuleType, str], ...] = (
     (verdict, "LEADS"),
 )  # fmt: skip
 OF_POSTERIOR: tuple[tuple[ModuleType, str], ...] = (
-    (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "LOCAL_S"), (posterior, "FORM"),
+    (posterior, "EXPECTED"), (posterior, "WORTH"), (noise, "LOCAL_S"), (posterior, "FORM"),
     (posterior, "MOST_DOUBT"), (posterior, "MOST"), (posterior, "TRIED"), (plant_channel, "BEYOND"),
     (how_far, "COLOUR"), (diagnosis, "NEGLIGIBLE"), (diagnosis, "LOUD"),
 )  # fmt: skip

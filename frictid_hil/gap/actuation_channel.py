@@ -306,4 +306,5 @@ def _rows(
         table[:, -1],
         table[:, :-1],
         np.zeros(table.shape[0]),
+        np.ones(table.shape[0], dtype=bool),
     )

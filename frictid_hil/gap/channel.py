@@ -57,6 +57,7 @@ class Rows:
         y: the residual, shape (n,).
         x: every column of the channel, shape (n, m).
         known_noise: a sample of that part of y's noise which is known beforehand, shape (n,).
+        told: rows that tell something of the joint; in the others that noise is too strong. Shape (n,).
     """
 
     name: str
@@ -65,6 +66,7 @@ class Rows:
     y: Array
     x: Array
     known_noise: Array
+    told: np.ndarray
 
 
 @dataclass(frozen=True, slots=True)

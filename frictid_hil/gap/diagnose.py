@@ -32,7 +32,7 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, Verdict, verdict
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, Verdict, needed, verdict
 from frictid_hil.gap.where import lives, where
 from frictid_hil.simulation.effects import all_effects
 
@@ -77,7 +77,11 @@ def diagnose(
     gaps = _closed(channels, found)
     runs = None if replay is None else replay({}, validation=_judged_role(logs))
     nothing_nm = _negligible(nominal, channels, negligible)
-    quiet = _raw_quiet(channels, negligible) and _loop_quiet(gaps, runs, _white_nm(logs), nothing_nm)
+    quiet = _raw_quiet(channels, negligible)
+    if quiet and replay is not None and runs is not None:
+        quiet_nm = _quiet_nm(gaps, _white_nm(logs), nothing_nm)
+        tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps)
+        quiet = settled_nm(replay(tolerable, validation=_judged_role(logs)) if tolerable else runs) <= quiet_nm
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
@@ -181,17 +185,27 @@ def _white_nm(logs: Sequence[Recording]) -> float:
     return gain * rms(np.array([white_rms(t) for r in judged if (t := r.experiment.torque_nm) is not None] or [0.0]))
 
 
-def _loop_quiet(
-    gaps: Sequence[Closed], runs: Mapping[str, Replayed] | None, white_nm: float, negligible_nm: float
-) -> bool:
-    """Whether the joint simulated in closed loop shows no more than noise either: as the actuation does, and white.
+def _quiet_nm(gaps: Sequence[Closed], white_nm: float, negligible_nm: float) -> float:
+    """The torque gap of the simulated closed loop that is no more than noise: as the actuation has it, and white, N m.
 
     What an encoder's steps make of the torque is known in a replay, and another draw of them in a simulation.
     """
     noise = next((gap.floor for gap in gaps if gap.channel == "actuation"), None)
-    if runs is None or noise is None:
-        return True
-    return settled_nm(runs) <= min(FLOORS * max(noise, white_nm), max(LOUD * white_nm, negligible_nm))
+    if noise is None:
+        return math.inf
+    return min(FLOORS * max(noise, white_nm), max(LOUD * white_nm, negligible_nm))
+
+
+def _tolerable(
+    found: Sequence[Finding], channels: Sequence[Sampled], gaps: Sequence[Closed]
+) -> dict[str, dict[str, float]]:
+    """Errors of the belief within their tolerances that are likelier there than not, where no gap shows besides."""
+    if any(gap.before > FLOORS * gap.floor for gap in gaps):
+        return {}
+    likely = [f for f in found if f.chance >= UNDECIDED and f.parameters]
+    if any(needed(f, channels) for f in likely):
+        return {}
+    return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in likely}
 
 
 def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed], gaps: Sequence[Closed]) -> Loop:

@@ -79,7 +79,7 @@ def sampled(posterior: Posterior) -> Sampled:
     draws = posterior.draws(posterior.search(), DRAWS)
     # The level of a log is free but along the motion, so that a constant there is no size.
     levels = float(posterior.channel.name != "plant")
-    x = np.concatenate([log.x - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
+    x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
     sizes: dict[str, Array] = {}
     blurs: dict[str, Array] = {}

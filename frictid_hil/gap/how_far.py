@@ -88,7 +88,7 @@ def coefficients(channel: Sampled, draw: Draw) -> Array:
 
 
 def _left(logs: Sequence[Rows], theta: Array, without_mean: bool) -> Array:
-    parts = [log.y - log.x @ theta for log in logs]
+    parts = [(log.y - log.x @ theta)[log.told] for log in logs]
     return np.concatenate([part - np.mean(part) if without_mean else part for part in parts])
 
 
@@ -102,7 +102,7 @@ def _appeared(channel: Sampled, theta: Array) -> tuple[str, float] | None:
     for log in posterior.channel.logs:
         if not log.validation:
             continue
-        rest = log.y - log.x @ theta
+        rest = np.where(log.told, log.y - log.x @ theta, 0.0)
         if rms(rest) < APPEARED * usual:
             continue
         rows = max(1, round(WINDOW_S / posterior.channel.step_s))

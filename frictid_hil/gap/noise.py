@@ -15,6 +15,8 @@ from scipy import linalg
 
 from frictid_hil.friction.trajectory import Array
 
+LOCAL_S = 0.3
+"""Time over which the size of the noise may change: a reversal, a stop."""
 ORDER = 8
 """Rows that a row is predicted from: 0.16 s at 50 Hz, several times what the low-pass smears."""
 

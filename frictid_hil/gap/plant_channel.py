@@ -13,6 +13,7 @@ from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, T
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import families
 from frictid_hil.gap.nuisances import nuisances
+from frictid_hil.gap.noise import LOCAL_S
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import (
     LowPass,
@@ -35,6 +36,10 @@ EACH_LOG = "each log"
 """Family of what differs from log to log, and says nothing of a further one."""
 SEVERAL = 3
 """Logs from which on what is of one log alone can be told from what is of all."""
+SWAMPED = 3.0
+"""Noise of the position over that of the median row, from which on a row tells nothing: a ninth of the others."""
+UNTOLD = 0.1
+"""The same over the friction level, below which a row does tell something."""
 LINE_ROWS = 20_000
 """Rows of a log by which lines are looked for at most."""
 LINE_SHARE = 0.1
@@ -82,6 +87,7 @@ def plant_channel(
     rows = tuple(_rows(r, residuals[k], builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, known, candidates)
     step_s = logs[0].step_s * low_pass.stride
+    rows = _told(rows, _white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
     raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
     return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
 
@@ -137,8 +143,24 @@ def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence
 
 def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowPass) -> float:
     """RMS that white noise of the torque and noise of the position leave behind the low-pass, N m."""
-    white = [white_rms(t) * low_pass.white_gain for r in logs if (t := r.experiment.torque_nm) is not None]
-    return math.hypot(rms(np.array(white)), rms(np.concatenate([log.known_noise for log in rows])))
+    return math.hypot(_white_nm(logs, low_pass), rms(np.concatenate([log.known_noise[log.told] for log in rows])))
+
+
+def _white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
+    """RMS that white noise of the torque leaves behind the low-pass, N m."""
+    white = [white_rms(t) for r in logs if (t := r.experiment.torque_nm) is not None]
+    return low_pass.white_gain * rms(np.array(white))
+
+
+def _told(rows: Sequence[Rows], white_nm: float, coulomb_nm: float, step_s: float) -> tuple[Rows, ...]:
+    """The logs, those rows marked in which noise of the position is much louder than in most: of a stuck spring.
+
+    A coarse encoder does not say how far a stuck joint has bent its spring, and so not which torque it asks for.
+    """
+    window = np.full(round(LOCAL_S / step_s) + 1, 1.0) / (round(LOCAL_S / step_s) + 1)
+    local = [np.sqrt(np.convolve(log.known_noise**2, window, mode="same") + white_nm**2) for log in rows]
+    most_nm = max(SWAMPED * float(np.median(np.concatenate(local))), UNTOLD * coulomb_nm)
+    return tuple(replace(log, told=size <= most_nm) for log, size in zip(rows, local, strict=True))
 
 
 def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
@@ -259,4 +281,5 @@ def _rows(
         table[:, -1],
         table[:, :-2],
         table[:, -2],
+        np.ones(table.shape[0], dtype=bool),
     )

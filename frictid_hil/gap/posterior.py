@@ -21,13 +21,12 @@ from scipy import special
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap import noise
 from frictid_hil.gap.channel import FAMILY, Channel, Term
+from frictid_hil.gap.residuals import rms
 
 SLOW = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Variance of the slow part over that of the noise: half decades."""
 MEMORY_S = (0.1, 0.5)
 """Its time constants: a reversal, a move."""
-LOCAL_S = 0.3
-"""Time over which the size of the noise may change: a reversal, a stop."""
 CARE = (0.1, 0.3, 1.0)
 """True one-sigma of a belief over the stated one: makers round up, rarely down."""
 EXPECTED = 1.0
@@ -131,9 +130,9 @@ class Posterior:
         known = [log.known_noise for log in channel.logs]
         rests, _ = self._richest()
         total = [np.hypot(rest, sample) for rest, sample in zip(rests, known, strict=True)]
-        self.floor = math.sqrt(float(np.mean(np.concatenate(total) ** 2)))
+        self.floor = rms(np.concatenate([t[log.told] for t, log in zip(total, channel.logs, strict=True)]))
         # A stuck spring's noise counts where the joint is stuck.
-        sizes = noise.local_size(total, round(LOCAL_S / channel.step_s) + 1)
+        sizes = noise.local_size(total, round(noise.LOCAL_S / channel.step_s) + 1)
         self._tables = [table / size[:, None] for table, size in zip(self._tables, sizes, strict=True)]
         rests, stretch = self._richest()
         known = [sample / size for sample, size in zip(known, sizes, strict=True)]

@@ -56,7 +56,8 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
         residual = (log.experiment.position_rad - command)[:, None]
         table = low_pass.thinned(np.concatenate([*builder.parts[k], residual], axis=1))[1:-2]
         e = log.experiment
-        rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], np.zeros(table.shape[0])))
+        quiet, told = np.zeros(table.shape[0]), np.ones(table.shape[0], dtype=bool)
+        rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], quiet, told))
     return Channel(
         "tracking",
         logs[0].step_s * low_pass.stride,

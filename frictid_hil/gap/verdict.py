@@ -71,7 +71,7 @@ def verdict(
         otherwise_quiet: the residual before any filter and the simulated closed loop show no more than noise.
     """
     helpless = [g.channel for c, g in zip(channels, gaps, strict=True) if g.after > HELPS * g.before or _faint(c, g)]
-    unreached = [f for f in found if f.size >= FLOORS and _needed(f, channels) and _unreached(f, channels)]
+    unreached = [f for f in found if f.size >= FLOORS and needed(f, channels) and _unreached(f, channels)]
     named = tuple(f for f in found if f.chance >= LISTED and (f.where not in helpless or f in unreached))
     quiet = otherwise_quiet and all(gap.before <= max(FLOORS * gap.floor, negligible) for gap in gaps)
     explained = _root_sum([channel.explained for channel in channels])
@@ -87,7 +87,7 @@ def verdict(
     shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     told = any(f in unreached for f in named)
-    tiny = tiny and not told and not (shows and any(_needed(f, channels) for f in named))
+    tiny = tiny and not told and not (shows and any(needed(f, channels) for f in named))
     doubtful = all(f.chance < EVEN for f in named)
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
@@ -105,7 +105,7 @@ def verdict(
     return Verdict("explained", named)
 
 
-def _needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
+def needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
     """Whether a cause stands out and hardly any draw does without it beyond what its tolerance allows."""
     if cause.chance < NEEDED or cause.size < STANDS_OUT:
         return False

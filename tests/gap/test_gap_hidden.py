@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import gap_sets
 import numpy as np
 import pytest
 
+from frictid_hil.gap.blind.generator import Assignment, draw_case, write_case
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.experiment_set import Experiment
+from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
 
 
@@ -50,3 +52,23 @@ def test_a_round_knee_approaches_the_clip() -> None:
     distances = [float(np.max(np.abs(knee - clip))) for knee in knees]
     assert distances == sorted(distances, reverse=True)
     assert all(np.abs(knee).max() <= 1.0 for knee in knees)
+
+
+def _drawn(effects: tuple[str, ...], index: int, seed: int, folder: Path) -> ExperimentSet:
+    """A joint of the blind world, whose plant shares no formula with the diagnosis."""
+    write_case(draw_case(index, seed, Assignment("double", effects)), folder)
+    return ExperimentSet.load(folder)
+
+
+@pytest.mark.slow
+def test_a_lag_of_the_drive_is_told_behind_a_velocity_that_lags_by_another_filter(tmp_path: Path) -> None:
+    found = diagnose(_drawn(("electrical_lag", "velocity_lag"), 0, 112304, tmp_path))
+    assert {c.effect for c in found.causes[:2]} == {"electrical_lag", "velocity_lag"}
+    lag = next(c for c in found.causes if c.effect == "electrical_lag")
+    assert lag.parameters["time_constant_s"].value == pytest.approx(0.0078, abs=0.0004)
+
+
+@pytest.mark.slow
+def test_play_is_found_behind_a_coarse_encoder(tmp_path: Path) -> None:
+    found = diagnose(_drawn(("backlash", "encoder_quantisation"), 42, SEED, tmp_path))
+    assert {c.effect for c in found.causes[:2]} == {"backlash", "encoder_quantisation"}
