@@ -16,9 +16,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.gap.blind.check import run_check
-from frictid_hil.gap.blind.generator import Assignment, draw_case
-from frictid_hil.gap.blind.page import AIMS, CLOSED_AIMS, LEFT_OUT_AIM, SECONDS_AIM, headline, page
+from frictid_hil.blind.check import run_check
+from frictid_hil.blind.generator import Assignment, draw_case
+from frictid_hil.blind.page import AIMS, CLOSED_AIMS, LEFT_OUT_AIM, SECONDS_AIM, headline, page
 
 DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-check.md"
 BEGIN, END = "<!-- the last full run: written by benchmarks/gap_check.py -->", "<!-- end of the last full run -->"

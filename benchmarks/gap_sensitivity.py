@@ -19,10 +19,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from frictid_hil.blind.check import draw_sealed
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.gap import diagnose as diagnosis
 from frictid_hil.gap import findings, how_far, noise, plant_channel, posterior, verdict
-from frictid_hil.gap.blind.check import draw_sealed
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.verdict import Verdict
 

@@ -12,8 +12,8 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
 from frictid_hil.gap.generic import families
-from frictid_hil.gap.nuisances import nuisances
 from frictid_hil.gap.noise import LOCAL_S
+from frictid_hil.gap.nuisances import nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
 from frictid_hil.gap.residuals import (
     LowPass,

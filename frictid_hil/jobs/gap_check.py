@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from frictid_hil.blind.check import code_digest, run_check
+from frictid_hil.blind.worlds import WORLDS
 from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
-from frictid_hil.gap.blind.check import code_digest, run_check
-from frictid_hil.gap.blind.worlds import WORLDS
 
 
 def run_gap_check(

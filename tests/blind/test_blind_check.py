@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from frictid_hil.blind.check import run_check
 from frictid_hil.errors import UsageError
-from frictid_hil.gap.blind.check import run_check
 from frictid_hil.jobs.gap_check import run_gap_check
 
 # Answers "stribeck, sure" to everything, dies on case_001, and reports every file it could see from where it stands.

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import yaml
 
-from frictid_hil.gap.blind.effects import LIBRARY
-from frictid_hil.gap.blind.figures import believed_motion, figures, record, together
-from frictid_hil.gap.blind.generator import Assignment, Case, assignments, draw_case, write_case
-from frictid_hil.gap.blind.joints import Joint, base_friction, draw_joint, nominal_mapping
-from frictid_hil.gap.blind.outsiders import OUTSIDERS
+from frictid_hil.blind.effects import LIBRARY
+from frictid_hil.blind.figures import believed_motion, figures, record, together
+from frictid_hil.blind.generator import Assignment, Case, assignments, draw_case, write_case
+from frictid_hil.blind.joints import Joint, base_friction, draw_joint, nominal_mapping
+from frictid_hil.blind.outsiders import OUTSIDERS
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
 
@@ -63,7 +63,7 @@ def joint() -> Joint:
 @pytest.mark.slow
 def test_the_generator_never_loads_the_effect_library() -> None:
     script = (
-        "import sys, frictid_hil.gap.blind.generator\n"
+        "import sys, frictid_hil.blind.generator\n"
         "print([m for m in sys.modules if m.startswith(('frictid_hil.simulation', 'frictid_hil.gap.posterior'))])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from frictid_hil.gap.blind.page import page
-from frictid_hil.gap.blind.score import Answer, Rate, score, score_left_out
+from frictid_hil.blind.page import page
+from frictid_hil.blind.score import Answer, Rate, score, score_left_out
 
 ALIASES = [["torque_delay", "electrical_lag"]]
 FLOOR = {"inverse_nm": 0.1, "actuation_nm": 0.1, "forward_torque_nm": 0.1, "forward_position_rad": 1e-5}

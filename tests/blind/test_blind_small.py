@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from frictid_hil.gap.blind.check import run_check
+from frictid_hil.blind.check import run_check
 
 pytestmark = pytest.mark.slow
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
+from frictid_hil.blind import judged, plant, spoilt, wide, zoo
+from frictid_hil.blind.worlds import WORLDS, write_rows
 from frictid_hil.errors import UsageError
-from frictid_hil.gap.blind import judged, plant, spoilt, wide, zoo
-from frictid_hil.gap.blind.worlds import WORLDS, write_rows
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.sanity import checked
 from frictid_hil.jobs.gap_check import run_gap_check

@@ -9,7 +9,7 @@ import gap_sets
 import numpy as np
 import pytest
 
-from frictid_hil.gap.blind.generator import Assignment, draw_case, write_case
+from frictid_hil.blind.generator import Assignment, draw_case, write_case
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported

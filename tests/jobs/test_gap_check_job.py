@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from frictid_hil.blind import check
 from frictid_hil.errors import UsageError
-from frictid_hil.gap.blind import check
 from frictid_hil.jobs import gap_check
 
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from frictid_hil.blind import judged, score, spoilt, wide, zoo
+from frictid_hil.blind import page as narrow_page
+from frictid_hil.blind.generator import assignments, draw_case, rounded, write_case
+from frictid_hil.blind.score import Answer
 from frictid_hil.files import write_whole
-from frictid_hil.gap.blind import judged, score, spoilt, wide, zoo
-from frictid_hil.gap.blind import page as narrow_page
-from frictid_hil.gap.blind.generator import assignments, draw_case, rounded, write_case
-from frictid_hil.gap.blind.score import Answer
 
 Documents = Mapping[str, Mapping[str, Any]]
 

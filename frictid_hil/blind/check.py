@@ -22,16 +22,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.gap.blind.generator import truth_text
-from frictid_hil.gap.blind.score import Answer, score_left_out
-from frictid_hil.gap.blind.worlds import WORLDS
+from frictid_hil.blind.generator import truth_text
+from frictid_hil.blind.score import Answer, score_left_out
+from frictid_hil.blind.worlds import WORLDS
 
 SCHEMA = "frictid.gap_check/1"
 
 Progress = Callable[[str, int, int], None]
 """Called with the phase (``draw``, ``diagnose``, ``leave one out``), how many are done, and of how many."""
 DiagnoserCommand = tuple[str, ...]
-DIAGNOSER: DiagnoserCommand = (sys.executable, "-m", "frictid_hil.gap.blind.diagnoser")
+DIAGNOSER: DiagnoserCommand = (sys.executable, "-m", "frictid_hil.blind.diagnoser")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ def run_check(
 
 def code_digest() -> str:
     """SHA-256 over the source files that answer, hexadecimal."""
-    room = Path(__file__).parents[2]
+    room = Path(__file__).parents[1]
     files = [path for path in sorted(room.rglob("*.py")) if "blind" not in path.parts]
     text = b"".join(path.relative_to(room).as_posix().encode() + path.read_bytes() for path in files)
     return hashlib.sha256(text).hexdigest()

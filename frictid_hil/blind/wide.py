@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import signal
 
+from frictid_hil.blind import plant
+from frictid_hil.blind.effects import LIBRARY
+from frictid_hil.blind.figures import rms, slip_of_spring
+from frictid_hil.blind.joints import Joint, Payload, either_sign, log_uniform
+from frictid_hil.blind.outsiders import OUTSIDERS
+from frictid_hil.blind.plant import Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.blind import plant
-from frictid_hil.gap.blind.effects import LIBRARY
-from frictid_hil.gap.blind.figures import rms, slip_of_spring
-from frictid_hil.gap.blind.joints import Joint, Payload, either_sign, log_uniform
-from frictid_hil.gap.blind.outsiders import OUTSIDERS
-from frictid_hil.gap.blind.plant import Controller, Physics
 from frictid_hil.gap.experiments import FULL, SHORT, Envelope, chosen
 
 KINDS = ("none",) * 4 + ("tolerance",) * 4 + ("single",) * 7 + ("double",) * 2 + ("outside",) * 3

@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from frictid_hil.gap.blind import plant
-from frictid_hil.gap.blind.joints import Joint, either_sign, log_uniform
-from frictid_hil.gap.blind.plant import Physics
+from frictid_hil.blind import plant
+from frictid_hil.blind.joints import Joint, either_sign, log_uniform
+from frictid_hil.blind.plant import Physics
 
 Draw = Callable[[np.random.Generator, Joint, float], Physics]
 

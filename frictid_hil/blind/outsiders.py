@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from frictid_hil.gap.blind.effects import Draw
-from frictid_hil.gap.blind.joints import Joint, log_uniform
-from frictid_hil.gap.blind.plant import Physics
+from frictid_hil.blind.effects import Draw
+from frictid_hil.blind.joints import Joint, log_uniform
+from frictid_hil.blind.plant import Physics
 
 
 def frictional_memory(rng: np.random.Generator, joint: Joint, peak_nm: float) -> Physics:

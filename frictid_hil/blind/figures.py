@@ -19,10 +19,10 @@ import numpy as np
 from numba import njit
 from scipy import signal
 
+from frictid_hil.blind import plant
+from frictid_hil.blind.joints import Joint, Payload, ticks
+from frictid_hil.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.blind import plant
-from frictid_hil.gap.blind.joints import Joint, Payload, ticks
-from frictid_hil.gap.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.gap.experiments import Experiment
 
 CUTOFF_HZ = 25.0

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from frictid_hil.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.gap.experiments import FULL, Envelope, Experiment, chosen
 
 TOLERANCE = 0.008

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from frictid_hil.blind.figures import rms
+from frictid_hil.blind.joints import either_sign, log_uniform
+from frictid_hil.blind.wide import Row, low_pass, multisine, pick_place
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.blind.figures import rms
-from frictid_hil.gap.blind.joints import either_sign, log_uniform
-from frictid_hil.gap.blind.wide import Row, low_pass, multisine, pick_place
 
 STEP_S = 2e-4
 TICK_S = 0.002

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.gap.blind.score import CONFIDENT, Answer, Rate
+from frictid_hil.blind.score import CONFIDENT, Answer, Rate
 
 FALSE_CLEAR = 3.0
 """Gap over floor from which ``none`` is a false all-clear."""

@@ -3,7 +3,7 @@
 A case is drawn from (seed, index) alone. Its truth compares the joint with the same joint and the same noise without
 the effects: the *gap* of the belief, and the *floor* that an ideal explanation would reach.
 
-``python -m frictid_hil.gap.blind.generator --out DIR --cases N --seed S`` writes ``DIR/cases`` and ``DIR/truth``.
+``python -m frictid_hil.blind.generator --out DIR --cases N --seed S`` writes ``DIR/cases`` and ``DIR/truth``.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from frictid_hil.gap.blind.effects import LIBRARY, Draw
-from frictid_hil.gap.blind.figures import Log, believed_motion, figures, record, together
-from frictid_hil.gap.blind.joints import Joint, changed, draw_joint, nominal_mapping
-from frictid_hil.gap.blind.outsiders import OUTSIDERS
-from frictid_hil.gap.blind.plant import TICK_S, Physics
+from frictid_hil.blind.effects import LIBRARY, Draw
+from frictid_hil.blind.figures import Log, believed_motion, figures, record, together
+from frictid_hil.blind.joints import Joint, changed, draw_joint, nominal_mapping
+from frictid_hil.blind.outsiders import OUTSIDERS
+from frictid_hil.blind.plant import TICK_S, Physics
 from frictid_hil.gap.experiments import FULL
 
 ALIASES = (

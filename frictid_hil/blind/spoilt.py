@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from frictid_hil.blind.joints import either_sign
+from frictid_hil.blind.wide import Row
+from frictid_hil.blind.zoo import truth_of
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.gap.blind.joints import either_sign
-from frictid_hil.gap.blind.wide import Row
-from frictid_hil.gap.blind.zoo import truth_of
 
 SOURCES = {"FRICTID_REAL_MORE_DATA": "real-more"}
 """Environment variables that name folders of recordings with ``cases/``; else beside the repository, in shared/data."""
@@ -32,7 +32,7 @@ def recorded_sets() -> tuple[Path, ...]:
     found: list[Path] = []
     for variable, name in SOURCES.items():
         told = os.environ.get(variable)
-        folder = Path(told) if told else Path(__file__).resolve().parents[4] / "shared" / "data" / name
+        folder = Path(told) if told else Path(__file__).resolve().parents[3] / "shared" / "data" / name
         found += [path.parent for path in sorted((folder / "cases").glob("*/nominal.yaml"))]
     return tuple(path for path in found if "torque_nm" in _header(path))
 
