@@ -100,11 +100,14 @@ def summary(result: Mapping[str, Any]) -> list[str]:
 
 
 def write_docs(text: str) -> None:
-    """Put the run between the page's two marks."""
+    """Put the rates between the page's two marks, and the whole run into the text beside it."""
+    (DOCS_PAGE.parent / "data" / "gap-check-run.txt").write_text(text)
+    rates = text.split("### Rates")[1].split("\n###")[0]
+    source = next(line for line in text.splitlines() if " joints, seed " in line)
     whole = DOCS_PAGE.read_text()
     before, rest = whole.split(BEGIN, 1)
     _, after = rest.split(END, 1)
-    DOCS_PAGE.write_text(f"{before}{BEGIN}\n\n{text.strip()}\n\n{END}{after}")
+    DOCS_PAGE.write_text(f"{before}{BEGIN}\n\n{source}\n\n{rates.strip()}\n\n{END}{after}")
 
 
 def _told(phase: str, done: int, of: int) -> None:

@@ -1,12 +1,14 @@
 """The diagnosis on real machines: fitted on some recordings, judged on others, both ways; every set, right or wrong.
 
-Prints one line per set; ``--write-docs`` puts the tables into ``docs/evidence/gap-real.md``. The recordings are named
-by FRICTID_REAL_DATA and FRICTID_REAL_MORE_DATA; see their READMEs for origin, licences and how the truth was found.
+Prints one line per set; ``--write-docs`` puts them into ``docs/evidence/data/gap-real.csv`` and the counts into
+``gap-real.md``. The recordings are named by FRICTID_REAL_DATA and FRICTID_REAL_MORE_DATA; see their READMEs for origin,
+licences and how the truth was found.
 """
 
 from __future__ import annotations
 
 import ast
+import csv
 import functools
 import gzip
 import os
@@ -304,7 +306,7 @@ def diagnosed(name: str, known: Known, make: Callable[[], ExperimentSet]) -> Fou
 
 
 def page(found: Mapping[str, Sequence[Found]]) -> str:
-    """Every set, by machine, and the counts first."""
+    """The counts, and every set that was answered wrongly; all sets are in the table beside the page."""
     every = [f for group in found.values() for f in group]
     sure = [f for f in every if f.known.certainty == "certain"]
     gaps = [f for f in every if (f.known.floors or 0.0) >= FALSE_CLEAR]
@@ -315,19 +317,24 @@ def page(found: Mapping[str, Sequence[Found]]) -> str:
         f"| ... where the cause is certain | {sum(f.right for f in sure)} of {len(sure)} |",
         f"| `none` beside {FALSE_CLEAR:g} floors or more | {sum(f.false_clear for f in gaps)} of {len(gaps)} |",
         f"| refused | {sum(f.diagnosis is None for f in every)} of {len(every)} |",
+        "",
+        "Answered wrongly:",
+        "",
+        *(f"- {f.name}: known is {_cells(f)[2]}, answered was {_cells(f)[3]}" for f in every if not f.right),
     ]
-    for machine, group in found.items():
-        parts += ["", f"## {machine}", "", "| set | floors | known | answer | closes | |", "|---|---|---|---|---|---|"]
-        parts += [_line(f) for f in group]
     return "\n".join(parts)
 
 
-def _line(f: Found) -> str:
+HEADS = ("machine", "set", "floors", "known", "answer", "closes", "judged")
+
+
+def _cells(f: Found) -> tuple[str, ...]:
+    """Set, floors, what is known, the answer, how much of the gap it closes, and whether it is right."""
     known = f"{' or '.join(f.known.accept)} ({f.known.certainty.replace('_', ' ')})"
     floors = "-" if f.known.floors is None else f"{f.known.floors:.3g}"
-    mark = "right" if f.right else "**false all-clear**" if f.false_clear else "**wrong**"
+    mark = "right" if f.right else "false all-clear" if f.false_clear else "wrong"
     if f.diagnosis is None:
-        return f"| {f.name} | {floors} | {known} | refused: {f.refused} | | {mark} |"
+        return f.name, floors, known, f"refused: {f.refused}", "", mark
     d = f.diagnosis
     told = "; ".join(
         f"{c.effect} {c.confidence:.2f}{' (or ' + ', '.join(c.confusable_with) + ')' if c.confusable_with else ''}"
@@ -337,11 +344,11 @@ def _line(f: Found) -> str:
     if pair[0] is None:
         pair = (d.before.forward_position_rad, d.after.forward_position_rad)
     closes = "-" if pair[0] is None or pair[1] is None or pair[0] == 0.0 else f"{100 * (1 - pair[1] / pair[0]):.0f} %"
-    return f"| {f.name} | {floors} | {known} | {d.verdict}{': ' + told if told else ''} | {closes} | {mark} |"
+    return f.name, floors, known, f"{d.verdict}{': ' + told if told else ''}", closes, mark
 
 
 def main() -> int:
-    """Print a line per set; with ``--write-docs`` put the tables into the docs page."""
+    """Print a line per set; with ``--write-docs`` put the counts into the docs page, and every set into its table."""
     folder, more = real_data(), real_data("FRICTID_REAL_MORE_DATA", "real-more")
     if folder is None and more is None:
         print("no recordings: set FRICTID_REAL_DATA, FRICTID_REAL_MORE_DATA", file=sys.stderr)
@@ -350,10 +357,13 @@ def main() -> int:
     for machine, name, known, make in cases(folder, more):
         begin = time.process_time()
         found.setdefault(machine, []).append(diagnosed(name, known, make))
-        print(f"{_line(found[machine][-1])} {time.process_time() - begin:.1f} s", flush=True)
+        print(*_cells(found[machine][-1]), f"{time.process_time() - begin:.1f} s", sep=" | ", flush=True)
     if "--write-docs" in sys.argv:
         before, rest = DOCS_PAGE.read_text().split(BEGIN, 1)
         DOCS_PAGE.write_text(f"{before}{BEGIN}\n\n{page(found)}\n\n{END}{rest.split(END, 1)[1]}")
+        with (DOCS_PAGE.parent / "data" / "gap-real.csv").open("w", newline="", encoding="utf-8") as file:
+            rows = [(machine, *_cells(f)) for machine, group in found.items() for f in group]
+            csv.writer(file, lineterminator="\n").writerows([HEADS, *rows])
     return 0
 
 
