@@ -31,17 +31,15 @@ simulated:
       stribeck_velocity_rad_s: 0.035
 ```
 
-A parameter that is left out takes its typical value if it shapes the effect, and is off if it sizes it. *Off* is the
-value at which an effect vanishes. F_0 is the joint's Coulomb level, phi_0(v) the part of its friction curve that
-depends on speed, q the joint's position, v its velocity; all on the joint side of the gear.
+A parameter that is left out takes its typical value if it shapes the effect, and is off if it sizes it. F_0 is the
+joint's Coulomb level, phi_0(v) the part of its friction curve that depends on speed, q the joint's position, v its
+velocity; all on the joint side of the gear.
 
-*Channel* is where an effect shows: P, reported torque against the joint's equation of motion; A, reported torque
-against the controller's demand; K, reported velocity against differenced position. *Region* is the part of the motion
-where it shows.
+*Channel* is where an effect shows: P, reported torque against the equation of motion; A, reported torque against the
+controller's demand; K, reported velocity against differenced position. *Region* is the part of the motion.
 
 `python -m frictid_hil.simulation.catalogue docs/reference` generates this page from `frictid_hil/simulation/effects/`.
-A file that you add there adds the effect to the simulated joint, to robot files, to the diagnosis and to this page. An
-effect of your own may also come in a package, by an entry point that leads to an `Effect`:
+A file that you add there is known to simulated joints, robot files and diagnosis; so is an entry point of a package:
 
 ```toml
 [project.entry-points."frictid_hil.effects"]
@@ -54,19 +52,19 @@ def page() -> str:
     """The whole page in Markdown."""
     effects = all_effects().values()
     rows = [
-        f"| [{e.name}](#{e.name}) | {e.summary} | {', '.join(c.value for c in e.signature.channels)} "
+        f"| [{e.name}](#{e.name}) | {', '.join(c.value for c in e.signature.channels)} "
         f"| {', '.join(r.value for r in e.signature.regions)} |"
         for e in effects
     ]
-    index = "\n".join(["| effect | what it is | channel | region |", "|---|---|---|---|", *rows])
+    index = "\n".join(["| effect | channel | region |", "|---|---|---|", *rows])
     return "\n".join([_INTRODUCTION, index, "", *(section(effect) for effect in effects)])
 
 
 def section(effect: Effect) -> str:
     """One effect in Markdown."""
     rows = [
-        f"| `{p.name}` | {p.description} | {p.lower:g} to {p.upper:g} | {'' if p.off is None else f'{p.off:g}'} "
-        f"| {p.typical:g} |"
+        f"- `{p.name}`: {p.description}; {p.lower:g} to {p.upper:g}, "
+        f"{'' if p.off is None else f'off {p.off:g}, '}typical {p.typical:g}"
         for p in effect.parameters
     ]
     return "\n".join(
@@ -79,8 +77,6 @@ def section(effect: Effect) -> str:
             "",
             effect.documentation,
             "",
-            "| parameter | meaning | bounds | off | typical |",
-            "|---|---|---|---|---|",
             *rows,
             "",
         ]
