@@ -12,12 +12,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Rows, Term
 from frictid_hil.gap.command_timing import FASTEST, between_rows
 from frictid_hil.gap.experiment_set import Controller, Nominal, ReportFilter
-from frictid_hil.gap.plant_channel import (
-    BEYOND,
-    SIZES,
-    family,
-    without_nuisances,
-)
+from frictid_hil.gap.plant_channel import BEYOND, SIZES, family, white_nm, without_nuisances
 from frictid_hil.gap.residuals import (
     LowPass,
     Recording,
@@ -127,6 +122,7 @@ def actuation_channel(
     low_pass = LowPass.at(1.0 / logs[0].step_s)
     rows = tuple(_rows(r, residuals[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, nuisances, candidates)
+    between = any(r.resampled or between_rows(controller, r.step_s) for r in logs)
     return Channel(
         "actuation",
         logs[0].step_s * low_pass.stride,
@@ -135,7 +131,9 @@ def actuation_channel(
         tuple(candidates),
         scale,
         low_pass.cutoff_hz,
-        between_rows=any(r.resampled or between_rows(controller, r.step_s) for r in logs),
+        # A demand that is known exactly leaves the torque's own noise, and nothing that a model may take for noise.
+        known_floor=math.inf if between else white_nm(logs, low_pass),
+        between_rows=between,
     )
 
 

@@ -45,7 +45,8 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     """The verdict as far as the closed loop bears it out, and what to tell of that.
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
-    more. A cause is refuted that adds ``HALF`` of it or more to what they leave.
+    more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
+    ``HALF`` of the visible gap or more to what the chosen ones leave.
     """
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
     kept, gap_nm, beside = _chosen(values, loop)
@@ -76,7 +77,20 @@ def _of_the_drive(cause: Finding) -> bool:
 
 
 def _chosen(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float, dict[str, float]]:
-    """(causes that help, in that order; the gap with them; the gap with each of the others beside them)."""
+    """(causes that help, the best first; the gap with them; the gap with each of the others beside them)."""
+    kept, gap_nm = _added(values, loop)
+    if gap_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
+        # A wrong gain and a wrong inertia may each take a joint further off, and together bring it home.
+        others, left_nm = _taken_off(values, loop)
+        if gap_nm**2 - left_nm**2 > REMAINS**2 * loop.visible:
+            kept, gap_nm = others, left_nm
+    own = {name: values[name] for name in kept}
+    beside = {name: loop.gap_nm({**own, name: values[name]}) for name in values if name not in kept}
+    return kept, gap_nm, beside
+
+
+def _added(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float]:
+    """(causes added one by one, the one that helps most first; the gap with them)."""
     kept: list[str] = []
     gap_nm = loop.before_nm
     while True:
@@ -84,9 +98,23 @@ def _chosen(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list
         beside = {name: loop.gap_nm({**own, name: values[name]}) for name in values if name not in kept}
         best = min(beside, key=lambda name: beside[name], default=None)
         if best is None or gap_nm**2 - beside[best] ** 2 < REMAINS**2 * loop.visible:
-            return kept, gap_nm, beside
+            return kept, gap_nm
         kept.append(best)
         gap_nm = beside[best]
+
+
+def _taken_off(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float]:
+    """(all causes less those without which the joint is nearer, in the order given; the gap with them)."""
+    kept = list(values)
+    gap_nm = loop.gap_nm(values)
+    while len(kept) > 1:
+        without = {name: loop.gap_nm({n: values[n] for n in kept if n != name}) for name in kept}
+        best = min(without, key=lambda name: without[name])
+        if without[best] >= gap_nm:
+            break
+        kept.remove(best)
+        gap_nm = without[best]
+    return kept, gap_nm
 
 
 def _refined(first: Finding, kept: Effects, loop: Loop, gap_nm: float) -> tuple[Finding, float]:

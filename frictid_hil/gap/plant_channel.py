@@ -87,7 +87,7 @@ def plant_channel(
     rows = tuple(_rows(r, residuals[k], builder.parts[k], noises[k], low_pass, report) for k, r in enumerate(logs))
     rows = without_nuisances(rows, known, candidates)
     step_s = logs[0].step_s * low_pass.stride
-    rows = _told(rows, _white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
+    rows = _told(rows, white_nm(logs, low_pass), views[0].coulomb_nm, step_s)
     raw, known_floor = _raw(logs, residuals, noises), _known_floor(logs, rows, low_pass)
     return Channel("plant", step_s, rows, tuple(known), tuple(candidates), scale, low_pass.cutoff_hz, raw, known_floor)
 
@@ -143,10 +143,10 @@ def _raw(logs: Sequence[Recording], residuals: Sequence[Array], noises: Sequence
 
 def _known_floor(logs: Sequence[Recording], rows: Sequence[Rows], low_pass: LowPass) -> float:
     """RMS that white noise of the torque and noise of the position leave behind the low-pass, N m."""
-    return math.hypot(_white_nm(logs, low_pass), rms(np.concatenate([log.known_noise[log.told] for log in rows])))
+    return math.hypot(white_nm(logs, low_pass), rms(np.concatenate([log.known_noise[log.told] for log in rows])))
 
 
-def _white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
+def white_nm(logs: Sequence[Recording], low_pass: LowPass) -> float:
     """RMS that white noise of the torque leaves behind the low-pass, N m."""
     white = [white_rms(t) for r in logs if (t := r.experiment.torque_nm) is not None]
     return low_pass.white_gain * rms(np.array(white))

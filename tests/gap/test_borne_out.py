@@ -22,10 +22,10 @@ def cause(effect: str, where: str = "plant", chance: float = 0.99, **values: flo
 
 
 def loop(gaps_nm: Mapping[str, float], before_nm: float = 1.0) -> Loop:
-    """A loop whose gaps are told by a table; causes joined by "+" in the order of the alphabet."""
+    """A loop whose gaps are told by a table; causes joined by "+" in the order of the alphabet, others far off."""
 
     def gap_nm(effects: Effects) -> float:
-        return gaps_nm["+".join(sorted(effects))]
+        return gaps_nm.get("+".join(sorted(effects)), 9.0)
 
     return Loop(gap_nm, before_nm, 0.02)
 
@@ -38,6 +38,16 @@ def test_a_pair_that_cancels_falls_and_the_cause_that_helps_leads() -> None:
     assert said.word == "explained" and [f.effect for f in said.named] == ["inertia_error", "stribeck", "viscous_error"]
     assert said.named[0].chance == DOUBTED and said.named[1].chance == said.named[2].chance == REFUTED
     assert told is not None and "1 N m off, 0.1 with inertia_error" in told
+
+
+def test_two_causes_that_help_only_together_stand() -> None:
+    named = (cause("controller_gain_error"), cause("inertia_error"), cause("stribeck"))
+    gaps = {"controller_gain_error": 1.5, "inertia_error": 1.4, "stribeck": 2.0}
+    gaps |= {"controller_gain_error+inertia_error": 0.1, "controller_gain_error+inertia_error+stribeck": 1.2}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert said.word == "explained" and said.named[:2] == named[:2]
+    assert said.named[2].chance == REFUTED
+    assert told is not None and "0.1 with controller_gain_error and inertia_error" in told
 
 
 def test_where_nothing_helps_the_gap_is_unknown() -> None:
