@@ -19,7 +19,7 @@ _LABELS = {
     "singles_top_1_or_alias": "... or its alias",
     "singles_top_2": "... among the first two",
     "none_answered_none": "Healthy joints answered `none`",
-    "outside_answered_unknown": "Visible effects from outside the library answered `unknown`, or `none` below two floors",
+    "outside_answered_unknown": "Visible effects from outside answered `unknown`, or `none` below two floors",
     "doubles_both_in_top_2": "Both of two effects (each visible alone) in the first two",
     "doubles_all_both_in_top_2": "... of all pairs",
     "invisible_none_or_named": "Invisible effects answered `none` or by their name",
