@@ -293,10 +293,10 @@ def _rows(
     recording: Recording, residual_nm: Array, parts: list[Array], low_pass: LowPass, report: ReportFilter | None
 ) -> Rows:
     e = recording.experiment
-    columns = np.concatenate(parts, axis=1)
+    columns = parts
     if report is not None:
-        columns = reported(columns, report, recording.step_s)
-    table = low_pass.thinned(np.concatenate([columns, residual_nm[:, None]], axis=1))[1:-2]
+        columns = [reported(block, report, recording.step_s) for block in columns]
+    table = low_pass.thinned_blocks([*columns, residual_nm[:, None]])[1:-2]
     return Rows(
         e.name,
         e.validation,

@@ -286,6 +286,7 @@ def _told(
         candidate=replay.model(effects) if replay is not None else None,
         held_out=held_out(plant) if plant is not None else {},
         samples=whole_draws(list(effects), channels) if effects and channels else (),
+        presliding_nm_per_rad=experiments.nominal.presliding_stiffness_nm_per_rad,
         raw=None if plant is None else Raw(*plant.posterior.channel.raw, plant.posterior.channel.cutoff_hz),
     )
 

@@ -104,6 +104,8 @@ class Diagnosis:
         held_out: by effect, change of the held-out squares when it alone is added, percent.
         raw: the gap before any filter; None where it is not formed.
         samples: draws of the posterior, parameters by effect; empty where nothing was sampled.
+        presliding_nm_per_rad: stiffness at the believed level that the recordings were compared with; None where no
+            stiffness is believed.
     """
 
     name: str
@@ -122,6 +124,7 @@ class Diagnosis:
     held_out: Mapping[str, float] = field(default_factory=dict)
     raw: Raw | None = None
     samples: tuple[Mapping[str, Mapping[str, float]], ...] = ()
+    presliding_nm_per_rad: float | None = None
 
     def improved_model(self) -> JointModel | None:
         """The joint with the named causes added; the nominal joint where nothing is applied; None without a controller.

@@ -149,7 +149,7 @@ def _columns(known: Known, view: View, low_pass: LowPass) -> Array:
         form = all_effects()[term.effect].inverse if term.effect in all_effects() else None
         own = None if form is None or STIFFNESS in term.shape else form.regressors([view], term.shape)[0]
         columns.append(own if own is not None else np.zeros((view.position_rad.size, len(term.columns))))
-    return low_pass.thinned(np.concatenate(columns, axis=1))
+    return low_pass.thinned_blocks(columns)
 
 
 def _evidence(x_first: Array, first: Known, x_second: Array, second: Known, floor: float) -> float:

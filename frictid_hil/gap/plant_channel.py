@@ -267,10 +267,10 @@ def _rows(
 ) -> Rows:
     view = recording.view
     assert view is not None
-    columns = np.concatenate([*parts, noise_nm[:, None]], axis=1)
+    columns = [*parts, noise_nm[:, None]]
     if report is not None:
-        columns = reported(columns, report, recording.step_s)
-    table = low_pass.thinned(np.concatenate([columns, residual_nm[:, None]], axis=1))
+        columns = [reported(block, report, recording.step_s) for block in columns]
+    table = low_pass.thinned_blocks([*columns, residual_nm[:, None]])
     held = first_slide(view.position_rad, 3.0 * view.coulomb_nm / view.stiffness_nm_per_rad)
     first = min(held // low_pass.stride + 1, table.shape[0] // 3)
     table = table[first:-2]

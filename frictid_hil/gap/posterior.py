@@ -124,9 +124,9 @@ class Posterior:
         self._columns = np.array([c for term in terms for c in term.columns], dtype=int)
         self._scale: Array = np.concatenate([term.deviation for term in terms])
         self._mean: Array = np.concatenate([term.mean for term in terms])
-        self._tables = [
-            np.concatenate([log.x[:, self._columns] * self._scale, log.y[:, None]], axis=1) for log in channel.logs
-        ]
+        # Terms share columns: the tables hold each once, and whatever is made of them is spread over the terms.
+        held, self._place = np.unique(self._columns, return_inverse=True)
+        self._tables = [np.concatenate([log.x[:, held], log.y[:, None]], axis=1) for log in channel.logs]
         known = [log.known_noise for log in channel.logs]
         rests, _ = self._richest()
         total = [np.hypot(rest, sample) for rest, sample in zip(rests, known, strict=True)]
@@ -140,18 +140,25 @@ class Posterior:
 
     def _richest(self) -> tuple[list[Array], float]:
         """(what all terms together leave, rows over rows less fitted freedoms); ridges as large as the noise."""
-        table = np.concatenate(self._tables)
-        x, y = table[:, :-1], table[:, -1]
-        values, vectors = np.linalg.eigh(x.T @ x)
+        y = np.concatenate([t[:, -1] for t in self._tables])
+        gram = self._spread(np.sum([t.T @ t for t in self._tables], axis=0))
+        values, vectors = np.linalg.eigh(gram[:-1, :-1])
         values = np.maximum(values, 0.0)
         variance, stretch = float(np.mean(np.diff(y) ** 2)) / 2.0 + 1e-300, 1.0
         rests = [t[:, -1] for t in self._tables]
         for _ in range(3):
-            weights = vectors @ ((vectors.T @ (x.T @ y)) / (values + variance))
-            rests = [t[:, -1] - t[:, :-1] @ weights for t in self._tables]
+            weights = self._scale * (vectors @ ((vectors.T @ gram[:-1, -1]) / (values + variance)))
+            each = np.bincount(self._place, weights)
+            rests = [t[:, -1] - t[:, :-1] @ each for t in self._tables]
             stretch = y.size / max(y.size - float(np.sum(values / (values + variance))), 0.1 * y.size)
             variance = stretch * float(np.mean(np.concatenate(rests) ** 2)) + 1e-300
         return rests, stretch
+
+    def _spread(self, gram: Array) -> Array:
+        """Gram matrix of the tables over the scaled columns of all terms, the residual last, (terms + 1, terms + 1)."""
+        at, scale = np.append(self._place, gram.shape[0] - 1), np.append(self._scale, 1.0)
+        spread: Array = gram[np.ix_(at, at)] * scale[:, None] * scale
+        return spread
 
     def _reduce(self) -> None:
         """Integrate the nuisances out, at every point of the grid."""
@@ -162,7 +169,9 @@ class Posterior:
         self._left: list[Array] = []
         for slow_share, memory_s in combinations:
             covariance = self._covariance + noise.slow(slow_share * self._covariance[0], memory_s / channel.step_s)
-            gram, fitted, rows = np.zeros((terms + 1, terms + 1)), np.zeros((terms + 1, terms + 1)), 0
+            width = self._tables[0].shape[1]
+            gram: Array = np.zeros((width, width))
+            fitted, rows = gram.copy(), 0
             for log, table in zip(channel.logs, self._tables, strict=True):
                 white, deviation = noise.whitened(table, covariance)
                 inner = white.T @ white
@@ -170,6 +179,7 @@ class Posterior:
                 if any(log is one for one in channel.fitted):
                     fitted += inner
                 rows += white.shape[0]
+            gram, fitted = self._spread(gram), self._spread(fitted)
             log_density = -rows * (math.log(deviation) + 0.5 * math.log(2.0 * math.pi)) - 0.5 * float(gram[-1, -1])
             self._left.append(fitted)
             for care in CARE:
@@ -321,7 +331,8 @@ class Posterior:
         slow = noise.slow(setting.slow * self._covariance[0], setting.memory_s / self.channel.step_s)
         grams, rows = [], []
         for table in self._tables:
-            white, _ = noise.whitened(table[:, [*at, -1]] * np.append(care, 1.0), self._covariance + slow)
+            own = table[:, [*self._place[at], -1]] * np.append(care * self._scale[at], 1.0)
+            white, _ = noise.whitened(own, self._covariance + slow)
             parts = 1 if len(self._tables) >= STRETCHES else STRETCHES // len(self._tables) + 1
             for part in np.array_split(white, parts):
                 grams.append(part.T @ part)

@@ -3,12 +3,15 @@
 A file often states the stiffness of presliding, and not the form. The slip spring of the paper follows a straight line
 up to its slip; Dahl's and the LuGre model approach it exponentially, MuJoCo's DC motor among them. Both are in common
 use, so that taking one for the other is a matter of reading the file, and no gap of the joint.
+
+A stiffness is a fact of its own, too. Where friction is larger than believed, a spring of the stated stiffness bends
+further before it slips; elsewhere the travel is what stays. The recordings tell which.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,8 +23,33 @@ GRADUALLY = (
     "the file states a presliding stiffness and not how presliding yields: 'gradually' (Dahl, LuGre) fits these "
     "recordings better than 'at once'"
 )
+FURTHER = (
+    "the stated presliding stiffness holds and the level does not: friction builds up over {now:.2g} rad instead of "
+    "{was:.2g} rad"
+)
 SLOW_RAD_S = (0.01, 0.05)
 """Speeds over which friction may fall when sliding begins: what a Stribeck effect makes is not the form's."""
+BEGINS_RAD_S = 0.02
+"""Speed at which friction counts as that of a joint that begins to slide."""
+WRONG = 0.1
+"""Error of the level, over it, from which on the travel is in question."""
+ROUNDS = 3
+"""Times that level and travel are fitted to one another."""
+CLEARLY = 0.95
+"""Squares that remain with another travel, over those with the believed one, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """What one form leaves, and the level that it finds.
+
+    Attributes:
+        left: squares of the torque that remain.
+        level_nm: of friction where the joint begins to slide.
+    """
+
+    left: float
+    level_nm: float
 
 
 def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]:
@@ -34,14 +62,35 @@ def as_it_yields(experiments: ExperimentSet) -> tuple[ExperimentSet, str | None]
     if stated or nominal.presliding_stiffness_nm_per_rad is None or nominal.curve is None:
         return experiments, None
     logs = [r for r in recordings(experiments) if r.view is not None]
-    if not logs or _left(logs, nominal, gradually=True) >= _left(logs, nominal, gradually=False):
+    if not logs:
         return experiments, None
-    return replace(experiments, nominal=replace(nominal, yields_gradually=True)), GRADUALLY
+    told = None
+    at_once, gradual = _fit(logs, nominal), _fit(logs, replace(nominal, yields_gradually=True))
+    if gradual.left < at_once.left:
+        nominal, told = replace(nominal, yields_gradually=True), GRADUALLY
+    else:
+        nominal, told = _with_own_travel(logs, nominal, at_once)
+    return replace(experiments, nominal=nominal), told
 
 
-def _left(logs: Sequence[Recording], nominal: Nominal, *, gradually: bool) -> float:
-    """Squares of the torque that remain with one form, numbers of the belief and a Stribeck effect fitted along."""
-    form = replace(nominal, yields_gradually=gradually)
+def _with_own_travel(logs: Sequence[Recording], nominal: Nominal, believed: _Fit) -> tuple[Nominal, str | None]:
+    """The belief whose spring bends as far as the level of these recordings asks for, where that fits better."""
+    assert nominal.presliding_stiffness_nm_per_rad is not None and nominal.curve is not None
+    stiffness, level = nominal.presliding_stiffness_nm_per_rad, nominal.curve.coulomb_nm
+    found, longer = believed, nominal
+    for _ in range(ROUNDS):
+        if not WRONG < abs(found.level_nm / level - 1.0) < 1.0 / WRONG:
+            return nominal, None
+        longer = replace(nominal, presliding_stiffness_nm_per_rad=stiffness * level / found.level_nm)
+        found = _fit(logs, longer)
+    if found.left > CLEARLY * believed.left or longer.presliding_stiffness_nm_per_rad is None:
+        return nominal, None
+    travel = level / longer.presliding_stiffness_nm_per_rad
+    return longer, FURTHER.format(now=travel, was=level / stiffness)
+
+
+def _fit(logs: Sequence[Recording], form: Nominal) -> _Fit:
+    """One form, numbers of the belief and a Stribeck effect fitted along."""
     x, y = [], []
     for log in logs:
         v, low_pass = log.view, LowPass.at(1.0 / log.step_s)
@@ -55,6 +104,9 @@ def _left(logs: Sequence[Recording], nominal: Nominal, *, gradually: bool) -> fl
         table = low_pass.thinned(np.stack([*columns, log.plant_nm - believed], axis=1))
         x.append(table[:, :-1])
         y.append(table[:, -1])
-    table, left = np.concatenate(x), np.concatenate(y)
-    weights = np.linalg.lstsq(table, left, rcond=None)[0]
-    return float(np.sum((left - table @ weights) ** 2))
+    table, rest = np.concatenate(x), np.concatenate(y)
+    weights = np.linalg.lstsq(table, rest, rcond=None)[0]
+    begins = np.exp(-BEGINS_RAD_S / np.array([np.inf, *SLOW_RAD_S]))
+    assert form.curve is not None
+    level = form.curve.coulomb_nm + float(begins @ weights[: begins.size])
+    return _Fit(float(np.sum((rest - table @ weights) ** 2)), level)

@@ -54,7 +54,7 @@ def tracking_channel(recordings: Sequence[Recording], library: Collection[str]) 
     rows = []
     for k, (log, command) in enumerate(zip(logs, commands, strict=True)):
         residual = (log.experiment.position_rad - command)[:, None]
-        table = low_pass.thinned(np.concatenate([*builder.parts[k], residual], axis=1))[1:-2]
+        table = low_pass.thinned_blocks([*builder.parts[k], residual])[1:-2]
         e = log.experiment
         quiet, told = np.zeros(table.shape[0]), np.ones(table.shape[0], dtype=bool)
         rows.append(Rows(e.name, e.validation, log.step_s, table[:, -1], table[:, :-1], quiet, told))

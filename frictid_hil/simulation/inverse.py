@@ -17,6 +17,9 @@ from frictid_hil.friction.trajectory import Array
 
 Shape = Mapping[str, float]
 
+ENOUGH_ROWS = 60_000
+"""Rows of recordings by which the most telling shape is chosen, about."""
+
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -100,7 +103,11 @@ class InverseForm:
 def most_telling(
     views: Sequence[View], shapes: Sequence[Shape], regressors: Callable[[Sequence[View], Shape], list[Array]]
 ) -> int:
-    """Number of the shape whose first column describes most of what the believed joint leaves of the torque."""
+    """Number of the shape whose first column describes most of what the believed joint leaves of the torque.
+
+    Of recordings that have more rows than that takes, only every so many are looked at.
+    """
+    views = views[:: max(1, sum(v.position_rad.size for v in views) // ENOUGH_ROWS)]
     rest = np.concatenate(
         [
             v.torque_nm - v.load_nm - v.motor_inertia_kg_m2 * v.acceleration_rad_s2 - v.coulomb_nm * v.slip - v.rate_nm

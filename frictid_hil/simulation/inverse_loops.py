@@ -10,6 +10,9 @@ from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
 
+NEAR_RAD = 0.1
+"""Angle between motor and link up to which a series of sine and cosine is exact to 1e-5."""
+
 
 def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:
     """First-order lag, exact for held input; starts settled."""
@@ -122,25 +125,37 @@ def transmitted(
     parts = max(1, math.ceil(step_s * math.sqrt(stiffness_nm_per_rad / link_kg_m2) / 0.35))
     part_s = step_s / parts
     half = 0.5 * gap_rad
+    damped = 1.0 / (1.0 + part_s / link_kg_m2 * damping_nm_s_per_rad)
     load = gravity_cos_nm * math.cos(position_rad[0]) + gravity_sin_nm * math.sin(position_rad[0])
     link = position_rad[0] - load / stiffness_nm_per_rad - math.copysign(half, load)
     speed = 0.0
     for k in range(rows - 1):
         motor_speed = (position_rad[k + 1] - position_rad[k]) / step_s
+        cos, sin = math.cos(position_rad[k]), math.sin(position_rad[k])
+        here = gravity_cos_nm * cos + gravity_sin_nm * sin
+        slope = gravity_sin_nm * cos - gravity_cos_nm * sin
+        total = 0.0
         for part in range(parts):
             motor = position_rad[k] + motor_speed * part_s * (part + 0.5)
             stretch = motor - link
             spring = 0.0
             damping = 0.0
+            share = 1.0
             if abs(stretch) > half:
                 spring = stiffness_nm_per_rad * (stretch - math.copysign(half, stretch))
                 damping = damping_nm_s_per_rad
-            torque[k] += 0.5 * (spring + damping * (motor_speed - speed)) / parts
-            torque[k + 1] += 0.5 * (spring + damping * (motor_speed - speed)) / parts
-            gravity = gravity_cos_nm * math.cos(link) + gravity_sin_nm * math.sin(link)
+                share = damped
+            total += spring + damping * (motor_speed - speed)
+            away = link - position_rad[k]
+            if abs(away) < NEAR_RAD:
+                gravity = here * (1.0 - 0.5 * away * away) + slope * away * (1.0 - away * away / 6.0)
+            else:
+                gravity = here * math.cos(away) + slope * math.sin(away)
             push = spring + damping * motor_speed - gravity
-            speed = (speed + part_s / link_kg_m2 * push) / (1.0 + part_s / link_kg_m2 * damping)
+            speed = (speed + part_s / link_kg_m2 * push) * share
             link += part_s * speed
+        torque[k] += 0.5 * total / parts
+        torque[k + 1] += 0.5 * total / parts
     torque[0] *= 2.0
     torque[rows - 1] *= 2.0
     return torque

@@ -35,6 +35,8 @@ _STIFFEST = 0.4
 """Stiffness times squared step over inertia, at most: what an explicit spring bears without ringing."""
 _STEP_RULE = 1.3
 """sigma1 over the least that LuGre needs at the model's step."""
+_SMALLEST_RISE = 1e-3
+"""Rise at standstill over the level, below which it is rounding."""
 _RISE_BASE = 0.05
 """Level that LuGre needs at speed, over its rise; taken off the spring."""
 FAR_RAD = 3e5
@@ -140,9 +142,8 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     speed = _speeds(use)
     odd, even = _sliding(model, speed, use)
     soft_nm = _soft_nm(model)
-    if form == "lugre":
-        dry, rise, at, poly = _with_stribeck(speed, odd, fastest)
-    else:
+    dry, rise, at, poly = _with_stribeck(speed, odd, fastest) if form == "lugre" else (0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
+    if rise <= _SMALLEST_RISE * dry:
         dry, a, b, c = _level_and_damping(speed, odd, fastest)
         rise, at, poly = 0.0, 0.0, (a, b, c)
     # Friction builds up over a travel that does not depend on the level.
@@ -152,7 +153,7 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     stiffness = min(stiffness * dry / (dry + soft_nm), _STIFFEST * inertia / step**2)
     name = believed.name
     native.joint |= {"damping": _words(poly), "frictionloss": "0"}
-    if form == "lugre" and rise > 0.0:
+    if rise > 0.0:
         base = _RISE_BASE * rise
         sigma = min(stiffness * rise / dry, inertia / (_STEP_RULE * step**2))
         lugre = (sigma, _STEP_RULE * step * sigma, base, base + rise, at)
@@ -179,7 +180,7 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     if abs(even) > 1e-3 * max(dry, 1e-9):
         native.more_tendons.append(_constant(f"{name}_asymmetry", name, even))
         where += "; asymmetry: a far spring (constant torque)"
-    if form == "lugre":
+    if rise > 0.0:
         where += "; the rise near standstill: passive dcmotor (LuGre)"
     present = sorted(FRICTION & set(model.effects))
     native.placed |= dict.fromkeys(present or ["friction"], where)

@@ -146,7 +146,8 @@ def friction(
     level_nm = coulomb_nm
     # effects at level transform level_nm
     level_nm = max(level_nm, 0.0)
-    rate_nm = rate_torque(parameters, velocity_rad_s)
+    curve_nm = rate_torque(parameters, velocity_rad_s)
+    rate_nm = curve_nm
     # effects at rate transform rate_nm
     other_nm = 0.0
     # effects at friction transform other_nm

@@ -24,11 +24,13 @@ BELIEF = replace(
 )
 
 
-def friction(position: np.ndarray, step_s: float, bristle: bool, rise_nm: float) -> np.ndarray:
+def friction(
+    position: np.ndarray, step_s: float, bristle: bool, rise_nm: float, level_nm: float = LEVEL_NM
+) -> np.ndarray:
     """LuGre without micro-damping, or a spring that slips, integrated along a motion; explicit steps."""
     state, force = 0.0, np.empty(position.size)
     for k, v in enumerate(np.gradient(position, step_s)):
-        level = LEVEL_NM + rise_nm * np.exp(-((v / 0.08) ** 2))
+        level = level_nm + rise_nm * np.exp(-((v / 0.08) ** 2))
         bent = STIFFNESS * abs(state) / level * (1.0 if state * v > 0.0 else -1.0) if bristle else 0.0
         state += v * step_s * (1.0 - bent)
         if not bristle:
@@ -37,7 +39,7 @@ def friction(position: np.ndarray, step_s: float, bristle: bool, rise_nm: float)
     return force
 
 
-def recorded(nominal: Nominal, bristle: bool, rise_nm: float = 0.0) -> ExperimentSet:
+def recorded(nominal: Nominal, bristle: bool, rise_nm: float = 0.0, level_nm: float = LEVEL_NM) -> ExperimentSet:
     """Two motions with many reversals, the torque of a joint that is otherwise as believed."""
     rng, experiments = np.random.default_rng(4), []
     for order, phases in enumerate((rng.uniform(0.0, 6.28, 4), rng.uniform(0.0, 6.28, 4))):
@@ -47,7 +49,7 @@ def recorded(nominal: Nominal, bristle: bool, rise_nm: float = 0.0) -> Experimen
         acceleration = np.gradient(np.gradient(q, t), t)
         assert nominal.inertia_kg_m2 is not None
         torque = nominal.inertia_kg_m2 * acceleration + nominal.gravity_cos_nm * np.cos(q)
-        torque += friction(q, STEP_S / FINE, bristle, rise_nm)
+        torque += friction(q, STEP_S / FINE, bristle, rise_nm, level_nm)
         mean = torque[: torque.size // FINE * FINE].reshape(-1, FINE).mean(axis=1)
         rows = slice(FINE, None, FINE)
         time, position = t[rows], q[rows]
@@ -72,6 +74,12 @@ def test_the_form_is_read_off_the_recordings(bristle: bool) -> None:
     experiments, told = as_it_yields(recorded(BELIEF, bristle))
     assert (experiments.nominal.yields_gradually is True) is bristle
     assert (told is not None) is bristle
+
+
+def test_more_friction_on_a_spring_of_the_stated_stiffness_bends_it_further() -> None:
+    experiments, told = as_it_yields(recorded(BELIEF, bristle=False, level_nm=1.5 * LEVEL_NM))
+    assert experiments.nominal.presliding_stiffness_nm_per_rad == pytest.approx(STIFFNESS / 1.5, rel=0.05)
+    assert told is not None and "the level does not" in told
 
 
 def test_a_stiffness_that_nobody_states_has_no_form() -> None:

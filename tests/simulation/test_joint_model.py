@@ -57,6 +57,13 @@ def test_a_measured_curve_can_be_the_friction() -> None:
     assert read(model.to_mapping()) == model
 
 
+def test_errors_of_level_and_of_viscosity_add_up() -> None:
+    speed = np.array([-0.8, 0.3, 0.8])
+    effects = {"friction_level_error": {"error_share": 0.5}, "viscous_error": {"error_share": -0.4}}
+    expected = np.sign(speed) * 1.5 * COULOMB + 1.1 * VISCOUS * speed
+    assert steady_friction_nm(bare().with_effects(effects), speed) == pytest.approx(expected)
+
+
 def test_steady_friction_of_the_plain_joint_is_its_formula() -> None:
     v = np.array([[-1.0, 0.0], [0.5, 2.0]])
     np.testing.assert_allclose(steady_friction_nm(bare(), v), COULOMB * np.sign(v) + VISCOUS * v)

@@ -77,11 +77,12 @@ def write_targets(
             continue
         use = use_of(arm, name)
         effects = applied(found[name], apply=apply)
-        joints[name] = numbers_of(joint.believed, joint_model(joint, effects), use)
+        stiffness = found[name].presliding_nm_per_rad
+        joints[name] = numbers_of(joint.believed, joint_model(joint, effects, stiffness), use)
         drawn: list[Numbers] = []
         for _ in range(wanted.samples):
             other = _drawn(effects, found[name], random)
-            drawn.append(numbers_of(joint.believed, joint_model(joint, other), use))
+            drawn.append(numbers_of(joint.believed, joint_model(joint, other, stiffness), use))
         if drawn:
             samples[name] = drawn
     step_s = float(arm.robot.compiled.opt.timestep)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False)
     for name, effects in wanted.items():
         joint = arm.joints[name]
         if (effects or joint.drafted) and joint.experiments.nominal.curve is not None:
-            made[name] = _export(arm, joint, effects)
+            made[name] = _export(arm, joint, effects, found[name].presliding_nm_per_rad)
     return made
 
 
@@ -138,8 +139,10 @@ def _within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
     return {n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in told.items() if n in limits}
 
 
-def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> JointModel:
-    """The believed joint with effects, as we simulate it."""
+def joint_model(
+    joint: JointSet, effects: Mapping[str, Mapping[str, float]], presliding_nm_per_rad: float | None = None
+) -> JointModel:
+    """The believed joint with effects, as we simulate it; its presliding stiffness as believed unless given."""
     nominal = joint.experiments.nominal
     assert nominal.inertia_kg_m2 is not None
     curve = nominal.curve or _FRICTIONLESS
@@ -153,16 +156,20 @@ def joint_model(joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> 
         gravity_sin_nm=nominal.gravity_sin_nm,
         gear_ratio=nominal.gear_ratio or 1.0,
         friction=curve,
-        presliding_stiffness_nm_per_rad=nominal.presliding_stiffness_nm_per_rad or curve.coulomb_nm / PRESLIDING_RAD,
+        presliding_stiffness_nm_per_rad=presliding_nm_per_rad
+        or nominal.presliding_stiffness_nm_per_rad
+        or curve.coulomb_nm / PRESLIDING_RAD,
         encoder=Encoder("motor", 0.0),
         drive=Drive(rated, limit, 0.0, 0.0, 0.0),
         servo=ServoGains(0.0, 0.0, 0.0),
     ).with_effects(effects)
 
 
-def _export(arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]]) -> Export:
+def _export(
+    arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]], presliding_nm_per_rad: float | None
+) -> Export:
     robot, name = arm.robot, joint.believed.name
-    model = joint_model(joint, effects)
+    model = joint_model(joint, effects, presliding_nm_per_rad)
     use = use_of(arm, name)
     rewritten = bool(joint.drafted or FRICTION & set(effects))
     forms = FORMS if rewritten and not robot.urdf else ("loss",)
@@ -358,7 +365,8 @@ def _commanded(motions: Sequence[Motion], names: Sequence[str]) -> bool:
 
 def gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
     """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
-    every = [_off(arm, model, motion) for motion in motions]
+    with ThreadPoolExecutor() as threads:  # MuJoCo steps without Python's lock
+        every = list(threads.map(lambda motion: _off(arm, model, motion), motions))
     torque, position = (np.concatenate([off[part] for off in every]) for part in (0, 1))
     return np.sqrt(np.mean(torque**2, axis=0)), np.sqrt(np.mean(position**2, axis=0))
 

@@ -14,9 +14,9 @@ from frictid_hil.simulation.inverse import InverseForm, Shape, View
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
-def rate(rate_nm: float, error_share: float) -> float:
-    """What depends on speed."""
-    return rate_nm * (1.0 + error_share)
+def rate(rate_nm: float, curve_nm: float, error_share: float) -> float:
+    """What depends on speed; a share of the bare curve, so that it adds to an error of friction as a whole."""
+    return rate_nm + error_share * curve_nm
 
 
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
