@@ -1,6 +1,6 @@
 """Every file's keys as a page: ``python -m frictid_hil.config.reference docs/reference`` writes it from the schemas.
 
-The tables hold what the loaders enforce: types, limits and defaults come from the models, the words from their
+The lists hold what the loaders enforce: types, limits and defaults come from the models, the words from their
 docstrings. The same models give JSON schemas, with which an editor completes and checks a file while it is typed.
 """
 
@@ -30,7 +30,8 @@ FILES: Mapping[str, tuple[str, type[BaseModel]]] = {
 _HEAD = """# Files
 
 Every file is YAML and names its kind by `schema:`, except `nominal.yaml`. A number is in the unit that ends its key:
-rad, rad/s, N m, s, m. An unknown key is an error that names the nearest known one, with file, line and column.
+rad, rad/s, N m, s, m. An unknown key is an error that names the nearest known one, with file, line and column. Brackets
+hold a key's type and what it is unless given; a key with neither that nor *required* may be left out.
 
 For completion in an editor, write the JSON schema of a kind and name it in the file's first line:
 
@@ -45,7 +46,7 @@ def page() -> str:
     """The whole page as Markdown."""
     sections = [_HEAD]
     for title, model in FILES.values():
-        sections += [f"## {title}\n", *_tables(model)]
+        sections += [f"## {title}\n", *_lists(model)]
     return "\n".join(sections)
 
 
@@ -63,24 +64,24 @@ def schema(model: type[BaseModel]) -> dict[str, Any]:
     return whole
 
 
-def _tables(model: type[BaseModel]) -> Iterator[str]:
-    """The table of a model, then those of the models that it holds, each once."""
+def _lists(model: type[BaseModel]) -> Iterator[str]:
+    """The keys of a model, then those of the models that it holds, each once."""
     whole = schema(model)
     of = model.__name__.lower()
-    yield _table(whole, of)
+    yield _list(whole, of)
     for name, definition in whole.get("$defs", {}).items():
         if "properties" in definition:
             yield f"### {name} {{ #{of}-{name.lower()} }}\n"
-            yield _table(definition, of)
+            yield _list(definition, of)
 
 
-def _table(definition: Mapping[str, Any], of: str) -> str:
+def _list(definition: Mapping[str, Any], of: str) -> str:
     required = definition.get("required", ())
-    rows = [f"{definition['description']}\n", "| Key | Type | Default | Meaning |", "|---|---|---|---|"]
+    rows = [f"{definition['description']}\n"]
     for key, field in definition["properties"].items():
         default = "required" if key in required else _default(field.get("default"))
-        meaning = field["description"].replace("|", "\\|")
-        rows.append(f"| `{key}` | {_type(field, of)} | {default} | {meaning} |")
+        said = ", ".join(part for part in (_type(field, of), default) if part)
+        rows.append(f"- `{key}` ({said}): {field['description']}")
     return "\n".join(rows) + "\n"
 
 
@@ -107,9 +108,9 @@ def _type(field: Mapping[str, Any], of: str) -> str:
 
 
 def _default(value: Any) -> str:
-    if value is None:
-        return "-"
-    return "see below" if isinstance(value, Mapping) and value else f"`{json.dumps(value)}`"
+    if value is None or isinstance(value, Mapping):
+        return ""
+    return f"`{json.dumps(value)}` unless given"
 
 
 def _documented(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
