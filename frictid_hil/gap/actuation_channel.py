@@ -91,16 +91,10 @@ def actuation_channel(
         return None
     logs = [r for r in recordings if r.experiment.torque_nm is not None and r.demand_nm is not None]
     controller = nominal.controller
-    limit_nm = controller.torque_limit_nm if controller is not None else math.inf
+    limit_nm = math.inf if controller is None else controller.torque_limit_nm
     drives = [_Drive.of(r, nominal, limit_nm) for r in logs]
     base = [drive.torque(nominal.believed_effects) for drive in drives]
-    report = nominal.torque_report_filter
-    residuals = [_residual(r, b, report) for r, b in zip(logs, base, strict=True)]
-    if believed:
-        exact = [
-            _residual(b, _Drive.of(b, nominal, limit_nm).torque(nominal.believed_effects), report) for b in believed
-        ]
-        residuals = [left - shown for left, shown in zip(residuals, exact, strict=True)]
+    residuals = _residuals(nominal, logs, base, limit_nm, believed)
     views = [_view(r, controller, limit_nm) for r in logs]
     builder = Builder([[] for _ in logs])
     nuisances, candidates = _gains(nominal, views, builder, library)
@@ -120,7 +114,9 @@ def actuation_channel(
         numbers = builder.add(columns)
         candidates += [family(name, size * scale, numbers, columns) for size in SIZES]
     low_pass = LowPass.at(1.0 / logs[0].step_s)
-    rows = tuple(_rows(r, residuals[k], builder.parts[k], low_pass, report) for k, r in enumerate(logs))
+    rows = tuple(
+        _rows(r, residuals[k], builder.parts[k], low_pass, nominal.torque_report_filter) for k, r in enumerate(logs)
+    )
     rows = without_nuisances(rows, nuisances, candidates)
     between = any(r.resampled or between_rows(controller, r.step_s) for r in logs)
     return Channel(
@@ -278,6 +274,19 @@ class _Drive:
     def torque(self, effects: Mapping[str, Mapping[str, float]]) -> Array:
         """Torque that the drive makes with these effects, at every row, N m, shape (n,)."""
         return through(self.demand_nm, effects, self.recording.step_s / self.ticks, self.limit_nm)[:: self.ticks]
+
+
+def _residuals(
+    nominal: Nominal, logs: Sequence[Recording], base: Sequence[Array], limit_nm: float, believed: Sequence[Recording]
+) -> list[Array]:
+    """Reported torque less the demand's, per log; less what the believed joint recorded alike shows of that."""
+    report = nominal.torque_report_filter
+    residuals = [_residual(r, b, report) for r, b in zip(logs, base, strict=True)]
+    if not believed:
+        return residuals
+    drives = [_Drive.of(b, nominal, limit_nm) for b in believed]
+    shown = [_residual(d.recording, d.torque(nominal.believed_effects), report) for d in drives]
+    return [left - own for left, own in zip(residuals, shown, strict=True)]
 
 
 def _residual(recording: Recording, asked_nm: Array, report: ReportFilter | None) -> Array:
