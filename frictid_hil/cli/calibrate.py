@@ -131,8 +131,8 @@ MeasureSkewOption = Annotated[
     bool | None,
     typer.Option(
         "--measure-skew/--declared-skew",
-        help="Each joint also shakes for 8 s, which measures by how much its torque is late; without, the declared "
-        "timing alone counts. Default: the robot file's `procedure: measure_skew`, else declared.",
+        help="Each joint also shakes for 8 s, which measures how late its torque is. Default: the robot file's "
+        "`procedure: measure_skew`, else the declared timing.",
         show_default=False,
     ),
 ]

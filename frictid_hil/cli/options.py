@@ -70,7 +70,7 @@ def profiles(incomplete: str) -> list[str]:
     return sorted(name for name in known | near | {"active"} if name.startswith(incomplete))
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout, nothing else.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Exactly one JSON object on stdout.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
@@ -85,8 +85,7 @@ NotifyOption = Annotated[
     typer.Option(
         "--notify",
         metavar="CMD",
-        help="Command that is given the JSON on its standard input, however it ended; `sh -c '...'` where it needs a "
-        "shell.",
+        help="Command that is given the JSON on its standard input, however it ended; a shell needs `sh -c '...'`.",
     ),
 ]
 
