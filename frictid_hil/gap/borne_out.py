@@ -54,7 +54,9 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > worse}
     refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     if not refuted:
-        return said, None
+        read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+        open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
+        return (_doubted(said) if kept and not read and open_still else said), None
     stands = [f for f in said.named if f.effect not in refuted]
     falls = [replace(f, chance=min(f.chance, REFUTED)) for f in said.named if f.effect in refuted]
     if said.word != "unknown" and said.named[0].effect not in refuted:
@@ -69,6 +71,11 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
         return Verdict("explained", (*stands, *falls)), told
     word = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
     return Verdict("unknown", (*stands, *falls), said.place or word), told
+
+
+def _doubted(said: Verdict) -> Verdict:
+    """What describes the torque along the motion, and leaves half of the closed loop's gap, is less than sure."""
+    return replace(said, named=tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in said.named))
 
 
 def _of_the_drive(cause: Finding) -> bool:

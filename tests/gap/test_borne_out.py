@@ -87,3 +87,12 @@ def test_play_leads_where_the_motion_told_half_of_it() -> None:
     assert said.word == "explained" and said.named[0].effect == "backlash"
     told = {name: value.value for name, value in said.named[0].parameters.items()}
     assert gap_nm({"backlash": told}) < gap_nm({"backlash": {**BACKLASH, "gap_rad": 0.5 * BACKLASH["gap_rad"]}})
+
+
+def test_a_cause_that_leaves_half_of_the_loop_open_is_doubted() -> None:
+    named = (cause("torque_bias"), cause("inertia_error", chance=0.6))
+    gaps = {"torque_bias": 0.6, "inertia_error": 1.0, "inertia_error+torque_bias": 0.6}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert told is None and [f.chance for f in said.named] == [DOUBTED, 0.6]
+    gaps = {"torque_bias": 0.3, "inertia_error": 1.0, "inertia_error+torque_bias": 0.3}
+    assert borne_out(Verdict("explained", named), loop(gaps))[0].named == named

@@ -21,6 +21,10 @@ def encoder(measured_rad: float, offset_rad: float) -> float:
 # -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
+LARGEST_RAD = 0.2
+"""Offset up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than the model has it."""
+
+
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """Slope of gravity, per radian."""
     return [np.stack([-v.gravity_slope_nm_per_rad], axis=1) for v in views]
@@ -64,6 +68,7 @@ EFFECT = Effect(
     inverse=InverseForm(
         shapes=({},),
         regressors=regressors,
+        first_coefficient=(-LARGEST_RAD, LARGEST_RAD),
         parameters=lambda shape, coefficients: {"offset_rad": float(coefficients[0])},
     ),
 )
