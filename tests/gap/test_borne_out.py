@@ -96,3 +96,19 @@ def test_a_cause_that_leaves_half_of_the_loop_open_is_doubted() -> None:
     assert told is None and [f.chance for f in said.named] == [DOUBTED, 0.6]
     gaps = {"torque_bias": 0.3, "inertia_error": 1.0, "inertia_error+torque_bias": 0.3}
     assert borne_out(Verdict("explained", named), loop(gaps))[0].named == named
+
+
+def test_elasticity_that_the_motion_tells_badly_is_rescued_by_the_loop() -> None:
+    elastic = cause("joint_elasticity", compliance_rad_per_nm=3e-4)
+
+    def gap_nm(effects: Effects) -> float:
+        return 0.1 + 2000.0 * abs(effects.get("joint_elasticity", {}).get("compliance_rad_per_nm", 1.0) - 2.1e-4)
+
+    said, told = borne_out(Verdict("unknown", (elastic,)), Loop(gap_nm, 0.6, 0.02))
+    assert said.word == "explained" and said.named[0].chance == DOUBTED
+    assert said.named[0].parameters["compliance_rad_per_nm"].value == pytest.approx(2.1e-4, rel=0.01)
+    assert told is not None and "would take" not in told
+    assert (
+        borne_out(Verdict("unknown", (cause("torque_bias", bias_nm=0.1),)), loop({"torque_bias": 0.1}))[0].word
+        == "unknown"
+    )
