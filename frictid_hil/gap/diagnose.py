@@ -32,7 +32,7 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, Verdict, needed, verdict
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, FLOORS_AS_STATED, Verdict, as_stated, needed, verdict
 from frictid_hil.gap.where import lives, where
 from frictid_hil.simulation.effects import all_effects
 
@@ -80,7 +80,7 @@ def diagnose(
     quiet = _raw_quiet(channels, negligible)
     if quiet and replay is not None and runs is not None:
         quiet_nm = _quiet_nm(gaps, _white_nm(logs), nothing_nm)
-        tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps)
+        tolerable = {} if settled_nm(runs) <= quiet_nm else _tolerable(found, channels, gaps, nothing_nm)
         quiet = settled_nm(replay(tolerable, validation=_judged_role(logs)) if tolerable else runs) <= quiet_nm
     said = verdict(found, channels, gaps, nothing_nm, quiet)
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
@@ -197,10 +197,11 @@ def _quiet_nm(gaps: Sequence[Closed], white_nm: float, negligible_nm: float) -> 
 
 
 def _tolerable(
-    found: Sequence[Finding], channels: Sequence[Sampled], gaps: Sequence[Closed]
+    found: Sequence[Finding], channels: Sequence[Sampled], gaps: Sequence[Closed], negligible_nm: float
 ) -> dict[str, dict[str, float]]:
     """Errors of the belief within their tolerances that are likelier there than not, where no gap shows besides."""
-    if any(gap.before > FLOORS * gap.floor for gap in gaps):
+    floors = FLOORS_AS_STATED if as_stated(found, channels) else FLOORS
+    if any(gap.before > min(floors * gap.floor, negligible_nm) for gap in gaps):
         return {}
     likely = [f for f in found if f.chance >= UNDECIDED and f.parameters]
     if any(needed(f, channels) for f in likely):

@@ -8,13 +8,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frictid_hil.gap.channel import FAMILY
+from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.findings import VISIBLE, Finding, Sampled
 from frictid_hil.gap.how_far import Closed
 from frictid_hil.gap.residuals import rms
+from frictid_hil.simulation.effects import all_effects
 
 FLOORS = 2.0
 """A gap below so many noise floors is none, by promise."""
+AS_STATED = 0.5
+"""Error of a belief over its one-sigma, below which it is as right as it says."""
+FLOORS_AS_STATED = 3.0
+"""A gap below so many floors is none, too, if it means nothing in practice and every belief is as right as it says."""
 STANDS_OUT = 1.0
 """Size of all causes together, over the floor, below which nothing is named: less than what noise itself makes."""
 UNNAMED = 0.33
@@ -83,7 +88,8 @@ def verdict(
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
     unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
-    tiny = quiet and all(gap.before <= min(FLOORS * gap.floor, negligible) for gap in gaps)
+    floors = FLOORS_AS_STATED if as_stated(named, channels) else FLOORS
+    tiny = quiet and all(gap.before <= min(floors * gap.floor, negligible) for gap in gaps)
     shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     told = any(f in unreached for f in named)
@@ -110,6 +116,22 @@ def needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
     if cause.chance < NEEDED or cause.size < STANDS_OUT:
         return False
     return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)
+
+
+def as_stated(found: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
+    """Whether all causes that are likelier there than not are errors of the belief, well within its tolerances."""
+    plant = [c.posterior.channel for c in channels if c.posterior.channel.name == "plant"]
+    stated = {t.effect: t for channel in plant for t in channel.nuisances if t.effect and not t.shape}
+    likely = [f for f in found if f.chance >= EVEN]
+    return bool(likely) and all(f.effect in stated and _right(f, stated[f.effect]) for f in likely)
+
+
+def _right(error: Finding, belief: Term) -> bool:
+    """Whether an error is small beside the one-sigma of the belief that it is of."""
+    form = all_effects()[error.effect].inverse
+    assert form is not None
+    one_sigma = form.parameters({}, belief.deviation)
+    return all(abs(v.value) < AS_STATED * abs(one_sigma[name]) for name, v in error.parameters.items())
 
 
 def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
