@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import shlex
@@ -10,7 +11,8 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NoReturn, Protocol
 
@@ -30,6 +32,21 @@ NOTIFY_TIMEOUT_S = 60.0
 """A command of ``--notify`` may take this long."""
 
 Result = Mapping[str, Any]
+
+
+@contextmanager
+def _noted(console: Console) -> Iterator[None]:
+    """What the library logs on its way, such as that it compiles, is printed for a person."""
+    from rich.logging import RichHandler
+
+    logger = logging.getLogger("frictid_hil")
+    handler = RichHandler(console=console, show_time=False, show_level=False, show_path=False)
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 class Told(Protocol):
@@ -90,7 +107,8 @@ class Output:
             show: prints the result for a person.
         """
         try:
-            done = job()
+            with _noted(self.err):
+                done = job()
             result = dict(done) if isinstance(done, Mapping) else done.to_json()
         except FrictidError as error:
             self._fail(verb, error)

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import logging
 import re
 import sys
 import tempfile
@@ -26,6 +27,7 @@ from frictid_hil.simulation import plant
 from frictid_hil.simulation.effect import Effect
 from frictid_hil.simulation.effects import all_effects
 
+_LOG = logging.getLogger(__name__)
 _MARKER = re.compile(r"^(?P<indent> *)# effects at (?P<stage>\w+) (?:transform (?P<name>\w+)|update)$")
 
 
@@ -163,6 +165,7 @@ def _load(source: str) -> Any:
     name = f"frictid_hil_kernel_{_digest(source)}"
     path = _cache_folder() / f"{name}.py"
     if not path.exists():
+        _LOG.info("compiling the simulated joint for this computer, once; a few seconds")
         # Another process may write the same file at this moment: make the complete file appear at once.
         with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as file:
             file.write(source)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from called import run
 from rich.console import Console
 
@@ -94,3 +96,14 @@ def test_the_time_left_is_whole_beside_a_long_name() -> None:
         and "123.4 N m" in shown
         and re.search(r"-:--:--|\d:\d\d:\d\d", shown)
     )
+
+
+def test_what_the_library_logs_is_printed_for_a_person(capsys: pytest.CaptureFixture[str]) -> None:
+    def job() -> dict[str, str]:
+        logging.getLogger("frictid_hil.simulation").info("compiling, once")
+        return {}
+
+    for quiet in (False, True):
+        with pytest.raises(typer.Exit):
+            Output(quiet=quiet).run("check", job)
+    assert capsys.readouterr().err.count("compiling, once") == 1

@@ -194,6 +194,15 @@ def test_the_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.Monk
     folder.rmdir()
 
 
+def test_that_it_compiles_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compose, "_cache_folder", lambda: tmp_path)
+    caplog.set_level("INFO", "frictid_hil")
+    assert [compose._load("x = 1").x for _ in range(2)] == [1, 1]
+    assert len(caplog.messages) == 1 and "compiling the simulated joint" in caplog.messages[0]
+
+
 def test_the_page_of_effects_is_up_to_date() -> None:
     docs = Path(__file__).parents[2] / "docs" / "reference"
     regenerate = "python -m frictid_hil.simulation.catalogue docs/reference"
