@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import math
 import multiprocessing
 import os
@@ -29,6 +30,7 @@ from typing import Any
 
 import can
 import canopen
+import numba
 import numpy as np
 from canopen.objectdictionary import ODVariable
 
@@ -41,7 +43,7 @@ from frictid_drivers.cia402.scale import Scale
 from frictid_drivers.cia402.settings import read_settings
 from frictid_drivers.virtual.channel import socket_path
 from frictid_drivers.virtual.rack_process import be_punctual
-from frictid_drivers.virtual.socket_bus import FRAME, Hub, pack
+from frictid_drivers.virtual.socket_bus import CLASSICAL, pack
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.mode import Mode
@@ -57,6 +59,7 @@ RATES_HZ, ACTIVE = (250, 500, 1000), (1, 6, 12)
 PATIENCE_S = 2.0
 ENABLED, CSP = 0x1237, 8
 SYNC, HEARTBEAT, OPERATIONAL = 0x80, 0x700, b"\5"
+MSG_DONTWAIT = int(socket.MSG_DONTWAIT)
 KINDS = {0x6040: 6, 0x607A: 4, 0x60B2: 3, 0x6041: 6, 0x6064: 4, 0x6077: 3, 0x606C: 4}
 """Data types of CANopen: 3 i16, 4 i32, 6 u16."""
 
@@ -72,32 +75,57 @@ def layout_of(active: int, cycle_hz: float) -> Layout:
 
 
 def answer(channel: str, active: int, cycle_hz: float) -> None:
-    """Be the drives: answer SYNC with packed reports until standard input closes."""
-    hub, due = Hub(socket_path(channel)), []
+    """Be the drives: answer SYNC with packed reports, for whoever is on the bus, until this process is killed."""
+    due = []
     for pdos in layout_of(active, cycle_hz).pdos.values():
         for pdo in pdos:
             if pdo.transmit:
                 values = {0x6041: ENABLED, 0x6061: CSP}
                 packed = (values.get(entry.index, 0).to_bytes(entry.type.bits // 8, "little") for entry in pdo.entries)
-                due.append((pdo.cob_id, b"".join(packed), pdo.every))
-    heartbeats = [(HEARTBEAT + number + 1, OPERATIONAL, max(1, round(0.1 * cycle_hz))) for number in range(active)]
-    syncs = 0
-
-    def heard(can_id: int, data: bytes, stamp_ns: int) -> None:
-        nonlocal syncs
-        if can_id == SYNC:
-            for cob_id, frame, every in (*due, *heartbeats):
-                if syncs % every == 0:
-                    hub.send(cob_id, frame)
-            syncs += 1
-
-    hub.heard = heard
+                due.append((pack(pdo.cob_id, b"".join(packed), 0), pdo.every))
+    heartbeat_every = max(1, round(0.1 * cycle_hz))
+    due += [(pack(HEARTBEAT + number + 1, OPERATIONAL, 0), heartbeat_every) for number in range(active)]
+    frames = np.frombuffer(b"".join(frame for frame, _ in due), np.uint8).copy()
+    every = np.array([cycles for _, cycles in due])
+    heard = np.zeros(CLASSICAL.size, np.uint8)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.bind(str(socket_path(channel)))
+    listener.listen(1)
+    _answer_one(-1, heard, heard.ctypes.data, frames.ctypes.data, every)  # compiles it
     be_punctual()
-    owner = os.getppid()
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     print("ready", flush=True)
-    while os.getppid() == owner:
-        hub.wait(0.1)
-        hub.serve()
+    while True:
+        member, _ = listener.accept()
+        _answer_one(member.fileno(), heard, heard.ctypes.data, frames.ctypes.data, every)
+        member.close()
+
+
+def _libc(name: str) -> Any:
+    function = getattr(ctypes.CDLL(None), name)
+    function.argtypes, function.restype = (
+        [ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t, ctypes.c_int],
+        ctypes.c_ssize_t,
+    )
+    return function
+
+
+_RECEIVE, _SEND = _libc("recv"), _libc("send")
+
+
+@numba.njit
+def _answer_one(fd: int, heard: Any, heard_at: int, frames_at: int, every: Any) -> None:
+    """Until the other side closes. Never sleeps, as drives do not: this costs a core."""
+    syncs, size = 0, heard.size
+    while fd >= 0:
+        received = _RECEIVE(fd, heard_at, size, MSG_DONTWAIT)
+        if received == 0:
+            return
+        if received == size and heard[0] == SYNC and heard[1] == 0:
+            for at in range(every.size):
+                if syncs % every[at] == 0:
+                    _SEND(fd, frames_at + at * size, size, MSG_DONTWAIT)
+            syncs += 1
 
 
 @contextlib.contextmanager
@@ -182,7 +210,7 @@ class BareWire:
         left = len(self._awaited)
         while left:
             try:
-                left -= FRAME.unpack(self._socket.recv(FRAME.size))[0] in self._awaited
+                left -= CLASSICAL.unpack(self._socket.recv(CLASSICAL.size))[0] in self._awaited
             except BlockingIOError:
                 self._poll.poll(1e3 * PATIENCE_S)
 

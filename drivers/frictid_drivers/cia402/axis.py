@@ -77,6 +77,7 @@ class Axis:
         self.mode = Mode.POSITION
         self._locked = False
         self._steady_status = _NEVER
+        self._following_status = _NEVER
         self.alarm: HardwareError | None = None
         self._scale = scale
         self._torque_units = math.floor(max_torque_nm / abs(scale.torque_nm))
@@ -105,7 +106,7 @@ class Axis:
         self.target = Target.ENABLED
         self._power_cut = False
         self._reset_wanted = True
-        self._steady_status = _NEVER
+        self._forget_status()
 
     def disable(self) -> None:
         """Ask for power off."""
@@ -113,19 +114,22 @@ class Axis:
             self._stop_cycles = 0
         self.target = Target.DISABLED
         self._reset_wanted = False
-        self._steady_status = _NEVER
+        self._forget_status()
 
     def lock(self) -> None:
         """Hold the present target in position mode, whatever the set-point says."""
         self.mode = Mode.POSITION
         self._locked = True
-        self._steady_status = _NEVER
+        self._forget_status()
 
     def unlock(self) -> None:
         """Follow the set-point again."""
         self._locked = False
         self._held_at_rad = None
-        self._steady_status = _NEVER
+        self._forget_status()
+
+    def _forget_status(self) -> None:
+        self._steady_status = self._following_status = _NEVER
 
     @property
     def steady(self) -> bool:
@@ -158,6 +162,8 @@ class Axis:
         Raises:
             SafetyAbort: the set-point is not a finite number.
         """
+        if self._following_status == self.feedback.status_raw and self._goes_on(set_point):
+            return
         shown = self.feedback.mode
         mode = self.mode
         controlword = self._controlword(healthy)
@@ -177,6 +183,8 @@ class Axis:
             offset = self._torque(set_point.torque_offset_nm)
             if mode is Mode.POSITION:
                 self._follow(set_point.position_rad)
+                if self._held_at_rad != self._held_at_rad:  # not a number: it moves
+                    self._following_status = self.feedback.status_raw
             elif mode is Mode.TORQUE:
                 torque, offset = self._torque(set_point.torque_nm + set_point.torque_offset_nm), 0
             else:
@@ -200,6 +208,17 @@ class Axis:
                 secondary.set(meaning, value)
             secondary.pack()
 
+    def _goes_on(self, set_point: SetPoint) -> bool:
+        """The same status as when it followed a position in the last cycle: only place and torque are new."""
+        offset = self._torque(set_point.torque_offset_nm)
+        if self.feedback.mode is not Mode.POSITION or self._secondary_told is None or offset != self._secondary_told[0]:
+            self._following_status = _NEVER
+            return False
+        self._target_units = self._units(set_point.position_rad, self._scale.position_rad)
+        self.primary.set("target_position", self._target_units)
+        self.primary.pack()
+        return True
+
     def _controlword(self, healthy: bool) -> int:
         if self.state in _FAULTS:
             return self._in_fault()
@@ -222,8 +241,8 @@ class Axis:
         if self.target is Target.ENABLED:
             self._stop_cycles = 0
         self.target = Target.STOPPED
-        self._steady_status = _NEVER
         self._reset_wanted = False
+        self._forget_status()
         primary, secondary = self._emergency
         primary.set("controlword", QUICK_STOP)
         primary.set("target_position", self._target_units or 0)

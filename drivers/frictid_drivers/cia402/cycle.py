@@ -18,7 +18,7 @@ waiting for any answer.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import can
@@ -27,13 +27,13 @@ from frictid_drivers.cia402.axis import Axis
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE, Command, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
 from frictid_drivers.cia402.layout import Layout
-from frictid_drivers.cia402.network import BUS_OFF, CONTROLLER_STATES, controller_state, logged_id
 from frictid_drivers.cia402.settings import BusSettings
 from frictid_drivers.cia402.state import DISABLE_VOLTAGE, QUICK_STOP, DriveState, Target
 from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.can_bus import BUS_ERRORS
-from frictid_hil.protocol.driver import Clock, Feedback, FrameSink, SetPoint
+from frictid_hil.protocol.can_frames import BUS_OFF, CONTROLLER_STATES, Heard, frames_of
+from frictid_hil.protocol.driver import FD_FRAME, Clock, Feedback, FrameSink, SetPoint
 
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
@@ -70,20 +70,16 @@ class CycleTiming:
 class _Outgoing:
     """One command frame, sent when due; remembers what the drive has been told."""
 
-    __slots__ = ("cob_id", "command", "data", "message", "told", "told_cycle")
+    __slots__ = ("axis", "can_id", "data", "primary", "told", "told_cycle")
 
-    def __init__(self, command: Command, *, fd: bool) -> None:
-        self.command = command
-        self.cob_id = command.cob_id
+    def __init__(self, axis: Axis, command: Command, *, fd: bool) -> None:
+        self.axis = axis
+        self.primary = command is axis.primary
+        self.can_id = command.cob_id | FD_FRAME if fd else command.cob_id
+        # The command's own buffer: packing the command is all it takes to update it.
         self.data = command.data
-        # The message holds the command's own buffer: packing the command is all it takes to update it.
-        self.message = _message(command.cob_id, command.data, fd=fd)
         self.told = b""
         self.told_cycle = 0
-
-
-def _message(cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> can.Message:
-    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=data, is_fd=fd, bitrate_switch=fd)
 
 
 class Cycle:
@@ -116,7 +112,7 @@ class Cycle:
         lock_step: bool,
         other: Callable[[int, bytearray, float], None],
     ) -> None:
-        self._bus = bus
+        self._frames = frames_of(bus)
         self._clock = clock
         self._sink = sink
         self._axes = list(axes)
@@ -127,23 +123,22 @@ class Cycle:
         self._active = [axis.joint in layout.active for axis in axes]
         self._fd = layout.fd
         self._resend = [layout.resend_cycles.get(axis.joint, 0) for axis in axes]
-        self._primary = [_Outgoing(axis.primary, fd=layout.fd) for axis in axes]
-        self._secondary = [_Outgoing(axis.secondary, fd=layout.fd) for axis in axes]
-        self._sync = _message(SYNC_COB_ID, bytearray(1 if layout.sync_overflow else 0))
+        self._primary = [_Outgoing(axis, axis.primary, fd=layout.fd) for axis in axes]
+        self._secondary = [_Outgoing(axis, axis.secondary, fd=layout.fd) for axis in axes]
+        self._sync = bytes(1 if layout.sync_overflow else 0)
         self._overflow = layout.sync_overflow
         self._counter = 0
-        self._heartbeat = _message(HEARTBEAT_BASE + settings.host_node, bytearray(_OPERATIONAL))
+        self._heartbeat = (HEARTBEAT_BASE + settings.host_node, _OPERATIONAL)
         self._heartbeat_due_ns = 0
         self._healthy = [False] * len(self._axes)
         self._nodes = [joint.node for joint in frame_map.joints]
         self._reporter = {frame.cob_id: at for at, joint in enumerate(frame_map.joints) for frame in joint.reports}
         self._other_kind: int | None = None
         self._window_end_ns = -1
-        self._late: list[tuple[int, bytearray, float]] = []
+        self._late: list[Heard] = []
         self._turn = 0
         self._failures = 0
         self._alarmed = False
-        self._controller = ""
         self._insisted = [0] * len(self._axes)
         self._bad_since_ns: list[int | None] = [None] * len(self._axes)
         self._bad_ns = [0] * len(self._axes)
@@ -161,25 +156,27 @@ class Cycle:
         begun = False
         try:
             self._take_late(clock.now_ns())
-            for outgoing, axis in self._due(set_points):
-                self._send(outgoing.message, clock.now_ns())
-                outgoing.told = bytes(outgoing.data)
-                outgoing.told_cycle = decoder.cycle
-                if outgoing.command is axis.primary:
-                    axis.sent()
+            due = self._due(set_points)
             if self._overflow:
                 self._counter = self._counter % self._overflow + 1
-                self._sync.data[0] = self._counter
+                self._sync = bytes((self._counter,))
+            frames = [(outgoing.can_id, bytes(outgoing.data)) for outgoing in due]
+            frames.append((SYNC_COB_ID, self._sync))
             now_ns = clock.now_ns()
             decoder.begin(now_ns)
             begun = True
             self._window_end_ns = now_ns + self._timing.window_ns
-            self._send(self._sync, now_ns)
+            self._send(frames, now_ns)
+            for outgoing, (_, data) in zip(due, frames, strict=False):
+                outgoing.told = data
+                outgoing.told_cycle = decoder.cycle
+                if outgoing.primary:
+                    outgoing.axis.sent()
             self._receive()
             if now_ns >= self._heartbeat_due_ns:
                 # After the reports, so that no SYNC ever waits behind it.
                 self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
-                self._send(self._heartbeat, clock.now_ns())
+                self._send([self._heartbeat], clock.now_ns())
             self._failures = 0
         except FrictidError:
             raise
@@ -210,7 +207,7 @@ class Cycle:
         for _ in range(2):
             for frame in frames:
                 self._send_whatever_happens(frame.cob_id, frame.data, fd=self._fd)
-            self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
+            self._send_whatever_happens(SYNC_COB_ID, self._sync)
 
     def cut_power(self) -> None:
         """Controlword 00 to all joints: the last resort where a joint would not come to rest; never raises."""
@@ -219,7 +216,7 @@ class Cycle:
             axis.primary.set("torque_offset", 0)
             self._send_whatever_happens(axis.primary.cob_id, axis.primary.pack(), fd=self._fd)
             self._send_controlword(at, DISABLE_VOLTAGE)
-        self._send_whatever_happens(SYNC_COB_ID, self._sync.data)
+        self._send_whatever_happens(SYNC_COB_ID, self._sync)
 
     def _insist(self, at: int, axis: Axis, now_ns: int) -> None:
         """A stop or a disabled power stage that is not seen: by SDO, then without PDOs, then without voltage."""
@@ -255,14 +252,15 @@ class Cycle:
 
     # -- sending ------------------------------------------------------------------------------------------------
 
-    def _due(self, set_points: Sequence[SetPoint]) -> Iterator[tuple[_Outgoing, Axis]]:
+    def _due(self, set_points: Sequence[SetPoint]) -> list[_Outgoing]:
         """What is sent in this cycle: every moving joint's frame, and one more that has changed."""
-        decoder = self._decoder
+        position_units = self._decoder.position_units
+        due = []
         changed = False
         for at, axis in enumerate(self._axes):
             primary, secondary = self._primary[at], self._secondary[at]
             if not axis.steady:
-                actual_units = decoder.position_units(at)
+                actual_units = position_units(at)
                 if actual_units is None:
                     continue
                 try:
@@ -273,40 +271,43 @@ class Cycle:
             if self._resend[at]:
                 # A drive that supervises its RPDOs hears them again before it misses them.
                 for outgoing in (primary, secondary):
-                    if decoder.cycle - outgoing.told_cycle >= self._resend[at]:
+                    if self._decoder.cycle - outgoing.told_cycle >= self._resend[at]:
                         outgoing.told = b""
             if self._active[at]:
                 regular, other = (primary, secondary) if axis.mode is Mode.POSITION else (secondary, primary)
-                yield regular, axis
+                due.append(regular)
                 changed = changed or other.data != other.told
             else:
                 changed = changed or primary.data != primary.told or secondary.data != secondary.told
-        if not changed:
-            return
-        # The next that differs from what its drive was told, each joint in its turn.
+        if changed:
+            due += self._one_more(due)
+        return due
+
+    def _one_more(self, due: Sequence[_Outgoing]) -> list[_Outgoing]:
+        """The next that differs from what its drive was told, each joint in its turn."""
         count = len(self._axes)
         for step in range(count):
             at = (self._turn + step) % count
             for outgoing in (self._secondary[at], self._primary[at]):
-                if outgoing.data != outgoing.told and self._decoder.position_units(at) is not None:
+                fresh = outgoing.data != outgoing.told and outgoing not in due
+                if fresh and self._decoder.position_units(at) is not None:
                     self._turn = at + 1
-                    yield outgoing, self._axes[at]
-                    return
+                    return [outgoing]
+        return []
 
-    def _send(self, message: can.Message, t_ns: int) -> None:
+    def _send(self, frames: Sequence[tuple[int, bytes]], t_ns: int) -> None:
         if self._sink is not None:
-            self._sink(t_ns, logged_id(message), bytes(message.data), True)
-        self._bus.send(message)
-        # Some interfaces (gs_usb) pad the data in place; this message is sent again in the next cycle.
-        del message.data[message.dlc :]
+            for can_id, data in frames:
+                self._sink(t_ns, can_id, data, True)
+        self._frames.send(frames)
 
     def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> None:
-        message = _message(cob_id, bytes(data), fd=fd)
+        can_id = cob_id | FD_FRAME if fd else cob_id
         # Nothing may keep the next joint from being stopped, whatever this interface raises.
         with contextlib.suppress(Exception):
-            self._bus.send(message)
+            self._frames.send_alone(can_id, bytes(data))
             if self._sink is not None:
-                self._sink(self._clock.now_ns(), logged_id(message), bytes(data), True)
+                self._sink(self._clock.now_ns(), can_id, bytes(data), True)
 
     def _wire_failed(self, error: Exception) -> None:
         """One frame that could not be sent is a missed cycle; several in a row are a broken bus."""
@@ -317,7 +318,7 @@ class Cycle:
 
     def _broken_bus(self, what: str) -> HardwareError:
         cause = CONTROLLER_STATES.get(
-            self._controller, "bus-off, an unplugged adapter, or nobody left on the bus to acknowledge"
+            self._frames.controller, "bus-off, an unplugged adapter, or nobody left on the bus to acknowledge"
         )
         return HardwareError(
             what,
@@ -330,7 +331,7 @@ class Cycle:
     # -- receiving ----------------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        recv, now_ns, decoder = self._bus.recv, self._clock.now_ns, self._decoder
+        receive, now_ns, decoder = self._frames.receive, self._clock.now_ns, self._decoder
         end_ns = self._window_end_ns
         lock_step = self._lock_step
         while decoder.missing > 0:
@@ -338,47 +339,46 @@ class Cycle:
             timeout_s = 0.0 if lock_step else (end_ns - now_ns()) * 1e-9
             if timeout_s < 0.0:
                 return
-            message = recv(timeout_s)
-            if message is None:
+            heard = receive(timeout_s)
+            if heard is None:
                 return
-            self._take(message, now_ns())
+            self._take(heard, now_ns())
         # Reports that are due on this SYNC only now and then.
-        while (message := recv(0.0)) is not None:
-            self._take(message, now_ns())
+        while (heard := receive(0.0)) is not None:
+            self._take(heard, now_ns())
 
-    def _take(self, message: can.Message, t_ns: int) -> None:
-        if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
-            if message.is_error_frame:
-                self._controller = controller_state(message) or self._controller
-            return
-        cob_id, data = message.arbitration_id, message.data
-        if self._sink is not None:
-            self._sink(t_ns, logged_id(message), bytes(data), False)
-        if message.is_fd is not self._fd and self._other_kind is None:
-            self._other_kind = self._reporter.get(cob_id)
-        if t_ns > self._window_end_ns:
-            # Kept until the next row begins, as a replay of the log will.
-            self._late.append((cob_id, data, message.timestamp))
-        elif not self._decoder.feed(t_ns, cob_id, data):
-            self._other(cob_id, data, message.timestamp)
+    def _take(self, heard: Sequence[Heard], t_ns: int) -> None:
+        sink, feed, fd = self._sink, self._decoder.feed, self._fd
+        late = t_ns > self._window_end_ns
+        for can_id, data, arrived_s in heard:
+            if sink is not None:
+                sink(t_ns, can_id, data, False)
+            cob_id = can_id & ~FD_FRAME
+            if (cob_id != can_id) is not fd and self._other_kind is None:
+                self._other_kind = self._reporter.get(cob_id)
+            if late:
+                # Kept until the next row begins, as a replay of the log will.
+                self._late.append((cob_id, data, arrived_s))
+            elif not feed(t_ns, cob_id, data):
+                self._other(cob_id, bytearray(data), arrived_s)
 
     def _take_late(self, now_ns: int) -> None:
         """What came after the last row was closed: fed before the next one begins."""
         t_ns = max(now_ns, self._window_end_ns + 1)
-        recv = self._bus.recv
-        while (message := recv(0.0)) is not None:
-            self._take(message, t_ns)
+        receive = self._frames.receive
+        while (heard := receive(0.0)) is not None:
+            self._take(heard, t_ns)
         if self._late:
-            for cob_id, data, timestamp in self._late:
+            for cob_id, data, arrived_s in self._late:
                 if not self._decoder.feed(t_ns, cob_id, data):
-                    self._other(cob_id, data, timestamp)
+                    self._other(cob_id, bytearray(data), arrived_s)
             self._late.clear()
 
     # -- watchdogs ----------------------------------------------------------------------------------------------
 
     def _check(self, now_ns: int) -> None:
         decoder, timing = self._decoder, self._timing
-        if self._controller == BUS_OFF and not self._alarmed:
+        if self._frames.controller == BUS_OFF and not self._alarmed:
             self._alarmed = True
             self.quick_stop()
             raise self._broken_bus("the bus is off (bus-off)")
@@ -422,6 +422,8 @@ class Cycle:
         raise SafetyAbort(
             what,
             where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
-            cause=CONTROLLER_STATES.get(self._controller, "a drive that lost its supply or its bus, or a broken cable"),
+            cause=CONTROLLER_STATES.get(
+                self._frames.controller, "a drive that lost its supply or its bus, or a broken cable"
+            ),
             next_step="run `frictid-hil check`, and look at the drive's supply and wiring",
         )

@@ -33,28 +33,6 @@ def logged_id(message: can.Message) -> int:
 
 
 _SDO_BYTES = 8
-BUS_OFF = "bus-off"
-_PASSIVE = "error-passive"
-
-
-def controller_state(message: can.Message) -> str:
-    """What an error frame of the interface says of our own CAN controller, by name; "" for passing errors.
-
-    Source: Linux SocketCAN, ``linux/can/error.h``: the class is in the identifier (0x40 bus-off, 0x04 controller, 0x20
-    nobody acknowledged), the controller's state in byte 1 (0x10, 0x20 error-passive).
-    """
-    if message.arbitration_id & 0x40:
-        return BUS_OFF
-    if message.arbitration_id & 0x04 and len(message.data) > 1 and message.data[1] & 0x30:
-        return _PASSIVE
-    return "no acknowledgement" if message.arbitration_id & 0x20 else ""
-
-
-CONTROLLER_STATES = {
-    BUS_OFF: "our CAN controller went bus-off: a short circuit, a wrong bit rate, or missing termination",
-    _PASSIVE: "our CAN controller is error-passive: frames are destroyed by a bad cable, termination or bit rate",
-    "no acknowledgement": "nobody acknowledges our frames: no other device is on the bus, or all have another bit rate",
-}
 
 
 class Wire(canopen.Network):

@@ -22,11 +22,12 @@ from typing import Any
 import can
 
 from frictid_drivers.virtual.channel import runtime_folder, socket_path
+from frictid_hil.protocol.can_frames import SocketFrames
 from frictid_hil.protocol.driver import FD_FRAME
 
-FRAME = struct.Struct("<IBB2x64sQ")
-"""Identifier with flags as in SocketCAN, length, 1 for a CAN FD frame, data, and when it was sent on the machine's
-monotonic clock, ns."""
+CLASSICAL, FD = struct.Struct("<IBB2x8sQ"), struct.Struct("<IBB2x64sQ")
+"""A packet: identifier with flags, length, 1 for a switched bit rate, and data as in SocketCAN, and when it was sent on
+the machine's monotonic clock, ns."""
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 _BUFFER_BYTES = 1 << 20
@@ -35,7 +36,16 @@ _CONNECT_S = 0.2
 
 def pack(can_id: int, data: bytes, stamp_ns: int, *, fd: bool = False) -> bytes:
     """One frame as a packet."""
-    return FRAME.pack(can_id, len(data), fd, data, stamp_ns)
+    return (FD if fd else CLASSICAL).pack(can_id, len(data), fd, data, stamp_ns)
+
+
+def unpacked(packet: bytes) -> tuple[int, bytes, int, bool] | None:
+    """Identifier with flags, data, when it was sent, and whether it is a CAN FD frame; None for what is no packet."""
+    if len(packet) not in (CLASSICAL.size, FD.size):
+        return None
+    fd = len(packet) == FD.size
+    can_id, size, _, data, stamp_ns = (FD if fd else CLASSICAL).unpack(packet)
+    return can_id, data[:size], stamp_ns, fd
 
 
 class SocketBus(can.BusABC):
@@ -67,6 +77,7 @@ class SocketBus(can.BusABC):
         self.channel_info = f"simulated bus {channel}"
         super().__init__(channel=channel, can_filters=can_filters)
         self._can_protocol = can.CanProtocol.CAN_FD
+        self.frames = None if can_filters else SocketFrames(self._socket, stamped=True)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Put a frame on the bus.
@@ -99,7 +110,7 @@ class SocketBus(can.BusABC):
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         while True:
             try:
-                packet = self._socket.recv(FRAME.size)
+                packet = self._socket.recv(FD.size)
             except BlockingIOError:
                 if timeout is not None and timeout <= 0:
                     return None, False
@@ -129,17 +140,19 @@ class SocketBus(can.BusABC):
 
 def message_of(packet: bytes, channel: str | None = None) -> can.Message:
     """A packet as python-can's message."""
-    can_id, size, fd, data, stamp_ns = FRAME.unpack(packet)
+    found = unpacked(packet)
+    assert found is not None, "the hub passes on nothing else"
+    can_id, data, stamp_ns, fd = found
     return can.Message(
         timestamp=(time.time_ns() - time.monotonic_ns() + stamp_ns) * 1e-9,
         arbitration_id=can_id & 0x1FFFFFFF,
         is_extended_id=bool(can_id & EXTENDED),
         is_remote_frame=bool(can_id & REMOTE),
         is_error_frame=bool(can_id & ERROR),
-        is_fd=bool(fd),
-        bitrate_switch=bool(fd),
-        dlc=size,
-        data=None if can_id & REMOTE else data[:size],
+        is_fd=fd,
+        bitrate_switch=fd,
+        dlc=len(data),
+        data=None if can_id & REMOTE else data,
         channel=channel,
     )
 
@@ -213,7 +226,7 @@ class Hub:
         member = self._members[number]
         while True:
             try:
-                packet = member.recv(FRAME.size)
+                packet = member.recv(FD.size)
             except BlockingIOError:
                 return
             except OSError:
@@ -221,11 +234,12 @@ class Hub:
             if not packet:
                 self._drop(number)
                 return
-            if len(packet) == FRAME.size:
+            found = unpacked(packet)
+            if found is not None:
                 self._spread(packet, number)
-                can_id, size, fd, data, stamp_ns = FRAME.unpack(packet)
+                can_id, data, stamp_ns, fd = found
                 if not can_id & ERROR:
-                    self.heard(can_id | FD_FRAME if fd else can_id, data[: min(size, 64 if fd else 8)], stamp_ns)
+                    self.heard(can_id | FD_FRAME if fd else can_id, data, stamp_ns)
 
     def _spread(self, packet: bytes, sender: int) -> None:
         for number, member in list(self._members.items()):

@@ -1,0 +1,272 @@
+"""Frames of a CAN bus by the batch: all of a cycle in one call of the system, where the bus is a socket.
+
+python-can makes an object of every frame and calls the system several times for it. A cycle that has its deadline in a
+millisecond has no time for that. ``frames_of`` gives the quick way for SocketCAN and for the simulated bus, and the way
+over ``can.Message`` for any other interface.
+
+Identifiers carry the flags of ``FrameSink``: bit 29 for CAN FD. Extended and remote frames are nobody's here and are
+left out; error frames are kept as the state of our own controller.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import select
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from typing import Protocol
+
+import can
+from can.interfaces.socketcan import SocketcanBus
+
+from frictid_hil.protocol.driver import FD_FRAME
+
+Heard = tuple[int, bytes, float]
+"""Identifier, data, and when it came, s of python-can's time stamps."""
+
+BUS_OFF = "bus-off"
+_PASSIVE, _ALONE = "error-passive", "no acknowledgement"
+CONTROLLER_STATES = {
+    BUS_OFF: "our CAN controller went bus-off: a short circuit, a wrong bit rate, or missing termination",
+    _PASSIVE: "our CAN controller is error-passive: frames are destroyed by a bad cable, termination or bit rate",
+    _ALONE: "nobody acknowledges our frames: no other device is on the bus, or all have another bit rate",
+}
+
+
+class Frames(Protocol):
+    """A bus for one cycle.
+
+    Attributes:
+        controller: what error frames last said of our own CAN controller: a key of ``CONTROLLER_STATES``, or "".
+    """
+
+    controller: str
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Send all of them, in order.
+
+        Raises:
+            Exception: one of ``can_bus.BUS_ERRORS``; those before the one that failed are sent.
+        """
+        ...
+
+    def send_alone(self, can_id: int, data: bytes) -> None:
+        """Send one, from any thread."""
+        ...
+
+    def receive(self, timeout_s: float) -> list[Heard] | None:
+        """What has come, at least one frame; None where nothing came in time. Empty where it was of no meaning.
+
+        Raises:
+            Exception: one of ``can_bus.BUS_ERRORS``.
+        """
+        ...
+
+
+def frames_of(bus: can.BusABC) -> Frames:
+    """The quickest way that a bus has."""
+    if isinstance(bus, SocketcanBus) and bus.channel and not bus.filters:
+        return SocketFrames(bus.socket)
+    own: Frames | None = getattr(bus, "frames", None)
+    return own or MessageFrames(bus)
+
+
+def controller_state(can_id: int, data: bytes | bytearray) -> str:
+    """What an error frame of the interface says of our own CAN controller, by name; "" for passing errors.
+
+    Source: Linux SocketCAN, ``linux/can/error.h``: the class is in the identifier (0x40 bus-off, 0x04 controller, 0x20
+    nobody acknowledged), the controller's state in byte 1 (0x10, 0x20 error-passive).
+    """
+    if can_id & 0x40:
+        return BUS_OFF
+    if can_id & 0x04 and len(data) > 1 and data[1] & 0x30:
+        return _PASSIVE
+    return _ALONE if can_id & 0x20 else ""
+
+
+class MessageFrames:
+    """Any interface of python-can, frame by frame.
+
+    Args:
+        bus: nobody else reads it meanwhile.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._messages: dict[int, can.Message] = {}
+        self.controller = ""
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """One by one."""
+        for can_id, data in frames:
+            message = self._messages.get(can_id)
+            if message is None:
+                message = self._messages[can_id] = _message(can_id, data)
+            # Bytes of its own each time: some interfaces (gs_usb) pad them in place.
+            message.data, message.dlc = bytearray(data), len(data)
+            self._bus.send(message)
+
+    def send_alone(self, can_id: int, data: bytes) -> None:
+        """Send one, from any thread."""
+        self._bus.send(_message(can_id, data))
+
+    def receive(self, timeout_s: float) -> list[Heard] | None:
+        """The next one."""
+        message = self._bus.recv(timeout_s)
+        if message is None:
+            return None
+        if message.is_error_frame:
+            self.controller = controller_state(message.arbitration_id, message.data) or self.controller
+            return []
+        if message.is_extended_id or message.is_remote_frame:
+            return []
+        can_id = message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
+        return [(can_id, bytes(message.data), message.timestamp)]
+
+
+def _message(can_id: int, data: bytes) -> can.Message:
+    fd = can_id & FD_FRAME != 0
+    return can.Message(
+        arbitration_id=can_id & ~FD_FRAME, is_extended_id=False, data=bytearray(data), is_fd=fd, bitrate_switch=fd
+    )
+
+
+class _Header(ctypes.Structure):
+    """``struct msghdr`` of Linux."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("pieces", ctypes.c_void_p),
+        ("piece_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    """``struct mmsghdr``: one of the packets of a call."""
+
+    _fields_ = (("header", _Header), ("length", ctypes.c_uint32))
+
+
+class _Piece(ctypes.Structure):
+    """``struct iovec``: where its bytes are."""
+
+    _fields_ = (("at", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+MOST = 64
+"""Packets in one call of the system."""
+CLASSICAL_BYTES, FD_BYTES = 16, 72
+"""``struct can_frame`` and ``struct canfd_frame`` of Linux."""
+_NOT_OURS, _ERROR_FRAME = 0xC000_0000, 0x2000_0000
+_BIT_RATE_SWITCH = 1
+
+
+class _Packets:
+    """Room for packets that are handed to the system together."""
+
+    def __init__(self, stride: int) -> None:
+        self.room = bytearray(MOST * stride)
+        at = ctypes.addressof(ctypes.c_char.from_buffer(self.room))
+        self._pieces = (_Piece * MOST)(*(_Piece(at + k * stride, stride) for k in range(MOST)))
+        first = ctypes.addressof(self._pieces)
+        size = ctypes.sizeof(_Piece)
+        self._messages = (_Message * MOST)(
+            *(_Message(_Header(pieces=first + k * size, piece_count=1)) for k in range(MOST))
+        )
+        self.address = ctypes.addressof(self._messages)
+        self.sizes = memoryview(self._pieces).cast("B").cast("L")[1::2]
+        """Of what is sent, by packet."""
+        words = ctypes.sizeof(_Message) // 4
+        self.lengths = memoryview(self._messages).cast("B").cast("I")[_Message.length.offset // 4 :: words]
+        """Of what came."""
+
+
+class SocketFrames:
+    """A socket whose packets are SocketCAN's, in as few calls of the system as there can be.
+
+    Args:
+        wire: SocketCAN's, or one of the simulated bus; nobody else reads it meanwhile.
+        stamped: packets end with when they were sent, ns of the monotonic clock (the simulated bus).
+    """
+
+    def __init__(self, wire: socket.socket, *, stamped: bool = False) -> None:
+        self.controller = ""
+        self._wire, self._fd, self._stamped = wire, wire.fileno(), stamped
+        tail = "Q" if stamped else ""
+        self._packing = {False: struct.Struct(f"<IBB2x8s{tail}"), True: struct.Struct(f"<IBB2x64s{tail}")}
+        self._stride = self._packing[True].size
+        self._classical = self._packing[False].size
+        self._packets = struct.Struct("<IB3x64s8x" if stamped else "<IB3x64s")
+        self._out, self._in = _Packets(self._stride), _Packets(self._stride)
+        self._arrived = memoryview(self._in.room)
+        # These calls never wait, so that the interpreter's lock need not be let go.
+        library = ctypes.PyDLL(None, use_errno=True)
+        self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
+        self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
+        self._recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """All of them; a full transmit buffer is an error at once."""
+        if len(frames) > MOST:
+            self.send(frames[:MOST])
+            return self.send(frames[MOST:])
+        room, sizes, stride = self._out.room, self._out.sizes, self._stride
+        stamp = (time.monotonic_ns(),) if self._stamped else ()
+        for at, (can_id, data) in enumerate(frames):
+            fd = can_id & FD_FRAME != 0
+            packing = self._packing[fd]
+            packing.pack_into(room, at * stride, can_id & ~FD_FRAME, len(data), fd and _BIT_RATE_SWITCH, data, *stamp)
+            sizes[at] = packing.size
+        done = 0
+        while done < len(frames):
+            first = self._out.address + done * ctypes.sizeof(_Message)
+            sent = self._sendmmsg(self._fd, first, len(frames) - done, socket.MSG_DONTWAIT)
+            if sent < 0:
+                raise _failed()
+            done += sent
+        return None
+
+    def send_alone(self, can_id: int, data: bytes) -> None:
+        """Send one, from any thread."""
+        fd = can_id & FD_FRAME != 0
+        stamp = (time.monotonic_ns(),) if self._stamped else ()
+        packet = self._packing[fd].pack(can_id & ~FD_FRAME, len(data), fd and _BIT_RATE_SWITCH, data, *stamp)
+        self._wire.send(packet, socket.MSG_DONTWAIT)
+
+    def receive(self, timeout_s: float) -> list[Heard] | None:
+        """All that has come."""
+        count = self._recvmmsg(self._fd, self._in.address, MOST, socket.MSG_DONTWAIT, None)
+        if count < 0 and ctypes.get_errno() == errno.EAGAIN:
+            if timeout_s <= 0.0 or not select.select((self._fd,), (), (), timeout_s)[0]:
+                return None
+            count = self._recvmmsg(self._fd, self._in.address, MOST, socket.MSG_DONTWAIT, None)
+        if count < 0:
+            raise _failed()
+        now_s = time.time()
+        heard: list[Heard] = []
+        packets = self._packets.iter_unpack(self._arrived[: count * self._stride])
+        for length, (can_id, size, data) in zip(self._in.lengths[:count], packets, strict=True):
+            if length < self._classical:
+                raise ConnectionResetError(errno.ECONNRESET, "the bus is gone: whoever kept it has ended")
+            if can_id & _ERROR_FRAME:
+                self.controller = controller_state(can_id, data) or self.controller
+            elif not can_id & _NOT_OURS:
+                if length > self._classical:
+                    can_id |= FD_FRAME
+                elif size > 8:
+                    size = 8
+                heard.append((can_id, data[:size], now_s))
+        return heard
+
+
+def _failed() -> OSError:
+    number = ctypes.get_errno()
+    return OSError(number, os.strerror(number))
