@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NoReturn, Protocol
 
 import numpy as np
@@ -78,6 +78,7 @@ class CycleCount:
         last_ns: run time of the last exchange.
         streamed: cycles in which a joint was streamed set-points.
         limited: those of them in which a limit of its drive was active.
+        stops: run time of the first deadline that was missed, and for how long the set-points stood still; ns.
     """
 
     cycles: int = 0
@@ -88,6 +89,7 @@ class CycleCount:
     last_ns: int = 0
     streamed: int = 0
     limited: int = 0
+    stops: list[tuple[int, int]] = field(default_factory=list)
 
     @property
     def rate_hz(self) -> float:
@@ -178,6 +180,7 @@ class CyclicLoop:
             if late_ns >= period_ns:
                 skipped = late_ns // period_ns
                 count.missed += skipped
+                count.stops.append((deadline_ns + self._offset_ns, skipped * period_ns))
                 deadline_ns += skipped * period_ns
         self._deadline_ns = deadline_ns + period_ns
 

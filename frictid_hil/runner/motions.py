@@ -76,6 +76,7 @@ class Motions:
         self._limits = limits
         self._approach_rad_s = approach_rad_s
         self._notify = notify
+        self._wall_clock = not driver.clock.lock_step
         self._laws = {
             index: LawRunner(driver, loop, supervisor, joint, index, limits[index]) for index, joint in joints.items()
         }
@@ -94,7 +95,7 @@ class Motions:
             first = next(iter(motions.values()))
             self._notify(PhaseStarted(name, first.name, first.duration_s))
             sources, ending = self._sources(motions)
-            start_ns, before = loop.now_ns(), replace(loop.count)
+            start_ns, before = loop.now_ns(), replace(loop.count, stops=list(loop.count.stops))
             loop.run(sources, ending=ending)
             end_ns = loop.now_ns()
             for index, motion in motions.items():
@@ -172,12 +173,14 @@ class Motions:
         return {}
 
     def _told(self, before: CycleCount) -> dict[str, Any]:
-        """Of the cycles since: how many were limited by the drive where one joint moved, or who moved together."""
-        count = self._loop.count
+        """Of the cycles since: where set-points stood still, how many were limited by the drive, who moved together."""
+        count, told = self._loop.count, dict[str, Any]()
+        if self._wall_clock:
+            told["stops_ns"] = [list(stop) for stop in count.stops[len(before.stops) :]]
         if len(self._joints) > 1:
-            return {"together": [joint.name for joint in self._joints.values()]}
+            return {**told, "together": [joint.name for joint in self._joints.values()]}
         limited = count.limited - before.limited
-        return {"limited_share": limited / (count.streamed - before.streamed)} if limited else {}
+        return {**told, "limited_share": limited / (count.streamed - before.streamed)} if limited else told
 
 
 def _approach(here_rad: float, motion: Motion, speed_rad_s: float) -> Move:

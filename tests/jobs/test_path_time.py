@@ -80,6 +80,34 @@ def test_where_stops_and_lost_reports_mix_the_inertia_is_still_right() -> None:
     assert mixed.inertia_kg_m2.value == pytest.approx(INERTIA, rel=0.01)
 
 
+def noted(samples: Samples) -> Samples:
+    """The run with those stops, as the loop that made them notes them."""
+    shifts = np.concatenate([[0], np.cumsum(list(STOPS.values()))])[:-1]
+    stops = [[(row + int(by)) * STEP_NS, STOPS[row] * STEP_NS] for row, by in zip(STOPS, shifts, strict=True)]
+    hold, cycles = stopped(samples, STOPS).marks
+    told = [stop for stop in stops if stop[0] < hold.end_ns], [stop for stop in stops if stop[0] >= hold.end_ns]
+    marks = tuple(
+        replace(mark, details={**mark.details, "stops_ns": of}) for mark, of in zip((hold, cycles), told, strict=True)
+    )
+    return replace(stopped(samples, STOPS), marks=marks)
+
+
+def test_what_the_loop_noted_counts_whatever_reports_were_lost_and_however_late_the_others_came() -> None:
+    whole, samples = run(), noted(run())
+    rng = np.random.default_rng(2)
+    kept = rng.random(len(samples)) > 0.1
+    late = samples.time_ns + rng.integers(0, STEP_NS, len(samples))
+    path = path_time(replace(samples, time_ns=late).select(kept), P, samples.marks[1].start_ns)
+    assert path is not None and path.after_ns.size == len(STOPS)
+    assert np.array_equal(np.diff(path.of(samples.time_ns)), np.diff(whole.time_ns))
+
+
+def test_a_loop_that_noted_no_stop_made_none() -> None:
+    samples = stopped(run(), {2100: 27})
+    marks = tuple(replace(mark, details={**mark.details, "stops_ns": []}) for mark in samples.marks)
+    assert path_time(replace(samples, marks=marks), P, samples.marks[1].start_ns) is None
+
+
 def test_without_commanded_positions_nothing_tells() -> None:
     samples = stopped(run(), STOPS)
     silent = Samples(samples.joint, samples.time_ns, samples.position_rad, torque_nm=samples.torque_nm)

@@ -2,7 +2,8 @@
 
 A set-point that could not be sent in time is not skipped, because a jump would jerk the joint. The path stands still
 and goes on with the next set-point while the clock goes on. So the cycles lie later in the recording than (1) says, by
-more with every missed cycle. Lost reports look alike; the commanded positions tell the two apart.
+more with every missed cycle. The loop notes where it stopped, in the marks of the recording. Where nobody noted it,
+gaps in the samples tell; lost reports look alike, and the commanded positions tell the two apart.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from frictid_hil.recording.samples import Nanoseconds, Samples
 
 _GAP_STEPS = 1.5
 """Between two samples, in sample periods: a longer one is a gap."""
+STOPS = "stops_ns"
+"""Detail of a mark: the stops during it, each with the run time of the first deadline missed and how long it took."""
 _LONG_STEPS = 2.5
 """A gap of one lost report is bridged as well as it was measured."""
 
@@ -26,7 +29,7 @@ class PathTime:
     """From run time to the time of the path.
 
     Attributes:
-        after_ns: run time of the last sample before every stop, shape (k,).
+        after_ns: run time of every stop; samples up to it came before. Shape (k,).
         stopped_ns: how long the path stood still there, shape (k,).
         start_ns: start of cycle 1, at which both times agree.
     """
@@ -79,6 +82,13 @@ def path_time(samples: Samples, procedure: Procedure, start_ns: int) -> PathTime
         procedure: whose cycles start at ``start_ns``.
         start_ns: run time.
     """
+    if any(STOPS in mark.details for mark in samples.marks):
+        noted = sorted(tuple(stop) for mark in samples.marks for stop in mark.details.get(STOPS, ()))
+        if not noted:
+            return None
+        first_ns, stopped_ns = np.array(noted, dtype=np.int64).T
+        # A cycle that is late by less than a period belongs before.
+        return PathTime(first_ns - 1, stopped_ns, start_ns)
     steps_ns = np.diff(samples.time_ns)
     step_ns = int(np.median(steps_ns))
     gaps = np.flatnonzero(steps_ns > _GAP_STEPS * step_ns)
