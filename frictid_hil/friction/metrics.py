@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
@@ -75,3 +76,29 @@ def rms(time_s: Array, values: Array) -> float:
     square = np.asarray(values, dtype=np.float64) ** 2
     step_s = np.diff(time_s)
     return float(np.sqrt(np.sum(step_s * (square[1:] + square[:-1])) / (2 * np.sum(step_s))))
+
+
+def rms_by_part(values: Array, parts: int) -> Array:
+    """Root mean squares of parts of equal length, one after the other, shape (parts,); unit of ``values``."""
+    roots: Array = np.array([np.sqrt(np.mean(np.square(part))) for part in np.array_split(values, parts)])
+    return roots
+
+
+def ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
+    """95 % interval of a root mean square over another, from those of repetitions of the same motion.
+
+    Args:
+        before: of each repetition, shape (n,).
+        after: of each repetition, shape (m,); against ones, the interval is that of ``after`` itself.
+
+    Returns:
+        None where one of them was not repeated, or vanishes.
+    """
+    squares = [np.square(one) for one in (before, after)]
+    if min(one.size for one in squares) < 2 or min(float(np.mean(one)) for one in squares) <= 0.0:
+        return None
+    # Half the relative error of a mean square is that of its root.
+    errors = [0.5 * float(np.std(one, ddof=1) / np.mean(one)) / np.sqrt(one.size) for one in squares]
+    reach = float(stats.t.ppf(0.975, min(one.size for one in squares) - 1) * np.hypot(*errors))
+    middle = float(np.sqrt(np.mean(squares[1]) / np.mean(squares[0])))
+    return middle * float(np.exp(-reach)), middle * float(np.exp(reach))

@@ -12,6 +12,7 @@ from frictid_hil.units import degrees
 
 _COLORS = {"nc": "#b2477f", "mo": PUBLISHED, "mol": "#8a5fb0", "mop": IDENTIFIED, "mop-reference": REFERENCE}
 _SHOWN_CYCLES = 2.0
+_INTERVAL = "In brackets: 95 % interval, from the scatter between the cycles."
 _NAMES = {
     "nc": "NC: no friction compensation",
     "mo": "MO: Coulomb spring",
@@ -42,6 +43,11 @@ class Run(Protocol):
     @property
     def reference_rad(self) -> Array:
         """Position on the planned path."""
+        ...
+
+    @property
+    def torque_nm(self) -> Array:
+        """Of the drive."""
         ...
 
     @property
@@ -98,15 +104,15 @@ def compensation_page(
 
 def _headline(joint: str, task: str, modes: Mapping[str, Mapping[str, Any]]) -> str:
     best = [
-        (float(figure["reduction_percent"]), mode)
+        (float(figure["reduction_percent"]), mode, figure.get("reduction_interval_95_percent"))
         for mode, figure in modes.items()
         if mode != "nc" and figure.get("reduction_percent") is not None
     ]
     measure = "the torque a person needs" if task == "hand" else "the tracking error"
     if not best:
         return f"Joint {joint}: nothing to compare with; run nc beside the others."
-    reduction, mode = max(best)
-    return f"Joint {joint}: {_short(mode)} reduces {measure} by {reduction:.1f} %."
+    reduction, mode, interval = max(best)
+    return f"Joint {joint}: {_short(mode)} reduces {measure} by {reduction:.1f} %{_between(interval, 1.0, ' %')}."
 
 
 def _table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]], *, hand: bool) -> Table:
@@ -127,8 +133,9 @@ def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) ->
         (
             _NAMES.get(name, name),
             _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
-            _number(modes[name]["torque_rms_nm"]),
-            _percent(modes[name]["reduction_percent"]),
+            _number(modes[name]["torque_rms_nm"]) + _between(modes[name].get("interval_95")),
+            _percent(modes[name]["reduction_percent"])
+            + _between(modes[name].get("reduction_interval_95_percent"), unit=" %"),
             _percent(modes[name].get("ceiling_percent")),
             _number(modes[name]["torque_rms_inertia_removed_nm"]),
             _percent(modes[name]["reduction_inertia_removed_percent"]),
@@ -137,7 +144,7 @@ def _hand_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) ->
     )
     caption = (
         "Root mean squares over the whole task. The ceiling is what a joint without any friction would reach, whose "
-        "inertia the hand still has to move."
+        f"inertia the hand still has to move. {_INTERVAL}"
     )
     return Table(headings, rows, caption)
 
@@ -146,9 +153,13 @@ def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]
     rows = tuple(
         (
             _NAMES.get(name, name),
-            _number(modes[name]["tracking_rms_rad"], degrees(1.0)),
-            _percent(modes[name]["reduction_percent"]),
+            _number(modes[name]["tracking_rms_rad"], degrees(1.0))
+            + _between(modes[name].get("interval_95"), degrees(1.0)),
+            _percent(modes[name]["reduction_percent"])
+            + _between(modes[name].get("reduction_interval_95_percent"), unit=" %"),
             _percent(modes[name].get("ceiling_percent")),
+            _number(modes[name].get("velocity_error_rms_rad_s"), degrees(1.0)),
+            _number(modes[name].get("drive_torque_rms_nm")),
             _number(modes[name]["velocity_rms_rad_s"], degrees(1.0)),
         )
         for name in names
@@ -156,9 +167,17 @@ def _tracking_table(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]
     caption = (
         "Root mean squares over the whole task, the same gains in all modes. The ceiling is what they would reach on a "
         "joint without friction, or with the reference velocity on one whose friction is given back exactly; a PD this "
-        "weak still has to turn the inertia."
+        f"weak still has to turn the inertia. {_INTERVAL}"
     )
-    headings = ("mode", "tracking error E_s [deg]", "reduced by", "ceiling", "speed V_s [deg/s]")
+    headings = (
+        "mode",
+        "tracking error E_s [deg]",
+        "reduced by",
+        "ceiling",
+        "velocity error [deg/s]",
+        "drive torque [N m]",
+        "speed V_s [deg/s]",
+    )
     return Table(headings, rows, caption)
 
 
@@ -222,7 +241,7 @@ def _hand_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> 
     )
 
 
-def _following(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
+def _following(runs: Mapping[str, Run]) -> tuple[Figure, ...]:
     first = next(iter(runs.values()))
     shown = {mode: _first_cycles(run) for mode, run in runs.items()}
     reference = line(
@@ -252,7 +271,20 @@ def _following(runs: Mapping[str, Run]) -> tuple[Figure, Figure]:
     return (
         Figure("Position (Fig. 13)", (reference, *positions), "time [s]", "position [deg]"),
         Figure("Tracking error", tuple(errors), "time [s]", "reference - position [deg]"),
+        Figure("Velocity", tuple(_traces(runs, "velocity_rad_s", degrees(1.0))), "time [s]", "velocity [deg/s]"),
+        Figure("Torque of the drive", tuple(_traces(runs, "torque_nm")), "time [s]", "torque [N m]"),
     )
+
+
+def _traces(runs: Mapping[str, Run], column: str, scale: float = 1.0) -> list[Mapping[str, Any]]:
+    """One column of every mode over the first cycles."""
+    return [
+        line(
+            _short(mode), run.time_s[_first_cycles(run)], scale * getattr(run, column)[_first_cycles(run)],
+            _color(mode), width=1,
+        )
+        for mode, run in runs.items()
+    ]  # fmt: skip
 
 
 def _tracking_bars(names: Sequence[str], modes: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -282,6 +314,10 @@ def _color(mode: str) -> str:
 
 def _number(value: float | None, scale: float = 1.0) -> str:
     return "" if value is None else f"{value * scale:.4g}"
+
+
+def _between(interval: Sequence[float] | None, scale: float = 1.0, unit: str = "") -> str:
+    return "" if interval is None else f" ({interval[0] * scale:.4g} to {interval[1] * scale:.4g}{unit})"
 
 
 def _percent(value: float | None) -> str:

@@ -92,3 +92,24 @@ def test_friction_dominates_where_giving_it_back_exactly_would_leave_little(floo
     found = figures({"nc": nc, "mop-reference": mop}, "track", INERTIA, {"mop-reference": floor_rad})
     assert friction_dominates(found) is dominates
     assert friction_dominates(figures({"nc": nc}, "track", INERTIA)) is None
+
+
+def test_the_error_before_and_after_has_an_interval_from_cycle_to_cycle() -> None:
+    rng = np.random.default_rng(3)
+    time_s = np.arange(8 * 1000) * STEP
+    path = REACH * np.sin(2.0 * math.pi * time_s)
+
+    def followed(error_rad: float) -> ModeRun:
+        size = np.repeat(error_rad * rng.normal(1.0, 0.05, 8), 1000)
+        still = np.zeros(time_s.size)
+        position = path - size * np.cos(2.0 * math.pi * time_s)
+        return ModeRun("", time_s, position, np.gradient(path, STEP), path, still, None, cycles=8)
+
+    found = figures({"nc": followed(0.02), "mop": followed(0.004)}, "track", None)
+    low, high = found["mop"].reduction_interval_percent or (0.0, 0.0)
+    assert low < 80.0 < high < low + 5.0
+    low, high = found["nc"].interval or (0.0, 0.0)
+    assert low < 0.02 * math.sqrt(0.5) < high and found["nc"].reduction_interval_percent is None
+    assert found["mop"].velocity_error_rms_rad_s == pytest.approx(0.0, abs=1e-2)
+    alone = figures({"nc": replace(followed(0.02), cycles=1)}, "track", None)
+    assert alone["nc"].interval is None, "one cycle tells nothing of the next"

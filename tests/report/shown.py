@@ -169,6 +169,7 @@ class ModeRun:
     position_rad: Array
     velocity_rad_s: Array
     reference_rad: Array
+    torque_nm: Array
     external_torque_nm: Array | None
 
 
@@ -176,7 +177,9 @@ def compensated(task: str, *, force_sensor: bool = True) -> Page:
     time_s = np.arange(0.0, 4.0, 0.01)
     wave = 0.2 * np.sin(2 * np.pi * time_s / 4)
     runs = {
-        mode: ModeRun(time_s, scale * wave, scale * np.gradient(wave, time_s), wave, 8 * wave if force_sensor else None)
+        mode: ModeRun(
+            time_s, scale * wave, scale * np.gradient(wave, time_s), wave, 5 * wave, 8 * wave if force_sensor else None
+        )
         for mode, scale in (("nc", 0.7), ("mop", 0.98))
     }
     modes: dict[str, dict[str, Any]] = {
@@ -187,6 +190,8 @@ def compensated(task: str, *, force_sensor: bool = True) -> Page:
             "reduction_percent": reduction,
             "reduction_inertia_removed_percent": reduction,
             "tracking_rms_rad": 0.01 * torque,
+            "interval_95": (0.009 * torque, 0.011 * torque),
+            "reduction_interval_95_percent": None if reduction is None else (reduction - 1.0, reduction + 1.0),
         }
         for mode, torque, reduction in (("nc", 5.0, None), ("mop", 1.0, 80.0))
     }

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.friction.filtering import Gaussian
+from frictid_hil.friction.metrics import ratio_interval, rms_by_part
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.plan.control import Compensated
 from frictid_hil.recording.samples import Mark, Samples
@@ -36,6 +37,7 @@ class ModeRun:
         torque_nm: of the drive.
         external_torque_nm: a person's; None without a force sensor.
         velocity_delay_s: by which the reported velocity is older than its row.
+        cycles: of the task, each a repetition of the others.
     """
 
     mode: str
@@ -46,6 +48,7 @@ class ModeRun:
     torque_nm: Array
     external_torque_nm: Array | None
     velocity_delay_s: float = 0.0
+    cycles: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,10 @@ class ModeFigures:
         ceiling_percent: reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without
             any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor``).
         inertial_rms_nm: of inertia times acceleration.
+        velocity_error_rms_rad_s: of the path's speed less the measured one; None by hand.
+        drive_torque_rms_nm: of the drive.
+        interval: 95 % of the task's own measure, from cycle to cycle; None where there is one cycle.
+        reduction_interval_percent: 95 % of its reduction.
         reasons: by figure.
     """
 
@@ -73,6 +80,10 @@ class ModeFigures:
     tracking_rms_rad: float | None = None
     ceiling_percent: float | None = None
     inertial_rms_nm: float | None = None
+    velocity_error_rms_rad_s: float | None = None
+    drive_torque_rms_nm: float | None = None
+    interval: tuple[float, float] | None = None
+    reduction_interval_percent: tuple[float, float] | None = None
     reasons: Mapping[str, str] | None = None
 
     def values(self) -> dict[str, object]:
@@ -84,7 +95,11 @@ class ModeFigures:
             "reduction_percent": self.reduction_percent,
             "reduction_inertia_removed_percent": self.reduction_inertia_removed_percent,
             "tracking_rms_rad": self.tracking_rms_rad,
+            "reduction_interval_95_percent": self.reduction_interval_percent,
+            "interval_95": self.interval,
             "ceiling_percent": self.ceiling_percent,
+            "velocity_error_rms_rad_s": self.velocity_error_rms_rad_s,
+            "drive_torque_rms_nm": self.drive_torque_rms_nm,
             "reasons": dict(self.reasons or {}),
         }
 
@@ -94,7 +109,8 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
     part = samples.during(mark)
     time_s = (part.time_ns - mark.start_ns) * 1e-9
     whole_s = np.floor(float(time_s[-1]) / period_s + 0.01) * period_s
-    kept = (time_s >= min(period_s, whole_s - period_s)) & (time_s < whole_s)
+    begin_s = min(period_s, whole_s - period_s)
+    kept = (time_s >= begin_s) & (time_s < whole_s)
     part, time_s = part.select(kept), time_s[kept]
     assert part.velocity_rad_s is not None and part.torque_nm is not None  # live rows have both
     return ModeRun(
@@ -106,6 +122,7 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
         torque_nm=part.torque_nm,
         external_torque_nm=part.external_torque_nm,
         velocity_delay_s=_velocity_delay_s(samples.meta),
+        cycles=max(1, round((whole_s - begin_s) / period_s)),
     )
 
 
@@ -123,7 +140,32 @@ def figures(
     floors_rad = floors_rad or {}
     alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}
     base = alone.get("nc")
-    return {mode: _against(figure, base, task, floors_rad.get(mode)) for mode, figure in alone.items()}
+    repeated = {mode: _by_cycle(run, task) for mode, run in runs.items()}
+    return {
+        mode: _with_intervals(
+            _against(figure, base, task, floors_rad.get(mode)),
+            repeated[mode],
+            repeated.get("nc") if mode != "nc" else None,
+        )
+        for mode, figure in alone.items()
+    }
+
+
+def _by_cycle(run: ModeRun, task: str) -> Array | None:
+    """The task's own measure of each cycle, shape (cycles,); None where there is none."""
+    measure = run.reference_rad - run.position_rad if task == "track" else run.external_torque_nm
+    if measure is None or not np.all(np.isfinite(measure)):
+        return None
+    return rms_by_part(measure, run.cycles)
+
+
+def _with_intervals(figure: ModeFigures, own: Array | None, base: Array | None) -> ModeFigures:
+    """The figures with the scatter from cycle to cycle: of the mode, and of its reduction against ``base``."""
+    if own is None:
+        return figure
+    ratio = None if base is None else ratio_interval(base, own)
+    reduction = None if ratio is None else (100.0 * (1.0 - ratio[1]), 100.0 * (1.0 - ratio[0]))
+    return replace(figure, interval=ratio_interval(np.ones_like(own), own), reduction_interval_percent=reduction)
 
 
 def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
@@ -170,11 +212,12 @@ def _velocity_delay_s(meta: Mapping[str, object]) -> float:
 
 
 def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
-    figure = ModeFigures(velocity_rms_rad_s=_rms(run.velocity_rad_s))
+    figure = ModeFigures(velocity_rms_rad_s=_rms(run.velocity_rad_s), drive_torque_rms_nm=_rms(run.torque_nm))
     if task == "track":
         return replace(
             figure,
             tracking_rms_rad=_rms(run.reference_rad - run.position_rad),
+            velocity_error_rms_rad_s=_rms(np.gradient(run.reference_rad, run.time_s) - run.velocity_rad_s),
             reasons={"torque_rms_nm": "nobody touches the joint while it tracks"},
         )
     reasons = {"tracking_rms_rad": "a person's hand has no reference"}
