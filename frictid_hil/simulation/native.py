@@ -343,8 +343,9 @@ def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: U
             native.placed["electrical_lag"] = "actuator: timeconst"
             native.lost["electrical_lag"] = _FRESH
         else:
-            lag = _word(effects["electrical_lag"]["time_constant_s"])
-            native.actuators |= {"dyntype": "filterexact", "dynprm": lag}
+            # Taken early, the filter acts half a step sooner than the drive does on average.
+            lag = _word(effects["electrical_lag"]["time_constant_s"] + 0.5 * use.timestep_s)
+            native.actuators |= {"dyntype": "filterexact", "dynprm": lag, "actearly": "true"}
             native.placed["electrical_lag"] = "actuator: dyntype filterexact"
             native.lost["electrical_lag"] = "one more activation: keyframes get a zero for it"
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 HELD_KG_M2 = 1e9
 """Armature of the joints that shall stand."""
+RESTED_S = 1.0
+"""Time in which a link behind play or spring comes to rest."""
 SETTLED_S = 0.3
 """Start of a motion that is not compared."""
 
@@ -127,16 +129,21 @@ def _in_mujoco(
     for name in robot.joints:
         data.qpos[int(m.joint(name).qposadr[0])] = posture[int(robot.compiled.joint(name).qposadr[0])]
     data.qpos[place] = command[0]
+    if play is not None:
+        _let_link_rest(library, m, data, dof)
     drive = drive_of(m, number) if believed.motor is not None else None
     gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
     control = control_of(m, drive)
     if control is not None:
         # What the other side begins with: the torque that holds the joint.
         data.ctrl[control] = gear * (command[0] + start_nm / loop.kp_nm_per_rad) if by_position else start_nm / gear
+        if drive is not None and (adr := int(m.actuator_actadr[drive])) >= 0:
+            data.act[adr] = data.ctrl[control]  # a drive that lags holds the joint already
         if hasattr(library, "mj_initCtrlHistory"):
             _fill_history(library, m, data)
     relax(m, data)
     library.mj_forward(m, data)
+    _let_friction_hold(m, data, number, start_nm)
     torque, rate = np.empty(command.size), np.gradient(command, float(m.opt.timestep))
     integral, last, step_s = start_nm, command[0], float(m.opt.timestep)
     for k, wanted in enumerate(command):
@@ -159,6 +166,29 @@ def _in_mujoco(
         library.mj_step(m, data)
         torque[k] = demand if drive is None else gear * float(data.actuator_force[force_of(m, drive)])
     return torque
+
+
+def _let_link_rest(library: Any, m: Any, data: Any, motor_dof: int) -> None:
+    """Let the link behind play or spring come to rest while its motor stands: machines do not begin in mid-air."""
+    held = copy.copy(m)
+    held.dof_armature[motor_dof] = HELD_KG_M2
+    motor = data.qpos.copy()
+    for _ in range(round(RESTED_S / float(m.opt.timestep))):
+        library.mj_step(held, data)
+    place = int(m.jnt_qposadr[int(m.dof_jntid[motor_dof])])
+    data.qpos[place], data.time = motor[place], 0.0
+    data.qvel[:] = 0.0
+
+
+def _let_friction_hold(m: Any, data: Any, joint: int, drive_nm: float) -> None:
+    """Bend a joint's spring that yields until it holds what the drive does not, as on a machine that has stopped."""
+    at = int(m.jnt_plasticadr[joint]) if hasattr(m, "jnt_plasticadr") else -1
+    if at < 0:
+        return
+    dof, stiffness = int(m.jnt_dofadr[joint]), float(m.jnt_stiffness[joint])
+    left_nm = float(data.qfrc_bias[dof] - data.qfrc_passive[dof]) - drive_nm
+    largest = stiffness * float(m.jnt_springyield[joint])
+    data.plastic[at] += min(largest, max(-largest, left_nm)) / stiffness
 
 
 def drive_of(m: Any, joint: int) -> int | None:
