@@ -140,7 +140,9 @@ def main() -> int:
             process.join()
             size = path.stat().st_size / 1e6
             print(
-                f"{name:12s} {size:7.0f} MB  {joints} joints x {rows}  {seconds:6.2f} s  {megabytes:6.0f} MB of memory"
+                f"{name:12s} {size:7.0f} MB  {joints} joints x {rows}  {seconds:6.2f} s  {cpu:6.2f} s of a processor  "
+                f"{megabytes:6.0f} MB of memory",
+                flush=True,
             )
             worst = max(worst, cpu)
             path.unlink()

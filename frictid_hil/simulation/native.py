@@ -11,6 +11,7 @@ joint. Sliding friction has three forms, and whoever writes the file measures wh
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
+from frictid_hil.simulation.inverse_loops import soft_spring
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.robot_model import ModelJoint
 from frictid_hil.simulation.steady import steady_friction_nm
@@ -39,6 +41,12 @@ _SMALLEST_RISE = 1e-3
 """Rise at standstill over the level, below which it is rounding."""
 _RISE_BASE = 0.05
 """Level that LuGre needs at speed, over its rise; taken off the spring."""
+_LOOP_ENDS = 20.0
+"""Travel over that of a presliding loop, after which it is turned over."""
+_LOOP_KNOTS = (0.3, 0.6, 0.85, 0.97)
+"""Parts of its turn-over at which one of the springs that stand for it yields."""
+_LEAST_SHARE = 0.03
+"""Share of a loop below which a spring is not worth its line."""
 FAR_RAD = 3e5
 """Where a spring is anchored whose torque shall not depend on the joint."""
 
@@ -122,7 +130,7 @@ _NOWHERE = {
 def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, tuple[float, float, float]]:
     """(level, rise at standstill, Stribeck speed, damping polynomial) that stand nearest to the joint's sliding."""
     fastest = float(np.max(use.speed_rad_s))
-    speed = _speeds(use)
+    speed = _speeds(use, falling="stribeck" in model.effects)
     odd, _ = _sliding(model, speed, use)
     if "stribeck" in model.effects:
         return _with_stribeck(speed, odd, fastest)
@@ -130,16 +138,17 @@ def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, tup
     return level, 0.0, 0.0, (a, b, c)
 
 
-def _speeds(use: Use) -> Array:
-    """Speeds as often as they were driven, and one near standstill."""
-    driven = np.quantile(use.speed_rad_s, np.linspace(0.02, 1.0, 150))
-    speeds: Array = np.unique(np.concatenate([driven, [1e-3 * float(np.max(use.speed_rad_s))]]))
+def _speeds(use: Use, *, falling: bool = False) -> Array:
+    """Speeds as often as they were driven, and one near standstill; many of those where friction is ``falling``."""
+    driven, fastest = np.quantile(use.speed_rad_s, np.linspace(0.02, 1.0, 150)), float(np.max(use.speed_rad_s))
+    slow = np.geomspace(1e-3, 0.3, 100) if falling else np.array([1e-3])
+    speeds: Array = np.unique(np.concatenate([driven, slow * fastest]))
     return speeds
 
 
 def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use: Use, form: str) -> None:
     fastest = float(np.max(use.speed_rad_s))
-    speed = _speeds(use)
+    speed = _speeds(use, falling=form == "lugre")
     odd, even = _sliding(model, speed, use)
     soft_nm = _soft_nm(model)
     dry, rise, at, poly = _with_stribeck(speed, odd, fastest) if form == "lugre" else (0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
@@ -173,10 +182,10 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         if believed.presliding_nm_per_rad is not None and believed.spring_nm_per_rad == 0.0:
             native.joint["stiffness"] = "0"
     if soft_nm > 0.0:
-        values = model.effects["presliding_hysteresis"]
-        travel = values["distance_rad"]
-        native.more_tendons.append(_slipping(f"{name}_presliding", name, soft_nm / travel, travel))
-        where += "; presliding: a second spring that yields"
+        for number, (share, yields_rad) in enumerate(_slip_elements(model.effects["presliding_hysteresis"]), 1):
+            stiffness = share * soft_nm / yields_rad
+            native.more_tendons.append(_slipping(f"{name}_presliding_{number}", name, stiffness, yields_rad))
+        where += "; presliding: more springs that yield, one after the other"
     if abs(even) > 1e-3 * max(dry, 1e-9):
         native.more_tendons.append(_constant(f"{name}_asymmetry", name, even))
         where += "; asymmetry: a far spring (constant torque)"
@@ -198,6 +207,21 @@ _FRICTION_LOSES = {
     "stiction_breakaway": "the growth with rest",
     "temperature_drift": "the temperature: friction of a cold joint is written",
 }
+
+
+def _slip_elements(hysteresis: Mapping[str, float]) -> list[tuple[float, float]]:
+    """(share, yield in rad) of springs that yield one after the other along the rounded loop of an effect."""
+    distance = hysteresis["distance_rad"]
+    travel = np.linspace(0.0, _LOOP_ENDS * distance, 2000)
+    position = np.concatenate([[0.0, -_LOOP_ENDS * distance], travel - _LOOP_ENDS * distance])
+    loop = soft_spring(position, distance, hysteresis["loop_exponent"], hysteresis["loop_beta"])[2:]
+    turned = 0.5 * (loop + 1.0)
+    knots = np.interp(_LOOP_KNOTS, turned, travel)
+    slopes = np.diff([0.0, *_LOOP_KNOTS[:-1], 1.0]) / np.diff([0.0, *knots])
+    shares = -np.diff([*slopes, 0.0]) * knots
+    shares = np.where(shares > _LEAST_SHARE, shares, 0.0) / np.sum(shares[shares > _LEAST_SHARE])
+    # A spring that yields by so much turns over within twice that.
+    return [(float(share), 0.5 * float(knot)) for share, knot in zip(shares, knots, strict=True) if share > 0.0]
 
 
 def _sliding(model: JointModel, speed: Array, use: Use) -> tuple[Array, float]:
