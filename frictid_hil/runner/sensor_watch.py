@@ -26,6 +26,8 @@ _JUMP_RAD = math.radians(0.3)
 _BOTH_WAYS_RAD_S = math.radians(4.0)
 _BOTH_WAYS_RAD = math.radians(0.5)
 """A torque has been seen in a direction once the joint moved so far at such a speed."""
+_SAME_RAD = math.radians(1.0)
+"""A set-point that went so far changes the torque of a joint that stands, unless its reports are old ones."""
 
 
 def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, period_s: float) -> tuple[float, float]:
@@ -80,16 +82,18 @@ class SensorWatch:
     def restart(self) -> None:
         """Forget what was reported, because the joint stands or another mode begins."""
         self._rows: deque[_Row] = deque()
+        self._same: tuple[float, float, float] | None = None
+        self._same_since_ns, self._same_asked_rad = 0, math.nan
         self._torque_nm = math.nan
         self._seen_rad = [0.0, 0.0]
 
-    def verdict(self, report: Feedback, most_rad_s: float, *, held: bool) -> str:
+    def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
         """Say in a sentence what is wrong; an empty string while all is well.
 
         Args:
             report: new.
             most_rad_s: highest speed that the joint may have.
-            held: by a position loop, whose torque depends on the direction of motion.
+            asked_rad: where a position loop shall hold it, whose torque then depends on the direction of motion.
         """
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
@@ -113,7 +117,9 @@ class SensorWatch:
             rows.popleft()
         if t_ns - rows[0].t_ns >= 0.9e9 * _WINDOW_S and (wrong := self._disagreement()):
             return wrong
-        return self._frozen(report.torque_nm, velocity, jump_rad) if held else ""
+        if math.isnan(asked_rad):
+            return ""
+        return self._old(report, asked_rad) or self._frozen(report.torque_nm, velocity, jump_rad)
 
     def _disagreement(self) -> str:
         """Say how position and velocity contradict each other within the window; an empty string where they agree."""
@@ -130,6 +136,20 @@ class SensorWatch:
         return (
             f"position went {format_angle(went_rad)} within {_WINDOW_S:g} s, its reported velocity says "
             f"{format_angle(said_rad)} (may differ by {format_angle(allowed_rad)})"
+        )
+
+    def _old(self, report: Feedback, asked_rad: float) -> str:
+        """Say that the same report comes again and again: a loop whose set-point moves has another torque at least."""
+        figures = (report.position_rad, report.velocity_rad_s, report.torque_nm)
+        if figures != self._same or math.isnan(report.torque_nm):
+            self._same, self._same_since_ns, self._same_asked_rad = figures, report.t_ns, asked_rad
+            return ""
+        asked_rad -= self._same_asked_rad
+        if report.t_ns - self._same_since_ns < _WINDOW_S * 1e9 or abs(asked_rad) < _SAME_RAD:
+            return ""
+        return (
+            f"the same position, velocity and torque for {_WINDOW_S:g} s, while the set-point went "
+            f"{format_angle(asked_rad)}"
         )
 
     def _frozen(self, torque_nm: float, velocity_rad_s: float, step_rad: float) -> str:

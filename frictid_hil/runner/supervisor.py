@@ -235,7 +235,8 @@ class Supervisor:
                 )
         in_position = self._modes == _POSITION
         if not report.age_cycles:
-            wrong = self._sensors[index].verdict(report, limits.velocity_rad_s, held=in_position)
+            asked_rad = _in_force(set_point, report) if in_position else math.nan
+            wrong = self._sensors[index].verdict(report, limits.velocity_rad_s, asked_rad=asked_rad)
             if wrong:
                 raise self._abort(
                     index,
@@ -258,9 +259,8 @@ class Supervisor:
             )
 
     def _check_following(self, index: int, set_point: SetPoint, report: Feedback) -> None:
-        # Judged against what is in force, where the driver tells: a set-point may be due many ticks later.
-        in_force, bound = report.position_command_rad, self._limits[index].following_error_rad
-        error = (set_point.position_rad if math.isnan(in_force) else in_force) - report.position_rad
+        bound = self._limits[index].following_error_rad
+        error = _in_force(set_point, report) - report.position_rad
         if not abs(error) <= bound:
             raise self._abort(
                 index,
@@ -290,3 +290,9 @@ class Supervisor:
 
     def _abort(self, index: int, what: str, *, cause: str = "", next_step: str = "") -> SafetyAbort:
         return SafetyAbort(what, where=f"joint {self.names[index]}", cause=cause, next_step=next_step)
+
+
+def _in_force(set_point: SetPoint, report: Feedback) -> float:
+    """Where the joint shall be: what is in force, where the driver tells; a set-point may be due many ticks later."""
+    in_force = report.position_command_rad
+    return set_point.position_rad if math.isnan(in_force) else in_force

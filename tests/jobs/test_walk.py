@@ -84,7 +84,7 @@ def named_in_the_page(functions: list[str], heading: str) -> None:
 
 def test_a_set_point_reaches_the_wire_through_twelve_functions_at_most(walks: dict[str, list[str]]) -> None:
     walk = walks["send"]
-    assert walk[0] == "calibrate" and walk[-1] == "Cycle._send"
+    assert walk[0] == "calibrate" and walk[-1] == "MessageFrames.send"
     assert len(walk) <= 12, walk
     named_in_the_page(walk, "A set-point, from `calibrate` to the wire")
 

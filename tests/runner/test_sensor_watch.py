@@ -29,7 +29,7 @@ def reports(cycles, late_ms=lambda n: 0.0, went=1.0, said=1.0, speed=90.0, moves
 
 def verdict(samples):
     watch = SensorWatch(0.001)
-    return next(filter(None, (watch.verdict(report, 200 * DEG, held=True) for report in samples)), "")
+    return next(filter(None, (watch.verdict(report, 200 * DEG, asked_rad=0.0) for report in samples)), "")
 
 
 def stalls(seed):
@@ -106,3 +106,24 @@ def test_the_first_motion_of_half_a_degree_is_not_judged_by_a_stall(seed):
     judged(1.0)
     with pytest.raises(Exception, match="position says"):
         judged(-1.0)
+
+
+def repeated(cycles, torque_nm=lambda n: 1.0, went=lambda n: n):
+    """Somebody repeats a report of a joint that stood, while the set-point goes on by 0.05 deg in every cycle."""
+    watch = SensorWatch(0.001)
+    for n in range(cycles):
+        report = Feedback(t_ns=n * MS, position_rad=0.1, velocity_rad_s=0.0, torque_nm=torque_nm(n))
+        if wrong := watch.verdict(report, 200 * DEG, asked_rad=0.1 + 0.05 * DEG * went(n)):
+            return wrong
+    return ""
+
+
+def test_the_same_report_again_and_again_is_noticed_once_the_set_point_moves():
+    assert "the same position, velocity and torque for 0.1 s" in repeated(103)
+    assert repeated(99) == ""
+
+
+def test_a_joint_that_stands_or_sticks_repeats_nothing_that_matters():
+    assert repeated(1000, went=lambda n: 0) == ""
+    assert repeated(1000, torque_nm=lambda n: 0.01 * (n // 20)) == "", "its loop pulls harder and harder"
+    assert repeated(1000, torque_nm=lambda n: math.nan) == "", "nobody reports a torque"

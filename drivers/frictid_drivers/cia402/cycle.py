@@ -166,7 +166,8 @@ class Cycle:
             decoder.begin(now_ns)
             begun = True
             self._window_end_ns = now_ns + self._timing.window_ns
-            self._send(frames, now_ns)
+            self._log_sent(frames, now_ns)
+            self._frames.send(frames)
             for outgoing, (_, data) in zip(due, frames, strict=False):
                 outgoing.told = data
                 outgoing.told_cycle = decoder.cycle
@@ -176,7 +177,8 @@ class Cycle:
             if now_ns >= self._heartbeat_due_ns:
                 # After the reports, so that no SYNC ever waits behind it.
                 self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
-                self._send([self._heartbeat], clock.now_ns())
+                self._log_sent([self._heartbeat], clock.now_ns())
+                self._frames.send([self._heartbeat])
             self._failures = 0
         except FrictidError:
             raise
@@ -295,11 +297,10 @@ class Cycle:
                     return [outgoing]
         return []
 
-    def _send(self, frames: Sequence[tuple[int, bytes]], t_ns: int) -> None:
+    def _log_sent(self, frames: Sequence[tuple[int, bytes]], t_ns: int) -> None:
         if self._sink is not None:
             for can_id, data in frames:
                 self._sink(t_ns, can_id, data, True)
-        self._frames.send(frames)
 
     def _send_whatever_happens(self, cob_id: int, data: bytes | bytearray, *, fd: bool = False) -> None:
         can_id = cob_id | FD_FRAME if fd else cob_id
