@@ -6,7 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does, before numpy is loaded
 _home = tempfile.mkdtemp(prefix="frictid-tests-")
@@ -14,4 +14,9 @@ for _name in ("FRICTID_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_DATA_HOME"):
     os.environ[_name] = f"{_home}/{_name.lower()}"
     Path(os.environ[_name]).mkdir()
 
-settings.register_profile("fast", max_examples=20)  # the developer's loop; the whole check draws as many as tests say
+# How long a busy computer takes says nothing of what is tested.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
+settings.register_profile(
+    "fast", settings.get_profile("patient"), max_examples=20
+)  # the developer's loop; the whole check draws as many as tests say
