@@ -13,6 +13,7 @@ from cia402_wire import ScriptedDrive, robot
 
 from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.cia402.known_settings import KNOWN_SETTINGS, Effect, timing_of
+from frictid_drivers.cia402.network import Wire
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, UsageError
 from frictid_hil.protocol import can_bus
 from frictid_hil.protocol.can_bus import BusLock
@@ -230,3 +231,19 @@ def test_what_canopen_logs_stays_off_a_persons_screen():
     code = "import logging, frictid_drivers.cia402; logging.getLogger('canopen.sdo').error('transfer aborted')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == ""
+
+
+@pytest.mark.timeout(60)
+def test_a_transfer_that_ends_in_the_middle_of_a_frame_blocks_nothing():
+    """The collector may close a stream of canopen at any moment, and the stream then sends."""
+    told: list[int] = []
+
+    def collected(_now_ns: int, frame_id: int, _data: bytes, _sent: bool) -> None:
+        told.append(frame_id)
+        if len(told) == 1:
+            wire.send_message(0x602, b"\x80")
+
+    with can.Bus(interface="virtual", channel="collected") as bus:
+        wire = Wire(bus, collected, lambda: 0)
+        wire.send_message(0x601, b"\x40")
+    assert told == [0x601, 0x602]

@@ -49,7 +49,9 @@ class Wire(canopen.Network):
         self._wire = bus
         self._sink = sink
         self._now_ns = now_ns
-        self._sink_lock = threading.Lock()
+        # canopen ends a broken transfer when its stream is collected, which may be in the middle of a frame.
+        self.send_lock = threading.RLock()  # type: ignore[assignment]  # canopen's own is not re-entrant
+        self._sink_lock = threading.RLock()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame (canopen's own way out).
