@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from frictid_hil.blind.generator import Assignment, draw_case, write_case
+from frictid_hil.config.nominal import Tolerance
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
+from frictid_hil.gap.tolerances import Tolerances
 from frictid_hil.simulation.effects.torque_saturation import HARD, reported
 
 
@@ -72,3 +74,12 @@ def test_a_lag_of_the_drive_is_told_behind_a_velocity_that_lags_by_another_filte
 def test_play_is_found_behind_a_coarse_encoder(tmp_path: Path) -> None:
     found = diagnose(_drawn(("backlash", "encoder_quantisation"), 42, 102306, tmp_path))
     assert {c.effect for c in found.causes[:2]} == {"backlash", "encoder_quantisation"}
+
+
+@pytest.mark.slow
+def test_an_error_well_within_its_tolerance_is_no_gap_and_one_beyond_it_is_named() -> None:
+    made = gap_sets.make({"friction_level_error": {"error_share": -0.007}})
+    assert diagnose(made).verdict == "none"
+    exact = replace(made.nominal, tolerances=Tolerances.of(Tolerance(friction_torque=0.001)))
+    found = diagnose(replace(made, nominal=exact))
+    assert found.verdict == "explained" and found.causes[0].effect == "friction_level_error"
