@@ -32,6 +32,7 @@ ALIASES = (
 """Pairs that these columns can hardly separate."""
 
 VISIBLE = 1.5
+"""Gap over floor from which an effect counts as visible."""
 SMALL, MEDIUM = 4.0, 12.0
 SIZED_BY = ("inverse_nm", "actuation_nm", "forward_torque_nm")
 _COLUMNS = "time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad"

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.blind.score import CONFIDENT, Answer, Rate
+from frictid_hil.blind.generator import VISIBLE
+from frictid_hil.blind.score import CONFIDENT, Answer, Rate, not_taken_in
 
 FALSE_CLEAR = 3.0
 """Gap over floor from which ``none`` is a false all-clear."""
@@ -29,7 +30,8 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
     """
     absent = {"error": "no answer"}
     cases = [(t, Answer.from_json(documents.get(n, absent)), documents.get(n, absent)) for n, t in truths.items()]
-    visible = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
+    wrong = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]
+    visible = [(t, a) for t, a in wrong if t["size_ratio"] >= VISIBLE]
     named = [(t, effect, chance) for t, a, _ in cases if a.named for effect, chance in a.causes]
     sure = [_wrong(t, a) for t, a, _ in cases if a.confidence >= CONFIDENT]
     off = [(t, a) for t, a in visible if LEVEL in t["main"]]
@@ -48,7 +50,8 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
         },
         "first_or_tied": Rate.over(_right(t, a) or a.first in _tied(t) for t, a in visible).to_json(),
         "none": Rate.over(a.verdict == "none" for t, a, _ in cases if t["kind"] == "none").to_json(),
-        "outside": Rate.over(a.verdict == "unknown" for t, a, _ in cases if t["kind"] == "outside").to_json(),
+        "first_of_all": first(wrong),
+        "outside": Rate.over(not_taken_in(t, a) for t, a, _ in cases if t["kind"] == "outside").to_json(),
         "false_none": Rate.over(
             a.verdict == "none" for t, a, _ in cases if t["size_ratio"] >= FALSE_CLEAR
         ).to_json(),
@@ -73,7 +76,13 @@ def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The rates that a person asks for first, by name."""
     told = {f"first_controller_{name}": rate for name, rate in scores["first_by_controller"].items()}
     names = ("none", "outside", "false_none", "sure_and_wrong", "friction_level_taken_for_another", "parameters")
-    return {"first": scores["first"], **told, "first_or_tied": scores["first_or_tied"], **{n: scores[n] for n in names}}
+    return {
+        "first": scores["first"],
+        "first_of_all": scores["first_of_all"],
+        **told,
+        "first_or_tied": scores["first_or_tied"],
+        **{n: scores[n] for n in names},
+    }
 
 
 def page(result: Mapping[str, Any]) -> str:

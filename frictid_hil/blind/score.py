@@ -156,9 +156,9 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
             "false_alarms": Rate.over(a.verdict != "none" for _, a in healthy).to_json(),
         },
         "outside": {
-            "answered_unknown": Rate.over(_not_taken_in(t, a) for t, a in outside).to_json(),
+            "answered_unknown": Rate.over(not_taken_in(t, a) for t, a in outside).to_json(),
             "by_effect": {
-                name: Rate.over(_not_taken_in(t, a) for t, a in outside if _name(t) == name).to_json()
+                name: Rate.over(not_taken_in(t, a) for t, a in outside if _name(t) == name).to_json()
                 for name in sorted({_name(t) for t, _ in outside})
             },
         },
@@ -260,7 +260,7 @@ def _both_visible(truth: Mapping[str, Any]) -> bool:
     return all(effect.get("size_ratio_alone", math.inf) >= 1.5 for effect in truth["effects"])
 
 
-def _not_taken_in(truth: Mapping[str, Any], answer: Answer) -> bool:
+def not_taken_in(truth: Mapping[str, Any], answer: Answer) -> bool:
     """``unknown`` for what the library does not hold; ``none`` is as right below the gap up to which it is promised."""
     return answer.verdict == "unknown" or (answer.verdict == "none" and truth["size_ratio"] < PROMISED)
 
@@ -269,7 +269,7 @@ def _right(truth: Mapping[str, Any], answer: Answer) -> bool:
     if truth["kind"] == "none":
         return answer.verdict == "none"
     if truth["kind"] == "outside":
-        return _not_taken_in(truth, answer)
+        return not_taken_in(truth, answer)
     if not truth["visible"]:
         return answer.first in ("none", *_names(truth))
     return set(_names(truth)) <= set(answer.named[: len(truth["effects"])])
