@@ -143,7 +143,7 @@ def _in_mujoco(
             _fill_history(library, m, data)
     relax(m, data)
     library.mj_forward(m, data)
-    _let_friction_hold(m, data, number, start_nm)
+    _let_friction_hold(m, data, number, 0.0 if control is not None else start_nm)
     torque, rate = np.empty(command.size), np.gradient(command, float(m.opt.timestep))
     integral, last, step_s = start_nm, command[0], float(m.opt.timestep)
     for k, wanted in enumerate(command):
@@ -180,13 +180,13 @@ def _let_link_rest(library: Any, m: Any, data: Any, motor_dof: int) -> None:
     data.qvel[:] = 0.0
 
 
-def _let_friction_hold(m: Any, data: Any, joint: int, drive_nm: float) -> None:
-    """Bend a joint's spring that yields until it holds what the drive does not, as on a machine that has stopped."""
+def _let_friction_hold(m: Any, data: Any, joint: int, applied_nm: float) -> None:
+    """Bend a joint's spring that yields until it holds what actuators and ``applied_nm`` leave, as at rest."""
     at = int(m.jnt_plasticadr[joint]) if hasattr(m, "jnt_plasticadr") else -1
     if at < 0:
         return
     dof, stiffness = int(m.jnt_dofadr[joint]), float(m.jnt_stiffness[joint])
-    left_nm = float(data.qfrc_bias[dof] - data.qfrc_passive[dof]) - drive_nm
+    left_nm = float(data.qfrc_bias[dof] - data.qfrc_passive[dof] - data.qfrc_actuator[dof]) - applied_nm
     largest = stiffness * float(m.jnt_springyield[joint])
     data.plastic[at] += min(largest, max(-largest, left_nm)) / stiffness
 
