@@ -133,10 +133,11 @@ def _in_mujoco(
         _let_link_rest(library, m, data, dof)
     drive = drive_of(m, number) if believed.motor is not None else None
     gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
+    own_gear = believed.motor.gear if believed.motor is not None else 1.0
     control = control_of(m, drive)
     if control is not None:
         # What the other side begins with: the torque that holds the joint.
-        data.ctrl[control] = gear * (command[0] + start_nm / loop.kp_nm_per_rad) if by_position else start_nm / gear
+        data.ctrl[control] = gear * (command[0] + start_nm / loop.kp_nm_per_rad) if by_position else start_nm / own_gear
         if drive is not None and (adr := int(m.actuator_actadr[drive])) >= 0:
             data.act[adr] = data.ctrl[control]  # a drive that lags holds the joint already
         if hasattr(library, "mj_initCtrlHistory"):
@@ -160,7 +161,7 @@ def _in_mujoco(
             else:
                 integral += loop.ki_nm_per_rad_s * error * step_s
             if control is not None:
-                data.ctrl[control] = demand / (believed.motor.gear if believed.motor is not None else 1.0)
+                data.ctrl[control] = demand / own_gear
             else:
                 data.qfrc_applied[dof] = demand
         library.mj_step(m, data)
