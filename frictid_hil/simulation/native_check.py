@@ -184,9 +184,9 @@ def _let_link_rest(library: Any, m: Any, data: Any, motor_dof: int) -> None:
 def _let_friction_hold(m: Any, data: Any, joint: int, applied_nm: float) -> None:
     """Bend a joint's spring that yields until it holds what actuators and ``applied_nm`` leave, as at rest."""
     at = int(m.jnt_plasticadr[joint]) if hasattr(m, "jnt_plasticadr") else -1
-    if at < 0:
-        return
     dof, stiffness = int(m.jnt_dofadr[joint]), float(m.jnt_stiffness[joint])
+    if at < 0 or stiffness == 0.0:
+        return
     left_nm = float(data.qfrc_bias[dof] - data.qfrc_passive[dof] - data.qfrc_actuator[dof]) - applied_nm
     largest = stiffness * float(m.jnt_springyield[joint])
     data.plastic[at] += min(largest, max(-largest, left_nm)) / stiffness

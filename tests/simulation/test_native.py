@@ -119,6 +119,18 @@ def test_a_change_of_something_else_is_seen(robot: RobotModel, tmp_path: Path) -
     assert not any("dof_armature" in told for told in changed_elsewhere(a, b, {"joint": Native()}))
 
 
+def test_a_spring_that_yields_gives_way_to_frictionloss(bench: Any, tmp_path: Path) -> None:
+    path = bench.model_file(tmp_path, "wrist", STEP_S)
+    path.write_text(path.read_text().replace("frictionloss=", 'stiffness="20000" springyield="0.00015" frictionloss='))
+    robot, model = RobotModel.load(path), bench.joint_named("wrist").with_effects(bench.sizes("wrist", "viscous_error"))
+    use = Use(np.linspace(0.01, 1.6, 200), np.linspace(0.0, 1.0, 50), STEP_S)
+    exported = compiled_with(robot, {"joint": native_elements(robot.joint("joint"), model, use, "loss", friction=True)})
+    time, command = (column[:1000] for column in bench.motions()["sine"])
+    posture = robot.posture({})
+    ours = in_posture(robot, "joint", model, posture)
+    assert torque_difference(robot, exported, "joint", ours, posture, time, command) < 0.05
+
+
 def test_friction_is_left_alone_where_no_cause_concerns_it(bench: Any, robot: RobotModel) -> None:
     model = bench.joint_named("wrist").with_effects({"torque_bias": {"bias_nm": 0.4}})
     use = Use(np.linspace(0.01, 1.0, 50), np.zeros(1), STEP_S)
