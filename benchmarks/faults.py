@@ -551,7 +551,7 @@ class Bench:
                     verb.run()
             except FrictidError as error:
                 _ended(verdict, error)
-            except TimeoutError:
+            except Hangs:
                 verdict.failures.append("hangs")
             except Exception as error:
                 verdict.ended, verdict.said = "traceback", f"{type(error).__name__}: {error}"
@@ -656,8 +656,12 @@ def _no_faults() -> Iterator[None]:
     os.environ[ENVIRONMENT] = before
 
 
+class Hangs(BaseException):
+    """Nothing of the program may take this for an error of its bus."""
+
+
 def _hangs(_number: int, _frame: object) -> None:
-    raise TimeoutError("hangs")
+    raise Hangs
 
 
 def _ended(verdict: Verdict, error: FrictidError | None) -> None:

@@ -88,7 +88,7 @@ class Running:
 
     @staticmethod
     def _listen(channel: str) -> can.BusABC:
-        for _ in range(200):
+        for _ in range(900):
             with contextlib.suppress(can.CanError, OSError):
                 return can.Bus(interface="frictid", channel=channel)
             time.sleep(0.1)
