@@ -49,7 +49,8 @@ def test_the_second_joint_of_the_pendulum_has_a_gap_that_no_effect_closes(
     found = diagnose(benchmark.double_pendulum(REAL, "c1", 2, odd_judged))
     # Beyond two floors and beyond what friction repeats to: nothing is named, and nothing is cleared either.
     assert found.verdict == "unknown" and not found.causes
-    assert min(found.held_out.values()) > -10.0
+    # The best of them takes 5.2 % of the squares away, 2.6 % of the gap.
+    assert min(found.held_out.values()) > -5.5
 
 
 @pytest.mark.slow

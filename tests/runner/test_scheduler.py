@@ -233,11 +233,13 @@ def test_no_joint_that_has_warmed_up_ends_the_motion_of_the_others() -> None:
     """Only a joint alone stops at the end of a cycle: the cycles of others end at other times."""
     loop: Any = SimpleNamespace(period_s=0.001)
     driver: Any = SimpleNamespace(clock=SimpleNamespace(lock_step=True))
+    nobody: Any = None
     joints = dict(enumerate(ROBOT.to_setup().joints[:2]))
 
     def sources(*indices: int) -> list[str]:
         mine: Any = {index: joints[index] for index in indices}
-        motions = Motions(driver, loop, None, mine, dict.fromkeys(mine), approach_rad_s=0.1, notify=print)  # type: ignore[arg-type]
+        limits = dict.fromkeys(mine, nobody)
+        motions = Motions(driver, loop, nobody, mine, limits, approach_rad_s=0.1, notify=print)
         warm_ups = {index: WarmUp(0.0, 0.1 + 0.1 * index, 1.0, 60.0, 1.0) for index in indices}
         return [type(source).__name__ for source in motions._sources(warm_ups)[0].values()]
 
