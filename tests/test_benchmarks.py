@@ -170,5 +170,6 @@ def test_a_round_of_the_soak_keeps_nothing(benchmark_named: Callable[[str], Any]
 def test_memory_is_compared_from_early_to_late(benchmark_named: Callable[[str], Any]) -> None:
     soak = benchmark_named("soak")
     held = soak.held()
-    rounds = [200.0] * 2 + [250.0] * 17 + [255.0] * 2
-    assert soak.Soaked(rounds, held, held, {}, 1.0).growth == pytest.approx(0.02)
+    rounds = [200.0] * 7 + [250.0] * 17 + [255.0] * 3
+    soaked = soak.Soaked(rounds, [300.0] * 27, 7, held, held, {}, 1.0)
+    assert (soaked.growth, soaked.growth_with_freed) == pytest.approx((0.02, 0.0))

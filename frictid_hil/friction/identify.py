@@ -111,7 +111,7 @@ def _windows(procedure: Procedure) -> tuple[Array, Array]:
     return procedure.cycle_starts_s, procedure.ratio * procedure.peak_velocities_rad_s
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=2)  # on the wall clock no two recordings are sampled alike: few are kept, they are large
 def _by_sample(procedure: Procedure, lengths: tuple[int, ...]) -> tuple[Array, Array]:
     """Threshold of every sample, forwards and backwards: the same for all recordings that were sampled alike."""
     above = _windows(procedure)[1].repeat(lengths)

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -152,3 +154,15 @@ def test_unequal_lengths_are_refused():
     time, v, f = perfect()
     with pytest.raises(IdentificationError, match="equal 1-D shapes"):
         function_a(time, v[:-1], f, P)
+
+
+def test_recordings_that_are_sampled_unlike_leave_little_behind():
+    """On the wall clock no two recordings have the same number of samples: each one's thresholds were kept."""
+    recordings = [perfect(step=1e-3 * (1 + 0.01 * n)) for n in range(20)]
+    tracemalloc.start()
+    for recording in recordings:
+        function_a(*recording, P)
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert kept < 5 * recordings[0][0].nbytes
