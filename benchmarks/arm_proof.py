@@ -21,7 +21,8 @@ import numpy as np
 from arm_in_mujoco import JOINTS, Machine, write_case
 
 from frictid_hil.jobs.gap.from_model import ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.write_model import closed_loop_gap, exports
+from frictid_hil.jobs.gap.nearer import nearer_only
+from frictid_hil.jobs.gap.write_model import exports
 from frictid_hil.jobs.gap_diagnose_arm import diagnosed
 
 DRY_NM = {"pan": 9.0, "lift": 9.0, "elbow": 6.0, "wrist_1": 1.8, "wrist_2": 1.8, "wrist_3": 1.8}
@@ -98,8 +99,7 @@ def judged(seed: int, number: int, seconds: float, executor: str | None = None) 
         arm = sets_from_model(ModelLogs(folder / "arm.xml", logs, columns=str(folder / "columns.yaml")))
         found = diagnosed(arm, executor)
         took_s = time.perf_counter() - begin
-        made = exports(arm, found)
-        gap = closed_loop_gap(arm, made)
+        made, gap = nearer_only(arm, exports(arm, found))
     right = {j: any(c.effect == e for c in found[j].causes) for j, e in sealed.effects.items()}
     first = {j: bool(found[j].causes) and found[j].causes[0].effect == e for j, e in sealed.effects.items()}
     named = {j: [c.effect for c in d.causes] for j, d in found.items() if d.verdict == "explained"}
@@ -121,6 +121,7 @@ def judged(seed: int, number: int, seconds: float, executor: str | None = None) 
         "arm": cause.effect if cause is not None else "",
         "arm_right": (cause.effect if cause is not None else "") == sealed.arm,
         "closed_percent": closed,
+        "left_out": gap["left_out"],
         "seconds": round(took_s, 1),
     }
 

@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 from arm_in_mujoco import JOINTS, STEP_S, Machine, write_case
 
+from frictid_hil.jobs.gap.closed_loop import gap_of
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, Motion, sets_from_model
-from frictid_hil.jobs.gap.write_model import exports, gap_of
+from frictid_hil.jobs.gap.nearer import nearer_only
+from frictid_hil.jobs.gap.write_model import exports, natives
 from frictid_hil.jobs.gap_diagnose_arm import diagnosed
 from frictid_hil.simulation.model_edit import compiled_with
 from frictid_hil.simulation.robot_model import relax
@@ -127,8 +129,8 @@ def main() -> None:
         arm = sets_from_model(ModelLogs(folder / "arm.xml", logs, columns=str(folder / "columns.yaml")))
         told("the file as it was", arm, arm.robot.compiled, 0.0)
         found = diagnosed(arm, "processes:1")
-        made = exports(arm, found)
-        told("frictid-hil", arm, compiled_with(arm.robot, {n: e.native for n, e in made.items()}),
+        made, _ = nearer_only(arm, exports(arm, found))
+        told("frictid-hil", arm, compiled_with(arm.robot, natives(made)),
              time.perf_counter() - begin)  # fmt: skip
         print("  named:", {n: [c.effect for c in d.causes] for n, d in found.items() if d.verdict != "none"})
         begin = time.perf_counter()

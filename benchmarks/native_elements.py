@@ -147,8 +147,7 @@ def measured(
         robot = RobotModel.load(model_file(Path(folder), name, step_s, integrator))
         model = joint_named(name).with_effects(sizes(name, effect))
         speeds = np.linspace(0.01, 1.6, 200)
-        places = np.linspace(0.0, 1.0, 50)
-        use = Use(speeds, places, step_s)
+        use = Use(speeds, JOINTS[name]["gravity"] * np.cos(np.linspace(0.0, 1.0, 50)), step_s)
         posture = robot.posture({})
         ours = in_posture(robot, "joint", model, posture)
         for form in FORMS if not effect or effect in FRICTION else FORMS[:1]:

@@ -122,6 +122,8 @@ def _print_arm_cause(output: Output, result: Result) -> None:
 
 def _print_export(output: Output, result: Result) -> None:
     """The user's simulator before and after, and what was written where."""
+    from frictid_hil.jobs.gap.nearer import left_out_words
+
     loop = result["closed_loop"]
     if "reason" in loop:
         output.out.print(f"closed loop of your model: {loop['reason']}", markup=False, soft_wrap=True)
@@ -133,8 +135,8 @@ def _print_export(output: Output, result: Result) -> None:
             torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
             table.add_row(name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states))
         output.out.print(table)
-        for name in loop["farther"]:
-            output.out.print(f"{name}: the change takes your model farther from the recording; look before you use it")
+        for line in left_out_words(loop):
+            output.out.print(line, markup=False, soft_wrap=True)
     for name, joint in result.get("export", {}).get("joints", {}).items():
         off = joint["torque_difference_percent"]
         how = (

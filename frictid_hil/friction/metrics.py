@@ -102,3 +102,22 @@ def ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
     reach = float(stats.t.ppf(0.975, min(one.size for one in squares) - 1) * np.hypot(*errors))
     middle = float(np.sqrt(np.mean(squares[1]) / np.mean(squares[0])))
     return middle * float(np.exp(-reach)), middle * float(np.exp(reach))
+
+
+def paired_ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
+    """95 % interval of a root mean square over another, of two models along the same parts of a motion.
+
+    Args:
+        before: RMS of each part, shape (n,).
+        after: RMS of the same parts, shape (n,).
+
+    Returns:
+        None with fewer than two parts, or where ``before`` vanishes.
+    """
+    was, now = np.square(before), np.square(after)
+    if was.size < 2 or float(np.mean(was)) <= 0.0:
+        return None
+    ratio = float(np.mean(now) / np.mean(was))
+    error = float(np.std(now - ratio * was, ddof=1) / np.mean(was)) / np.sqrt(was.size)
+    reach = float(stats.t.ppf(0.975, was.size - 1)) * error
+    return float(np.sqrt(max(0.0, ratio - reach))), float(np.sqrt(ratio + reach))

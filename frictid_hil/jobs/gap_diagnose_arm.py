@@ -13,9 +13,11 @@ from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
+from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.write_model import Export, closed_loop_gap, exports, side_by_side, write_model
+from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
+from frictid_hil.jobs.gap.write_model import Export, exports, natives, write_model
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.arm import arm_page
 from frictid_hil.report.gap import gap_page
@@ -53,7 +55,8 @@ def diagnose_arm(
     Returns:
         The JSON of the verb: ``joints`` by name, each as the diagnosis of a set, with ``believed``, ``drafted`` and
         ``asked``; ``held``, ``still``, ``logs``, ``summary`` and ``arm`` (causes of no single joint); ``closed_loop``
-        of the user's model before and after in MuJoCo; ``export`` of a model that was written; ``report`` of the arm.
+        of the user's model before and after in MuJoCo, with what was ``left_out`` as it came no nearer; ``export`` of a
+        model that was written; ``report`` of the arm.
     """
     arm = sets_from_model(asked)
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
@@ -73,12 +76,11 @@ def diagnose_arm(
         "arm": _of_the_arm(arm.found),
         "joints": joints,
     }
-    made = exports(arm, found, apply=apply)
-    result["closed_loop"] = closed_loop_gap(arm, made)
+    made, result["closed_loop"] = nearer_only(arm, exports(arm, found, apply=apply))
     if write is not None:
-        result |= _written(arm, made, write, force)
+        result |= _written(arm, made, result["closed_loop"]["left_out"], write, force)
     if wanted is not None and wanted.files:
-        result["targets"] = write_targets(arm, found, wanted, apply=apply, force=force)
+        result["targets"] = write_targets(arm, found, made, wanted, force=force)
     if out is not None:
         _make_folder(out)
         for name, told in joints.items():
@@ -103,14 +105,19 @@ def _page_of_the_arm(
             f"These motions tell {base.rank} combinations of {base.columns} inertial parameters apart (condition "
             f"{base.condition:.0f})."
         )
+    notes += left_out_words(told["closed_loop"])
     notes += [f"{name} stands still in every log, so nothing can be said of it." for name in arm.still]
-    runs, why = side_by_side(arm, made), str(told["closed_loop"].get("reason", ""))
+    runs, why = side_by_side(arm, natives(made)), str(told["closed_loop"].get("reason", ""))
     return arm_page(arm.robot.path.stem, str(told["summary"]), found, pages, notes, runs, why)
 
 
-def _written(arm: ArmSet, made: Mapping[str, Export], write: Path, force: bool) -> dict[str, Any]:
+def _written(
+    arm: ArmSet, made: Mapping[str, Export], left_out: Mapping[str, Any], write: Path, force: bool
+) -> dict[str, Any]:
     if not made:
         why = "no cause is sure enough to change the model; record what is asked for, or add --apply"
+        if left_out:
+            why = "no change brings your model nearer to the recordings that were not fitted"
         return {"model": None, "model_refused": why}
     told = write_model(arm, made, write, force=force)
     return {"model": told["model"], "export": told}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from frictid_hil.friction.metrics import ratio_interval, rms_by_part
+from frictid_hil.friction.metrics import paired_ratio_interval, rms_by_part
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.where import by_region
@@ -15,7 +15,7 @@ from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, 
 from frictid_hil.report.pages import Link, Page, Section, Table
 from frictid_hil.simulation.effect import Region
 
-_PART_S = 2.0
+PART_S = 2.0
 """Parts of a motion whose differences count as independent of one another."""
 _SHOWN = 0.03
 """Share of an arm's largest gap below which a region has no colour of its own."""
@@ -112,18 +112,18 @@ def _where(found: Mapping[str, Diagnosis]) -> list[Figure]:
 def _before_and_after(runs: Sequence[JointRun]) -> Table:
     rows = []
     for run in runs:
-        parts = max(2, int((run.time_s[-1] - run.time_s[0]) / _PART_S))
+        parts = max(2, int((run.time_s[-1] - run.time_s[0]) / PART_S))
         before = rms_by_part(run.measured - run.nominal, parts)
         told = [run.joint, run.quantity, f"{_rms(before):.3g}", "-", "-"]
         if run.improved is not None:
             after = rms_by_part(run.measured - run.improved, parts)
-            left = ratio_interval(before, after)
+            left = paired_ratio_interval(before, after)
             told[3] = f"{_rms(after):.3g}"
             if left is not None:
                 told[4] = f"{100 * _rms(after) / _rms(before):.0f} % ({100 * left[0]:.0f} to {100 * left[1]:.0f} %)"
         rows.append(tuple(told))
     headings = ("joint", "difference to the machine", "your model", "improved", "left, noise included")
-    caption = f"RMS along the motion below; in brackets the 95 % interval, from parts of {_PART_S:g} s."
+    caption = f"RMS along the motion below; in brackets the 95 % interval, from parts of {PART_S:g} s."
     return Table(headings, tuple(rows), caption=caption)
 
 

@@ -145,7 +145,9 @@ def _body(inertia_kg_m2: float, cos_nm: float, sin_nm: float) -> str:
 def _own_friction(model: JointModel) -> Native:
     """Friction and ripple as elements of MuJoCo, without the callback."""
     bare = ModelJoint("joint", False, None, 0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0), None, False, 0.0, None)
-    use = Use(np.linspace(0.02, 2.0, 100), np.linspace(-0.5, 0.5, 11), STEP_S)
+    places = np.linspace(-0.5, 0.5, 11)
+    gravity_nm = model.gravity_cos_nm * np.cos(places) + model.gravity_sin_nm * np.sin(places)
+    use = Use(np.linspace(0.02, 2.0, 100), gravity_nm, STEP_S)
     kept = {name: values for name, values in model.effects.items() if name in FRICTION or name == "torque_ripple"}
     form = "lugre" if "stribeck" in kept else "spring"
     return native_elements(bare, replace(model, effects=kept), use, form, friction=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,6 +45,8 @@ _LOOP_ENDS = 20.0
 """Travel over that of a presliding loop, after which it is turned over."""
 _LOOP_KNOTS = (0.3, 0.6, 0.85, 0.97)
 """Parts of its turn-over at which one of the springs that stand for it yields."""
+_LOADS = (np.arange(12) + 0.5) / 12
+"""Quantiles of the load at which friction that depends on it is read."""
 _LEAST_SHARE = 0.03
 """Share of a loop below which a spring is not worth its line."""
 FAR_RAD = 3e5
@@ -57,13 +59,13 @@ class Use:
 
     Attributes:
         speed_rad_s: speeds of the recordings, shape (n,), positive.
-        position_rad: positions of the recordings, shape (n,).
+        load_nm: torque passed on to the link along the recordings, shape (n,).
         timestep_s: of the user's model.
         own_gravity_share: gravity torque of the joint's own body over that of all that it carries.
     """
 
     speed_rad_s: Array
-    position_rad: Array
+    load_nm: Array
     timestep_s: float
     own_gravity_share: float = 1.0
 
@@ -225,11 +227,12 @@ def _slip_elements(hysteresis: Mapping[str, float]) -> list[tuple[float, float]]
 
 
 def _sliding(model: JointModel, speed: Array, use: Use) -> tuple[Array, float]:
-    """(odd part over speed, mean even part) of steady sliding, at the positions of the recordings."""
+    """(odd part over speed, mean even part) of steady sliding, under the loads of the recordings."""
     loaded = {"load_dependent_friction", "directional_efficiency"} & set(model.effects)
-    places = np.quantile(use.position_rad, (0.05, 0.25, 0.5, 0.75, 0.95)) if loaded else [0.0]
-    forward = np.mean([steady_friction_nm(model, speed, position_rad=float(q)) for q in places], axis=0)
-    backward = np.mean([steady_friction_nm(model, -speed, position_rad=float(q)) for q in places], axis=0)
+    loads = np.quantile(use.load_nm, _LOADS) if loaded else [0.0]
+    under = [replace(model, gravity_cos_nm=float(load), gravity_sin_nm=0.0) for load in loads]
+    forward = np.mean([steady_friction_nm(one, speed) for one in under], axis=0)
+    backward = np.mean([steady_friction_nm(one, -speed) for one in under], axis=0)
     return 0.5 * (forward - backward), float(np.mean(0.5 * (forward + backward)))
 
 

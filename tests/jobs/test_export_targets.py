@@ -15,6 +15,7 @@ pytest.importorskip("mujoco", minversion="4.0")
 
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
+from frictid_hil.jobs.gap.write_model import exports
 
 MODEL = """<mujoco><compiler angle="radian"/><worldbody><body>
   <inertial pos="0.4 0 0" mass="2" diaginertia="0.1 0.1 0.1"/>
@@ -45,7 +46,7 @@ def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: Ar
     cause = Cause("friction_level_error", 0.9, {"error_share": Value(0.5, 0.4, 0.6)})
     found = {"lift": Diagnosis("lift", "explained", (cause,), (), Figures(), Figures(), Figures())}
     wanted = Wanted({"samples": tmp_path / "s.json", "c": tmp_path / "f.h"}, samples=200)
-    told = write_targets(arm, found, wanted, apply=False, force=False)
+    told = write_targets(arm, found, exports(arm, found), wanted, force=False)
     drawn = json.loads((tmp_path / "s.json").read_text())["samples"]
     levels = np.array([sample["lift"]["dry_nm"] for sample in drawn])
     slopes = np.array([sample["lift"]["viscous_nm_s_per_rad"] for sample in drawn])
@@ -53,7 +54,7 @@ def test_samples_spread_as_the_interval_says_and_nothing_is_written_over(arm: Ar
     assert np.corrcoef(levels, slopes)[0, 1] > 0.99, "a wrong level scales the whole curve, so both hang together"
     assert told["c"]["files"] == [str(tmp_path / "f.h")] and told["samples"]["lost"]
     with pytest.raises(UsageError, match="would be overwritten"):
-        write_targets(arm, found, wanted, apply=False, force=False)
+        write_targets(arm, found, exports(arm, found), wanted, force=False)
 
 
 @pytest.mark.slow
@@ -70,7 +71,8 @@ def test_numbers_of_a_sample_come_from_one_draw_of_the_posterior(arm: ArmSet, tm
         for k, s in enumerate(shares)
     )
     found = {"lift": Diagnosis("lift", "explained", causes, (), Figures(), Figures(), Figures(), samples=draws)}
-    write_targets(arm, found, Wanted({"samples": tmp_path / "s.json"}, samples=300), apply=False, force=False)
+    wanted = Wanted({"samples": tmp_path / "s.json"}, samples=300)
+    write_targets(arm, found, exports(arm, found), wanted, force=False)
     drawn = [sample["lift"] for sample in json.loads((tmp_path / "s.json").read_text())["samples"]]
     held = [(one["dry_nm"], one["viscous_nm_s_per_rad"] / one["dry_nm"]) for one in drawn if one["dry_nm"] > 2.1]
     assert np.corrcoef(np.array(held).T)[0, 1] < -0.9

@@ -15,8 +15,10 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
 
 pytest.importorskip("mujoco", minversion="4.0")
 
+from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.write_model import applied, closed_loop_gap, exports, write_model
+from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
+from frictid_hil.jobs.gap.write_model import applied, exports, natives, write_model
 from frictid_hil.simulation.robot_model import RobotModel
 
 LIFT = {"error_share": 0.5}
@@ -67,13 +69,36 @@ def test_the_cause_is_written_into_a_copy_that_is_nearer_to_the_machine(arm: Arm
         write_model(arm, made, out)
     write_model(arm, made, out, force=True)
 
-    gap = closed_loop_gap(arm, made)
+    gap = closed_loop_gap(arm, natives(made))
     assert gap["after"]["lift"]["torque_nm"] < 0.25 * gap["before"]["lift"]["torque_nm"]
     assert gap["after"]["lift"]["position_rad"] < 0.5 * gap["before"]["lift"]["position_rad"]
     assert gap["after"]["wrist_3"]["torque_nm"] == pytest.approx(gap["before"]["wrist_3"]["torque_nm"], rel=0.05)
-    assert gap["farther"] == []
-    wrong = exports(arm, healthy(arm, pan=found("explained"), lift=found("explained")))
-    assert closed_loop_gap(arm, wrong)["farther"] == ["pan"], "friction that the pan has not"
+    low, high = gap["left_percent"]["lift"]["interval_95"]
+    assert low < gap["left_percent"]["lift"]["value"] < high < 40.0
+
+
+@pytest.mark.slow
+def test_what_takes_the_model_farther_from_the_machine_is_left_out_and_told(arm: ArmSet) -> None:
+    bias = Cause("torque_bias", 0.9, {"bias_nm": Value(12.0)})
+    level = Cause("friction_level_error", 0.9, {"error_share": Value(0.5)})
+    lift = Diagnosis("joint", "explained", (bias, level), (), Figures(), Figures(), Figures())
+    made, told = nearer_only(arm, exports(arm, healthy(arm, pan=found("explained"), lift=lift)))
+    assert list(made) == ["lift"] and set(made["lift"].model.effects) == {"friction_level_error"}
+    pan, lift_out = told["left_out"]["pan"], told["left_out"]["lift"]
+    assert pan["effects"] == ["friction_level_error"] and pan["instead"] == [], "friction that the pan has not"
+    assert pan["left_percent"]["value"] > 100.0
+    assert lift_out["effects"] == ["torque_bias"] and lift_out["instead"] == ["friction_level_error"]
+    assert told["left_percent"]["lift"]["interval_95"][1] < 100.0 and "pan" not in told["left_percent"]
+    words = left_out_words(told)
+    assert any(line.startswith("lift: torque_bias would leave") and "friction_level" in line for line in words)
+    assert any(line.startswith("pan:") and line.endswith("nothing is written") for line in words)
+
+
+def test_a_cause_below_an_even_chance_is_not_written() -> None:
+    causes = tuple(Cause(e, c, {p: Value(0.1)}) for e, c, p in (
+        ("friction_level_error", 0.9, "error_share"), ("torque_bias", 0.3, "bias_nm")))  # fmt: skip
+    told = Diagnosis("joint", "explained", causes, (), Figures(), Figures(), Figures())
+    assert set(applied(told, apply=False)) == {"friction_level_error"}
 
 
 @pytest.mark.slow
@@ -126,4 +151,4 @@ def test_a_urdf_gets_what_it_can_hold_and_the_rest_beside_it(tmp_path: Path) -> 
     assert "<!-- the only joint -->" in (tmp_path / "better.urdf").read_text()
     assert "torque_bias" in (tmp_path / "better.effects.yaml").read_text()
     assert "URDF cannot hold" in told["joints"]["lift"]["lost"]["torque_bias"]
-    assert "closed_loop" not in told and "no position" in closed_loop_gap(arm, made)["reason"]
+    assert "closed_loop" not in told and "no position" in closed_loop_gap(arm, natives(made))["reason"]

@@ -49,7 +49,7 @@ EFFECTS = (
 def test_the_edited_file_moves_as_our_own_simulation(bench: Any, robot: RobotModel, effect: str) -> None:
     model = bench.joint_named("wrist").with_effects(bench.sizes("wrist", effect))
     form = "lugre" if effect == "stribeck" else "spring"
-    use = Use(np.linspace(0.01, 1.6, 200), np.linspace(0.0, 1.0, 50), STEP_S)
+    use = Use(np.linspace(0.01, 1.6, 200), 4.0 * np.cos(np.linspace(0.0, 1.0, 50)), STEP_S)
     native = native_elements(robot.joint("joint"), model, use, form, friction=True)
     exported = compiled_with(robot, {"joint": native})
     time, command = (column[:2500] for column in bench.motions()["sine"])
@@ -123,7 +123,7 @@ def test_a_spring_that_yields_gives_way_to_frictionloss(bench: Any, tmp_path: Pa
     path = bench.model_file(tmp_path, "wrist", STEP_S)
     path.write_text(path.read_text().replace("frictionloss=", 'stiffness="20000" springyield="0.00015" frictionloss='))
     robot, model = RobotModel.load(path), bench.joint_named("wrist").with_effects(bench.sizes("wrist", "viscous_error"))
-    use = Use(np.linspace(0.01, 1.6, 200), np.linspace(0.0, 1.0, 50), STEP_S)
+    use = Use(np.linspace(0.01, 1.6, 200), 4.0 * np.cos(np.linspace(0.0, 1.0, 50)), STEP_S)
     exported = compiled_with(robot, {"joint": native_elements(robot.joint("joint"), model, use, "loss", friction=True)})
     time, command = (column[:1000] for column in bench.motions()["sine"])
     posture = robot.posture({})

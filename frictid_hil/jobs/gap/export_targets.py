@@ -13,7 +13,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.jobs.gap.from_model import ArmSet
-from frictid_hil.jobs.gap.write_model import applied, joint_model, use_of
+from frictid_hil.jobs.gap.write_model import Export, joint_model, use_of
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, written_as
 
@@ -60,9 +60,9 @@ class Wanted:
 
 
 def write_targets(
-    arm: ArmSet, found: Mapping[str, Diagnosis], wanted: Wanted, *, apply: bool, force: bool
+    arm: ArmSet, found: Mapping[str, Diagnosis], made: Mapping[str, Export], wanted: Wanted, *, force: bool
 ) -> dict[str, Any]:
-    """Write every target that is wanted, of all joints with a friction curve.
+    """Write every target that is wanted, of all joints with a friction curve; with the causes that ``made`` has.
 
     Raises:
         UsageError: a file is there already.
@@ -76,7 +76,7 @@ def write_targets(
         if joint.experiments.nominal.curve is None:
             continue
         use = use_of(arm, name)
-        effects = applied(found[name], apply=apply)
+        effects = made[name].model.effects if name in made else {}
         stiffness = found[name].presliding_nm_per_rad
         joints[name] = numbers_of(joint.believed, joint_model(joint, effects, stiffness), use)
         drawn: list[Numbers] = []

@@ -1,41 +1,33 @@
-"""The improved model in the user's own file, and how near it comes: measured in the user's engine."""
+"""The improved model in the user's own file: what to change for each joint, and writing it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from frictid_hil.config.write import dump
 from frictid_hil.errors import FrictidError
 from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.diagnose import UNDECIDED
 from frictid_hil.gap.diagnosis import Diagnosis
-from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, Motion
-from frictid_hil.report.arm import JointRun
+from frictid_hil.jobs.gap.closed_loop import fitted, gap_of, why_no_closed_loop
+from frictid_hil.jobs.gap.from_model import ArmSet, JointSet
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
 from frictid_hil.simulation.model_edit import changed_elsewhere, compiled_with, edited_files
-from frictid_hil.simulation.model_replay import replayed, why_not_replayed
 from frictid_hil.simulation.native import FORMS, FRICTION, Native, Use, native_elements
 from frictid_hil.simulation.native_check import in_posture, torque_difference
 
-FARTHER = 1.05
-"""Gap after over that before, from which an improved joint is told to be none."""
-SHOWN_S = 20.0
-"""Length of the withheld motion that a page shows."""
 CHECKED_S = 10.0
 """Length of the withheld motion along which an export is compared with our own simulation."""
 PRESLIDING_RAD = 2e-4
 """Travel in which friction builds up, where nobody says it."""
-CUTOFF_HZ = 20.0
-"""Low-pass of torques that are compared with measured ones."""
 _FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9]))
 
 
@@ -56,6 +48,11 @@ class Export:
     off: Mapping[str, float]
 
 
+def natives(made: Mapping[str, Export]) -> dict[str, Native]:
+    """What is changed, by joint."""
+    return {name: export.native for name, export in made.items()}
+
+
 def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False) -> dict[str, Export]:
     """What to change in the user's model, by joint; only joints with named causes, or drafted friction.
 
@@ -71,7 +68,7 @@ def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False)
     for name, effects in wanted.items():
         joint = arm.joints[name]
         if (effects or joint.drafted) and joint.experiments.nominal.curve is not None:
-            made[name] = _export(arm, joint, effects, found[name].presliding_nm_per_rad)
+            made[name] = export_of(arm, joint, effects, found[name].presliding_nm_per_rad)
     return made
 
 
@@ -80,9 +77,8 @@ def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[
 
     A chain from command to position holds the lag of the servo's loop, which the model has too: it is taken off.
     """
-    fitted = [motion for motion in arm.motions if not motion.validation] or arm.motions
-    names = arm.recorded
-    if not wanted or why_not_replayed(arm.robot, names, _commanded(fitted, names)) is not None:
+    motions, names = fitted(arm), arm.recorded
+    if not wanted or why_no_closed_loop(arm, motions) is not None:
         return {}
     made = {}
     for name, effects in wanted.items():
@@ -92,8 +88,8 @@ def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[
         native = native_elements(joint.believed, model, use_of(arm, name), "", friction=False)
         native.lost |= {e: _NEEDS_TORQUE for e in effects if e not in _TIMING}
         made[name] = Export(model, native, "", {})
-    before = gap_of(arm, arm.robot.compiled, fitted)[1]
-    after = gap_of(arm, compiled_with(arm.robot, {n: export.native for n, export in made.items()}), fitted)[1]
+    before = gap_of(arm, arm.robot.compiled, motions)[1]
+    after = gap_of(arm, compiled_with(arm.robot, natives(made)), motions)[1]
     nearer = {name for name, off, was in zip(names, after, before, strict=True) if off < was}
     return {name: export for name, export in made.items() if name in nearer}
 
@@ -118,11 +114,14 @@ def _beyond_own_lag(joint: JointSet, effects: Mapping[str, Mapping[str, float]])
 
 
 def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
-    """The effects that the verdict allows to be written, with parameters within their bounds."""
+    """The effects that the verdict allows to be written, with parameters within their bounds.
+
+    A cause below an even chance is no part of them: its size is hardly more than a guess.
+    """
     if found.verdict != "explained" and not (apply and found.verdict in ("ambiguous", "unknown")):
         return {}
     effects: dict[str, dict[str, float]] = {}
-    for cause in found.causes:
+    for cause in [c for c in found.causes if c.confidence >= UNDECIDED] or found.causes[:1]:
         told = {name: value.value for name, value in cause.parameters.items()}
         if "lag_s" in told:
             # A chain from command to position: what lags is an effect of its own, and what no delay holds lags too.
@@ -165,9 +164,17 @@ def joint_model(
     ).with_effects(effects)
 
 
-def _export(
+def export_of(
     arm: ArmSet, joint: JointSet, effects: Mapping[str, Mapping[str, float]], presliding_nm_per_rad: float | None
 ) -> Export:
+    """The change of a joint with these effects, in the form of friction that comes nearest to our own simulation.
+
+    Args:
+        arm: model and recordings.
+        joint: to be changed.
+        effects: its causes.
+        presliding_nm_per_rad: its presliding stiffness; None as believed.
+    """
     robot, name = arm.robot, joint.believed.name
     model = joint_model(joint, effects, presliding_nm_per_rad)
     use = use_of(arm, name)
@@ -176,7 +183,7 @@ def _export(
     time, command, posture = _withheld(arm, name)
     ours = in_posture(robot, name, model, posture)
     tried: dict[str, float] = {}
-    natives = {}
+    forms_of = {}
     for form in forms:
         native = native_elements(joint.believed, model, use, form, friction=rewritten)
         try:
@@ -185,26 +192,26 @@ def _export(
         except FrictidError:
             # An older MuJoCo has not every element.
             continue
-        natives[form] = native
+        forms_of[form] = native
     if not tried:
         compiled_with(robot, {name: native})  # raises, and says why
     best = min(tried, key=lambda form: tried[form] if np.isfinite(tried[form]) else np.inf)
-    return Export(model, natives[best], best, tried)
+    return Export(model, forms_of[best], best, tried)
 
 
 def use_of(arm: ArmSet, name: str) -> Use:
-    """Speeds and places of a joint in the recordings."""
+    """Speeds and loads of a joint in the recordings."""
     samples = [motion.samples[name] for motion in arm.motions]
     speed = np.concatenate([np.abs(np.gradient(s.position_rad, s.time_s)) for s in samples])
-    position = np.concatenate([s.position_rad for s in samples])
     moving = speed[speed > 0.02 * float(np.quantile(speed, 0.99))]
     top = float(np.quantile(moving, 0.999))
     step_s = float(arm.robot.compiled.opt.timestep)
-    return Use(moving[moving <= top], position, step_s, _own_gravity_share(arm, name))
+    gravity_nm, own_share = _gravity(arm, name)
+    return Use(moving[moving <= top], gravity_nm, step_s, own_share)
 
 
-def _own_gravity_share(arm: ArmSet, name: str) -> float:
-    """Gravity torque of the joint's own body over that of all that it carries, along the recordings."""
+def _gravity(arm: ArmSet, name: str) -> tuple[Array, float]:
+    """Gravity torque that a joint carries along the recordings, (n,), and its own body's share of it."""
     robot = arm.robot
     names = arm.recorded
     every = np.concatenate([motion.position_rad for motion in arm.motions])
@@ -218,7 +225,7 @@ def _own_gravity_share(arm: ArmSet, name: str) -> float:
         own = robot.rigid_body_torque(names, some, still, still, arm.held)[:, column]
     finally:
         robot.compiled.body_mass[:] = masses
-    return float(own @ whole) / max(float(whole @ whole), 1e-12) or 1e-9
+    return whole, float(own @ whole) / max(float(whole @ whole), 1e-12) or 1e-9
 
 
 def _withheld(arm: ArmSet, name: str) -> tuple[Array, Array, Array]:
@@ -242,14 +249,14 @@ def write_model(arm: ArmSet, made: Mapping[str, Export], out: Path, *, force: bo
         ``model`` and ``files`` (absolute paths), ``joints`` by name: where each effect went, what is lost, and the
         torque difference in percent.
     """
-    natives = {name: export.native for name, export in made.items()}
-    after = compiled_with(arm.robot, natives)
-    if changed := changed_elsewhere(arm.robot.compiled, after, natives):
+    changes = natives(made)
+    after = compiled_with(arm.robot, changes)
+    if changed := changed_elsewhere(arm.robot.compiled, after, changes):
         raise FrictidError(
             f"the edit would change more than was meant: {', '.join(changed[:5])}; nothing is written",
             where=str(arm.robot.path),
         )
-    files = edited_files(arm.robot, natives, out)
+    files = edited_files(arm.robot, changes, out)
     if arm.robot.urdf:
         files[out.with_suffix(".effects.yaml")] = _sidecar(made).encode()
     refuse_overwriting(files, force=force)
@@ -287,101 +294,3 @@ def _account(export: Export, *, urdf: bool) -> dict[str, Any]:
 def _sidecar(made: Mapping[str, Export]) -> str:
     """All effects of the joints, as a robot file has them under ``simulated``; a URDF cannot hold most."""
     return dump({name: {"effects": export.model.effects} for name, export in made.items()})
-
-
-def closed_loop_gap(arm: ArmSet, made: Mapping[str, Export]) -> dict[str, Any]:
-    """The user's own model, as it was and improved, run in MuJoCo along the logs that were not fitted.
-
-    Returns:
-        ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
-        torque behind a low-pass) and ``farther``, the changed joints that came no nearer; or ``reason``.
-    """
-    judged = [motion for motion in arm.motions if motion.validation] or list(arm.motions)
-    names = arm.recorded
-    if reason := why_not_replayed(arm.robot, names, _commanded(judged, names)):
-        return {"reason": reason}
-    natives = {name: export.native for name, export in made.items()}
-    models = {"before": arm.robot.compiled, "after": compiled_with(arm.robot, natives)}
-    told: dict[str, Any] = {}
-    for when, model in models.items():
-        torque, position = gap_of(arm, model, judged)
-        told[when] = {
-            name: {
-                "torque_nm": float(torque[k]) if np.isfinite(torque[k]) else None,
-                "position_rad": float(position[k]),
-            }
-            for k, name in enumerate(names)
-        }
-    told["farther"] = [name for name in made if _farther(told["before"][name], told["after"][name])]
-    return told
-
-
-def _farther(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> bool:
-    """Whether a change took the user's model away from the recordings: by torque, or by position without any."""
-    number = "position_rad" if before["torque_nm"] is None else "torque_nm"
-    was, now = before[number], after[number]
-    return was is not None and now is not None and not now <= FARTHER * was
-
-
-def side_by_side(arm: ArmSet, made: Mapping[str, Export]) -> tuple[JointRun, ...]:
-    """Each joint along the last log that was not fitted, its beginning: measured, the user's model, and improved.
-
-    Nothing where ``closed_loop_gap`` has a reason. Torques behind the low-pass; positions where no torque is known.
-    """
-    motion = next((m for m in reversed(arm.motions) if m.validation), arm.motions[-1])
-    names = arm.recorded
-    if why_not_replayed(arm.robot, names, _commanded([motion], names)):
-        return ()
-    keep = int(np.searchsorted(motion.time_s, motion.time_s[0] + SHOWN_S))
-    short = replace(motion, samples={n: s.select(np.arange(len(s)) < keep) for n, s in motion.samples.items()})
-    torque, position = _off(arm, arm.robot.compiled, short)
-    better = _off(arm, compiled_with(arm.robot, {n: e.native for n, e in made.items()}), short) if made else None
-    begin = keep - len(position)
-    low_pass = _low_pass(short.time_s)
-    runs = []
-    for k, (name, samples) in enumerate(short.samples.items()):
-        known = samples.torque_nm is not None
-        part, measured = 1 - known, samples.position_rad[begin:]
-        if samples.torque_nm is not None:
-            measured = low_pass(samples.torque_nm)[begin:]
-        off = (torque if known else position)[:, k]
-        improved = None if better is None else measured - better[part][:, k]
-        quantity = "torque [N m]" if known else "position [rad]"
-        if arm.robot.joint(name).prismatic:
-            quantity = "force [N]" if known else "position [m]"
-        runs.append(JointRun(name, motion.name, quantity, short.time_s[begin:], measured, measured - off, improved))
-    return tuple(runs)
-
-
-def _low_pass(time_s: Array) -> Callable[[Array], Array]:
-    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
-    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
-    return lambda columns: np.asarray(signal.filtfilt(b, a, columns, axis=0))
-
-
-def _commanded(motions: Sequence[Motion], names: Sequence[str]) -> bool:
-    return all(motion.samples[name].position_command_rad is not None for motion in motions for name in names)
-
-
-def gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
-    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
-    with ThreadPoolExecutor() as threads:  # MuJoCo steps without Python's lock
-        every = list(threads.map(lambda motion: _off(arm, model, motion), motions))
-    torque, position = (np.concatenate([off[part] for off in every]) for part in (0, 1))
-    return np.sqrt(np.mean(torque**2, axis=0)), np.sqrt(np.mean(position**2, axis=0))
-
-
-def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
-    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten."""
-    names = tuple(motion.samples)
-    samples = list(motion.samples.values())
-    time = samples[0].time_s
-    command = np.stack([s.position_command_rad for s in samples if s.position_command_rad is not None], axis=1)
-    ran = replayed(model, names, arm.held, time, motion.position_rad, command)
-    begin = int(np.searchsorted(time, time[0] + 1.0))
-    position = (motion.position_rad - ran.position_rad)[begin:]
-    measured = [s.torque_nm for s in samples]
-    if any(torque is None for torque in measured):
-        return np.full_like(position, np.nan), position
-    torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
-    return _low_pass(time)(torque)[begin:], position

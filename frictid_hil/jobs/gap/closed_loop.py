@@ -1,0 +1,151 @@
+"""The user's own model in closed loop along its recordings, as it was and changed: how far each is off the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from frictid_hil.friction.metrics import paired_ratio_interval, rms_by_part
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.jobs.gap.from_model import ArmSet, Motion
+from frictid_hil.report.arm import PART_S, JointRun
+from frictid_hil.simulation.model_edit import compiled_with
+from frictid_hil.simulation.model_replay import replayed, why_not_replayed
+from frictid_hil.simulation.native import Native
+
+SHOWN_S = 20.0
+"""Length of the withheld motion that a page shows."""
+CUTOFF_HZ = 20.0
+"""Low-pass of torques that are compared with measured ones."""
+LEAST_PARTS = 4
+"""Parts of a motion, at least, from which an interval is formed."""
+
+
+def withheld(arm: ArmSet) -> list[Motion]:
+    """The motions that are judged on; all where none is withheld."""
+    return [motion for motion in arm.motions if motion.validation] or list(arm.motions)
+
+
+def fitted(arm: ArmSet) -> list[Motion]:
+    """The motions that were fitted; all where every one is withheld."""
+    return [motion for motion in arm.motions if not motion.validation] or list(arm.motions)
+
+
+def why_no_closed_loop(arm: ArmSet, motions: Sequence[Motion]) -> str | None:
+    """Why the user's model cannot be run along these motions, or None where it can."""
+    commanded = all(s.position_command_rad is not None for motion in motions for s in motion.samples.values())
+    return why_not_replayed(arm.robot, arm.recorded, commanded)
+
+
+def closed_loop_gap(arm: ArmSet, natives: Mapping[str, Native]) -> dict[str, Any]:
+    """The user's own model, as it was and changed, run in MuJoCo along the logs that were not fitted.
+
+    Returns:
+        ``before`` and ``after`` by joint (``torque_nm``, ``position_rad``; RMS of the difference to the recording,
+        torque behind a low-pass) and ``left``, by changed joint, what is left of it (of the torque, or without one of
+        the position) with its 95 % interval, percent; or ``reason``.
+    """
+    motions, names = withheld(arm), arm.recorded
+    if reason := why_no_closed_loop(arm, motions):
+        return {"reason": reason}
+    before, after = (_each(arm, m, motions) for m in (arm.robot.compiled, compiled_with(arm.robot, natives)))
+    left = {}
+    for name in natives:
+        k = names.index(name)
+        part = 0 if np.all(np.isfinite(before[0][0][:, k])) else 1
+        was, now = (_by_part(off[part], motions, k) for off in (before, after))
+        interval = paired_ratio_interval(was, now)
+        ratio = float(np.sqrt(np.mean(now**2) / np.mean(was**2)))
+        ends = None if interval is None else [100.0 * end for end in interval]
+        left[name] = {"value": 100.0 * ratio, "interval_95": ends}
+    return {"before": _told(names, before), "after": _told(names, after), "left_percent": left}
+
+
+def _told(names: Sequence[str], off: tuple[list[Array], list[Array]]) -> dict[str, Any]:
+    torque, position = (_rms(motions) for motions in off)
+    return {
+        name: {"torque_nm": float(t) if np.isfinite(t) else None, "position_rad": float(p)}
+        for name, t, p in zip(names, torque, position, strict=True)
+    }
+
+
+def _by_part(off: Sequence[Array], motions: Sequence[Motion], joint: int) -> Array:
+    """RMS of one joint in parts of every motion."""
+    parts = []
+    for motion, values in zip(motions, off, strict=True):
+        long_s = float(motion.time_s[-1] - motion.time_s[0])
+        parts.append(rms_by_part(values[:, joint], max(LEAST_PARTS, int(long_s / PART_S))))
+    return np.concatenate(parts)
+
+
+def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, ...]:
+    """Each joint along the last log that was not fitted, its beginning: measured, the user's model, and improved.
+
+    Nothing where ``closed_loop_gap`` has a reason. Torques behind the low-pass; positions where no torque is known.
+    """
+    motion = next((m for m in reversed(arm.motions) if m.validation), arm.motions[-1])
+    if why_no_closed_loop(arm, [motion]):
+        return ()
+    keep = int(np.searchsorted(motion.time_s, motion.time_s[0] + SHOWN_S))
+    short = replace(motion, samples={n: s.select(np.arange(len(s)) < keep) for n, s in motion.samples.items()})
+    torque, position = _off(arm, arm.robot.compiled, short)
+    better = _off(arm, compiled_with(arm.robot, natives), short) if natives else None
+    begin = keep - len(position)
+    low_pass = _low_pass(short.time_s)
+    runs = []
+    for k, (name, samples) in enumerate(short.samples.items()):
+        known = samples.torque_nm is not None
+        part, measured = 1 - known, samples.position_rad[begin:]
+        if samples.torque_nm is not None:
+            measured = low_pass(samples.torque_nm)[begin:]
+        off = (torque if known else position)[:, k]
+        improved = None if better is None else measured - better[part][:, k]
+        quantity = "torque [N m]" if known else "position [rad]"
+        if arm.robot.joint(name).prismatic:
+            quantity = "force [N]" if known else "position [m]"
+        runs.append(JointRun(name, motion.name, quantity, short.time_s[begin:], measured, measured - off, improved))
+    return tuple(runs)
+
+
+def _low_pass(time_s: Array) -> Callable[[Array], Array]:
+    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
+    b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
+    return lambda columns: np.asarray(signal.filtfilt(b, a, columns, axis=0))
+
+
+def gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
+    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
+    torque, position = _each(arm, model, motions)
+    return _rms(torque), _rms(position)
+
+
+def _rms(motions: Sequence[Array]) -> Array:
+    return np.asarray(np.sqrt(np.mean(np.concatenate(motions) ** 2, axis=0)))
+
+
+def _each(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[list[Array], list[Array]]:
+    """(torque, position) of each recording less the model's."""
+    with ThreadPoolExecutor() as threads:  # MuJoCo steps without Python's lock
+        every = list(threads.map(lambda motion: _off(arm, model, motion), motions))
+    return [torque for torque, _ in every], [position for _, position in every]
+
+
+def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
+    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten."""
+    names = tuple(motion.samples)
+    samples = list(motion.samples.values())
+    time = samples[0].time_s
+    command = np.stack([s.position_command_rad for s in samples if s.position_command_rad is not None], axis=1)
+    ran = replayed(model, names, arm.held, time, motion.position_rad, command)
+    begin = int(np.searchsorted(time, time[0] + 1.0))
+    position = (motion.position_rad - ran.position_rad)[begin:]
+    measured = [s.torque_nm for s in samples]
+    if any(torque is None for torque in measured):
+        return np.full_like(position, np.nan), position
+    torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
+    return _low_pass(time)(torque)[begin:], position
