@@ -165,7 +165,6 @@ def test_the_pages_listen_on_this_computer_alone(tmp_path, monkeypatch):
 
 
 def test_the_stream_listens_on_this_computer_alone_and_takes_no_commands():
-    pytest.importorskip("foxglove")
     client = pytest.importorskip("websockets.sync.client")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -2,16 +2,18 @@
 
 One channel per joint, ``/joint/<name>``, JSON with a schema, units in every name. Rows come from the ring that the
 cyclic loop fills, in the process that writes files: the loop itself knows nothing of this, and a viewer that is slow or
-gone costs it nothing. Loopback unless told otherwise: whoever can reach the port can watch, nobody can command.
+gone costs it nothing. Loopback unless told otherwise: programs that reach the port can watch, and the pages that
+``foxglove.py`` lets in; nobody can command.
 """
 
 from __future__ import annotations
 
 import ipaddress
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,9 +24,14 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.ring import Rows
 
+if TYPE_CHECKING:
+    from frictid_hil.jobs.foxglove import FoxgloveServer
+
 DEFAULT_ADDRESS = "127.0.0.1:8765"
 LIVE_HZ = 100.0
 """Messages a joint and second of run time; the recording has every sample."""
+_MOST_TOLD = 10
+"""Refused origins that a person hears of."""
 
 _COLUMNS = (
     "position_rad",
@@ -47,27 +54,22 @@ class LiveWatcher:
 
     Args:
         watcher: follows the job as well.
-        server: of the Foxglove SDK, started.
-        context: that its channels belong to.
+        server: that viewers connect to.
+        refused: origins of pages that it turned away; each is told once.
     """
 
-    def __init__(self, watcher: Watcher, server: Any, context: Any) -> None:
+    def __init__(self, watcher: Watcher, server: FoxgloveServer, refused: deque[str]) -> None:
         self._watcher = watcher
         self._server = server
-        self._context = context
-        self._channels: list[Any] = []
+        self._refused = refused
+        self._told: set[str] = set()
         self._due_ns: list[int] = []
         self._epoch_ns = time.time_ns()
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
         """Announce a channel per joint."""
-        from foxglove import Channel
-
-        self._channels = [
-            Channel(f"/joint/{joint.name}", schema=_SCHEMA, message_encoding="json", context=self._context)
-            for joint in setup.joints
-        ]
-        self._due_ns = [0] * len(self._channels)
+        self._server.advertise((f"/joint/{joint.name}" for joint in setup.joints), _SCHEMA)
+        self._due_ns = [0] * len(setup.joints)
         self._watcher.plan(plan, setup)
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
@@ -84,13 +86,16 @@ class LiveWatcher:
 
     def rows(self, rows: Rows) -> None:
         """Send each joint's rows, thinned to ``LIVE_HZ``."""
+        messages = []
         for row in rows:
             index, t_ns = int(row["joint"]), int(row["t_ns"])
             if t_ns < self._due_ns[index]:
                 continue
             self._due_ns[index] = t_ns + round(1e9 / LIVE_HZ)
             # Of a log time the viewers expect a date; run time goes along as it is.
-            self._channels[index].log(_message(row), log_time=self._epoch_ns + t_ns)
+            messages.append((index + 1, self._epoch_ns + t_ns, _message(row)))
+        self._server.send(messages)
+        self._tell_refused()
         self._watcher.rows(rows)
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
@@ -101,28 +106,38 @@ class LiveWatcher:
         """Pass it on to the other watcher."""
         self._watcher.note(message)
 
+    def _tell_refused(self) -> None:
+        while self._refused:
+            origin = self._refused.popleft()
+            if origin not in self._told and len(self._told) < _MOST_TOLD:
+                self._told.add(origin)
+                self._watcher.note(
+                    f"warning: a page of {origin!r} wanted to watch and was refused; only Foxglove and pages of this "
+                    "computer may"
+                )
+
 
 @contextmanager
 def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
     """The watcher itself, or with ``address`` one that streams as well while the job lasts.
 
     Raises:
-        UsageError: not ``host:port``, the port is taken, or the Foxglove SDK is not installed.
+        UsageError: not ``host:port``, the port is taken, or ``websockets`` is not installed.
     """
     if address is None:
         yield watcher
         return
     host, port = _host_and_port(address)
     try:
-        import foxglove
+        from frictid_hil.jobs.foxglove import FoxgloveServer
     except ImportError:
         raise UsageError(
-            "--live needs the Foxglove SDK", next_step="install it with: pip install 'frictid-hil[live]'"
+            "--live needs the package websockets", next_step="install it with: pip install 'frictid-hil[live]'"
         ) from None
-    context = foxglove.Context()
+    refused: deque[str] = deque(maxlen=_MOST_TOLD)
     try:
-        server = foxglove.start_server(name="frictid-hil", host=host, port=port, context=context)
-    except Exception as error:  # the SDK raises RuntimeError and its own, by version
+        server = FoxgloveServer("frictid-hil", host, port, refused.append)
+    except OSError as error:
         raise UsageError(
             f"cannot listen: {error}", where=address, next_step="choose another port with --live-at HOST:PORT"
         ) from None
@@ -132,9 +147,9 @@ def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
                 f"warning: --live-at {address} is open to the network: everybody who reaches it can watch, unencrypted"
             )
         watcher.note(f"live: open ws://{host}:{server.port} in Foxglove (Open connection, Foxglove WebSocket)")
-        yield LiveWatcher(watcher, server, context)
+        yield LiveWatcher(watcher, server, refused)
     finally:
-        server.stop()
+        server.close()
 
 
 def _message(row: Any) -> dict[str, float]:

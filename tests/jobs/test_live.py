@@ -7,6 +7,7 @@ import socket
 import struct
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,17 @@ from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.mcap_reader import read_rows
+from frictid_hil.runner.ring import sample_ring
 
-pytestmark = pytest.mark.slow
+pytest.importorskip("websockets")
 
-pytest.importorskip("foxglove")
-connect = pytest.importorskip("websockets.sync.client").connect
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
 
-PROTOCOL = "foxglove.sdk.v1"
+from frictid_hil.jobs.foxglove import PROTOCOLS, FoxgloveServer
+
+PROTOCOL = Subprotocol("foxglove.sdk.v1")
 MESSAGE_DATA = 1
 
 
@@ -74,6 +79,7 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_a_client_sees_every_joint_and_its_samples(tmp_path: Path) -> None:
     values = load_robot("hp3j").values()
     values |= {"name": "seen", "bus": "virtual:seen", "joints": {"5": values["joints"]["5"]}}
@@ -140,8 +146,147 @@ def test_a_port_that_is_taken_is_told() -> None:
             pass
 
 
-def test_without_the_sdk_the_way_to_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(UsageError, match="Foxglove SDK") as told, live(Silent(), "127.0.0.1:0"):
+def test_without_the_package_the_way_to_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "frictid_hil.jobs.foxglove")
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    with pytest.raises(UsageError, match="websockets") as told, live(Silent(), "127.0.0.1:0"):
         pass
     assert "frictid-hil[live]" in told.value.next_step
+
+
+REFUSED: list[str] = []
+
+
+@pytest.fixture
+def server() -> Iterator[FoxgloveServer]:
+    yield (one := two_channels())
+    one.close()
+
+
+def two_channels() -> FoxgloveServer:
+    REFUSED.clear()
+    one = FoxgloveServer("bench", "127.0.0.1", 0, refused=REFUSED.append)
+    one.advertise(["/joint/1", "/joint/2"], {"title": "sample"})
+    return one
+
+
+def viewer(port: int, origin: str | None = None, protocol: Subprotocol = PROTOCOL) -> ClientConnection:
+    said = Origin(origin) if origin else None
+    # Without a long queue, and without a long farewell to a server that waits for it to be read.
+    return connect(
+        f"ws://127.0.0.1:{port}", origin=said, subprotocols=[protocol], max_queue=1, max_size=None, close_timeout=0.1
+    )
+
+
+def told(link: ClientConnection) -> dict[str, Any]:
+    return json.loads(link.recv(timeout=10.0))
+
+
+def subscribe(link: ClientConnection, channel_of: dict[int, int]) -> None:
+    wanted = [{"id": one, "channelId": channel} for one, channel in channel_of.items()]
+    link.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+    link.send("?")
+    assert told(link)["op"] == "status", "answered in turn: what was asked before is in force"
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        None, "https://app.foxglove.dev", "https://studio.foxglove.dev", "file://", "foxglove-app://main",
+        "http://localhost:8080", "https://localhost", "http://127.0.0.1:3000", "http://[::1]:8080",
+    ],
+)  # fmt: skip
+def test_programs_foxglove_and_this_computer_may_watch(server: FoxgloveServer, origin: str | None) -> None:
+    with viewer(server.port, origin) as link:
+        assert told(link)["op"] == "serverInfo"
+    assert not REFUSED
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "https://example.com", "http://example.com:8765", "null", "http://app.foxglove.dev", "HTTPS://example.com",
+        "https://app.foxglove.dev.example.com", "https://evil-foxglove.dev", "http://localhost.example.com",
+        "http://localhost:8080.example.com", "http://127.0.0.1.example.com", "https://example.com/http://localhost",
+        "http://192.168.0.7", "localhost",
+    ],
+)  # fmt: skip
+def test_a_page_from_elsewhere_is_refused(server: FoxgloveServer, origin: str) -> None:
+    with pytest.raises(InvalidStatus) as refusal, viewer(server.port, origin):
+        pass
+    assert refusal.value.response.status_code == 403
+    assert [origin] == REFUSED
+
+
+def test_who_was_refused_is_told_once() -> None:
+    notes, port, ring = Notes(), free_port(), sample_ring(4)
+    with live(notes, f"127.0.0.1:{port}") as watcher:
+        for _ in range(2):
+            with pytest.raises(InvalidStatus), viewer(port, "https://example.com"):
+                pass
+            watcher.rows(ring.drain())
+    ring.close()
+    assert sum("https://example.com" in note for note in notes.kept) == 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_viewer_gets_what_it_subscribed_to_and_nothing_else(server: FoxgloveServer, protocol: Subprotocol) -> None:
+    with viewer(server.port, protocol=protocol) as link:
+        assert link.subprotocol == protocol
+        assert told(link)["capabilities"] == []
+        assert [one["topic"] for one in told(link)["channels"]] == ["/joint/1", "/joint/2"]
+        subscribe(link, {7: 2, 9: 3})
+        server.send([(1, 10, {"a": 1.0}), (2, 11, {"a": 2.0})])
+        assert link.recv(timeout=10.0) == struct.pack("<BIQ", 1, 7, 11) + b'{"a": 2.0}'
+        link.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [7]}))
+        subscribe(link, {8: 1})
+        server.send([(2, 12, {"a": 3.0}), (1, 13, {"a": 4.0})])
+        assert link.recv(timeout=10.0) == struct.pack("<BIQ", 1, 8, 13) + b'{"a": 4.0}'
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "no json", b"\x01\x00", "[]", "{}", '{"op": "subscribe"}', '{"op": "advertise", "channels": []}', "[" * 60_000,
+        '{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": "a", "channelId": [1]}]}',
+        '{"op": "unsubscribe", "subscriptionIds": [5000000000]}',
+    ],
+)  # fmt: skip
+def test_what_a_viewer_sends_apart_from_subscriptions_is_refused(server: FoxgloveServer, frame: str | bytes) -> None:
+    with viewer(server.port) as link:
+        assert [told(link)["op"], told(link)["op"]] == ["serverInfo", "advertise"]
+        link.send(frame)
+        assert told(link)["op"] == "status"
+        subscribe(link, {1: 1})
+        server.send([(1, 10, {})])
+        assert link.recv(timeout=10.0) == struct.pack("<BIQ", 1, 1, 10) + b"{}"
+
+
+def test_a_viewer_that_stands_still_misses_messages_and_holds_nothing_up(server: FoxgloveServer) -> None:
+    long = {"much": "x" * 1_000_000}
+    with viewer(server.port) as slow, viewer(server.port) as quick:
+        for link in (slow, quick):
+            assert [told(link)["op"], told(link)["op"]] == ["serverInfo", "advertise"]
+            subscribe(link, {1: 1})
+        for log_ns in range(100):
+            server.send([(1, log_ns, long)])
+            assert quick.recv(timeout=10.0)[5:13] == struct.pack("<Q", log_ns)
+        quick.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [1]}))
+        seen = 1
+        while slow.recv(timeout=10.0)[5:13] != struct.pack("<Q", 100):
+            server.send([(1, 100, {})])
+            seen += 1
+    assert seen < 100
+
+
+def test_the_end_waits_for_nobody(capfd: pytest.CaptureFixture[str]) -> None:
+    server = two_channels()
+    with viewer(server.port) as link, socket.create_connection(("127.0.0.1", server.port)):
+        assert [told(link)["op"], told(link)["op"]] == ["serverInfo", "advertise"]
+        subscribe(link, {1: 1})
+        for log_ns in range(30):
+            server.send([(1, log_ns, {"much": "x" * 1_000_000})])
+        link.recv(timeout=10.0)
+        server.close()
+    assert not capfd.readouterr().err
