@@ -42,6 +42,8 @@ from frictid_drivers.cia402 import Cia402Driver
 from frictid_drivers.mit import MitDriver
 from frictid_drivers.mit.simulated import Rack as Motors
 from frictid_drivers.mit.simulated import VirtualMitDriver
+from frictid_drivers.servos.driver import ServoDriver
+from frictid_drivers.servos.simulated import Chain, VirtualServoDriver
 from frictid_drivers.virtual import VirtualDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
 from frictid_hil.config.profile import FrictionProfile
@@ -59,6 +61,7 @@ from frictid_hil.jobs.gap_record import GapRecordOptions, record
 from frictid_hil.jobs.recalibrate import RecalibrateOptions, recalibrate
 from frictid_hil.jobs.reset import reset
 from frictid_hil.jobs.watch import Silent
+from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.profiles.store import ProfileStore
@@ -85,11 +88,23 @@ def _motors(model: str) -> dict[str, Any]:
     return {**values, "joints": joints}
 
 
+def _servos(model: str, *names: str) -> dict[str, Any]:
+    values = load_robot("so101.yaml").values()
+    joint = values["joints"]["shoulder_pan"]
+    joint["options"] = {"model": model}
+    joints = {name: {**joint, "id": number} for number, name in enumerate(names, 1)}
+    procedure = values["procedure"] | {"cycles": 3}
+    return {**values, "joints": joints, "procedure": procedure, "policy": {"warm_up": {"fixed_s": 0}}}
+
+
 ROBOTS: dict[str, Callable[[], dict[str, Any]]] = {
     "two joints": lambda: _arm("0", "1", "2", "5"),
     "one joint": lambda: _arm("0", "1", "2", "4", "5", procedure={"cycles": 3}, policy={"warm_up": {"fixed_s": 0}}),
     "damiao": lambda: _motors("DM-J4310"),
     "robstride": lambda: _motors("RS00"),
+    "dynamixel": lambda: _servos("XL330-M288", JOINT, OTHER),
+    "one dynamixel": lambda: _servos("XL330-M288", JOINT),
+    "feetech": lambda: _servos("STS3215", JOINT, OTHER),
 }
 VERBS = {
     "calibrate": "two joints",
@@ -103,16 +118,25 @@ VERBS = {
     "damiao compensate": "damiao",
     "robstride calibrate": "robstride",
     "robstride together": "robstride",
+    "dynamixel calibrate": "dynamixel",
+    "dynamixel compensate": "dynamixel",
+    "dynamixel recalibrate": "one dynamixel",
+    "feetech calibrate": "feetech",
+    "feetech compensate": "feetech",
 }
-"""What is run, and on which robot."""
+"""What is run, and on which robot. Unattended runs refuse Feetech servos, which have no watchdog."""
+SERVOS = ("dynamixel", "one dynamixel", "feetech")
 STILL = ("check", "reset")
 """Verbs without power."""
 RATES_HZ = (250.0, 250.0, 250.0, 250.0, 500.0, 500.0, 1000.0)
 """Drawn from: most runs are slow, and therefore cheap."""
-REST_S, OFF_S, OFF_MPS = 0.5, 2.6, 0.02
+SERVO_RATES_HZ = (100.0, 200.0, 200.0, 200.0, 400.0)
+REST_S, OFF_S, OFF_RAD_S = 0.5, 2.6, 0.02
 """Longest from the host's stop to rest and to the end of power (docs/reference/stops.md), and what counts as rest."""
 SILENT_S = 1.0
 """Nobody talks to the drives for so long: their own watchdogs have had their say."""
+STANDS_S = 0.2
+"""Who stands has gone no way within this time: a loop under power has noise in its speed."""
 MARGIN = 0.02
 BEFORE_SYNC = ("preflight", "configure")
 HANGS_S = 120
@@ -249,6 +273,74 @@ MOTORS: dict[str, Draw] = {
     "drive faults": _of_either(kind="fault"),
     "brake stays closed": _of_joint(kind="blocked"),
 } | INTERFACE
+SERVO_LINE: dict[str, Draw] = {
+    "torque late 20 ms": _of_joint(kind="lag", quantity="torque", delay_s=0.02),
+    "torque late 60 ms": _of_joint(kind="lag", quantity="torque", delay_s=0.06),
+    "position late 20 ms": _of_joint(kind="lag", quantity="position", delay_s=0.02),
+    "torque clipped 0.3 N m": _of_joint(kind="clip", quantity="torque", level=0.3),
+    "torque times 1.5": _of_joint(kind="scale", quantity="torque", factor=1.5),
+    "torque times 0.7": _of_joint(kind="scale", quantity="torque", factor=0.7),
+    "torque frozen": _of_joint(kind="freeze", quantity="torque"),
+    "torque inverted": _of_joint(kind="invert", quantity="torque"),
+    "torque zero": _of_joint(kind="scale", quantity="torque", factor=0.0),
+    "torque offset": _of_joint(kind="jump", quantity="torque", level=0.2),
+    "position frozen": _of_either(kind="freeze", quantity="position"),
+    "position jumps": _of_either(kind="jump", quantity="position", level=0.6),
+    "position jumps for 10 ms": _of_either(kind="jump", quantity="position", level=0.6, for_s=0.01),
+    "position inverted": _of_either(kind="invert", quantity="position"),
+    "position scaled 1.1": _of_joint(kind="scale", quantity="position", factor=1.1),
+    "reports lost 1": _of_either(kind="drop", frames="report", count=1),
+    "reports lost 100": _of_either(kind="drop", frames="report", count=100),
+    "every report lost": _of_either(kind="drop", frames="report"),
+    "writes lost 1": _of_bus(kind="drop", frames="write", count=1),
+    "writes lost 100": _of_bus(kind="drop", frames="write", count=100),
+    "every write lost": _of_bus(kind="drop", frames="write"),
+    "requests lost 1": _of_bus(kind="drop", frames="request", count=1),
+    "requests lost 100": _of_bus(kind="drop", frames="request", count=100),
+    "reports late 2 ms": _of_joint(kind="delay", frames="report", delay_s=0.002),
+    "reports late 12 ms": _of_joint(kind="delay", frames="report", delay_s=0.012),
+    "writes late 20 ms": _of_bus(kind="delay", frames="write", delay_s=0.02),
+    "reports twice": _of_either(kind="duplicate", frames="report"),
+    "writes twice": _of_bus(kind="duplicate", frames="write"),
+    "reports reordered": _of_joint(kind="reorder", frames="report", count=50),
+    "reports damaged 1": _of_joint(kind="corrupt", frames="report", count=1),
+    "reports damaged 20": _of_joint(kind="corrupt", frames="report", count=20),
+    "writes damaged 1": _of_bus(kind="corrupt", frames="write", count=1),
+    "writes damaged 20": _of_bus(kind="corrupt", frames="write", count=20),
+    "reports cut short": _of_either(kind="truncate", frames="report", level=5, count=20),
+    "a wrong id answers": _of_either(kind="misaddress", frames="report", count=20),
+    "foreign writes": _of_bus(kind="foreign", frames="write"),
+    "foreign requests": _of_bus(kind="foreign", frames="request"),
+    "foreign reports": _of_joint(kind="foreign", frames="report"),
+    "servo silent": _of_either(kind="mute"),
+    "servo silent 50 ms": _of_either(kind="mute", for_s=0.05),
+    "servo reboots": _of_either(kind="reset"),
+    "error byte": _of_either(kind="fault"),
+    "joint blocked": _of_joint(kind="blocked"),
+    "host stalls 50 ms": _of_bus(kind="stall", delay_s=0.05),
+    "host stalls 400 ms": _of_bus(kind="stall", delay_s=0.4),
+} | {
+    f"{way} {error}{times}": _of_bus(kind=f"{way}_error", error=error, **count)
+    for way in ("send", "receive")
+    for error in ("can", "os", "runtime", "value")
+    for times, count in ((" once", {"count": 1}), ("", {}))
+}
+SERVO_SET_UP: dict[str, Draw] = {
+    "answer lost": _of_either(kind="drop", frames="report", count=1),
+    "every answer lost": _of_either(kind="drop", frames="report"),
+    "answer cut short": _of_either(kind="truncate", frames="report", level=5, count=1),
+    "answer damaged": _of_either(kind="corrupt", frames="report", count=1),
+    "a wrong id answers": _of_either(kind="misaddress", frames="report", count=1),
+    "answered twice": _of_either(kind="duplicate", frames="report", count=3),
+    "answer late": _of_either(kind="delay", frames="report", delay_s=0.03, count=1),
+    "request lost": _of_bus(kind="drop", frames="request", count=1),
+    "request damaged": _of_bus(kind="corrupt", frames="request", count=1),
+    "write lost": _of_bus(kind="drop", frames="write", count=1),
+    "port fails in set-up": _of_bus(kind="send_error", error="os"),
+    "port deaf in set-up": _of_bus(kind="receive_error", error="runtime"),
+}
+OUT_OF_REACH = ("every write lost", "servo silent", "send can", "send os", "send runtime", "send value")
+"""Nothing that the host says arrives any more. A servo without a watchdog then holds its last goal, under power."""
 MOTORS_SET_UP: dict[str, Draw] = {
     "answer lost": _of_either(kind="drop", frames="report", count=1),
     "every answer lost": _of_either(kind="drop", frames="report"),
@@ -267,6 +359,8 @@ WHOLE_RUN = ("torque times 1.5", "torque times 0.7", "torque offset", "position 
 
 def faults_of(verb: str, phase: str) -> Mapping[str, Draw]:
     """What can go wrong in a phase of a verb."""
+    if VERBS[verb] in SERVOS:
+        return SERVO_SET_UP if phase in BEFORE_SYNC else SERVO_LINE
     if VERBS[verb] in ("damiao", "robstride"):
         return MOTORS_SET_UP if phase in BEFORE_SYNC else MOTORS
     return SDO if phase in BEFORE_SYNC else IN_MOTION
@@ -288,13 +382,13 @@ class Case:
     @property
     def rate_hz(self) -> float:
         """Of the cycles, drawn."""
-        return float(self.drawn().choice(RATES_HZ))
+        return float(self.drawn().choice(SERVO_RATES_HZ if VERBS[self.verb] in SERVOS else RATES_HZ))
 
     def row(self, phases: Mapping[str, Phase]) -> dict[str, Any]:
         """The fault as a robot file would list it."""
         rng = self.drawn()
         row = faults_of(self.verb, self.phase)[self.name](rng)
-        if "joint" in row and VERBS[self.verb] == "one joint":
+        if "joint" in row and VERBS[self.verb].startswith("one "):
             row["joint"] = JOINT
         phase = phases[self.phase]
         if self.phase not in BEFORE_SYNC:
@@ -343,9 +437,10 @@ class Axle:
     velocity_rad_s: Callable[[], float]
     within_rad: tuple[float, float]
     fastest_rad_s: float
+    watchdog: bool = True
 
 
-def _axle(joint: JointSetup, powered: Callable[[], bool], plant: Any) -> Axle:
+def _axle(joint: JointSetup, powered: Callable[[], bool], plant: Any, *, watchdog: bool = True) -> Axle:
     return Axle(
         joint.name,
         powered,
@@ -353,6 +448,7 @@ def _axle(joint: JointSetup, powered: Callable[[], bool], plant: Any) -> Axle:
         lambda: float(plant.velocity_rad_s),
         (joint.position_min_rad, joint.position_max_rad),
         joint.max_velocity_rad_s,
+        watchdog,
     )
 
 
@@ -401,6 +497,7 @@ class Watched(Silent):
         """Hooks where the drives' time goes on, where rows are kept, and where the host stops."""
         opened, stopped = VirtualDriver.open, Cia402Driver.quick_stop
         made, braked, advance, receive = VirtualMitDriver.__init__, MitDriver.quick_stop, Motors.advance, Motors.receive
+        built, held, passed, said = VirtualServoDriver.__init__, ServoDriver.quick_stop, Chain.advance, Chain._say
 
         def open_(driver: VirtualDriver, sink: Any = None) -> None:
             self._follow_can(driver)
@@ -426,6 +523,22 @@ class Watched(Silent):
             self.answers += 1
             return receive(rack, can_id, data)
 
+        def build(driver: VirtualServoDriver, setup: RobotSetup) -> None:
+            built(driver, setup)
+            self._follow_servos(driver)
+
+        def hold(driver: ServoDriver) -> None:
+            self._stopped()
+            held(driver)
+
+        def went_on(chain: Chain, to_ns: int) -> None:
+            passed(chain, to_ns)
+            self._advanced()
+
+        def say(chain: Chain, *answer: Any) -> None:
+            self.answers += 1
+            said(chain, *answer)
+
         def ring(**how: Any) -> Ring:
             self.rings.append(sample_ring(**how))
             return self.rings[-1]
@@ -437,6 +550,10 @@ class Watched(Silent):
             (MitDriver, "quick_stop", brake),
             (Motors, "advance", advanced),
             (Motors, "receive", received),
+            (VirtualServoDriver, "__init__", build),
+            (ServoDriver, "quick_stop", hold),
+            (Chain, "advance", went_on),
+            (Chain, "_say", say),
             (run_module, "sample_ring", ring),
         ]
         before = [(owner, name, getattr(owner, name)) for owner, name, _ in vars_]
@@ -481,6 +598,20 @@ class Watched(Silent):
         pairs = [(joint, motors[joint.name]) for joint in driver.setup.joints]
         self.axles = [_axle(joint, partial(getattr, motor, "on"), motor.plant) for joint, motor in pairs]
 
+    def _follow_servos(self, driver: VirtualServoDriver) -> None:
+        servos = driver.chain.servos
+        self.rack, self.stop_ns = driver.chain, None
+        self.now = lambda: max(servo._now_ns for servo in servos.values())
+        self.axles = [
+            _axle(
+                joint,
+                partial(getattr, servos[joint.name], "on"),
+                servos[joint.name].plant,
+                watchdog=bool(servos[joint.name].mine.model.registers.watchdog),
+            )
+            for joint in driver.setup.joints
+        ]
+
     def _advanced(self) -> None:
         for axle in self.axles:
             if axle.powered():
@@ -489,13 +620,17 @@ class Watched(Silent):
 
     def _look(self, axle: Axle) -> None:
         speed = abs(axle.velocity_rad_s())
-        if speed > OFF_MPS:
+        if speed > OFF_RAD_S:
             self.moved_ns = self.now()
             low, high = axle.within_rad
             if not low <= axle.position_rad() <= high:
                 self.beyond.setdefault("limits", f"joint {axle.name} left its limits")
             if speed > axle.fastest_rad_s:
                 self.beyond["speed"] = f"joint {axle.name} passed its highest speed"
+
+
+def _usual_hz(kind: str) -> float:
+    return 200.0 if kind in SERVOS else 250.0
 
 
 class Bench:
@@ -506,9 +641,8 @@ class Bench:
         os.environ["XDG_STATE_HOME"] = str(folder / "home")
         self.folder = folder
         self.clean: dict[str, dict[str, Phase]] = {}
-        self._store: Path | None = None
-        self.calibrated = cache(self._calibrated)
-        self.file, self.robot = cache(self._file), cache(lambda kind: load_robot(str(self.file(kind, 250.0))))
+        self.calibrated, self.store = cache(self._calibrated), cache(self._promoted)
+        self.file, self.robot = cache(self._file), cache(lambda kind: load_robot(str(self.file(kind, _usual_hz(kind)))))
 
     def _file(self, kind: str, rate_hz: float) -> Path:
         path = self.folder / f"{kind.replace(' ', '-')}-{rate_hz:g}.yaml"
@@ -521,7 +655,7 @@ class Bench:
         """Of a clean run of a verb."""
         if verb not in self.clean:
             watched, verdict = Watched(), Verdict(verb, "clean", "nothing", 0)
-            self._run(watched, verdict, [], 250.0)
+            self._run(watched, verdict, [], _usual_hz(VERBS[verb]))
             if verdict.failures or verdict.exit_code:
                 raise SystemExit(f"the clean {verb} fails: {verdict.failures} {verdict.said}")
             self.clean[verb] = watched.phases
@@ -563,7 +697,7 @@ class Bench:
             _judge_drives(watched, verdict)
             if verdict.verb not in STILL:
                 _judge_recording(watched, verdict, Path(folder))
-            if verdict.verb == "recalibrate":
+            if verdict.verb.endswith("recalibrate"):
                 _judge_store(ProfileStore(verb.store), verdict, self.robot(VERBS[verdict.verb]))
             _judge_curves(verb.joints, verdict, self.robot(VERBS[verdict.verb]))
         verdict.took_s = round(time.monotonic() - began, 1)
@@ -572,21 +706,25 @@ class Bench:
         """A profile of the joint."""
         with _no_faults():
             options = CalibrateOptions(
-                str(self.file(kind, 250.0)), joints=(JOINT,), program="quick", out=self.folder / f"{kind} profile"
+                str(self.file(kind, _usual_hz(kind))),
+                joints=(JOINT,),
+                program="quick",
+                out=self.folder / f"{kind} profile",
             )
             profile = calibrate(options, Silent()).profile_file
         assert profile is not None
         return profile
 
-    def store(self) -> Path:
+    def _promoted(self, kind: str) -> Path:
         """A store with a profile in force."""
-        if self._store is None:
-            with _no_faults():
-                self._store = self.folder / "store"
-                file = str(self.file("one joint", 250.0))
-                result = recalibrate(RecalibrateOptions(file, store=self._store, out=self.folder / "night"), Silent())
-            assert result["promoted"], result
-        return self._store
+        store = self.folder / f"{kind} store"
+        with _no_faults():
+            options = RecalibrateOptions(
+                str(self.file(kind, _usual_hz(kind))), store=store, out=self.folder / f"{kind} night"
+            )
+            result = recalibrate(options, Silent())
+        assert result["promoted"], result
+        return store
 
 
 class _Verb:
@@ -596,8 +734,8 @@ class _Verb:
         self._verdict, self._watched, self._file = verdict, watched, str(file)
         self._folder, self.store = folder, folder / "store"
         self._profile = bench.calibrated(VERBS[verdict.verb]) if verdict.verb.endswith("compensate") else None
-        if verdict.verb == "recalibrate":
-            shutil.copytree(bench.store(), self.store)
+        if verdict.verb.endswith("recalibrate"):
+            shutil.copytree(bench.store(VERBS[verdict.verb]), self.store)
         self.joints: Mapping[str, Any] = {}
 
     def run(self) -> None:
@@ -624,7 +762,8 @@ class _Verb:
 
     def _compensate(self) -> None:
         assert self._profile is not None
-        wanted = Wanted("track", ("nc", "mo", "mop"), duration_s=2.0)
+        mode = Mode.POSITION if self._verdict.verb.startswith("feetech") else Mode.TORQUE
+        wanted = Wanted("track", ("nc", "mo", "mop"), drive_mode=mode, duration_s=2.0)
         options = CompensateOptions(
             self._file, self._profile, JOINT, wanted, seed=self._verdict.seed, out=self._folder / "run"
         )
@@ -668,7 +807,11 @@ def _ended(verdict: Verdict, error: FrictidError | None) -> None:
     if error is None:
         verdict.ended = "ok"
         return
-    verdict.ended, verdict.exit_code, verdict.said = type(error).__name__, error.exit_code, str(error)
+    verdict.ended, verdict.exit_code, verdict.said = (
+        type(error).__name__,
+        error.exit_code,
+        f"{error}; {error.next_step}",
+    )
     verdict.noticed = True
     if isinstance(error, Defect):
         verdict.failures.append(f"a defect: {error}")
@@ -695,10 +838,14 @@ def _judge_drives(watched: Watched, verdict: Verdict) -> None:
     if rack is None:
         return
     rack.advance(watched.now() + round(SILENT_S * 1e9))
-    for axle in watched.axles:
+    before_rad = [axle.position_rad() for axle in watched.axles]
+    rack.advance(watched.now() + round(STANDS_S * 1e9))
+    for axle, was_rad in zip(watched.axles, before_rad, strict=True):
         if axle.powered():
-            verdict.failures.append(f"joint {axle.name} has power after the end")
-            if abs(axle.velocity_rad_s()) > OFF_MPS:
+            told = "supply" in verdict.said or "may still" in verdict.said
+            if axle.watchdog or verdict.name not in OUT_OF_REACH or not told:
+                verdict.failures.append(f"joint {axle.name} has power after the end")
+            if abs(axle.position_rad() - was_rad) > OFF_RAD_S * STANDS_S:
                 verdict.failures.append(f"joint {axle.name} moves after the end")
     verdict.failures += watched.beyond.values()
     if watched.stop_ns is not None:

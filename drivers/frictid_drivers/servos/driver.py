@@ -16,9 +16,10 @@ from typing import Any
 
 from frictid_drivers.servos.inspection import Told, joint_findings, meet, torque_source
 from frictid_drivers.servos.line import Line, PortFactory, SerialPort
-from frictid_drivers.servos.logs import SPEED_CYCLES, Reader, frame_map_values, to_bytes
+from frictid_drivers.servos.logs import Reader, frame_map_values, speed_cycles, to_bytes
 from frictid_drivers.servos.operating_mode import OperatingMode
 from frictid_drivers.servos.packets import WIRES
+from frictid_drivers.servos.place import Place
 from frictid_drivers.servos.settings import read_settings
 from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
@@ -93,7 +94,8 @@ class ServoDriver:
         self._rows: RowDecoder | None = None
         self._wishes: list[Wish] = []
         self._powered: list[bool] = []
-        self._holding: list[int | None] = []
+        self._goals: list[int | None] = []
+        self._places: list[Place] = []
         self._cycle_hz = 0.0
 
     # -- reaching them ------------------------------------------------------------------------------------------
@@ -201,7 +203,11 @@ class ServoDriver:
         self._wishes = [
             Wish(joint, report) for joint, report in zip(self.setup.joints, self._rows.feedback, strict=True)
         ]
-        self._powered, self._holding = [False] * len(self._joints), [None] * len(self._joints)
+        self._powered, self._goals = [False] * len(self._joints), [None] * len(self._joints)
+        self._places = [
+            Place(joint.max_velocity_rad_s, mine.model.count_rad)
+            for joint, mine in zip(self.setup.joints, self._joints, strict=True)
+        ]
         self._ends_rad = {one.name: (one.position_min_rad, one.position_max_rad) for one in self.setup.joints}
         self._unwatched.clear()
         for at, mine in enumerate(self._joints):
@@ -273,7 +279,7 @@ class ServoDriver:
             HardwareError: the port is gone.
         """
         line, rows = self._open_line(), self._rows
-        if rows is None:
+        if rows is None or self._reader is None:
             raise HardwareError("exchange before configure")
         begun_ns, period_ns = self.clock.now_ns(), 1e9 / self._cycle_hz
         for _ in line.received(begun_ns):  # late answers
@@ -295,26 +301,30 @@ class ServoDriver:
         for _ in line.received(begun_ns + round(0.95 * period_ns)):
             if not rows.waiting():
                 break
+        for place, report, counts in zip(self._places, rows.feedback, self._reader.counts, strict=True):
+            place.see(report, counts)
         if refused is not None:
             raise refused
         return rows.feedback
 
     def quick_stop(self) -> None:
-        """Every joint holds where it was last seen; never raises."""
+        """Every joint holds the goal that it has, or where it was last seen; never raises.
+
+        A goal that goes back to a reading would send the joint wherever a reading that jumped says.
+        """
         line, reader = self._line, self._reader
         if line is None or reader is None:
             return
         goals = {}
         for at, wish in enumerate(self._wishes):
             wish.stop()
-            counts = reader.counts[at]
             if not self._powered[at]:
                 continue
             if reader.takes_currents(at):
                 with contextlib.suppress(Exception):
-                    self._modes[at].stop(counts)
+                    self._modes[at].stop(self._places[at].counts)
+            counts = self._counts(at, math.nan)
             if counts is not None:
-                self._holding[at] = counts
                 goals[self._joints[at].id] = to_bytes(counts, self._registers.goal_bytes, self._joints[at].model)
         with contextlib.suppress(Exception):
             if goals:
@@ -372,6 +382,8 @@ class ServoDriver:
             # Whatever else is asked of it in this mode: no current.
             current = self._current(at, order.torque_nm if order.mode is Mode.TORQUE else 0.0)
             told[registers.goal_current][mine.id] = to_bytes(current, 2, mine.model)
+        if not on or reader.takes_currents(at):
+            self._goals[at] = None
         counts = self._counts(at, self._goal_rad(at, order) if order.do is Do.FOLLOW else math.nan)
         if on and counts is not None and not reader.takes_currents(at):
             told[registers.goal][mine.id] = to_bytes(counts, registers.goal_bytes, mine.model)
@@ -400,8 +412,8 @@ class ServoDriver:
             present_nm = reader.feedback[at].torque_nm if self._powered[at] else 0.0
             operating.take_currents(self._current(at, present_nm), powered=self._powered[at])
         else:
-            self._holding[at] = reader.counts[at]
-            operating.take_positions(self._holding[at], powered=self._powered[at])
+            self._goals[at] = self._places[at].counts
+            operating.take_positions(self._goals[at], powered=self._powered[at])
 
     def _open_line(self) -> Line:
         if self._line is None:
@@ -416,14 +428,13 @@ class ServoDriver:
         raise HardwareError("not configured yet", where=f"joint {name}")
 
     def _counts(self, at: int, position_rad: float) -> int | None:
-        """The goal; where none is asked for (switching on, braking), where the joint was seen when that began."""
+        """The goal; where none is asked for, the one in force, and without any where the joint is."""
         if math.isfinite(position_rad):
-            self._holding[at] = None
             mine = self._joints[at]
-            return min(max(mine.counts(position_rad), 0), mine.model.counts_per_turn - 1)
-        if self._holding[at] is None and self._reader is not None:
-            self._holding[at] = self._reader.counts[at]
-        return self._holding[at]
+            self._goals[at] = min(max(mine.counts(position_rad), 0), mine.model.counts_per_turn - 1)
+        elif self._goals[at] is None:
+            self._goals[at] = self._places[at].counts
+        return self._goals[at]
 
     def _highest_rate_hz(self) -> float:
         count, registers, wire = len(self._joints), self._registers, self._wire
@@ -434,7 +445,8 @@ class ServoDriver:
         return float(int(_BUSIEST / ((asked + answered) * 10.0 / self._line_settings.baud + delays_s)))
 
     def _velocity_delay_s(self) -> float:
-        return SPEED_CYCLES / 2.0 / (self._cycle_hz or self.setup.cycle_hz)
+        period_s = 1.0 / (self._cycle_hz or self.setup.cycle_hz)
+        return speed_cycles(period_s) * period_s / 2.0
 
     def _watchdog(self, seconds: float) -> bytes:
         return bytes([min(127, round(seconds / _WATCHDOG_STEP_S))])

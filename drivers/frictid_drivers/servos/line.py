@@ -18,6 +18,8 @@ LOGGED_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 
 _TRIES = 3
+PORT_ERRORS = (OSError, RuntimeError, ValueError)
+"""What ports raise, pyserial's own error included."""
 
 
 class BytePort(Protocol):
@@ -54,7 +56,7 @@ class SerialPort:
     def __init__(self, path: str, baud: int) -> None:
         try:
             self._serial = serial.Serial(path, baud, timeout=0, exclusive=True)
-        except (serial.SerialException, OSError, ValueError) as error:
+        except PORT_ERRORS as error:
             busy = "exclusively lock" in str(error)
             raise (HardwareBusy if busy else HardwareError)(
                 f"cannot open the port: {error}",
@@ -109,7 +111,7 @@ class Line:
         """
         try:
             self._port.write(packet)
-        except (serial.SerialException, OSError) as error:
+        except PORT_ERRORS as error:
             raise _gone(error) from error
         self._tell(SENT_ID, packet, True)
 
@@ -119,7 +121,7 @@ class Line:
             left_s = (until_ns - self._clock.now_ns()) * 1e-9
             try:
                 data = self._port.read(0.0 if self._clock.lock_step else max(0.0, left_s))
-            except (serial.SerialException, OSError) as error:
+            except PORT_ERRORS as error:
                 raise _gone(error) from error
             self._buffer += data
             for packet in self._wire.parse(self._buffer, answers=True):
@@ -168,7 +170,7 @@ class Line:
 
     def close(self) -> None:
         """Release the port."""
-        with contextlib.suppress(serial.SerialException, OSError):
+        with contextlib.suppress(*PORT_ERRORS):
             self._port.close()
 
     def _tell(self, can_id: int, packet: bytes, sent: bool) -> None:

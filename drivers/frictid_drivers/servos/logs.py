@@ -28,9 +28,16 @@ SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11
 """Identifiers of packets in a bus log."""
 
 _SYNC_READ, _SYNC_WRITE = 0x82, 0x83
-SPEED_CYCLES = 8
-"""Position is differenced over so many cycles. Reported speeds are not used: a Feetech's unit depends on its firmware,
-and both makers sample a speed that swings from goal to goal."""
+_SPEED_CYCLES, _SPEED_S = 8, 0.04
+
+
+def speed_cycles(period_s: float) -> int:
+    """Over how many cycles position is differenced: eight, but no longer than 40 ms.
+
+    Reported speeds are not used: a Feetech's unit depends on its firmware, and both makers sample a speed that swings
+    from goal to goal.
+    """
+    return min(_SPEED_CYCLES, max(1, round(_SPEED_S / period_s)))
 
 
 class Reader:
@@ -51,7 +58,8 @@ class Reader:
         self._powered = [False] * len(joints)
         self._takes_currents = [False] * len(joints)
         self._cycle = 0
-        self._track: list[deque[tuple[int, float]]] = [deque(maxlen=SPEED_CYCLES + 1) for _ in joints]
+        rows = speed_cycles(period_s) + 1
+        self._track: list[deque[tuple[int, float]]] = [deque(maxlen=rows) for _ in joints]
         self.counts: list[int | None] = [None] * len(joints)
         self.feedback = [Feedback() for _ in joints]
 

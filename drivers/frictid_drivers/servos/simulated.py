@@ -35,10 +35,26 @@ class VirtualServoDriver(ServoDriver):
     kind = replace(ServoDriver.kind, simulated=True, line="virtual", elsewhere={"serial": "servos"})
 
     def __init__(self, setup: RobotSetup) -> None:
-        self.chain = Chain(setup)
-        clock: Clock = WallClock() if setup.realtime else ManualClock(self.chain.advance)
+        # Late, because faulty servos are servos of this file.
+        from frictid_drivers.servos.faulty_chain import FaultyChain, servo_faults
+
+        faults = servo_faults(setup)
+        healthy = replace(setup, options={name: value for name, value in setup.options.items() if name != "faults"})
+        self.chain = Chain(healthy)
+        self._faulty = FaultyChain(self.chain, faults, self._stand_still) if faults else None
+        port = self._faulty or self.chain
+        clock: Clock = WallClock() if setup.realtime else ManualClock(port.advance)
         self.chain.clock = clock
-        super().__init__(setup, port_factory=lambda: self.chain, clock=clock)
+        super().__init__(healthy, port_factory=lambda: port, clock=clock)
+
+    def start_cycling(self) -> None:
+        """As ``ServoDriver``; times of faults count from here."""
+        super().start_cycling()
+        if self._faulty is not None:
+            self._faulty.begin()
+
+    def _stand_still(self, lasts_s: float) -> None:
+        self.clock.wait_until(self.clock.now_ns() + round(lasts_s * 1e9))
 
     def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
         """Let a person guide a joint along centre + amplitude sin(2 pi f t), t from now; frequency 0 lets go."""
@@ -84,6 +100,23 @@ class Servo:
         self.on = False
         self._goal_rad = joint.locked_position_rad
         self._now_ns = self._heard_ns = 0
+        self._delivered = bytes(self.memory)
+
+    def told(self, quantity: str) -> float:
+        """What it measures: ``position`` in rad or ``torque`` in N m."""
+        return self.plant.measured_position_rad if quantity == "position" else self.plant.torque_nm
+
+    def reboot(self) -> None:
+        """As after a power failure: no torque, and everything that is not in its EEPROM is forgotten."""
+        begin = _EEPROM_END if self.mine.model.wire == "dynamixel" else self.mine.model.registers.torque
+        self.memory[begin:] = self._delivered[begin:]
+        self.error = 0
+        self._switch(False)
+
+    def fail(self) -> None:
+        """Overload: it shows so, and lets go."""
+        self.error = 0x80 if self.mine.model.wire == "dynamixel" else 0x20
+        self._switch(False)
 
     def write(self, address: int, data: bytes) -> int:
         """Into the control table; returns the error with which it is refused, 0 where it is taken."""
@@ -96,14 +129,17 @@ class Servo:
         if address == registers.goal:
             self._goal_rad = self.mine.direction * self._angle(self._decode(data))
         elif address == registers.torque:
-            self.on = data[0] == 1 and not self.error
-            self.plant.power(self.on)
+            self._switch(data[0] == 1 and not self.error)
         elif changed and registers.goal_current:
             # e-Manual, Operating Mode: gains, profile and goal current are reset.
             self._number(registers.p_gain, _P_GAIN[self.mine.model.wire])
             self.memory[registers.goal_current : registers.goal_current + 2] = self._limit()
             self.memory[108:116] = bytes(8)
         return 0
+
+    def _switch(self, on: bool) -> None:
+        self.on = on
+        self.plant.power(on)
 
     def _refusal(self, address: int, data: bytes) -> int:
         """EEPROM opens without torque alone, a tripped watchdog keeps goals, a current has a limit."""
@@ -130,8 +166,7 @@ class Servo:
         """Its own loop, period by period."""
         while self._now_ns + _LOOP_NS <= to_ns:
             if self._tripped() and self.on:
-                self.on = False
-                self.plant.power(False)
+                self._switch(False)
             self.plant.advance(_LOOP_NS * 1e-9, torque_nm=self._asked_nm() if self.on else 0.0)
             self._now_ns += _LOOP_NS
 
@@ -151,9 +186,9 @@ class Servo:
         """A stretch of the control table, as of now."""
         model, registers = self.mine.model, self.mine.model.registers
         sign = self.mine.direction
-        steps = math.floor(sign * self.plant.measured_position_rad / model.count_rad + 0.5) + self.mine.zero_counts
+        steps = math.floor(sign * self.told("position") / model.count_rad + 0.5) + self.mine.zero_counts
         self._put(registers.block + registers.position[0], registers.position[1], steps, 15)
-        effort = int(sign * self.plant.torque_nm / self.mine.torque_nm_per_unit) if self.on else 0
+        effort = int(sign * self.told("torque") / self.mine.torque_nm_per_unit) if self.on else 0
         if registers.load >= 0:
             load = effort if not model.current_a else max(-1000, min(1000, effort))
             self._put(registers.block + registers.load, 2, load, 10)
@@ -206,12 +241,13 @@ class Chain:
         setup: with ``simulated`` of every joint.
 
     Attributes:
+        wire: of the maker.
         fault: passed bytes and whether they go to the host; returns what becomes of them.
     """
 
     def __init__(self, setup: RobotSetup) -> None:
         _, settings = read_settings(setup)
-        self._wire = WIRES[settings[0].model.wire]
+        self.wire = WIRES[settings[0].model.wire]
         self._dynamixel = settings[0].model.wire == "dynamixel"
         self.clock: Clock = WallClock()
         self.servos = {
@@ -226,6 +262,14 @@ class Chain:
         """Run time goes on."""
         for servo in self.servos.values():
             servo.advance(to_ns)
+
+    def connect(self, joint: str, there: bool) -> None:
+        """Put a servo on the line, or take it off; it goes on either way."""
+        servo = self.servos[joint]
+        if there:
+            self._by_id[servo.mine.id] = servo
+        else:
+            self._by_id.pop(servo.mine.id, None)
 
     def write(self, data: bytes) -> None:
         """The host's bytes: one packet at a time, as on a half-duplex line."""
@@ -274,7 +318,7 @@ class Chain:
             self._say(servo, one.error, one.block(address, count))
 
     def _say(self, servo: int, error: int, data: bytes) -> None:
-        packet = self._wire.answer(servo, error, data)
+        packet = self.wire.answer(servo, error, data)
         self._out += packet if self.fault is None else self.fault(packet, True)
 
     def _instruction(self, data: bytes) -> tuple[int, int, bytes] | None:

@@ -1,0 +1,154 @@
+"""Simulated servos that fail by a schedule, and what the driver makes of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from servo_bench import Bench, setup_of
+
+from frictid_drivers.servos.simulated import VirtualServoDriver
+from frictid_drivers.virtual.faults import ENVIRONMENT
+from frictid_hil.errors import FrictidError, HardwareError, InvalidFields
+from frictid_hil.plan.mode import Mode
+from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
+
+MODELS = ("XL330-M288", "STS3215")
+FIRST, SECOND = "shoulder_pan", "shoulder_lift"
+
+
+class Running:
+    """A driver of two servos with faults, cycling at 200 Hz, both joints under power."""
+
+    def __init__(self, model: str, *faults: dict[str, Any]) -> None:
+        setup = replace(setup_of(model, bus={"faults": list(faults)}), realtime=False)
+        self.driver = VirtualServoDriver(setup)
+        self.driver.open()
+        self.driver.configure(200.0, [FIRST, SECOND])
+        self.driver.start_cycling()
+        self.at_rad = 0.0
+        for joint in (FIRST, SECOND):
+            self.driver.enable(joint, Mode.POSITION)
+
+    def cycles(self, count: int, *, step_rad: float = 0.0) -> list[Feedback]:
+        clock = self.driver.clock
+        for _ in range(count):
+            self.at_rad += step_rad
+            begun_ns = clock.now_ns()
+            reports = self.driver.exchange([SetPoint(position_rad=self.at_rad), SetPoint()])
+            clock.wait_until(begun_ns + 5_000_000)
+        return list(reports)
+
+    def servo(self, joint: str) -> Any:
+        return self.driver.chain.servos[joint]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_answers_of_one_servo_are_lost_for_a_while(model: str) -> None:
+    run = Running(model, {"kind": "drop", "frames": "report", "joint": FIRST, "at_s": 0.1, "count": 10})
+    assert [report.age_cycles for report in run.cycles(20)] == [0, 0]
+    assert [report.age_cycles for report in run.cycles(6)] == [6, 0]
+    assert [report.age_cycles for report in run.cycles(10)] == [0, 0]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_an_answer_with_another_servos_id_is_not_this_servos(model: str) -> None:
+    run = Running(model, {"kind": "misaddress", "frames": "report", "joint": SECOND, "at_s": 0.1, "count": 5})
+    run.cycles(20)
+    assert [report.age_cycles for report in run.cycles(5)] == [0, 5]
+
+
+@pytest.mark.parametrize("kind", ["corrupt", "truncate"])
+@pytest.mark.parametrize("model", MODELS)
+def test_damaged_answers_are_left_out(model: str, kind: str) -> None:
+    run = Running(model, {"kind": kind, "frames": "report", "joint": SECOND, "at_s": 0.1, "level": 5, "count": 4})
+    run.cycles(20)
+    assert run.cycles(4)[1].age_cycles == 4
+    assert run.cycles(2)[1].age_cycles == 0
+
+
+def test_a_servo_that_hears_nothing_lets_go_by_its_watchdog() -> None:
+    run = Running("XL330-M288", {"kind": "mute", "joint": SECOND, "at_s": 0.1})
+    run.cycles(20)
+    assert run.servo(SECOND).on
+    run.cycles(80)
+    assert run.servo(FIRST).on and not run.servo(SECOND).on
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_a_servo_reports_is_wrong_and_what_it_does_is_not(model: str) -> None:
+    run = Running(model, {"kind": "jump", "quantity": "position", "joint": FIRST, "level": 0.6, "at_s": 0.1})
+    assert run.cycles(19)[0].position_rad == pytest.approx(0.0, abs=0.02)
+    assert run.cycles(2)[0].position_rad == pytest.approx(0.6, abs=0.02)
+    assert run.servo(FIRST).plant.position_rad == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_servo_that_reboots_has_no_torque_and_forgets_its_goal(model: str) -> None:
+    run = Running(model, {"kind": "reset", "joint": FIRST, "at_s": 0.1})
+    run.cycles(30)
+    assert not run.servo(FIRST).on and run.servo(SECOND).on
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_an_error_byte_is_seen(model: str) -> None:
+    run = Running(model, {"kind": "fault", "joint": FIRST, "at_s": 0.1})
+    assert run.cycles(19)[0].state is JointState.ENABLED
+    assert run.cycles(4)[0].state is JointState.FAULT
+
+
+@pytest.mark.parametrize("way", ["send", "receive"])
+@pytest.mark.parametrize("error", ["can", "os", "runtime", "value"])
+def test_whatever_a_port_raises_is_a_lost_port(way: str, error: str) -> None:
+    run = Running("STS3215", {"kind": f"{way}_error", "error": error, "at_s": 0.1})
+    run.cycles(19)
+    with pytest.raises(HardwareError, match=r"the port is gone: .*injected"):
+        run.cycles(4)
+    run.driver.quick_stop()
+    run.driver.close()
+
+
+@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.TORQUE])
+def test_a_stop_does_not_follow_a_reading_that_jumped(mode: Mode) -> None:
+    """The joint was sent to where the jumped reading said, faster than it may ever go."""
+    run = Running("XL330-M288", {"kind": "jump", "quantity": "position", "joint": FIRST, "level": 0.8, "at_s": 0.2})
+    run.cycles(20, step_rad=0.004)
+    run.driver.enable(FIRST, mode)
+    run.cycles(20, step_rad=0.004)
+    assert run.cycles(1)[0].position_rad > 0.7
+    before_rad = run.servo(FIRST).plant.position_rad
+    run.driver.quick_stop()
+    run.cycles(40)
+    assert abs(run.servo(FIRST).plant.position_rad - before_rad) < 0.1
+
+
+@pytest.mark.parametrize("cycle_hz", [50.0, 100.0, 200.0, 400.0])
+def test_a_velocity_is_no_older_than_20_ms_at_any_rate(cycle_hz: float) -> None:
+    """At 100 Hz it was 40 ms old, and a healthy joint was stopped because position and velocity disagreed."""
+    bench = Bench(setup_of("STS3215"))
+    bench.begin(cycle_hz)
+    first, *_ = bench.setup.joints
+    delay_s = bench.driver.identify()[first.name].timing.velocity_delay_s
+    assert 0.0 < delay_s <= 0.02
+
+
+def test_faults_of_other_drives_are_refused() -> None:
+    with pytest.raises(InvalidFields, match="kind"):
+        Running("STS3215", {"kind": "emcy"})
+    with pytest.raises(InvalidFields, match="frames"):
+        Running("STS3215", {"kind": "drop", "frames": "sync"})
+
+
+def test_faults_come_from_the_environment_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(ENVIRONMENT, json.dumps([{"kind": "send_error", "error": "os"}]))
+    with pytest.raises(FrictidError):
+        Running("STS3215")
+
+
+def test_a_stall_lets_time_pass() -> None:
+    run = Running("STS3215", {"kind": "stall", "delay_s": 0.3, "at_s": 0.1})
+    run.cycles(22)
+    assert run.driver.clock.now_ns() > 0.4e9 and math.isfinite(run.at_rad)
