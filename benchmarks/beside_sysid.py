@@ -110,7 +110,7 @@ def fitted_by_sysid(path: Path, motions: list[Motion], iterations: int) -> tuple
 
 
 def told(name: str, arm: ArmSet, model: Any, seconds: float) -> None:
-    torque, position = gap_of(arm, model, [m for m in arm.motions if m.validation])
+    torque, position = gap_of(arm, {}, [m for m in arm.motions if m.validation], model)
     figures = "  ".join(f"{j} {t:.3f}" for j, t in zip(JOINTS, torque, strict=True))
     print(
         f"{name:22s} {seconds:6.1f} s  torque N m: {figures}  position mrad: {1e3 * np.max(position):.3f}", flush=True

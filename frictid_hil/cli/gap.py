@@ -126,7 +126,16 @@ ExportOption = Annotated[
     typer.Option(
         "--export",
         metavar="TARGET=FILE",
-        help="Also write the joints of a model as isaaclab or mjlab (.py), bam (.json), c (.h), samples (.json).",
+        help="Also write the joints of a model: isaaclab, mjlab (.py), newton (.usda), ros2 (.yaml), bam, samples "
+        "(.json), c (.h).",
+    ),
+]
+StageOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--stage",
+        metavar="FILE",
+        help="Your USD stage, over whose joints --export newton is laid; without it a new one.",
     ),
 ]
 RandomiseOption = Annotated[
@@ -155,6 +164,7 @@ def diagnose(
     write_model: WriteModelOption = None,
     mujoco: MujocoOption = None,
     export: ExportOption = None,
+    stage: StageOption = None,
     randomise: RandomiseOption = 0,
     apply: ApplyOption = False,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")] = None,
@@ -172,7 +182,7 @@ def diagnose(
     output = Output(as_json, quiet)
     every = [*(logs or ()), *(more_logs or ())]
     of_a_model = hold or tolerance or executor or export or randomise or len(joint or ()) > 1
-    if why := _contradiction(every, model, negligible, bool(of_a_model)):
+    if why := _contradiction(every, model, negligible, bool(of_a_model or stage)):
         output.refuse("gap_diagnose", UsageError(why))
     if model is not None:
         output.run(
@@ -181,7 +191,7 @@ def diagnose(
                 model_logs(model, every, joint, columns, hold, tolerance, validation, split, nominal, profile, mujoco),
                 write=write_model,
                 apply=apply,
-                wanted=Wanted.of(export or (), randomise),
+                wanted=Wanted.of(export or (), randomise, stage),
                 out=out,
                 force=force,
                 executor_name=executor,

@@ -155,11 +155,30 @@ def _print_export(output: Output, result: Result) -> None:
         output.out.print(f"model: {result['model']}", soft_wrap=True, markup=False)
     for target, told in result.get("targets", {}).items():
         output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True, markup=False)
-        output.out.print(f"  lost: {told['lost']}", soft_wrap=True, markup=False)
+    _print_figures(output, result)
     if result.get("report"):
         output.out.print(f"report: {result['report']}", soft_wrap=True, markup=False)
     if result.get("model_refused"):
         output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
+
+
+def _print_figures(output: Output, result: Result) -> None:
+    """How near every file comes to the machine: one row a file and engine."""
+    written = [result.get("export", {}), *result.get("targets", {}).values()]
+    rows = [row for told in written for row in told.get("figures", [])]
+    if not rows:
+        return
+    table = folding("export", "where it ran", "torque error before", "after", "what is lost", whole=("export",))
+    for row in rows:
+        if "refused" in row:
+            table.add_row(row["target"], row["where"], "", "refused", row["refused"])
+        else:
+            figures = [f"{row[when]:.2f} %" for when in ("before_percent", "after_percent")]
+            table.add_row(row["target"], row["where"], *figures, row["lost"])
+    output.out.print(table)
+    output.out.print(
+        "torque error: of the measured torque of the changed joints, on motion that was not fitted", soft_wrap=True
+    )
 
 
 def _units(joint: Mapping[str, Any]) -> tuple[str, str]:

@@ -14,6 +14,7 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.closed_loop import side_by_side
+from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
@@ -78,7 +79,7 @@ def diagnose_arm(
     }
     made, result["closed_loop"] = nearer_only(arm, exports(arm, found, apply=apply))
     if write is not None:
-        result |= _written(arm, made, result["closed_loop"]["left_out"], write, force)
+        result |= _written(arm, made, result["closed_loop"], write, force)
     if wanted is not None and wanted.files:
         result["targets"] = write_targets(arm, found, made, wanted, force=force)
     if out is not None:
@@ -112,15 +113,16 @@ def _page_of_the_arm(
 
 
 def _written(
-    arm: ArmSet, made: Mapping[str, Export], left_out: Mapping[str, Any], write: Path, force: bool
+    arm: ArmSet, made: Mapping[str, Export], loop: Mapping[str, Any], write: Path, force: bool
 ) -> dict[str, Any]:
     if not made:
         why = "no cause is sure enough to change the model; record what is asked for, or add --apply"
-        if left_out:
+        if loop["left_out"]:
             why = "no change brings your model nearer to the recordings that were not fitted"
         return {"model": None, "model_refused": why}
     told = write_model(arm, made, write, force=force)
-    return {"model": told["model"], "export": told}
+    figures = figures_of_model(arm, Withheld(arm, made), natives(made), loop)
+    return {"model": told["model"], "export": {**told, "figures": figures}}
 
 
 def diagnosed(arm: ArmSet, executor_name: str | None = None) -> dict[str, Diagnosis]:

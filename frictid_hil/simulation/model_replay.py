@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.native_check import control_of, drive_of, force_of
+from frictid_hil.simulation.native_check import HELD_KG_M2, control_of, drive_of, force_of
 from frictid_hil.simulation.rigid_bodies import mujoco_library
 from frictid_hil.simulation.robot_model import RobotModel, relax
 
@@ -48,6 +49,7 @@ def replayed(
     time_s: Array,
     position_rad: Array,
     command_rad: Array,
+    engine: Callable[[Any, Any], Stepper] | None = None,
 ) -> Replayed:
     """Run a model along the commands of a recording, from where the recording begins.
 
@@ -58,6 +60,7 @@ def replayed(
         time_s: shape (n,).
         position_rad: measured, shape (n, k); only the first row is used.
         command_rad: shape (n, k).
+        engine: that steps the model, see ``other_engines``; MuJoCo itself unless given.
     """
     library, m = mujoco_library(), model
     data = library.MjData(m)
@@ -77,19 +80,58 @@ def replayed(
     relax(m, data)
     library.mj_forward(m, data)
     mean = gears * data.actuator_force[forces]
+    stepper = _InMujoco(m, data, frozen) if engine is None else engine(_holding(m, frozen), data)
     for row, wanted in enumerate(command_rad):
-        positions[row], torques[row] = data.qpos[places], mean
+        positions[row], torques[row] = stepper.position()[places], mean
         if row == len(steps):
             break
-        data.ctrl[controls] = gears * wanted
+        control = data.ctrl.copy()
+        control[controls] = gears * wanted
         total = np.zeros(len(joints))
         for _ in range(steps[row]):
-            library.mj_step(m, data)
-            total += data.actuator_force[forces]
-            if frozen is not None:
-                data.qvel[frozen] = 0.0
+            total += stepper.step(control)[forces]
         mean = gears * total / steps[row]
     return Replayed(positions, torques)
+
+
+class Stepper(Protocol):
+    """A model that some engine moves, step by step."""
+
+    def step(self, control: Array) -> Array:
+        """One step under a control, (nu,); the force of every actuator."""
+        ...
+
+    def position(self) -> Array:
+        """Coordinates of the model, (nq,)."""
+        ...
+
+
+class _InMujoco:
+    """MuJoCo itself."""
+
+    def __init__(self, model: Any, data: Any, frozen: list[int] | None) -> None:
+        self._model, self._data, self._frozen = model, data, frozen
+        self._step = mujoco_library().mj_step
+
+    def step(self, control: Array) -> Array:
+        data = self._data
+        data.ctrl[:] = control
+        self._step(self._model, data)
+        if self._frozen is not None:
+            data.qvel[self._frozen] = 0.0
+        force: Array = data.actuator_force
+        return force
+
+    def position(self) -> Array:
+        place: Array = self._data.qpos
+        return place
+
+
+def _holding(model: Any, frozen: list[int] | None) -> Any:
+    """The model with joints that stand, by an inertia that nothing moves."""
+    held = copy.copy(model)
+    held.dof_armature[frozen or []] = HELD_KG_M2
+    return held
 
 
 def _frozen(model: Any, held: Mapping[str, float]) -> list[int] | None:

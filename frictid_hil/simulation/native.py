@@ -84,6 +84,7 @@ class Native:
         placed: where each effect went, by name.
         lost: what is lost, by effect.
         remarks: what its user has to do.
+        reported: torque that the drive reports over the torque that it gives, which is what MuJoCo tells.
     """
 
     joint: dict[str, str] = field(default_factory=dict)
@@ -95,6 +96,7 @@ class Native:
     placed: dict[str, str] = field(default_factory=dict)
     lost: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    reported: float = 1.0
 
 
 def native_elements(believed: ModelJoint, model: JointModel, use: Use, form: str, *, friction: bool) -> Native:
@@ -348,6 +350,7 @@ def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: U
         where = "actuator: kp and kv" if motor.law == "position" else "actuator: gear"
         native.placed |= dict.fromkeys(sorted({"torque_constant_error", "controller_gain_error"} & set(effects)), where)
         if "torque_constant_error" in effects:
+            native.reported = 1.0 / gain
             native.lost["torque_constant_error"] = "the drive's report: MuJoCo tells the true torque"
     if math.isfinite(limit) and ("torque_saturation" in effects or (gain != 1.0 and motor.law == "position")):
         force = limit * gain / abs(motor.gear)

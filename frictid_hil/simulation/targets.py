@@ -1,4 +1,4 @@
-"""Improved joints for other simulators: Isaac Lab, mjlab, BAM, a C header. What each cannot hold is told.
+"""Improved joints for other simulators: Isaac Lab, mjlab, BAM, ros2_control, a C header. What is lost is told.
 
 Every target gets the same few numbers of a joint (``Numbers``), made of our simulated joint with its causes.
 """
@@ -11,8 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import yaml
+from scipy.optimize import nnls
 
 from frictid_hil.errors import UsageError
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.native import Use, curve_numbers, largest_torque
 from frictid_hil.simulation.robot_model import ModelJoint
@@ -28,6 +31,7 @@ class Numbers:
         stribeck_rad_s: speed of the fall, exp(-(v/vs)**2).
         damping: (a, b, c) of a v + b v abs(v) + c v**3.
         viscous_nm_s_per_rad: the one slope that stands nearest to it.
+        straight: (level in N m, slope in N m s/rad) of the straight line nearest to all of sliding friction.
         presliding_nm_per_rad: stiffness before friction slips.
         armature_kg_m2: of the rotor.
         kp_nm_per_rad: of a position law; 0 where there is none.
@@ -41,6 +45,7 @@ class Numbers:
     stribeck_rad_s: float
     damping: tuple[float, float, float]
     viscous_nm_s_per_rad: float
+    straight: tuple[float, float]
     presliding_nm_per_rad: float
     armature_kg_m2: float
     kp_nm_per_rad: float
@@ -59,6 +64,7 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
     """
     dry, rise, at, damping = curve_numbers(model, use)
     speed = np.quantile(use.speed_rad_s, np.linspace(0.1, 1.0, 40))
+    bump = rise * np.exp(-((speed / at) ** 2)) if at > 0.0 else 0.0
     rest = (damping[0] + (damping[1] + damping[2] * speed) * speed) * speed
     effects, motor = model.effects, believed.motor
     gains = effects.get("controller_gain_error", {})
@@ -71,6 +77,7 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
         stribeck_rad_s=at,
         damping=damping,
         viscous_nm_s_per_rad=float(speed @ rest / (speed @ speed)),
+        straight=_straight(speed, dry + bump + rest),
         presliding_nm_per_rad=model.presliding_stiffness_nm_per_rad,
         armature_kg_m2=max(
             0.0, believed.armature_kg_m2 + effects.get("inertia_error", {}).get("error_share", 0.0) * link
@@ -80,6 +87,12 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
         torque_limit_nm=limit * constant,
         delay_s=(motor.delay_s if motor else 0.0) + effects.get("torque_delay", {}).get("delay_s", 0.0),
     )
+
+
+def _straight(speed: Array, torque: Array) -> tuple[float, float]:
+    """Level and slope nearest to a curve, neither below zero."""
+    level, slope = nnls(np.stack([np.ones_like(speed), speed], axis=1), torque)[0]
+    return float(level), float(slope)
 
 
 def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numbers]], step_s: float) -> str:
@@ -102,9 +115,9 @@ def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numb
             "stiffness": n.kp_nm_per_rad,
             "damping": n.kv_nm_s_per_rad,
             "armature": n.armature_kg_m2,
-            "friction": n.dry_nm + n.rise_nm,
-            "dynamic_friction": n.dry_nm,
-            "viscous_friction": n.viscous_nm_s_per_rad,
+            "friction": max(n.dry_nm + n.rise_nm, n.straight[0]),
+            "dynamic_friction": n.straight[0],
+            "viscous_friction": n.straight[1],
         }
         if math.isfinite(n.torque_limit_nm):
             values["actuator_effort_limit"] = n.torque_limit_nm
@@ -151,13 +164,13 @@ def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:
             "stiffness": n.kp_nm_per_rad,
             "damping": n.kv_nm_s_per_rad,
             "armature": n.armature_kg_m2,
-            "frictionloss": n.dry_nm,
+            "frictionloss": n.straight[0],
         }
         if math.isfinite(n.torque_limit_nm):
             values["effort_limit"] = n.torque_limit_nm
         told = ", ".join(f"{key}={value:.6g}" for key, value in values.items())
         lines.append(f"    BuiltinPositionActuatorCfg(target_names_expr=({json.dumps(name)},), {told}),")
-    damping = {name: float(f"{n.viscous_nm_s_per_rad:.6g}") for name, n in joints.items()}
+    damping = {name: float(f"{n.straight[1]:.6g}") for name, n in joints.items()}
     steps = {name: round(n.delay_s / step_s) for name, n in joints.items()}
     lines += [
         ")",
@@ -273,6 +286,15 @@ def friction_nm(n: Numbers, speed_rad_s: float, slip: float) -> float:
     return (n.dry_nm + n.rise_nm * bump) * slip + (a + b * abs(speed_rad_s) + c * speed_rad_s**2) * speed_rad_s
 
 
+def ros2(joints: Mapping[str, Numbers]) -> str:
+    """Parameters of a ros2_control node: a level and a slope by joint."""
+    friction = {
+        name: {"coulomb_nm": round(n.straight[0], 6), "viscous_nm_s_per_rad": round(n.straight[1], 6)}
+        for name, n in joints.items()
+    }
+    return yaml.safe_dump({"/**": {"ros__parameters": {"joints": list(joints), "friction": friction}}}, sort_keys=False)
+
+
 def samples_json(samples: Mapping[str, Sequence[Numbers]]) -> str:
     """Whole samples: the k-th of every joint belong together."""
     count = min((len(drawn) for drawn in samples.values()), default=0)
@@ -284,6 +306,9 @@ LOST = {
     "isaaclab": "presliding, the curve beyond one slope, asymmetry, ripple and play have no place in its joints",
     "bam": "presliding, the curve beyond one slope, asymmetry, ripple, play and delay have no place in its model m2",
     "mjlab": "presliding, Stribeck, a curve beyond one slope, asymmetry, ripple and play; the improved MJCF keeps them",
+    "newton": "presliding, Stribeck, a curve beyond one slope, asymmetry, ripple, play and delay; a stage of our own "
+    "has no shapes",
+    "ros2": "all but a level and a slope",
     "c": "asymmetry, ripple, play, delay, load: the step function is friction over speed and presliding",
     "samples": "nothing of the numbers; effects without a number of their own are not in them",
 }
@@ -296,7 +321,7 @@ def written_as(
     """Text by file name.
 
     Args:
-        target: one of ``TARGETS``.
+        target: one of ``TARGETS`` but ``newton``, whose text ``usd`` makes.
         file: name of the file; BAM has one a joint, ``NAME_JOINT.json``.
         joints: to write.
         samples: of the posterior, by joint; may be empty.
@@ -310,6 +335,7 @@ def written_as(
         "isaaclab": lambda: {file: isaac_lab(joints, samples, step_s)},
         "bam": lambda: {f"{stem or ending}_{name}{dot}{ending if stem else ''}": bam(n) for name, n in joints.items()},
         "mjlab": lambda: {file: mjlab(joints, step_s)},
+        "ros2": lambda: {file: ros2(joints)},
         "c": lambda: {file: c_header(joints)},
         "samples": lambda: {file: samples_json(samples)},
     }

@@ -36,7 +36,7 @@ def arm(tmp_path: Path) -> ArmSet:
 
 def test_words_are_read_and_refused() -> None:
     assert Wanted.of(["c=a.h", "bam=b.json"], 0).files == {"c": Path("a.h"), "bam": Path("b.json")}
-    for words, samples in ((["newton=x"], 0), (["c"], 0), (["samples=s.json"], 0), ([], 5)):
+    for words, samples in ((["drake=x"], 0), (["c"], 0), (["samples=s.json"], 0), ([], 5)):
         with pytest.raises(UsageError):
             Wanted.of(words, samples)
 

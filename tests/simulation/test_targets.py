@@ -15,6 +15,7 @@ from frictid_hil.errors import UsageError
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.native import Use
 from frictid_hil.simulation.robot_model import ModelJoint, Motor
+from frictid_hil.simulation.target_laws import laws_of, run_c
 from frictid_hil.simulation.targets import Numbers, friction_nm, numbers_of, written_as
 
 SERVO = Motor(("servo",), "position", 900.0, 30.0, 1.0, 40.0, 0.004, 0.0)
@@ -78,8 +79,21 @@ def test_bam_has_a_file_a_joint_and_samples_belong_together(joint: Numbers) -> N
     assert json.loads(made["bam_pan.json"])["friction_stribeck"] == joint.rise_nm
     (text,) = written_as("samples", "s.json", {}, {"lift": [joint] * 3, "pan": [joint] * 3}, 0.002).values()
     assert len(json.loads(text)["samples"]) == 3
-    with pytest.raises(UsageError, match="no target 'newton'"):
-        written_as("newton", "x", {}, {}, 0.002)
+    with pytest.raises(UsageError, match="no target 'drake'"):
+        written_as("drake", "x", {}, {}, 0.002)
+
+
+def test_what_a_file_says_is_read_back_from_it(joint: Numbers) -> None:
+    v = np.array([-0.7, 0.3, 1.2])
+    for target in ("isaaclab", "mjlab", "ros2", "bam", "c", "samples"):
+        texts = written_as(
+            target, f"a.{target}", {"lift": joint, "pan": joint}, {"lift": [joint], "pan": [joint]}, 0.002
+        )
+        (laws,) = laws_of(target, texts, ["lift", "pan"])
+        assert set(laws) == {"lift", "pan"}
+        expected = [friction_nm(joint, float(speed), float(np.sign(speed))) for speed in v]
+        assert laws["pan"].torque_nm(v, np.sign(v)) == pytest.approx(expected, rel=0.06), target
+        assert laws["lift"].armature_kg_m2 in (None, pytest.approx(joint.armature_kg_m2))
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -94,4 +108,7 @@ def test_the_c_step_function_compiles_and_meets_its_vectors(joint: Numbers, tmp_
     subprocess.run(command, cwd=tmp_path, check=True)
     worst = subprocess.run(["./check"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
     assert float(worst) < 1e-12
+    speed = np.array([0.5, 0.5, -0.2])
+    ran = run_c(text, {"pan": speed}, 0.01)["pan"]
+    assert ran[:2] == pytest.approx([friction_nm(plain, 0.5, 1.0)] * 2)
     assert text.count('{"pan"') == 1 and f"{friction_nm(plain, 0.0, 0.0)!r}" in text

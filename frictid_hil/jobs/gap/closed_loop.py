@@ -53,7 +53,7 @@ def closed_loop_gap(arm: ArmSet, natives: Mapping[str, Native]) -> dict[str, Any
     motions, names = withheld(arm), arm.recorded
     if reason := why_no_closed_loop(arm, motions):
         return {"reason": reason}
-    before, after = (_each(arm, m, motions) for m in (arm.robot.compiled, compiled_with(arm.robot, natives)))
+    before, after = _each(arm, {}, motions), _each(arm, natives, motions)
     left = {}
     for name in natives:
         k = names.index(name)
@@ -93,16 +93,16 @@ def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, 
         return ()
     keep = int(np.searchsorted(motion.time_s, motion.time_s[0] + SHOWN_S))
     short = replace(motion, samples={n: s.select(np.arange(len(s)) < keep) for n, s in motion.samples.items()})
-    torque, position = _off(arm, arm.robot.compiled, short)
-    better = _off(arm, compiled_with(arm.robot, natives), short) if natives else None
+    torque, position = _off(arm, arm.robot.compiled, short, {})
+    better = _off(arm, compiled_with(arm.robot, natives), short, natives) if natives else None
     begin = keep - len(position)
-    low_pass = _low_pass(short.time_s)
+    smooth = low_pass(short.time_s)
     runs = []
     for k, (name, samples) in enumerate(short.samples.items()):
         known = samples.torque_nm is not None
         part, measured = 1 - known, samples.position_rad[begin:]
         if samples.torque_nm is not None:
-            measured = low_pass(samples.torque_nm)[begin:]
+            measured = smooth(samples.torque_nm)[begin:]
         off = (torque if known else position)[:, k]
         improved = None if better is None else measured - better[part][:, k]
         quantity = "torque [N m]" if known else "position [rad]"
@@ -112,15 +112,25 @@ def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, 
     return tuple(runs)
 
 
-def _low_pass(time_s: Array) -> Callable[[Array], Array]:
+def low_pass(time_s: Array) -> Callable[[Array], Array]:
+    """What columns (n, ...) on these times look like below ``CUTOFF_HZ``, without any lag."""
     rate_hz = 1.0 / float(np.median(np.diff(time_s)))
     b, a = signal.butter(4, min(CUTOFF_HZ, 0.2 * rate_hz) / (0.5 * rate_hz))
     return lambda columns: np.asarray(signal.filtfilt(b, a, columns, axis=0))
 
 
-def gap_of(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[Array, Array]:
-    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded."""
-    torque, position = _each(arm, model, motions)
+def gap_of(
+    arm: ArmSet, natives: Mapping[str, Native], motions: Sequence[Motion], model: Any = None
+) -> tuple[Array, Array]:
+    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded.
+
+    Args:
+        arm: model and recordings.
+        natives: changes of the user's model.
+        motions: to run along.
+        model: another one, compiled, instead of the user's with the changes.
+    """
+    torque, position = _each(arm, natives, motions, model)
     return _rms(torque), _rms(position)
 
 
@@ -128,15 +138,22 @@ def _rms(motions: Sequence[Array]) -> Array:
     return np.asarray(np.sqrt(np.mean(np.concatenate(motions) ** 2, axis=0)))
 
 
-def _each(arm: ArmSet, model: Any, motions: Sequence[Motion]) -> tuple[list[Array], list[Array]]:
+def _each(
+    arm: ArmSet, natives: Mapping[str, Native], motions: Sequence[Motion], model: Any = None
+) -> tuple[list[Array], list[Array]]:
     """(torque, position) of each recording less the model's."""
+    if model is None:
+        model = compiled_with(arm.robot, natives) if natives else arm.robot.compiled
     with ThreadPoolExecutor() as threads:  # MuJoCo steps without Python's lock
-        every = list(threads.map(lambda motion: _off(arm, model, motion), motions))
+        every = list(threads.map(lambda motion: _off(arm, model, motion, natives), motions))
     return [torque for torque, _ in every], [position for _, position in every]
 
 
-def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
-    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten."""
+def _off(arm: ArmSet, model: Any, motion: Motion, natives: Mapping[str, Native]) -> tuple[Array, Array]:
+    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten.
+
+    A drive with another torque constant reports another torque than it gives.
+    """
     names = tuple(motion.samples)
     samples = list(motion.samples.values())
     time = samples[0].time_s
@@ -147,5 +164,6 @@ def _off(arm: ArmSet, model: Any, motion: Motion) -> tuple[Array, Array]:
     measured = [s.torque_nm for s in samples]
     if any(torque is None for torque in measured):
         return np.full_like(position, np.nan), position
-    torque = np.stack([t for t in measured if t is not None], axis=1) - ran.torque_nm
-    return _low_pass(time)(torque)[begin:], position
+    reported = np.array([natives[name].reported if name in natives else 1.0 for name in names])
+    torque = np.stack([t for t in measured if t is not None], axis=1) - reported * ran.torque_nm
+    return low_pass(time)(torque)[begin:], position

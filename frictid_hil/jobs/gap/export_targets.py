@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,10 @@ import numpy as np
 from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.jobs.gap.export_figures import Withheld, figure_in_newton, figure_of_target
 from frictid_hil.jobs.gap.from_model import ArmSet
 from frictid_hil.jobs.gap.write_model import Export, joint_model, use_of
+from frictid_hil.simulation import usd
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, written_as
 
@@ -29,14 +32,16 @@ class Wanted:
         files: path by target, see ``targets.TARGETS``.
         samples: of the posterior, how many; 0 draws none.
         seed: of the draw.
+        stage: USD of the user's, over whose joints ``newton`` is laid; None writes a stage of its own.
     """
 
     files: Mapping[str, Path]
     samples: int = 0
     seed: int = 1
+    stage: Path | None = None
 
     @staticmethod
-    def of(words: Sequence[str], samples: int) -> Wanted:
+    def of(words: Sequence[str], samples: int, stage: Path | None = None) -> Wanted:
         """Read what is wanted from words of the form ``TARGET=FILE``.
 
         Raises:
@@ -56,7 +61,9 @@ class Wanted:
             raise UsageError(
                 "--randomise has nothing to write to", next_step="add --export samples=FILE or isaaclab=FILE"
             )
-        return Wanted(files, samples)
+        if stage is not None and "newton" not in files:
+            raise UsageError("--stage is of Newton", next_step="add --export newton=FILE.usda")
+        return Wanted(files, samples, stage=stage)
 
 
 def write_targets(
@@ -68,7 +75,7 @@ def write_targets(
         UsageError: a file is there already.
 
     Returns:
-        By target: ``files`` (absolute paths) and ``lost``.
+        By target: ``files`` (absolute paths), ``lost`` and ``figures``, see ``export_figures``.
     """
     joints, samples = {}, {}
     random = np.random.default_rng(wanted.seed)
@@ -85,21 +92,39 @@ def write_targets(
             drawn.append(numbers_of(joint.believed, joint_model(joint, other, stiffness), use))
         if drawn:
             samples[name] = drawn
-    step_s = float(arm.robot.compiled.opt.timestep)
     texts = {
-        target: {
-            path.parent / name: text for name, text in written_as(target, path.name, joints, samples, step_s).items()
-        }
+        target: {path.parent / name: text for name, text in _texts(arm, target, path, joints, samples, wanted).items()}
         for target, path in wanted.files.items()
     }
     refuse_overwriting([path for files in texts.values() for path in files], force=force)
     for files in texts.values():
         for path, text in files.items():
             write_whole(path, text)
-    return {
-        target: {"files": [str(path.resolve()) for path in files], "lost": LOST[target]}
-        for target, files in texts.items()
-    }
+    motion = Withheld(arm, made)
+    told = {}
+    for target, files in texts.items():
+        figures = figure_of_target(arm, motion, target, {p.name: text for p, text in files.items()}, LOST[target])
+        if target == "newton":
+            figures = figure_in_newton(arm, motion, wanted.files[target], LOST[target]) or figures
+        told[target] = {"files": [str(p.resolve()) for p in files], "lost": LOST[target], "figures": figures}
+    return told
+
+
+def _texts(
+    arm: ArmSet,
+    target: str,
+    path: Path,
+    joints: Mapping[str, Numbers],
+    samples: Mapping[str, Sequence[Numbers]],
+    wanted: Wanted,
+) -> dict[str, str]:
+    """What to write for a target, by file name."""
+    if target != "newton":
+        return written_as(target, path.name, joints, samples, float(arm.robot.compiled.opt.timestep))
+    if wanted.stage is None:
+        return {path.name: usd.stage(arm.robot, joints)}
+    below = Path(os.path.relpath(wanted.stage.resolve(), path.resolve().parent))
+    return {path.name: usd.overlay(below, usd.joint_prims(wanted.stage, list(joints)), joints)}
 
 
 def _drawn(
@@ -126,10 +151,10 @@ def _within_interval(
     effect: str, values: Mapping[str, float], found: Diagnosis, random: np.random.Generator
 ) -> dict[str, float]:
     """Parameters of an effect that was read without a posterior, each within its interval."""
-    cause = next(cause for cause in found.causes if cause.effect == effect)
+    parameters = next((cause.parameters for cause in found.causes if cause.effect == effect), {})
     limits = {p.name: p for p in all_effects()[effect].parameters}
     drawn = dict(values)
-    for name, told in cause.parameters.items():
+    for name, told in parameters.items():
         if told.low is not None and told.high is not None and name in drawn:
             sigma = (told.high - told.low) / _SIGMAS
             value = drawn[name] + sigma * float(random.standard_normal())

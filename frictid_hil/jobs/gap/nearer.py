@@ -8,7 +8,6 @@ from typing import Any
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap, fitted, gap_of
 from frictid_hil.jobs.gap.from_model import ArmSet
 from frictid_hil.jobs.gap.write_model import Export, export_of, natives
-from frictid_hil.simulation.model_edit import compiled_with
 
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -77,7 +76,7 @@ def _another(arm: ArmSet, made: Mapping[str, Export], name: str) -> Export | Non
 
     def off(export: Export | None) -> float:
         changes = others if export is None else {**others, name: export.native}
-        torque, position = gap_of(arm, compiled_with(arm.robot, changes), fitted(arm))
+        torque, position = gap_of(arm, changes, fitted(arm))
         return float(torque[column] if torque[column] >= 0.0 else position[column])
 
     tried = [

@@ -88,8 +88,8 @@ def _exports_by_position(arm: ArmSet, wanted: Mapping[str, Mapping[str, Mapping[
         native = native_elements(joint.believed, model, use_of(arm, name), "", friction=False)
         native.lost |= {e: _NEEDS_TORQUE for e in effects if e not in _TIMING}
         made[name] = Export(model, native, "", {})
-    before = gap_of(arm, arm.robot.compiled, motions)[1]
-    after = gap_of(arm, compiled_with(arm.robot, natives(made)), motions)[1]
+    before = gap_of(arm, {}, motions)[1]
+    after = gap_of(arm, natives(made), motions)[1]
     nearer = {name for name, off, was in zip(names, after, before, strict=True) if off < was}
     return {name: export for name, export in made.items() if name in nearer}
 

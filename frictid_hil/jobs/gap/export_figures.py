@@ -1,0 +1,222 @@
+"""How near every file that is exported comes to the machine: torque on motion that was not fitted, before and after.
+
+The user's own MJCF runs in closed loop in MuJoCo, and for a short while in every other engine that is installed. Of a
+file whose simulator does not run here, the friction law is read back from the file and evaluated along the motion: what
+the machine gave, less what the bodies need, less what the file says. Such files say nothing of presliding: friction
+builds up as in the user's model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frictid_hil.errors import FrictidError
+from frictid_hil.friction.trajectory import Array
+from frictid_hil.jobs.gap.closed_loop import low_pass, why_no_closed_loop, withheld
+from frictid_hil.jobs.gap.from_model import ArmSet, Motion, kinematics
+from frictid_hil.jobs.gap.write_model import PRESLIDING_RAD
+from frictid_hil.simulation.model_edit import compiled_with
+from frictid_hil.simulation.model_replay import replayed
+from frictid_hil.simulation.native import Native
+from frictid_hil.simulation.other_engines import in_newton, installed, newton
+from frictid_hil.simulation.rigid_bodies import mujoco_library
+from frictid_hil.simulation.target_laws import Law, c_compiler, laws_of, run_c
+from frictid_hil.simulation.usd import prim_name
+
+LAW_S = 30.0
+"""Length of the withheld motion along which laws are evaluated."""
+ENGINE_S = 2.0
+"""Length of the withheld motion that runs in other engines."""
+EDGE_S = 0.25
+"""Both ends of a motion, where a low-pass is not yet itself."""
+_ITSELF = "our own evaluation of the file, not run there"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One exported file.
+
+    Attributes:
+        target: what it is for.
+        where: where it ran.
+        before: RMS of the torque error by joint, N m, of the user's model.
+        after: with the export.
+        size: RMS of the measured torque by joint, N m.
+        lost: what the target cannot hold.
+    """
+
+    target: str
+    where: str
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    size: Mapping[str, float]
+    lost: str
+
+    def told(self) -> dict[str, Any]:
+        """As JSON; percent is of the measured torque, the RMS over joints."""
+        joints = {name: {"before_nm": self.before[name], "after_nm": self.after[name]} for name in self.after}
+        percent = [
+            100.0 * float(np.sqrt(np.mean([(off[name] / self.size[name]) ** 2 for name in self.after])))
+            for off in (self.before, self.after)
+        ]
+        told = {"target": self.target, "where": self.where, "lost": self.lost, "joints": joints}
+        return {**told, "before_percent": percent[0], "after_percent": percent[1]}
+
+
+class Withheld:
+    """The last motion that was not fitted, and what the machine gave there beyond what the bodies need.
+
+    Attributes:
+        motion: the motion.
+        joints: whose torque error counts.
+        size: RMS of their measured torque, N m.
+    """
+
+    def __init__(self, arm: ArmSet, changed: Iterable[str]) -> None:
+        self._arm = arm
+        self.motion = _beginning(withheld(arm)[-1], LAW_S)
+        self.joints = tuple(changed) or arm.recorded
+        self._smooth = low_pass(self.motion.time_s)
+        measured = {n: s.torque_nm for n, s in self.motion.samples.items() if s.torque_nm is not None}
+        self.known = set(self.joints) <= set(measured)
+        if not self.known:
+            return
+        self.size = {name: _rms(measured[name]) for name in self.joints}
+        moved = kinematics(self.motion.time_s, self.motion.position_rad)
+        bodies = arm.robot.rigid_body_torque(arm.recorded, *moved, arm.held)
+        if arm.found is not None and arm.found.torque is not None:
+            bodies = bodies + arm.found.torque(*moved)
+        columns = {name: arm.recorded.index(name) for name in self.joints}
+        self._left = {name: self._smooth(measured[name] - bodies[:, k]) for name, k in columns.items()}
+        self.velocity = {name: self._smooth(moved[1][:, k]) for name, k in columns.items()}
+        self._slip = {name: _slip(moved[0][:, k], _travel(arm, name)) for name, k in columns.items()}
+        self._acceleration = {name: self._smooth(moved[2][:, k]) for name, k in columns.items()}
+
+    def off(self, laws: Mapping[str, Law], friction_nm: Mapping[str, Array] | None = None) -> dict[str, float]:
+        """RMS of the torque that a law leaves, by joint, N m; ``friction_nm`` where friction was computed elsewhere."""
+        found = {}
+        edge = slice(*np.searchsorted(self.motion.time_s, self.motion.time_s[[0, -1]] + [EDGE_S, -EDGE_S]))
+        for name in self.joints:
+            law, believed = laws[name], self._arm.robot.joint(name)
+            torque = (friction_nm or {}).get(name, law.torque_nm(self.velocity[name], self._slip[name]))
+            if law.armature_kg_m2 is not None:
+                torque = torque + (law.armature_kg_m2 - believed.armature_kg_m2) * self._acceleration[name]
+            found[name] = _rms((self._left[name] - self._smooth(torque))[edge])
+        return found
+
+    def before(self) -> dict[str, float]:
+        """The same with the friction of the user's model."""
+        believed = {name: self._arm.robot.joint(name) for name in self.joints}
+        return self.off({name: Law(b.dry_nm, *b.stribeck, b.damping) for name, b in believed.items()})
+
+
+def figure_of_target(
+    arm: ArmSet, motion: Withheld, target: str, texts: Mapping[str, str], lost: str
+) -> list[dict[str, Any]]:
+    """Rows of a target's files, see ``Row``; none where the logs have no torque."""
+    if not motion.known:
+        return []
+    before, laws = motion.before(), laws_of(target, texts, arm.joints)
+    if not laws or not set(motion.joints) <= set(laws[0]):
+        return []
+    where, friction = _ITSELF, None
+    if target == "c" and c_compiler() is not None:
+        (text,) = texts.values()
+        friction = run_c(text, motion.velocity, float(np.median(np.diff(motion.motion.time_s))))
+        where = "compiled and run here"
+    every = [motion.off(one, friction) for one in laws]
+    after = {name: float(np.median([off[name] for off in every])) for name in motion.joints}
+    return [Row(target, where, before, after, motion.size, lost).told()]
+
+
+def figures_of_model(
+    arm: ArmSet, motion: Withheld, natives: Mapping[str, Native], told: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Rows of the user's improved MJCF: in MuJoCo, and for a short while in the other engines that are installed.
+
+    Args:
+        arm: model and recordings.
+        motion: that was not fitted.
+        natives: what was changed.
+        told: its ``closed_loop_gap``.
+    """
+    if not motion.known or "reason" in told:
+        return []
+    before, after = ({n: told[when][n]["torque_nm"] for n in motion.joints} for when in ("before", "after"))
+    here = f"MuJoCo {mujoco_library().__version__}, closed loop"
+    rows = [Row("mjcf", here, before, after, motion.size, "told with each joint").told()]
+    improved = compiled_with(arm.robot, natives)
+    short = _beginning(motion.motion, ENGINE_S)
+    for name, engine in installed().items():
+        try:
+            ran = replayed(improved, *_driven(arm, short), engine=engine).torque_nm
+        except (NotImplementedError, FrictidError) as error:
+            rows.append({"target": "mjcf", "where": name, "refused": str(error)})
+            continue
+        ran *= [natives[joint].reported if joint in natives else 1.0 for joint in arm.recorded]
+        rows.append(_short_row(arm, motion, short, "mjcf", f"{name}, closed loop, {ENGINE_S:g} s", ran, "as above"))
+    return rows
+
+
+def figure_in_newton(arm: ArmSet, motion: Withheld, stage: Path, lost: str) -> list[dict[str, Any]]:
+    """The row of a stage in Newton itself, where it is installed and the whole arm can be driven."""
+    name = newton()
+    if name is None or not motion.known or why_no_closed_loop(arm, [motion.motion]):
+        return []
+    short, step_s = _beginning(motion.motion, ENGINE_S), float(arm.robot.compiled.opt.timestep)
+    joints, _, time, position, command = _driven(arm, short)
+    where = f"{name}, closed loop, {ENGINE_S:g} s"
+    try:
+        prims = [prim_name(joint) for joint in joints]
+        ran = in_newton(stage, prims, step_s, time, position[0], command)
+    except FrictidError as error:
+        return [{"target": "newton", "where": name, "refused": error.what}]
+    return [_short_row(arm, motion, short, "newton", where, ran, lost)]
+
+
+def _short_row(
+    arm: ArmSet, motion: Withheld, short: Motion, target: str, where: str, torque: Array, lost: str
+) -> dict[str, Any]:
+    smooth, begin = low_pass(short.time_s), int(np.searchsorted(short.time_s, short.time_s[0] + EDGE_S))
+    nominal = replayed(arm.robot.compiled, *_driven(arm, short)).torque_nm
+    before, after = {}, {}
+    for name in motion.joints:
+        k, measured = arm.recorded.index(name), np.asarray(short.samples[name].torque_nm)
+        before[name] = _rms(smooth(measured - nominal[:, k])[begin:])
+        after[name] = _rms(smooth(measured - torque[:, k])[begin:])
+    return Row(target, where, before, after, motion.size, lost).told()
+
+
+def _driven(arm: ArmSet, motion: Motion) -> tuple[Sequence[str], Mapping[str, float], Array, Array, Array]:
+    """(joints, held, time, position, command) of a motion."""
+    commands = [s.position_command_rad for s in motion.samples.values() if s.position_command_rad is not None]
+    return arm.recorded, arm.held, motion.time_s, motion.position_rad, np.stack(commands, axis=1)
+
+
+def _travel(arm: ArmSet, name: str) -> float:
+    """Travel over which a joint's friction builds up, as the user's model has it, rad."""
+    believed = arm.robot.joint(name)
+    stiffness = believed.presliding_nm_per_rad
+    return believed.dry_nm / stiffness if stiffness and believed.dry_nm > 0.0 else PRESLIDING_RAD
+
+
+def _slip(position_rad: Array, travel_rad: float) -> Array:
+    """How much of the level of friction has built up along a motion, -1..1, from a relaxed start."""
+    slip = np.zeros_like(position_rad)
+    for k, moved in enumerate(np.diff(position_rad) / travel_rad, 1):
+        slip[k] = min(1.0, max(-1.0, slip[k - 1] + moved))
+    return slip
+
+
+def _beginning(motion: Motion, seconds: float) -> Motion:
+    keep = motion.time_s - motion.time_s[0] <= seconds
+    return Motion(motion.name, motion.validation, {name: s.select(keep) for name, s in motion.samples.items()})
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
