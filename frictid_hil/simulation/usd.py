@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ROOT = "/robot"
 """Prim of the articulation in a stage of our own."""
 _HEAD = '#usda 1.0\n(\n    doc = "{doc}"\n{more})\n'
-_JOINT = re.compile(r'"(\w+)" \(\n\s+prepend apiSchemas = \["PhysicsDriveAPI:(\w+)"\]([^}]*)}')
+_JOINT = re.compile(r'"(\w+)" \(\n\s+prepend apiSchemas = \["PhysicsDriveAPI:(\w+)", "NewtonJointAPI"\]([^}]*)}')
 _UNITS = '    defaultPrim = "robot"\n    kilogramsPerUnit = 1\n    metersPerUnit = 1\n    upAxis = "Z"\n'
 
 
@@ -39,8 +39,13 @@ def overlay(stage: Path, prims: Mapping[str, tuple[str, bool]], joints: Mapping[
     """
     doc = "Joints identified by frictid-hil. Open this file instead of the one below it."
     below = f"    subLayers = [\n        @{stage.as_posix()}@\n    ]\n"
-    told = [_over(prims[name][0], _joint_lines(n, slides=prims[name][1])) for name, n in joints.items()]
-    return _HEAD.format(doc=doc, more=below) + "\n" + "\n".join(told)
+    told = {}
+    for name, n in joints.items():
+        path, slides = prims[name]
+        *_, prim = parts = tuple(path.strip("/").split("/"))
+        words = "".join(f"    {line}\n" for line in _joint_lines(n, slides=slides))
+        told[parts] = f'over "{prim}"{_schema(slides)}\n{{\n{words}}}\n'
+    return _HEAD.format(doc=doc, more=below) + "\n" + _overs(told)
 
 
 def joint_prims(stage: Path, joints: Sequence[str]) -> dict[str, tuple[str, bool]]:
@@ -95,7 +100,7 @@ def stage(robot: RobotModel, joints: Mapping[str, Numbers]) -> str:
     rate = round(1.0 / float(m.opt.timestep))
     doc = "Links and joints identified by frictid-hil; shapes are not in it."
     lines = [
-        'def PhysicsScene "scene"\n{\n'
+        'def PhysicsScene "scene" (\n    prepend apiSchemas = ["NewtonSceneAPI"]\n)\n{\n'
         f"    vector3f physics:gravityDirection = {down}\n    float physics:gravityMagnitude = {fall:.9g}\n"
         f"    int newton:timeStepsPerSecond = {rate}\n}}\n",
         'def Xform "robot" (\n    prepend apiSchemas = ["PhysicsArticulationRootAPI"]\n)\n{',
@@ -191,17 +196,17 @@ def _joint_lines(n: Numbers, *, slides: bool) -> list[str]:
     return lines
 
 
-def _over(path: str, lines: Sequence[str]) -> str:
-    *above, name = path.strip("/").split("/")
-    slides = any("drive:linear" in line for line in lines)
-    text = f'over "{name}"{_schema(slides)}\n{{\n' + "".join(f"    {line}\n" for line in lines) + "}\n"
-    for parent in reversed(above):
-        text = f'over "{parent}"\n{{\n{_indented(text)}}}\n'
+def _overs(told: Mapping[tuple[str, ...], str]) -> str:
+    """Nested ``over`` prims by path; each parent stands once, as USD asks."""
+    text = ""
+    for name in dict.fromkeys(path[0] for path in told):
+        below = {path[1:]: words for path, words in told.items() if path[0] == name}
+        text += below.get((), "") or f'over "{name}"\n{{\n{_indented(_overs(below))}}}\n'
     return text
 
 
 def _schema(slides: bool) -> str:
-    return f' (\n    prepend apiSchemas = ["PhysicsDriveAPI:{"linear" if slides else "angular"}"]\n)'
+    return f' (\n    prepend apiSchemas = ["PhysicsDriveAPI:{"linear" if slides else "angular"}", "NewtonJointAPI"]\n)'
 
 
 def _link(m: Any, body: int) -> str:
