@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sim_joints import bare
 
 from frictid_hil.errors import UsageError
 from frictid_hil.simulation import compose, effects
 from frictid_hil.simulation.effects import directional_efficiency, torque_ripple, transmission_error
 from frictid_hil.simulation.inverse import View
+from frictid_hil.simulation.replay import Controller, closed_loop
 
 MODULE = """
 import numpy as np
@@ -140,6 +142,15 @@ def test_driving_and_back_driving_are_told_apart() -> None:
     q = 0.5 * np.sin(2.0 * time_s)
     view = replace(_spinning(np.zeros_like(q), q, 0.001), load_nm=3.0 * np.cos(q) + 1.0)
     (columns,) = directional_efficiency.regressors([view], {})
-    loads = zip(view.load_nm, view.velocity_rad_s, view.slip, strict=True)
-    forward = np.array([directional_efficiency.level(0.0, load, v, 0.2, 0.05) * s for load, v, s in loads])
+    loads = zip(view.load_nm, view.slip, strict=True)
+    forward = np.array([directional_efficiency.level(0.0, load, s, 0.2, 0.05) * s for load, s in loads])
     assert np.linalg.lstsq(columns, forward, rcond=None)[0] == pytest.approx([0.2, 0.05])
+
+
+def test_a_joint_that_drives_worse_than_it_is_driven_back_comes_to_rest() -> None:
+    lossy = {"directional_efficiency": {"driving_share": 0.15, "backdriving_share": 0.02}}
+    time_s = 0.002 * np.arange(2000)
+    command = 0.3 + 0.2 * np.clip(time_s, 0.0, 1.0)
+    stiff = Controller(5e3, 1e5, 80.0, rate_hz=2000.0, velocity_filter_s=0.0, torque_limit_nm=60.0)
+    held = closed_loop(bare(gravity_cos_nm=20.0).with_effects(lossy), stiff, time_s, command)
+    assert np.max(np.abs(held.velocity_rad_s[-500:])) < 1e-6

@@ -14,11 +14,12 @@ from frictid_hil.simulation.inverse import InverseForm, Shape, View
 # -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
-def level(
-    level_nm: float, load_nm: float, velocity_rad_s: float, driving_share: float, backdriving_share: float
-) -> float:
-    """The level that multiplies the slip spring, raised by load: by power flow."""
-    driving = load_nm * velocity_rad_s >= 0.0
+def level(level_nm: float, load_nm: float, slip: float, driving_share: float, backdriving_share: float) -> float:
+    """The level that multiplies the slip spring, raised by load: by which way the spring is bent.
+
+    By the sign of the velocity a joint at rest would jump between both levels, and never come to rest.
+    """
+    driving = load_nm * slip >= 0.0
     return level_nm + (driving_share if driving else backdriving_share) * abs(load_nm)
 
 
