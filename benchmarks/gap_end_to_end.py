@@ -33,6 +33,8 @@ from frictid_hil.simulation.replay import Controller, closed_loop
 
 HP3J = find("hp3j.yaml").resolve()
 SEED = 20
+ALIKE = 1.1
+"""Error of the nominal model over that of the true joint, below which there is nothing to close."""
 
 SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "backlash": {"gap_rad": (1e-3, 4e-3)},
@@ -79,9 +81,8 @@ class Outcome:
         flagged: what the first cause is said to be confusable with.
         confidence: of the first cause.
         left_of_gap: error of the written model over that of the nominal one, both above the true joint's; both
-            validation recordings.
-        left_of_replay: the same by ``replay`` of the unloaded validation recording; None where nominal and true joint
-            replay alike.
+            validation recordings; None where the nominal joint's is within ``ALIKE`` of the true one's.
+        left_of_replay: the same by ``replay`` of the unloaded validation recording.
     """
 
     effect: str
@@ -89,7 +90,7 @@ class Outcome:
     named: str
     flagged: tuple[str, ...]
     confidence: float
-    left_of_gap: float
+    left_of_gap: float | None
     left_of_replay: float | None = None
 
     @property
@@ -99,8 +100,8 @@ class Outcome:
 
     @property
     def closed(self) -> bool:
-        """A fifth of the nominal model's error above the noise floor is left, or less."""
-        return self.left_of_gap <= 0.2
+        """Whether a fifth of the error above the noise floor is left, or less, or there was nothing to close."""
+        return self.left_of_gap is None or self.left_of_gap <= 0.2
 
 
 def robot_with(effects: Mapping[str, Mapping[str, float]], folder: Path) -> Path:
@@ -196,9 +197,20 @@ def outcome_of(effect: str, folder: Path, seed: int = SEED) -> Outcome:
         causes[0]["effect"] if causes else "",
         tuple(causes[0]["confusable_with"]) if causes else (),
         causes[0]["confidence"] if causes else 0.0,
-        max(0.0, written - floor) / max(nominal - floor, 1e-9),
-        max(0.0, told - truth) / (believed - truth) if believed > 1.05 * truth else None,
+        _left(written, nominal, floor),
+        _left(told, believed, truth),
     )
+
+
+def _left(written_nm: float, nominal_nm: float, true_nm: float) -> float | None:
+    """Share of the nominal model's error that the written one leaves, both above the true joint's."""
+    if nominal_nm < ALIKE * true_nm:
+        return None
+    return max(0.0, written_nm - true_nm) / (nominal_nm - true_nm)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.1f} %"
 
 
 def main() -> int:
@@ -215,10 +227,9 @@ def main() -> int:
         for effect in options.effects:
             o = outcome_of(effect, Path(folder) / effect, options.seed)
             outcomes.append(o)
-            replayed = "-" if o.left_of_replay is None else f"{100 * o.left_of_replay:.1f} %"
             print(
                 f"| {o.effect} | {o.named or 'nothing'} | {o.confidence:.2f} | {o.verdict} | {', '.join(o.flagged)} "
-                f"| {100 * o.left_of_gap:.1f} % | {replayed} |",
+                f"| {_percent(o.left_of_gap)} | {_percent(o.left_of_replay)} |",
                 flush=True,
             )
     right = [o for o in outcomes if o.right]

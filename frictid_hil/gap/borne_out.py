@@ -46,12 +46,11 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
     more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
-    ``HALF`` of the visible gap or more to what the chosen ones leave.
+    ``HALF`` of the visible gap or more to what the chosen ones leave; ``REMAINS`` or more if another one explains it.
     """
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
-    kept, gap_nm, beside = _chosen(values, loop)
-    worse = HALF**2 * loop.visible
-    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > worse}
+    kept, gap_nm, beside = _chosen(values, {f.effect: f.rivals for f in said.named}, loop)
+    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > _harm(name, said) * loop.visible}
     refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     if not refuted and said.word == "unknown" and kept == [said.named[0].effect]:
         return _rescued(said, values, loop, gap_nm)
@@ -75,6 +74,12 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     return Verdict("unknown", (*stands, *falls), said.place or word), told
 
 
+def _harm(cause: str, said: Verdict) -> float:
+    """Part of the visible gap, squared, that a cause may add to what the chosen ones leave."""
+    beside = said.word != "unknown" and cause != said.named[0].effect
+    return (REMAINS if beside else HALF) ** 2
+
+
 def _rescued(
     said: Verdict, values: Mapping[str, Mapping[str, float]], loop: Loop, gap_nm: float
 ) -> tuple[Verdict, str | None]:
@@ -96,26 +101,41 @@ def _of_the_drive(cause: Finding) -> bool:
     return all_effects()[cause.effect].actuation is not None
 
 
-def _chosen(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float, dict[str, float]]:
-    """(causes that help, the best first; the gap with them; the gap with each of the others beside them)."""
-    kept, gap_nm = _added(values, loop)
+def _chosen(
+    values: Mapping[str, Mapping[str, float]], rivals: Mapping[str, Sequence[str]], loop: Loop
+) -> tuple[list[str], float, dict[str, float]]:
+    """(causes that help, the best first; the gap with them; the gap with each of the others beside them).
+
+    A rival stands in the place of a cause: it is tried there, not beside it.
+    """
+    kept, gap_nm = _added(values, rivals, loop)
     if gap_nm**2 - loop.floor_nm**2 > REMAINS**2 * loop.visible:
         # A wrong gain and a wrong inertia may each take a joint further off, and together bring it home.
         others, left_nm = _taken_off(values, loop)
         if gap_nm**2 - left_nm**2 > REMAINS**2 * loop.visible:
             kept, gap_nm = others, left_nm
-    own = {name: values[name] for name in kept}
-    beside = {name: loop.gap_nm({**own, name: values[name]}) for name in values if name not in kept}
+    beside = {name: loop.gap_nm(_with(name, kept, values, rivals)) for name in values if name not in kept}
     return kept, gap_nm, beside
 
 
-def _added(values: Mapping[str, Mapping[str, float]], loop: Loop) -> tuple[list[str], float]:
+def _with(name: str, kept: Sequence[str], values: Effects, rivals: Mapping[str, Sequence[str]]) -> Effects:
+    """A cause and those of the kept ones that are no rivals of it."""
+    return {n: values[n] for n in (*(n for n in kept if not _rival(n, name, rivals)), name)}
+
+
+def _rival(one: str, other: str, rivals: Mapping[str, Sequence[str]]) -> bool:
+    return one in rivals[other] or other in rivals[one]
+
+
+def _added(
+    values: Mapping[str, Mapping[str, float]], rivals: Mapping[str, Sequence[str]], loop: Loop
+) -> tuple[list[str], float]:
     """(causes added one by one, the one that helps most first; the gap with them)."""
     kept: list[str] = []
     gap_nm = loop.before_nm
     while True:
-        own = {name: values[name] for name in kept}
-        beside = {name: loop.gap_nm({**own, name: values[name]}) for name in values if name not in kept}
+        others = [n for n in values if n not in kept and not any(_rival(n, k, rivals) for k in kept)]
+        beside = {name: loop.gap_nm({n: values[n] for n in (*kept, name)}) for name in others}
         best = min(beside, key=lambda name: beside[name], default=None)
         if best is None or gap_nm**2 - beside[best] ** 2 < REMAINS**2 * loop.visible:
             return kept, gap_nm

@@ -34,6 +34,8 @@ DESCRIPTIONS = {
     START: "friction that depends on the way since a start and on the rest before",
     "travel": "a torque that builds up over a good part of the travel after a reversal",
 }
+WHOLE = ("torque", "position")
+"""Families that keep the part which a wrong belief could say: a gain that droops lacks torque everywhere, a cable pulls."""
 WAYS_RAD = (5e-4, 2e-3, 8e-3)
 """Ways within which a start may be forgotten."""
 REST_S = 0.1

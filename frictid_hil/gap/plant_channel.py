@@ -11,7 +11,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Builder, Channel, Rows, Term, effect_prior
 from frictid_hil.gap.experiment_set import Nominal, ReportFilter
-from frictid_hil.gap.generic import families
+from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
 from frictid_hil.gap.nuisances import nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
@@ -171,8 +171,9 @@ def _gap_nm(residuals: Sequence[Array], step_s: float) -> float:
 
 def without_nuisances(logs: Sequence[Rows], nuisances: Sequence[Term], candidates: Sequence[Term]) -> tuple[Rows, ...]:
     """The logs with that part of generic functions taken off which the belief's own tolerances can say."""
+    whole = (EACH_LOG, *WHOLE)
     known = [c for term in nuisances for c in term.columns]
-    families = [t for t in candidates if t.effect.startswith(FAMILY) and t.effect != FAMILY + EACH_LOG]
+    families = [t for t in candidates if t.effect.startswith(FAMILY) and t.effect.removeprefix(FAMILY) not in whole]
     generic = sorted({c for term in families for c in term.columns})
     x = np.concatenate([log.x for log in logs])
     weights = np.linalg.pinv(x[:, known]) @ x[:, generic]

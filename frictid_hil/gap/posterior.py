@@ -106,11 +106,15 @@ class Posterior:
 
     def __init__(self, channel: Channel, library: int) -> None:
         self.channel = channel
-        self.doubt = 1.0
-        self._chance = math.log(EXPECTED / library)
         self.settings: list[Setting] = []
         self._prepare()
         self._reduce()
+        self.begin(library)
+
+    def begin(self, library: int) -> None:
+        """Nothing has been searched yet; ``library`` as above."""
+        self.doubt = 1.0
+        self._chance = math.log(EXPECTED / library)
         self._known: dict[tuple[int, ...], Model] = {}
         self._prepare_blocks()
 

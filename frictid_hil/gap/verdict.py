@@ -98,7 +98,8 @@ def verdict(
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     new = any(gap.appeared is not None and _stays(gap, REMAINS) for gap in gaps)
-    untold = unnamed and any(_stays(gap, UNNAMED) for gap in gaps)
+    # Where what has no name is the larger part, the names tell the gap only if they close it.
+    untold = unnamed and any(_stays(gap, REMAINS if generic_wins else UNNAMED) for gap in gaps)
     if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
     if unnamed or any(_stays(gap, REMAINS) for gap in gaps):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import gap_sets
 import pytest
@@ -48,6 +49,22 @@ def test_two_causes_that_help_only_together_stand() -> None:
     assert said.word == "explained" and said.named[:2] == named[:2]
     assert said.named[2].chance == REFUTED
     assert told is not None and "0.1 with controller_gain_error and inertia_error" in told
+
+
+def test_a_rival_stands_in_the_place_of_a_cause_and_not_beside_it() -> None:
+    first = replace(cause("load_dependent_friction", chance=0.75), rivals=("directional_efficiency",))
+    named = (first, cause("directional_efficiency", chance=0.25))
+    gaps = {"load_dependent_friction": 0.06, "directional_efficiency": 0.05}
+    gaps |= {"directional_efficiency+load_dependent_friction": 1.2}
+    assert borne_out(Verdict("explained", named), loop(gaps)) == (Verdict("explained", named), None)
+
+
+def test_what_is_not_first_and_does_harm_is_refuted_sooner() -> None:
+    named = (cause("encoder_offset"), cause("torque_constant_error"))
+    gaps = {"encoder_offset": 0.1, "torque_constant_error": 1.1, "encoder_offset+torque_constant_error": 0.3}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert [f.chance for f in said.named] == [0.99, REFUTED]
+    assert told is not None and "torque_constant_error would take it further off" in told
 
 
 def test_where_nothing_helps_the_gap_is_unknown() -> None:

@@ -25,6 +25,32 @@ def test_a_scale_of_all_parts_is_not_lost_behind_their_tolerances() -> None:
 
 
 @pytest.mark.slow
+def test_a_torque_gain_that_droops_is_no_wrong_torque_constant() -> None:
+    made = gap_sets.make()
+
+    def drooping(e: Experiment) -> Experiment:
+        assert e.torque_nm is not None
+        top = float(np.max(np.abs(e.torque_nm)))
+        return replace(e, torque_nm=e.torque_nm * (1.0 + 0.1 * np.abs(e.torque_nm) / top))
+
+    found = diagnose(replace(made, experiments=tuple(drooping(e) for e in made.experiments)))
+    assert found.verdict == "unknown" and "torque" in found.reasons["cause"]
+
+
+@pytest.mark.slow
+def test_a_cable_that_pulls_back_is_no_shifted_zero() -> None:
+    made = gap_sets.make()
+
+    def pulled(e: Experiment) -> Experiment:
+        assert e.torque_nm is not None
+        bent = e.position_rad - 0.2
+        return replace(e, torque_nm=e.torque_nm + 1.5 * bent + 6.0 * bent**3)
+
+    found = diagnose(replace(made, experiments=tuple(pulled(e) for e in made.experiments)))
+    assert found.verdict == "unknown" and "position" in found.reasons["cause"]
+
+
+@pytest.mark.slow
 def test_a_delay_that_is_over_when_the_torque_is_reported_is_found_in_the_plant() -> None:
     made = gap_sets.make({"torque_delay": {"delay_s": 0.0015}}, noise_nm=0.0)
     random = np.random.default_rng(3)
