@@ -46,12 +46,11 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
     more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
-    ``HALF`` of the visible gap or more to what the chosen ones leave; ``REMAINS`` or more if another one explains it.
+    ``HALF`` of the visible gap or more to what the chosen ones leave, or ``REMAINS`` if another one explains the gap.
     """
     values = {f.effect: {name: v.value for name, v in f.parameters.items()} for f in said.named}
     kept, gap_nm, beside = _chosen(values, {f.effect: f.rivals for f in said.named}, loop)
-    refuted = {name for name, with_it in beside.items() if with_it**2 - gap_nm**2 > _harm(name, said) * loop.visible}
-    refuted -= {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+    refuted = _refuted(said, values, beside, gap_nm, loop)
     if not refuted and said.word == "unknown" and kept == [said.named[0].effect]:
         return _rescued(said, values, loop, gap_nm)
     if not refuted:
@@ -74,10 +73,25 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     return Verdict("unknown", (*stands, *falls), said.place or word), told
 
 
-def _harm(cause: str, said: Verdict) -> float:
-    """Part of the visible gap, squared, that a cause may add to what the chosen ones leave."""
-    beside = said.word != "unknown" and cause != said.named[0].effect
-    return (REMAINS if beside else HALF) ** 2
+def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:
+    """Causes that do harm: ``HALF`` of the visible gap, or ``REMAINS`` of it both beside the chosen ones and among all.
+
+    Args:
+        said: the verdict so far.
+        values: parameters of all causes.
+        beside: the gap with each cause that was not chosen, N m.
+        gap_nm: with the chosen ones.
+        loop: of the set.
+    """
+    spared = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+    added = {n: (nm**2 - gap_nm**2) / loop.visible for n, nm in beside.items() if n not in spared}
+    refuted = {name for name, share in added.items() if share > HALF**2}
+    some = {name for name, share in added.items() if share > REMAINS**2} - refuted - {said.named[0].effect}
+    if said.word == "unknown" or not some:
+        return refuted
+    all_nm = loop.gap_nm(values)
+    without = {name: loop.gap_nm({n: v for n, v in values.items() if n != name}) for name in some}
+    return refuted | {n for n, nm in without.items() if all_nm**2 - nm**2 > REMAINS**2 * loop.visible}
 
 
 def _rescued(

@@ -61,10 +61,18 @@ def test_a_rival_stands_in_the_place_of_a_cause_and_not_beside_it() -> None:
 
 def test_what_is_not_first_and_does_harm_is_refuted_sooner() -> None:
     named = (cause("encoder_offset"), cause("torque_constant_error"))
-    gaps = {"encoder_offset": 0.1, "torque_constant_error": 1.1, "encoder_offset+torque_constant_error": 0.3}
+    gaps = {"encoder_offset": 0.1, "torque_constant_error": 1.1, "encoder_offset+torque_constant_error": 0.4}
     said, told = borne_out(Verdict("explained", named), loop(gaps))
     assert [f.chance for f in said.named] == [0.99, REFUTED]
     assert told is not None and "torque_constant_error would take it further off" in told
+
+
+def test_what_does_harm_by_itself_and_none_among_all_stands() -> None:
+    named = (cause("encoder_offset"), cause("torque_constant_error"), cause("gravity_error"))
+    gaps = {"encoder_offset": 0.1, "torque_constant_error": 1.1, "gravity_error": 1.1}
+    gaps |= {"encoder_offset+torque_constant_error": 0.4, "encoder_offset+gravity_error": 0.4}
+    gaps |= {"encoder_offset+gravity_error+torque_constant_error": 0.1}
+    assert borne_out(Verdict("explained", named), loop(gaps)) == (Verdict("explained", named), None)
 
 
 def test_where_nothing_helps_the_gap_is_unknown() -> None:
