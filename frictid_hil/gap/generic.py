@@ -35,7 +35,7 @@ DESCRIPTIONS = {
     "travel": "a torque that builds up over a good part of the travel after a reversal",
 }
 WHOLE = ("torque", "position")
-"""Families that keep the part which a wrong belief could say: a gain that droops lacks torque everywhere, a cable pulls."""
+"""Families that keep what a wrong belief could say, too: a gain that droops, a cable that pulls."""
 WAYS_RAD = (5e-4, 2e-3, 8e-3)
 """Ways within which a start may be forgotten."""
 REST_S = 0.1
