@@ -106,7 +106,7 @@ class Seat:
 
 
 def _listen(channel: str) -> can.BusABC:
-    for _ in range(600):
+    for _ in range(6000):
         with contextlib.suppress(can.CanError, OSError):
             return can.Bus(interface="frictid", channel=channel)
         time.sleep(0.1)

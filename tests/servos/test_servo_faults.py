@@ -12,7 +12,7 @@ from servo_bench import Bench, setup_of
 
 from frictid_drivers.servos.simulated import VirtualServoDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
-from frictid_hil.errors import FrictidError, HardwareError, InvalidFields
+from frictid_hil.errors import FrictidError, HardwareError, InvalidFields, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 
@@ -48,7 +48,7 @@ class Running:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_answers_of_one_servo_are_lost_for_a_while(model: str) -> None:
-    run = Running(model, {"kind": "drop", "frames": "report", "joint": FIRST, "at_s": 0.1, "count": 10})
+    run = Running(model, {"kind": "drop", "frames": "report", "joint": FIRST, "at_s": 0.1, "count": 8})
     assert [report.age_cycles for report in run.cycles(20)] == [0, 0]
     assert [report.age_cycles for report in run.cycles(6)] == [6, 0]
     assert [report.age_cycles for report in run.cycles(10)] == [0, 0]
@@ -152,3 +152,28 @@ def test_a_stall_lets_time_pass() -> None:
     run = Running("STS3215", {"kind": "stall", "delay_s": 0.3, "at_s": 0.1})
     run.cycles(22)
     assert run.driver.clock.now_ns() > 0.4e9 and math.isfinite(run.at_rad)
+
+
+@pytest.mark.parametrize(
+    "lost", [{"kind": "mute", "joint": FIRST, "at_s": 0.1}, {"kind": "drop", "frames": "write", "at_s": 0.1}]
+)
+@pytest.mark.parametrize("model", MODELS)
+def test_a_servo_that_is_not_seen_to_be_off_is_named(model: str, lost: dict[str, Any]) -> None:
+    """Its power is no part of what is read in a cycle: it was taken to be off as soon as it had been told."""
+    run = Running(model, lost)
+    run.cycles(25)
+    run.driver.quick_stop()
+    with pytest.raises(SafetyAbort, match="has no power any more"):
+        run.driver.stop_cycling()
+    named = run.driver.may_be_powered
+    assert named == ((FIRST,) if lost["kind"] == "mute" else (FIRST, SECOND))
+    run.driver.clock.wait_until(run.driver.clock.now_ns() + 500_000_000)
+    watched = model == "XL330-M288"
+    assert [run.servo(joint).on for joint in named] == [not watched] * len(named)
+
+
+def test_a_lost_write_does_not_keep_a_joint_under_power() -> None:
+    run = Running("STS3215", {"kind": "drop", "frames": "write", "at_s": 0.1, "count": 8})
+    run.cycles(25)
+    run.driver.stop_cycling()
+    assert run.driver.may_be_powered == () and not run.servo(FIRST).on and not run.servo(SECOND).on

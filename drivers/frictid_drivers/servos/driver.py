@@ -57,6 +57,9 @@ class ServoDriver:
         port_factory: opens the port (a simulated one).
         clock: run time.
 
+    Attributes:
+        may_be_powered: joints that were not seen to be off after the end.
+
     Raises:
         InvalidFields: an option of the robot file is wrong.
         ConfigError: the bus is no serial port.
@@ -94,6 +97,8 @@ class ServoDriver:
         self._rows: RowDecoder | None = None
         self._wishes: list[Wish] = []
         self._powered: list[bool] = []
+        self._energised: set[int] = set()
+        self.may_be_powered: tuple[str, ...] = ()
         self._goals: list[int | None] = []
         self._places: list[Place] = []
         self._cycle_hz = 0.0
@@ -210,6 +215,7 @@ class ServoDriver:
         ]
         self._ends_rad = {one.name: (one.position_min_rad, one.position_max_rad) for one in self.setup.joints}
         self._unwatched.clear()
+        self._energised.clear()
         for at, mine in enumerate(self._joints):
             if mine.model.registers.goal_current:
                 self._modes[at] = OperatingMode(line, mine)
@@ -238,7 +244,7 @@ class ServoDriver:
         if restart is not None:
             restart()
         line.heard = rows.feed
-        self._arm_watchdog(self._line_settings.watchdog_s)
+        self._arm_watchdog(self._line_settings.watchdog_s, range(len(self._joints)))
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power; progress is in the feedback. A change of mode under power begins with the torque of now.
@@ -334,19 +340,19 @@ class ServoDriver:
         """Bring every joint to rest and off.
 
         Raises:
-            SafetyAbort: a joint does not answer any more; it was told to let go all the same.
+            SafetyAbort: a joint was not seen to be off; it was told to let go all the same.
         """
         if not self._wishes:
             return
         try:
-            powered = self._settle()
+            self._settle()
         finally:
             self._let_go()
             self._wishes, self._rows, self._reader = [], None, None
-        if powered:
+        if self.may_be_powered:
             raise SafetyAbort(
-                f"did not come to rest and off within {_SETTLE_S:g} s",
-                where=", ".join(f"joint {name}" for name in powered),
+                "did not say that it has no power any more",
+                where=", ".join(f"joint {name}" for name in self.may_be_powered),
                 next_step="switch its supply off, then look at the servo",
             )
 
@@ -389,6 +395,7 @@ class ServoDriver:
             told[registers.goal][mine.id] = to_bytes(counts, registers.goal_bytes, mine.model)
         if on is not self._powered[at] and (counts is not None or not on):
             told[registers.torque][mine.id], self._powered[at] = bytes([on]), on
+            self._energised |= {at} if on else set()
 
     def _goal_rad(self, at: int, order: Order) -> float:
         """Where to; a torque that is added is a distance on the spring that the servo's loop is."""
@@ -451,39 +458,44 @@ class ServoDriver:
     def _watchdog(self, seconds: float) -> bytes:
         return bytes([min(127, round(seconds / _WATCHDOG_STEP_S))])
 
-    def _arm_watchdog(self, seconds: float) -> None:
+    def _arm_watchdog(self, seconds: float, servos: Sequence[int]) -> None:
         """0 clears what tripped earlier, and ends it."""
-        if self._registers.watchdog:
+        if self._registers.watchdog and servos:
             for value in dict.fromkeys((b"\0", self._watchdog(seconds))):
-                self._open_line().tell(self._registers.watchdog, {mine.id: value for mine in self._joints})
+                self._open_line().tell(self._registers.watchdog, {self._joints[at].id: value for at in servos})
 
-    def _settle(self) -> list[str]:
+    def _settle(self) -> None:
+        """Cycle until every joint stands and was told to let go."""
         for wish in self._wishes:
             wish.disable()
         set_points = [SetPoint() for _ in self._wishes]
         period_ns = round(1e9 / self._cycle_hz)
-        powered: list[str] = []
         begun_ns = self.clock.now_ns()
         for k in range(max(2, math.ceil(_SETTLE_S * self._cycle_hz))):
             self.clock.wait_until(begun_ns + k * period_ns)
             reports = self.exchange(set_points)
-            powered = [
-                joint.name
-                for joint, report in zip(self.setup.joints, reports, strict=True)
-                if report.age_cycles or report.state is JointState.ENABLED
-            ]
-            if not powered:
+            if not any(report.age_cycles or report.state is JointState.ENABLED for report in reports):
                 break
-        return powered
 
     def _let_go(self) -> None:
-        """Off, twice: a lost packet must not keep a joint under power. Servos are left in position mode."""
+        """Off, and read back: servos do not tell their power in the cycle. They are left in position mode.
+
+        Who is not seen to be off keeps its bus watchdog.
+        """
+        line = self._open_line()
         with contextlib.suppress(FrictidError):
-            for _ in range(2):
-                self._open_line().tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
-            self._arm_watchdog(0.0)
-            for at, operating in self._modes.items():
-                if self._reader is not None and self._reader.takes_currents(at):
-                    operating.take_positions(None, powered=False)
-        if self._line is not None:
-            self._line.heard = None
+            line.tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
+        off = [at for at in range(len(self._joints)) if self._seen_off(at)]
+        names = [joint.name for joint in self.setup.joints]
+        self.may_be_powered = tuple(names[at] for at in sorted(self._energised - set(off)))
+        with contextlib.suppress(FrictidError):
+            self._arm_watchdog(0.0, off)
+            for at in off:
+                if at in self._modes and self._reader is not None and self._reader.takes_currents(at):
+                    self._modes[at].take_positions(None, powered=False)
+        line.heard = None
+
+    def _seen_off(self, at: int) -> bool:
+        with contextlib.suppress(FrictidError):
+            return self._open_line().put(self._joints[at].id, self._registers.torque, b"\0")
+        return False
