@@ -113,8 +113,10 @@ def _told(found: Latency, cycle_hz: float) -> list[Finding]:
         f"cycles of an empty loop begin late by at most: {figures}, in {found.duration_s:g} s; it holds "
         f"{found.highest_hz} Hz"
     )
+    if found.isolated_cpu is not None:
+        said += f", alone on processor {found.isolated_cpu}"
     enough = found.highest_hz >= cycle_hz
-    remedy = "close other programs, use a real-time kernel, or lower cycle_hz in the robot file"
+    remedy = "close other programs, isolate a processor, use a real-time kernel, or lower cycle_hz in the robot file"
     findings = [
         Finding(Severity.OK if enough else Severity.WARNING, "this computer", said, "" if enough else remedy),
     ]

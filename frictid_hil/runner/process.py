@@ -35,7 +35,7 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import new_driver
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight, Warned
-from frictid_hil.runner.realtime import make_punctual
+from frictid_hil.runner.realtime import make_punctual, move_to_isolated_cpu
 from frictid_hil.runner.ring import frame_ring, sample_ring
 from frictid_hil.runner.scheduler import Recorder, Scheduler
 from frictid_hil.runner.stop_signals import HeardStop, StopSignals
@@ -243,6 +243,7 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
         while not pipe.poll(_POLL_S):
             if stop.level:
                 raise Interrupted("stopped before anything moved")
+        move_to_isolated_cpu()  # now that all threads and simulated drives are there, and stay on the others
         return bool(pipe.recv())
 
     try:

@@ -1,7 +1,8 @@
 """Makes the cyclic loop as punctual as this account may, and measures how punctual this computer is.
 
 Real-time scheduling and locked memory are asked for before any thread exists, and garbage collection is off while the
-loop runs: each alone makes the tail of the lateness many times longer.
+loop runs: each alone makes the tail of the lateness many times longer. A processor of its own the loop takes only where
+one was isolated for such work: bound to an ordinary one it comes later, because it can't leave it when that stalls.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import gc
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +23,7 @@ RATES_HZ = (1000, 800, 500, 400, 250, 200, 125, 100, 50)
 _MEASURED_HZ = 1000
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _HOLDS_PERCENTILE = 99.9
+_ISOLATED = Path("/sys/devices/system/cpu/isolated")
 
 
 def make_punctual() -> list[str]:
@@ -48,6 +51,43 @@ def make_punctual() -> list[str]:
     return told
 
 
+def move_to_isolated_cpu() -> int | None:
+    """Bind the calling thread to a processor that the kernel keeps free of other work (``isolcpus=``).
+
+    Nothing else of ours runs there: processes start on the others. What this thread starts from now on comes along.
+    Loops of several runs spread over the isolated processors by their process numbers.
+
+    Returns:
+        Its number; None where none is isolated, or this process may use none of them.
+    """
+    isolated = [cpu for cpu in _numbers(_ISOLATED) if _allowed(cpu)]
+    if not isolated:
+        return None
+    cpu = isolated[os.getpid() % len(isolated)]
+    os.sched_setaffinity(0, {cpu})
+    return cpu
+
+
+def _numbers(path: Path) -> list[int]:
+    """Read the kernel's lists, like ``2-3,6``; empty where there is no such file."""
+    try:
+        ranges = [part.split("-") for part in path.read_text().split(",") if part.strip()]
+    except OSError:
+        return []
+    return [number for one in ranges for number in range(int(one[0]), int(one[-1]) + 1)]
+
+
+def _allowed(cpu: int) -> bool:
+    """The control group lets this process onto that processor, whether or not it has been on it so far."""
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError:
+        return False
+    os.sched_setaffinity(0, before)
+    return True
+
+
 @dataclass(frozen=True, slots=True)
 class Latency:
     """How late an empty loop is on this computer.
@@ -60,6 +100,7 @@ class Latency:
         worst_s: the latest cycle.
         highest_hz: the highest usual rate at which 99.9 % of the cycles begin within half a period; 0 for none.
         told: what was not permitted, and the remedy.
+        isolated_cpu: processor that the loop had to itself; None where none is isolated.
     """
 
     duration_s: float
@@ -69,13 +110,14 @@ class Latency:
     worst_s: float
     highest_hz: int
     told: tuple[str, ...]
+    isolated_cpu: int | None
 
 
-def judged(late_s: Array, duration_s: float, told: list[str]) -> Latency:
+def judged(late_s: Array, duration_s: float, told: list[str], isolated_cpu: int | None = None) -> Latency:
     """Form the figures of a measurement."""
     p50, p99, p999 = (float(value) for value in np.percentile(late_s, (50, 99, _HOLDS_PERCENTILE)))
     held = [rate for rate in RATES_HZ if p999 <= 0.5 / rate]
-    return Latency(duration_s, p50, p99, p999, float(late_s.max()), max(held, default=0), tuple(told))
+    return Latency(duration_s, p50, p99, p999, float(late_s.max()), max(held, default=0), tuple(told), isolated_cpu)
 
 
 def measure_latency(duration_s: float) -> Latency:
@@ -84,7 +126,7 @@ def measure_latency(duration_s: float) -> Latency:
     Args:
         duration_s: at least 0.1.
     """
-    told = make_punctual()
+    told, cpu = make_punctual(), move_to_isolated_cpu()
     period_ns = round(1e9 / _MEASURED_HZ)
     late_ns = np.zeros(max(100, round(duration_s * _MEASURED_HZ)), np.int64)
     deadline_ns = time.monotonic_ns() + period_ns
@@ -95,4 +137,4 @@ def measure_latency(duration_s: float) -> Latency:
         late = late_ns[at] = time.monotonic_ns() - deadline_ns
         # A stall is one late cycle, not a burst of them.
         deadline_ns += period_ns * (1 + int(late) // period_ns)
-    return judged(late_ns * 1e-9, duration_s, told)
+    return judged(late_ns * 1e-9, duration_s, told, cpu)

@@ -2,10 +2,13 @@
 
 import gc
 import multiprocessing
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from frictid_hil.runner import realtime
 from frictid_hil.runner.realtime import Latency, judged, measure_latency
 
 
@@ -29,3 +32,23 @@ def test_measured_in_a_process_of_its_own_it_leaves_this_one_alone():
         found = pool.apply(measure_latency, (0.2,))
     assert isinstance(found, Latency) and 0.0 <= found.p50_s <= found.p99_s <= found.p999_s <= found.worst_s
     assert gc.isenabled()
+
+
+def moved(isolated: Path, started_on: set[int]) -> tuple[int | None, set[int]]:
+    """Where a process that started on some processors is after it looked for an isolated one; run in its own."""
+    realtime._ISOLATED = isolated
+    os.sched_setaffinity(0, started_on)
+    return realtime.move_to_isolated_cpu(), os.sched_getaffinity(0)
+
+
+@pytest.mark.parametrize(
+    ("kernel_says", "taken"),
+    [("{last}\n", "last"), ("{last}-{last},4000\n", "last"), ("\n", None), ("4000\n", None), (None, None)],
+)
+def test_the_loop_takes_an_isolated_processor_and_no_other(tmp_path, kernel_says, taken):
+    first, *_, last = sorted(os.sched_getaffinity(0)) * 2
+    if kernel_says is not None:
+        (tmp_path / "isolated").write_text(kernel_says.format(last=last))
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        cpu, bound_to = pool.apply(moved, (tmp_path / "isolated", {first}))
+    assert (cpu, bound_to) == ((last, {last}) if taken else (None, {first}))
