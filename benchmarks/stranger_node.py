@@ -21,6 +21,7 @@ from durand.network import NetworkABC
 from durand.node import MinimalNodeCapabilities
 from durand.object_dictionary import Record, Variable
 from durand.scheduler import VirtualScheduler, set_scheduler
+from socketcand_gateway import Gateway
 from stranger_motor import Motor
 from stranger_wire import DONE
 
@@ -145,7 +146,9 @@ def main() -> None:
     robot, family = sys.argv[1:]
     file = load_robot(robot).file
     interface, _, channel = file.bus.partition(":")
-    line = Line(can.Bus(interface=interface, channel=channel, port=file.options["port"]))
+    port = file.options["port"]
+    gateway = interface == "socketcand"
+    line = Line(Gateway(port) if gateway else can.Bus(interface=interface, channel=channel, port=port))
     stranger = build(robot, family, line)
     print("ready", flush=True)
     assert stranger

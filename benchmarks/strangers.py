@@ -2,6 +2,7 @@
 
     python benchmarks/strangers.py                 all families (2 min), by `durand` on UDP multicast
     python benchmarks/strangers.py elmo nanotec    these
+    python benchmarks/strangers.py --gateway       the same on socketcand, behind a gateway on TCP
     python benchmarks/strangers.py --npm           the same by the npm package `canopen`, on slcan (needs node and npm)
 
 Every family: `check` has no error, configuring meets nothing that `check` did not say, F_0 is within 1 % of the
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from socketcand_gateway import CHANNEL
 from stranger_wire import StrangerDriver
 
 from frictid_drivers.virtual.personality import known_personalities
@@ -53,21 +55,27 @@ class Stack:
         script: plays the node.
         arguments: of the script, after robot file and family.
         usual_hz: cycle rate, where a family has no own.
+        gateway: the bus is behind a gateway on TCP, as `socketcand` serves it.
     """
 
     script: str
     arguments: tuple[str, ...] = ()
     usual_hz: int = 500
+    gateway: bool = False
 
     def wire(self, folder: Path, family: str) -> tuple[str, dict[str, Any]]:
         """Bus and options of a robot file, of this process's own."""
         if self.arguments:
             return f"slcan:{folder / family}.tty", {"sleep_after_open": 0}
+        port = 20_000 + os.getpid() % 20_000
+        if self.gateway:
+            return f"socketcand:{CHANNEL}", {"host": "127.0.0.1", "port": port, "tcp_tune": True}
         group = f"udp_multicast:239.74.{os.getpid() >> 8 & 0xFF}.{os.getpid() & 0xFF}"
-        return group, {"port": 20_000 + os.getpid() % 20_000}
+        return group, {"port": port}
 
 
 DURAND = Stack("stranger_node.py")
+GATEWAY = Stack("stranger_node.py", gateway=True)
 PACKAGE = Path(__file__).with_name("npm_canopen")
 
 
@@ -240,13 +248,14 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("families", nargs="*", metavar="FAMILY", help=", ".join(sorted(known_personalities())))
     parser.add_argument("--npm", action="store_true", help="the npm package `canopen` instead of durand")
+    parser.add_argument("--gateway", action="store_true", help="durand behind a gateway on TCP")
     wanted = parser.parse_args(arguments)
     os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp())
     failed = 0
     print(f"{'family':12} {'outcome':12} {'F_0 off %':>9} {'frames':>7} {'malformed':>9} surprises")
     with tempfile.TemporaryDirectory() as home:
         register(Path(home))
-        stack = npm_canopen(Path(home) / "npm") if wanted.npm else DURAND
+        stack = npm_canopen(Path(home) / "npm") if wanted.npm else GATEWAY if wanted.gateway else DURAND
         for family in wanted.families or sorted(known_personalities()):
             with tempfile.TemporaryDirectory() as folder:
                 found = calibrated(Path(folder), family, stack)
