@@ -1,7 +1,7 @@
 """A CAN bus behind TCP, as the daemon ``socketcand`` serves it in raw mode: the drives' end of it.
 
 Written after the daemon's description of its protocol (github.com/linux-can/socketcand, ``doc/protocol.md``). One
-client, on 127.0.0.1, such as python-can's interface `socketcand`. Its frames arrive as ``< send ID LENGTH B0 B1 ... >``,
+client, on 127.0.0.1, such as python-can's interface `socketcand`. Its frames arrive as ``< send ID LENGTH B0 ... >``,
 and it is sent ``< frame ID SECONDS DATA >``.
 """
 

@@ -66,6 +66,14 @@ def test_calibrated_behind_a_third_canopen_on_a_serial_adapter(npm_canopen, tmp_
     assert malformed == 0 and (frames > 5000 or shutil.which("tshark") is None)
 
 
+@pytest.mark.slow
+def test_calibrated_behind_anothers_canopen_and_a_gateway_on_tcp(tmp_path):
+    found = strangers.calibrated(tmp_path, "copley", strangers.GATEWAY)
+    assert found.check["ok"] and found.run["outcome"] == "ok", found.run
+    assert not found.surprises
+    assert abs(found.off_percent) <= strangers.LIMIT_PERCENT
+
+
 @pytest.fixture(scope="module", params=sorted(strangers.known_personalities()))
 def found(request, tmp_path_factory):
     return strangers.calibrated(tmp_path_factory.mktemp(request.param), request.param)
