@@ -9,7 +9,9 @@ libraries and fill caches: what is held is compared from the second round of eit
 last tenth of the rounds is to be within 1 % of that of the first tenth after it; everything else is to be the same.
 
 Memory is counted after the C library has given back to the system what it keeps of freed memory for later
-(``malloc_trim``), which depends on the order of allocations; what it was before that is told, too.
+(``malloc_trim``), which depends on the order of allocations; what it was before that is told, too. Python's own
+allocator gives back whole megabytes only, which one small object can hold: with ``PYTHONMALLOC=malloc`` in the
+environment it is not used, and *in use* counts every object to the byte.
 """
 
 from __future__ import annotations
@@ -100,6 +102,23 @@ def own_memory_mb() -> float:
     return next(int(line.split()[1]) for line in status if line.startswith("RssAnon:")) * 1.024e-3
 
 
+class _Malloc(ctypes.Structure):
+    """As ``mallinfo2`` of the C library returns it."""
+
+    _fields_ = [
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks")),
+        *((name, ctypes.c_size_t) for name in ("hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")),
+    ]
+
+
+def in_use_mb() -> float:
+    """What the C library has handed out and not got back."""
+    mallinfo = ctypes.CDLL(None).mallinfo2
+    mallinfo.restype = _Malloc
+    told = mallinfo()
+    return float(told.uordblks + told.hblkhd) * 1e-6
+
+
 def robot_file(place: Path) -> str:
     """One joint, a short procedure."""
     values = load_robot("hp3j").values()
@@ -137,6 +156,7 @@ class Soaked:
     Attributes:
         memory_mb: after every round.
         with_freed_mb: the same, before freed memory was given back.
+        in_use_mb: handed out by the C library.
         steady_from: first round after the second of either kind.
         before: held then.
         after: held at the end.
@@ -146,6 +166,7 @@ class Soaked:
 
     memory_mb: list[float]
     with_freed_mb: list[float]
+    in_use_mb: list[float]
     steady_from: int
     before: Held
     after: Held
@@ -162,6 +183,11 @@ class Soaked:
         """The same, freed memory included."""
         return _growth(self.with_freed_mb[self.steady_from :])
 
+    @property
+    def growth_in_use(self) -> float:
+        """The same of what is handed out."""
+        return _growth(self.in_use_mb[self.steady_from :])
+
 
 def _growth(memory_mb: list[float]) -> float:
     tenth = max(1, len(memory_mb) // 10)
@@ -171,7 +197,7 @@ def _growth(memory_mb: list[float]) -> float:
 def soak(lasts_s: float, *, wall_clock_every: int = 5, tell: Callable[[str], None] = print) -> Soaked:
     """Rounds for so long, and at least one after the second of either kind."""
     began, outcomes, before = time.monotonic(), dict[str, int](), held()
-    memory_mb, with_freed_mb, steady_from = list[float](), list[float](), wall_clock_every + 2
+    memory_mb, with_freed_mb, used_mb, steady_from = list[float](), list[float](), list[float](), wall_clock_every + 2
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary)
         robot = robot_file(place)
@@ -183,12 +209,13 @@ def soak(lasts_s: float, *, wall_clock_every: int = 5, tell: Callable[[str], Non
             with_freed_mb.append(own_memory_mb())
             give_back_freed()
             memory_mb.append(own_memory_mb())
+            used_mb.append(in_use_mb())
             if number == steady_from - 1:
                 before = held()
             minutes, clock = (time.monotonic() - began) / 60, " on the wall clock" if wall_clock else ""
-            figures = f"{memory_mb[-1]:.2f} MB ({with_freed_mb[-1]:.1f} with what was freed), {astuple(held())}"
-            tell(f"{minutes:.1f} min, round {number}{clock}: {figures}, {outcomes}")
-    return Soaked(memory_mb, with_freed_mb, steady_from, before, held(), outcomes, time.monotonic() - began)
+            figures = f"{memory_mb[-1]:.2f} MB ({with_freed_mb[-1]:.1f} with what was freed), {used_mb[-1]:.2f} in use"
+            tell(f"{minutes:.1f} min, round {number}{clock}: {figures}, {astuple(held())}, {outcomes}")
+    return Soaked(memory_mb, with_freed_mb, used_mb, steady_from, before, held(), outcomes, time.monotonic() - began)
 
 
 def main() -> int:
@@ -212,6 +239,8 @@ def main() -> int:
         f"from round {found.steady_from} on; {100 * found.growth:+.2f} % from the first tenth of those to the last, "
         f"{100 * found.growth_with_freed:+.2f} % with what was freed"
     )
+    used_mb = found.in_use_mb[found.steady_from :]
+    print(f"in use {min(used_mb):.2f} to {max(used_mb):.2f} MB; {100 * found.growth_in_use:+.2f} % from early to late")
     print(f"held after {found.steady_from} rounds: {found.before}")
     print(f"held at the end:     {found.after}")
     return int(abs(found.growth) > WITHIN or found.after != found.before)

@@ -171,5 +171,11 @@ def test_memory_is_compared_from_early_to_late(benchmark_named: Callable[[str], 
     soak = benchmark_named("soak")
     held = soak.held()
     rounds = [200.0] * 7 + [250.0] * 17 + [255.0] * 3
-    soaked = soak.Soaked(rounds, [300.0] * 27, 7, held, held, {}, 1.0)
-    assert (soaked.growth, soaked.growth_with_freed) == pytest.approx((0.02, 0.0))
+    soaked = soak.Soaked(rounds, [300.0] * 27, [90.0] * 24 + [99.0] * 3, 7, held, held, {}, 1.0)
+    assert (soaked.growth, soaked.growth_with_freed, soaked.growth_in_use) == pytest.approx((0.02, 0.0, 0.1))
+
+
+def test_what_is_in_use_is_counted(benchmark_named: Callable[[str], Any]) -> None:
+    soak = benchmark_named("soak")
+    before_mb, block = soak.in_use_mb(), bytearray(50_000_000)
+    assert soak.in_use_mb() - before_mb == pytest.approx(50.0, abs=1.0) and block

@@ -27,6 +27,9 @@ class CanCycle:
         frame: of a joint (index) for an order.
         cycle_hz: rate.
         window: share of a cycle that reports are waited for.
+
+    Attributes:
+        may_be_powered: joints that were not seen to be off when ``stop`` ended.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class CanCycle:
         self.wishes = list(wishes)
         self._period_ns = round(1e9 / cycle_hz)
         self._window_ns = round(window * self._period_ns)
+        self.may_be_powered: tuple[str, ...] = ()
 
     def wish(self, joint: str) -> Wish:
         """Of the joint with that name."""
@@ -106,6 +110,8 @@ class CanCycle:
                 if not powered:
                     break
         finally:
+            on = [wish.joint.name for wish in self.wishes if wish.feedback.state is JointState.ENABLED]
+            self.may_be_powered = tuple(on)
             for at in (*range(len(self.wishes)), *range(len(self.wishes))):
                 with contextlib.suppress(FrictidError):
                     self._line.send(*self._frame(at, Order(Do.REST)))

@@ -12,7 +12,7 @@ from mit_bench import robot
 from frictid_drivers.mit.faulty_motors import KINDS
 from frictid_drivers.mit.simulated import VirtualMitDriver
 from frictid_drivers.virtual.faults import ENVIRONMENT
-from frictid_hil.errors import FrictidError, HardwareError, InvalidFields
+from frictid_hil.errors import FrictidError, HardwareError, InvalidFields, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 
@@ -107,3 +107,23 @@ def test_every_kind_ends_in_a_report_or_in_one_of_our_errors(tmp_path: Path, kin
         run.driver.close()
         run.driver.rack.advance(2_000_000_000)
         assert not any(motor.on for motor in run.driver.rack.actuators.values())
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_motor_that_is_not_seen_to_be_off_is_named(tmp_path: Path, family: str) -> None:
+    run = Running(tmp_path, family, {"kind": "mute", "joint": "1", "at_s": 0.05})
+    run.cycles(30)
+    run.driver.quick_stop()
+    with pytest.raises(SafetyAbort):
+        run.driver.stop_cycling()
+    assert run.driver.may_be_powered == ("1",)
+
+
+def test_where_the_bus_is_gone_every_joint_may_have_power(tmp_path: Path) -> None:
+    run = Running(tmp_path, "damiao", {"kind": "send_error", "error": "os", "at_s": 0.05})
+    run.cycles(20)
+    with pytest.raises(HardwareError):
+        run.cycles(10)
+    with pytest.raises(HardwareError):
+        run.driver.stop_cycling()
+    assert run.driver.may_be_powered == ("0", "1")

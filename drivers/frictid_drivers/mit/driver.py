@@ -58,6 +58,9 @@ class MitDriver:
         bus_factory: opens the bus instead of python-can (a simulated one).
         clock: run time.
 
+    Attributes:
+        may_be_powered: joints that were not seen to be off after the end.
+
     Raises:
         InvalidFields: an option of the robot file is wrong.
     """
@@ -81,6 +84,7 @@ class MitDriver:
         self._watched: set[str] = set()
         self._actuators: list[Actuator] = []
         self._cycle: CanCycle | None = None
+        self.may_be_powered: tuple[str, ...] = ()
 
     # -- reaching them ------------------------------------------------------------------------------------------
 
@@ -260,7 +264,10 @@ class MitDriver:
         """Bring every joint to rest and off; see ``CanCycle.stop``."""
         cycle, self._cycle = self._cycle, None
         if cycle is not None:
-            cycle.stop()
+            try:
+                cycle.stop()
+            finally:
+                self.may_be_powered = cycle.may_be_powered
 
     def close(self) -> None:
         """Everything to rest, settings as they were, the bus released; safe to call twice and after errors."""
