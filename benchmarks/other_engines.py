@@ -1,16 +1,22 @@
 """The elements that a model is written with, in other engines on the processor: torque against MuJoCo's.
 
-Run: python benchmarks/other_engines.py warp|mjx
+Run: python benchmarks/other_engines.py warp|mjx|newton
 
 Needs mujoco and mujoco-warp, or mujoco-mjx with jax, and nothing of this package. A position drive follows a sine of
 0.5 Hz for three seconds; RMS of the difference in percent of the torque's RMS.
+
+``newton`` needs newton, usd-core, newton-usd-schemas and this package: the arm of ``arm_in_mujoco`` as a USD stage, and
+with half as much friction again as an overlay on it, along three seconds of all six joints.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import importlib
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,13 +87,51 @@ def in_mjx(model: Any) -> Array:
     return torque
 
 
+def newton() -> None:
+    """Stage and overlay, each against MuJoCo with the same numbers; percent, the worst joint."""
+    arms = importlib.import_module("arm_in_mujoco")
+    robots, usd, targets, engines, replay = (
+        importlib.import_module(f"frictid_hil.simulation.{name}")
+        for name in ("robot_model", "usd", "targets", "other_engines", "model_replay")
+    )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        robot = robots.RobotModel.load(arms.write_arm(folder))
+        wanted = arms.command(3, 3.0, arms.STEP_S, len(robot.joints))
+        time_s = arms.STEP_S * np.arange(len(wanted))
+        stage, over = folder / "arm.usda", folder / "over.usda"
+        for path, more in ((stage, 1.0), (over, 1.5)):
+            numbers, model = {}, copy.copy(robot.compiled)
+            model.jnt_stiffness[:] = 0.0
+            for joint in robot.joints:
+                b, k = robot.joint(joint), robot.number(joint)
+                line = (more * b.dry_nm, b.damping[0])
+                model.dof_frictionloss[k] = line[0]
+                model.dof_solref[k], model.dof_solimp[k] = (0.004, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
+                numbers[joint] = targets.Numbers(
+                    line[0], 0.0, 0.0, b.damping, line[1], line, 0.0, b.armature_kg_m2,
+                    b.motor.kp_nm_per_rad, b.motor.kv_nm_s_per_rad, b.motor.torque_limit_nm, 0.0,
+                )  # fmt: skip
+            prims = usd.joint_prims(stage, robot.joints) if path == over else {}
+            path.write_text(usd.overlay(stage, prims, numbers) if prims else usd.stage(robot, numbers))
+            step_s = float(model.opt.timestep)
+            theirs = engines.in_newton(path, robot.joints, step_s, time_s, wanted[0], wanted)[SETTLED:]
+            ours = replay.replayed(model, robot.joints, {}, time_s, wanted, wanted).torque_nm[SETTLED:]
+            off = 100.0 * np.sqrt(np.mean((theirs - ours) ** 2, axis=0) / np.mean(ours**2, axis=0))
+            print(f"{path.stem}: {np.max(off):.4f} %", flush=True)
+
+
 ENGINES: dict[str, Callable[[Any], Array]] = {"warp": in_warp, "mjx": in_mjx}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("engine", choices=tuple(ENGINES))
-    engine = ENGINES[parser.parse_args().engine]
+    parser.add_argument("engine", choices=(*ENGINES, "newton"))
+    asked = parser.parse_args().engine
+    if asked == "newton":
+        newton()
+        return
+    engine = ENGINES[asked]
     for form, (friction, more) in FORMS.items():
         model = importlib.import_module("mujoco").MjModel.from_xml_string(MODEL.format(friction=friction, more=more))
         expected = in_mujoco(model)[SETTLED:]

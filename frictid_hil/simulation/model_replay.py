@@ -50,6 +50,7 @@ def replayed(
     position_rad: Array,
     command_rad: Array,
     engine: Callable[[Any, Any], Stepper] | None = None,
+    begin: int = 0,
 ) -> Replayed:
     """Run a model along the commands of a recording, from where the recording begins.
 
@@ -61,6 +62,7 @@ def replayed(
         position_rad: measured, shape (n, k); only the first row is used.
         command_rad: shape (n, k).
         engine: that steps the model, see ``other_engines``; MuJoCo itself unless given.
+        begin: row at which it takes over from MuJoCo.
     """
     library, m = mujoco_library(), model
     data = library.MjData(m)
@@ -80,8 +82,10 @@ def replayed(
     relax(m, data)
     library.mj_forward(m, data)
     mean = gears * data.actuator_force[forces]
-    stepper = _InMujoco(m, data, frozen) if engine is None else engine(_holding(m, frozen), data)
+    stepper: Stepper = _InMujoco(m, data, frozen)
     for row, wanted in enumerate(command_rad):
+        if engine is not None and row == begin:
+            stepper = engine(_holding(m, frozen), data)
         positions[row], torques[row] = stepper.position()[places], mean
         if row == len(steps):
             break

@@ -31,7 +31,9 @@ from frictid_hil.simulation.usd import prim_name
 LAW_S = 30.0
 """Length of the withheld motion along which laws are evaluated."""
 ENGINE_S = 2.0
-"""Length of the withheld motion that runs in other engines."""
+"""Length of the withheld motion that runs in Newton."""
+SLOW_FROM_S, SLOW_S = 2.0, 0.5
+"""Start and length of its part that runs in engines that need ten milliseconds for a step of one."""
 EDGE_S = 0.25
 """Both ends of a motion, where a low-pass is not yet itself."""
 _ITSELF = "our own evaluation of the file, not run there"
@@ -151,19 +153,23 @@ def figures_of_model(
     here = f"MuJoCo {mujoco_library().__version__}, closed loop"
     rows = [Row("mjcf", here, before, after, motion.size, "told with each joint").told()]
     improved = compiled_with(arm.robot, natives)
-    short = _beginning(motion.motion, ENGINE_S)
+    short = _beginning(motion.motion, SLOW_FROM_S + SLOW_S)
+    begin = int(np.searchsorted(short.time_s, short.time_s[0] + SLOW_FROM_S))
     for name, engine in installed().items():
         try:
-            ran = replayed(improved, *_driven(arm, short), engine=engine).torque_nm
+            ran = replayed(improved, *_driven(arm, short), engine=engine, begin=begin).torque_nm
         except (NotImplementedError, FrictidError) as error:
             rows.append({"target": "mjcf", "where": name, "refused": str(error)})
             continue
-        ran *= [natives[joint].reported if joint in natives else 1.0 for joint in arm.recorded]
-        rows.append(_short_row(arm, motion, short, "mjcf", f"{name}, closed loop, {ENGINE_S:g} s", ran, "as above"))
+        where, torque = f"{name}, closed loop, {SLOW_S:g} s", _reported(arm, natives) * ran
+        off = _short_off(arm, motion, short, begin, torque)
+        rows.append(Row("mjcf", where, *off, motion.size, "as above").told())
     return rows
 
 
-def figure_in_newton(arm: ArmSet, motion: Withheld, stage: Path, lost: str) -> list[dict[str, Any]]:
+def figure_in_newton(
+    arm: ArmSet, motion: Withheld, stage: Path, natives: Mapping[str, Native], lost: str
+) -> list[dict[str, Any]]:
     """The row of a stage in Newton itself, where it is installed and the whole arm can be driven."""
     name = newton()
     if name is None or not motion.known or why_no_closed_loop(arm, [motion.motion]):
@@ -176,20 +182,28 @@ def figure_in_newton(arm: ArmSet, motion: Withheld, stage: Path, lost: str) -> l
         ran = in_newton(stage, prims, step_s, time, position[0], command)
     except FrictidError as error:
         return [{"target": "newton", "where": name, "refused": error.what}]
-    return [_short_row(arm, motion, short, "newton", where, ran, lost)]
+    begin = int(np.searchsorted(time, time[0] + EDGE_S))
+    off = _short_off(arm, motion, short, begin, _reported(arm, natives) * ran)
+    return [Row("newton", where, *off, motion.size, lost).told()]
 
 
-def _short_row(
-    arm: ArmSet, motion: Withheld, short: Motion, target: str, where: str, torque: Array, lost: str
-) -> dict[str, Any]:
-    smooth, begin = low_pass(short.time_s), int(np.searchsorted(short.time_s, short.time_s[0] + EDGE_S))
+def _reported(arm: ArmSet, natives: Mapping[str, Native]) -> Array:
+    """Torque that each drive reports over the torque that it gives, (k,)."""
+    return np.array([natives[joint].reported if joint in natives else 1.0 for joint in arm.recorded])
+
+
+def _short_off(
+    arm: ArmSet, motion: Withheld, short: Motion, begin: int, torque: Array
+) -> tuple[dict[str, float], dict[str, float]]:
+    """RMS of the torque error by joint from row ``begin`` on: user's model in MuJoCo, and ``torque`` (n, k)."""
+    smooth = low_pass(short.time_s)
     nominal = replayed(arm.robot.compiled, *_driven(arm, short)).torque_nm
     before, after = {}, {}
     for name in motion.joints:
         k, measured = arm.recorded.index(name), np.asarray(short.samples[name].torque_nm)
         before[name] = _rms(smooth(measured - nominal[:, k])[begin:])
         after[name] = _rms(smooth(measured - torque[:, k])[begin:])
-    return Row(target, where, before, after, motion.size, lost).told()
+    return before, after
 
 
 def _driven(arm: ArmSet, motion: Motion) -> tuple[Sequence[str], Mapping[str, float], Array, Array, Array]:

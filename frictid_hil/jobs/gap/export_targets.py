@@ -15,7 +15,7 @@ from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.jobs.gap.export_figures import Withheld, figure_in_newton, figure_of_target
 from frictid_hil.jobs.gap.from_model import ArmSet
-from frictid_hil.jobs.gap.write_model import Export, joint_model, use_of
+from frictid_hil.jobs.gap.write_model import Export, joint_model, natives, use_of
 from frictid_hil.simulation import usd
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, written_as
@@ -105,7 +105,7 @@ def write_targets(
     for target, files in texts.items():
         figures = figure_of_target(arm, motion, target, {p.name: text for p, text in files.items()}, LOST[target])
         if target == "newton":
-            figures = figure_in_newton(arm, motion, wanted.files[target], LOST[target]) or figures
+            figures = figure_in_newton(arm, motion, wanted.files[target], natives(made), LOST[target]) or figures
         told[target] = {"files": [str(p.resolve()) for p in files], "lost": LOST[target], "figures": figures}
     return told
 
