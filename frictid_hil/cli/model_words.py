@@ -164,17 +164,13 @@ def _print_export(output: Output, result: Result) -> None:
 
 def _print_figures(output: Output, result: Result) -> None:
     """How near every file comes to the machine: one row a file and engine."""
-    written = [result.get("export", {}), *result.get("targets", {}).values()]
-    rows = [row for told in written for row in told.get("figures", [])]
-    if not rows:
+    from frictid_hil.jobs.gap.export_figures import rows_of
+
+    if not (rows := rows_of(result)):
         return
     table = folding("export", "where it ran", "torque error before", "after", "what is lost", whole=("export",))
     for row in rows:
-        if "refused" in row:
-            table.add_row(row["target"], row["where"], "", "refused", row["refused"])
-        else:
-            figures = [f"{row[when]:.2f} %" for when in ("before_percent", "after_percent")]
-            table.add_row(row["target"], row["where"], *figures, row["lost"])
+        table.add_row(*row)
     output.out.print(table)
     output.out.print(
         "torque error: of the measured torque of the changed joints, on motion that was not fitted", soft_wrap=True

@@ -14,7 +14,7 @@ from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.closed_loop import side_by_side
-from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model
+from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
@@ -109,7 +109,7 @@ def _page_of_the_arm(
     notes += left_out_words(told["closed_loop"])
     notes += [f"{name} stands still in every log, so nothing can be said of it." for name in arm.still]
     runs, why = side_by_side(arm, natives(made)), str(told["closed_loop"].get("reason", ""))
-    return arm_page(arm.robot.path.stem, str(told["summary"]), found, pages, notes, runs, why)
+    return arm_page(arm.robot.path.stem, str(told["summary"]), found, pages, notes, runs, why, rows_of(told))
 
 
 def _written(

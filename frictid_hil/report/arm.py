@@ -52,6 +52,7 @@ def arm_page(
     notes: Sequence[str] = (),
     runs: Sequence[JointRun] = (),
     why_no_runs: str = "",
+    exports: Sequence[Sequence[str]] = (),
 ) -> Page:
     """The page of an arm.
 
@@ -63,6 +64,7 @@ def arm_page(
         notes: what is said of the arm as a whole.
         runs: of the joints, in closed loop.
         why_no_runs: why there are none.
+        exports: what was written: target, where it ran, torque error before and after, and what is lost.
     """
     rows = tuple(_row(joint, d, pages.get(joint)) for joint, d in found.items())
     headings = ("joint", "verdict", "causes (confidence)", "gap lies", "gap before", "after", "noise floor")
@@ -76,7 +78,12 @@ def arm_page(
     tables = (_before_and_after(runs),) if runs else ()
     figures = tuple(_beside(run) for run in runs)
     beside = Section("Measured, your model, improved", words=words, tables=tables, figures=figures)
-    return Page(f"Sim-to-real gap of {name}", summary, (glance, beside))
+    written: tuple[Section, ...] = ()
+    if exports:
+        titles = ("export", "where it ran", "torque error before", "after", "what is lost")
+        caption = "RMS over the changed joints' measured torque, on motion that was not fitted."
+        written = (Section("What was written", tables=(Table(titles, tuple(map(tuple, exports)), caption=caption),)),)
+    return Page(f"Sim-to-real gap of {name}", summary, (glance, beside, *written))
 
 
 def _row(joint: str, d: Diagnosis, page: str | None) -> tuple[str | Link, ...]:

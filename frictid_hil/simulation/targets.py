@@ -314,6 +314,57 @@ LOST = {
 }
 TARGETS = tuple(LOST)
 
+_SLIDING = dict.fromkeys(("friction_level_error", "viscous_error", "viscous_nonlinearity"), "friction")
+_MEAN = dict.fromkeys(("load_dependent_friction", "directional_efficiency"), "friction")
+_GAINS = dict.fromkeys(("torque_constant_error", "controller_gain_error"), "gains")
+_KINDS = _SLIDING | _MEAN | _GAINS | {"temperature_drift": "friction"}
+_PLACES: dict[str, dict[str, str]] = {
+    "isaaclab": {
+        "friction": "dynamic_friction and viscous_friction",
+        "stribeck": "friction, the static level",
+        "inertia_error": "armature",
+        "gains": "stiffness and damping",
+        "torque_saturation": "actuator_effort_limit",
+        "torque_delay": "min_delay and max_delay",
+    },
+    "mjlab": {
+        "friction": "frictionloss and JOINT_DAMPING",
+        "inertia_error": "armature",
+        "gains": "stiffness and damping",
+        "torque_saturation": "effort_limit",
+        "torque_delay": "DELAY_STEPS",
+    },
+    "newton": {
+        "friction": "newton:friction and newton:damping",
+        "inertia_error": "newton:armature",
+        "gains": "drive: stiffness and damping",
+        "torque_saturation": "drive: maxForce",
+    },
+    "ros2": {"friction": "coulomb_nm and viscous_nm_s_per_rad"},
+    "bam": {
+        "friction": "friction_base and friction_viscous",
+        "stribeck": "friction_stribeck and dtheta_stribeck",
+        "inertia_error": "armature",
+    },
+    "c": {"friction": "dry_nm, a, b and c", "stribeck": "rise_nm and stribeck_rad_s"},
+    "samples": {
+        "friction": "dry_nm and damping",
+        "stribeck": "rise_nm and stribeck_rad_s",
+        "inertia_error": "armature_kg_m2",
+        "gains": "kp_nm_per_rad and kv_nm_s_per_rad",
+        "torque_saturation": "torque_limit_nm",
+        "torque_delay": "delay_s",
+    },
+}
+
+
+def place_of(target: str, effect: str) -> str | None:
+    """Where a target holds an effect; None where it cannot."""
+    place = _PLACES[target].get(_KINDS.get(effect, effect))
+    if place is None:
+        return None
+    return place + ("; at the mean load" if effect in _MEAN else "; cold" if effect == "temperature_drift" else "")
+
 
 def written_as(
     target: str, file: str, joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numbers]], step_s: float

@@ -13,7 +13,7 @@ from frictid_hil.simulation.targets import TARGETS
 
 pytest.importorskip("mujoco", minversion="4.0")
 
-from frictid_hil.jobs.gap.export_figures import figures_of_model
+from frictid_hil.jobs.gap.export_figures import figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import export_of
@@ -51,10 +51,11 @@ def test_every_target_is_measured_where_it_can_be(arm: ArmSet, tmp_path: Path) -
     assert set(told) == set(TARGETS)
     for target, one in told.items():
         (row,) = one["figures"]
-        assert row["target"] == target and row["lost"]
+        assert row["target"] == target and row["lost"] and one["effects"]["lift"]["friction_level_error"]
         assert row["before_percent"] > 5.0 and row["after_percent"] < 0.2 * row["before_percent"], target
     if c_compiler():
         assert told["c"]["figures"][0]["where"] == "compiled and run here"
+    assert [row[0] for row in rows_of({"targets": told})] == list(TARGETS)
     assert "not run there" in told["isaaclab"]["figures"][0]["where"]
 
 

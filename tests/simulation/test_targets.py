@@ -16,7 +16,7 @@ from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.native import Use
 from frictid_hil.simulation.robot_model import ModelJoint, Motor
 from frictid_hil.simulation.target_laws import laws_of, run_c
-from frictid_hil.simulation.targets import Numbers, friction_nm, numbers_of, written_as
+from frictid_hil.simulation.targets import TARGETS, Numbers, friction_nm, numbers_of, place_of, written_as
 
 SERVO = Motor(("servo",), "position", 900.0, 30.0, 1.0, 40.0, 0.004, 0.0)
 BELIEVED = ModelJoint("lift", False, None, 0.2, 3.0, (1.0, 0.0, 0.0), (0.0, 0.0), None, False, 0.0, SERVO)
@@ -81,6 +81,14 @@ def test_bam_has_a_file_a_joint_and_samples_belong_together(joint: Numbers) -> N
     assert len(json.loads(text)["samples"]) == 3
     with pytest.raises(UsageError, match="no target 'drake'"):
         written_as("drake", "x", {}, {}, 0.002)
+
+
+def test_every_effect_has_a_place_or_is_lost() -> None:
+    for target in TARGETS:
+        assert place_of(target, "friction_level_error") and place_of(target, "torque_ripple") is None
+        assert (place_of(target, "directional_efficiency") or "").endswith("mean load")
+    assert place_of("ros2", "inertia_error") is None and place_of("newton", "inertia_error") == "newton:armature"
+    assert place_of("isaaclab", "torque_delay") and place_of("newton", "torque_delay") is None
 
 
 def test_what_a_file_says_is_read_back_from_it(joint: Numbers) -> None:

@@ -36,6 +36,7 @@ SLOW_FROM_S, SLOW_S = 2.0, 0.5
 """Start and length of its part that runs in engines that need ten milliseconds for a step of one."""
 EDGE_S = 0.25
 """Both ends of a motion, where a low-pass is not yet itself."""
+_PERCENT = ("before_percent", "after_percent")
 _ITSELF = "our own evaluation of the file, not run there"
 
 
@@ -115,6 +116,16 @@ class Withheld:
         """The same with the friction of the user's model."""
         believed = {name: self._arm.robot.joint(name) for name in self.joints}
         return self.off({name: Law(b.dry_nm, *b.stribeck, b.damping) for name, b in believed.items()})
+
+
+def rows_of(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Every figure of a result, as words: target, where it ran, torque error before and after, what is lost."""
+    written = [result.get("export", {}), *result.get("targets", {}).values()]
+    rows = []
+    for told in (row for one in written for row in one.get("figures", [])):
+        figures = ("", "refused") if "refused" in told else (f"{told[w]:.2f} %" for w in _PERCENT)
+        rows.append((told["target"], told["where"], *figures, told.get("refused") or told["lost"]))
+    return rows
 
 
 def figure_of_target(

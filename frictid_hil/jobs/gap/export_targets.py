@@ -18,7 +18,7 @@ from frictid_hil.jobs.gap.from_model import ArmSet
 from frictid_hil.jobs.gap.write_model import Export, joint_model, natives, use_of
 from frictid_hil.simulation import usd
 from frictid_hil.simulation.effects import all_effects
-from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, written_as
+from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, place_of, written_as
 
 _SIGMAS = 2.0 * 1.96
 """Standard deviations in a 95 % interval."""
@@ -75,7 +75,8 @@ def write_targets(
         UsageError: a file is there already.
 
     Returns:
-        By target: ``files`` (absolute paths), ``lost`` and ``figures``, see ``export_figures``.
+        By target: ``files`` (absolute paths), ``effects`` (by joint, where each went: None where the target cannot hold
+        it), ``lost`` and ``figures``, see ``export_figures``.
     """
     joints, samples = {}, {}
     random = np.random.default_rng(wanted.seed)
@@ -103,11 +104,21 @@ def write_targets(
     motion = Withheld(arm, made)
     told = {}
     for target, files in texts.items():
-        figures = figure_of_target(arm, motion, target, {p.name: text for p, text in files.items()}, LOST[target])
+        places = {name: {e: place_of(target, e) for e in one.model.effects} for name, one in made.items()}
+        lost = _lost_words(target, places)
+        figures = figure_of_target(arm, motion, target, {p.name: text for p, text in files.items()}, lost)
         if target == "newton":
-            figures = figure_in_newton(arm, motion, wanted.files[target], natives(made), LOST[target]) or figures
-        told[target] = {"files": [str(p.resolve()) for p in files], "lost": LOST[target], "figures": figures}
+            figures = figure_in_newton(arm, motion, wanted.files[target], natives(made), lost) or figures
+        paths = [str(path.resolve()) for path in files]
+        told[target] = {"files": paths, "effects": places, "lost": lost, "figures": figures}
     return told
+
+
+def _lost_words(target: str, places: Mapping[str, Mapping[str, str | None]]) -> str:
+    """What of this machine is lost, then what the target lacks."""
+    gone = {name: [e for e, place in placed.items() if place is None] for name, placed in places.items()}
+    told = [f"{' and '.join(lost)} of {name}" for name, lost in gone.items() if lost]
+    return "; ".join([*told, LOST[target]])
 
 
 def _texts(
