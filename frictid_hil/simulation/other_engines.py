@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.errors import FrictidError
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.model_replay import Stepper
 
@@ -100,18 +99,15 @@ def in_newton(
         command_rad: shape (n, k).
 
     Raises:
-        FrictidError: Newton cannot read the stage.
+        Exception: whatever Newton raises of a stage that it cannot read.
     """
     engine = importlib.import_module("newton")
     importlib.import_module("warp").config.quiet = True
     builder = engine.ModelBuilder()
     engine.solvers.SolverMuJoCo.register_custom_attributes(builder)
-    try:
-        builder.add_usd(str(stage))
-        model = builder.finalize(device="cpu")
-        solver = engine.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, disable_contacts=True, integrator="euler")
-    except Exception as error:  # whatever its importer raises
-        raise FrictidError(f"Newton cannot read the stage: {error}", where=str(stage)) from error
+    builder.add_usd(str(stage))
+    model = builder.finalize(device="cpu")
+    solver = engine.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, disable_contacts=True, integrator="euler")
     numbers = [[label.rpartition("/")[2] for label in model.joint_label].index(name) for name in joints]
     dofs, places = model.joint_qd_start.numpy()[numbers], model.joint_q_start.numpy()[numbers]
     gain, rate = model.joint_target_ke.numpy()[dofs], model.joint_target_kd.numpy()[dofs]

@@ -13,10 +13,12 @@ from frictid_hil.simulation.targets import TARGETS
 
 pytest.importorskip("mujoco", minversion="4.0")
 
-from frictid_hil.jobs.gap.export_figures import figures_of_model, rows_of
+from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
+from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import export_of
+from frictid_hil.simulation.model_replay import Stepper
 from frictid_hil.simulation.target_laws import c_compiler
 
 MODEL = """<mujoco><compiler angle="radian"/><worldbody><body>
@@ -60,8 +62,6 @@ def test_every_target_is_measured_where_it_can_be(arm: ArmSet, tmp_path: Path) -
 
 
 def test_nothing_is_said_of_a_model_that_cannot_be_run(arm: ArmSet) -> None:
-    from frictid_hil.jobs.gap.export_figures import Withheld
-
     assert figures_of_model(arm, Withheld(arm, ["lift"]), {}, {"reason": "the logs have no position commands"}) == []
 
 
@@ -69,3 +69,21 @@ def test_a_stage_is_only_of_newton(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--stage is of Newton"):
         Wanted.of(["c=a.h"], 0, tmp_path / "arm.usd")
     assert Wanted.of(["newton=a.usda"], 0, tmp_path / "arm.usd").stage == tmp_path / "arm.usd"
+
+
+@pytest.mark.slow
+def test_an_engine_that_fails_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def broken(model: object, data: object) -> Stepper:
+        raise RuntimeError("no such kernel")
+
+    (tmp_path / "arm.xml").write_text(MODEL)
+    time = np.arange(0, 9, 0.004)
+    q = 0.6 * np.sin(1.3 * time)
+    header = "time_s,position_rad,position_command_rad,torque_nm"
+    table = np.column_stack([time, q, q, 8.0 * np.cos(q) + 2.0 * np.sign(np.cos(1.3 * time))])
+    np.savetxt(tmp_path / "walk.csv", table, delimiter=",", header=header, comments="")
+    arm = sets_from_model(ModelLogs(tmp_path / "arm.xml", [tmp_path / "walk.csv"]))
+    monkeypatch.setattr("frictid_hil.jobs.gap.export_figures.installed", lambda: {"engine 1.0": broken})
+    here, there = figures_of_model(arm, Withheld(arm, ["lift"]), {}, closed_loop_gap(arm, {}))
+    assert here["after_percent"] == pytest.approx(here["before_percent"])
+    assert there["refused"] == "RuntimeError: no such kernel" and there["where"] == "engine 1.0"
