@@ -22,6 +22,7 @@ from frictid_hil.cli import (
     reports,
 )
 from frictid_hil.cli.output import Output
+from frictid_hil.cli.terminal import outlive_the_terminal
 from frictid_hil.errors import UsageError
 from frictid_hil.version import __version__
 
@@ -63,6 +64,7 @@ def _root(
 
 def main() -> None:
     """Entry point of the console script."""
+    outlive_the_terminal()
     # Libraries log what we tell better as errors with cause and next step.
     logging.getLogger().addHandler(logging.NullHandler())
     if "--json" not in sys.argv[1:]:

@@ -127,3 +127,19 @@ def test_a_joint_that_stands_or_sticks_repeats_nothing_that_matters():
     assert repeated(1000, went=lambda n: 0) == ""
     assert repeated(1000, torque_nm=lambda n: 0.01 * (n // 20)) == "", "its loop pulls harder and harder"
     assert repeated(1000, torque_nm=lambda n: math.nan) == "", "nobody reports a torque"
+
+
+def swinging(torque_nm):
+    """A joint that swings at 1 Hz, by 5.7 deg to either side."""
+    for n in range(1500):
+        phase = 2e-3 * math.pi * n
+        velocity = 0.2 * math.pi * math.cos(phase)
+        yield Feedback(n * MS, 0.1 * math.sin(phase), velocity, torque_nm=torque_nm(n, velocity))
+
+
+@pytest.mark.parametrize("stuck_nm", [0.0, 3.7])
+def test_a_torque_that_stands_whichever_way_the_joint_moves_is_told(stuck_nm):
+    told = verdict(swinging(lambda n, velocity: stuck_nm if n > 300 else math.copysign(5.0, velocity)))
+    assert "torque stands at exactly" in told
+    assert verdict(swinging(lambda n, velocity: math.copysign(5.0, velocity))) == ""
+    assert verdict(swinging(lambda n, velocity: math.nan)) == "", "nobody reports a torque"

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import json
 import math
 import os
+import pty
+import select
 import signal
 import struct
 import subprocess
 import sys
+import termios
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,9 +36,15 @@ COUNTS_PER_RAD = 131072 * 81.5 / (2 * math.pi)
 
 
 class Running:
-    """A calibration in the background, and an ear on its bus; of three cycles, the second of which is fast."""
+    """A calibration in the background, and an ear on its bus; of three cycles, the second of which is fast.
 
-    def __init__(self, out: Path, channel: str) -> None:
+    Args:
+        out: folder of the run.
+        channel: of the bus.
+        terminal: that it runs on, as the side of the program; None for a pipe.
+    """
+
+    def __init__(self, out: Path, channel: str, terminal: int | None = None) -> None:
         self.out = out
         program = Path(sys.executable).parent / "frictid-hil"
         self.parent = subprocess.Popen(
@@ -41,9 +53,12 @@ class Running:
                 *("calibrate", "--robot", "hp3j", "--joint", JOINT, "--cycles", "3", "--realtime", "--yes"),
                 *("--bus", f"virtual:{channel}", "--out", str(out)),
             ],
-            stdout=subprocess.PIPE,
+            stdin=terminal,
+            stdout=subprocess.PIPE if terminal is None else terminal,
             stderr=subprocess.STDOUT,
             text=True,
+            start_new_session=terminal is not None,
+            preexec_fn=None if terminal is None else lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
         )
         self.bus = self._listen(channel)
 
@@ -182,13 +197,61 @@ def test_a_suspended_loop_does_not_hang_its_parent(running: Running) -> None:
     assert not mine & shared_memory()
 
 
-def test_a_closed_terminal_stops_the_run_like_ctrl_c(running: Running) -> None:
+def test_a_hang_up_stops_the_run_like_ctrl_c_and_leaves_no_shared_memory(running: Running) -> None:
     mine = {m.path.split("/")[-1] for m in running.child().memory_maps() if "/dev/shm/psm_" in m.path}
     running.parent.send_signal(signal.SIGHUP)
     said = running.last_words()
     assert running.parent.returncode == 130, said
     assert "brought to rest" in said
     assert mine and not mine & shared_memory()
+
+
+def test_a_closed_terminal_stops_the_run_like_ctrl_c(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    run = Running(tmp_path / "run", f"closed-{os.getpid()}", terminal=theirs)
+    os.close(theirs)
+    closed = threading.Event()
+    threading.Thread(target=_shown, args=(ours, closed)).start()
+    try:
+        run.wait_for_cycles()
+        closed.set()
+        positions_until_quiet(run, 0.5)
+        run.bus.shutdown()
+        assert run.parent.wait(60) == 130
+        assert json.loads((run.out / "manifest.json").read_text())["outcome"] == "interrupted"
+        assert run.last_run_time_s() > 3.0
+    finally:
+        closed.set()
+        run.parent.kill()
+        run.parent.wait()
+
+
+def _shown(terminal: int, closed: threading.Event) -> None:
+    """Take what a program shows; then close its terminal."""
+    while not closed.is_set():
+        if select.select([terminal], [], [], 0.05)[0]:
+            os.read(terminal, 4096)
+    os.close(terminal)
+
+
+def speed_at_the_quick_stop_rad_s(run: Running) -> float:
+    """Of the joint, as recorded, when its drive began its quick stop; that also ends a stop along the path."""
+    frames = read_frames(run.out / "bus.blf")
+    reports = np.flatnonzero((frames.can_id == 0x180 + NODE) & (frames.length >= 6))
+    position = frames.data[reports, 2:6].copy().view("<i4")[:, 0] / COUNTS_PER_RAD
+    began = int(np.flatnonzero(frames.data[reports, 0] & 0x6F == 0x07)[0])
+    before = slice(began - 10, began)
+    return float(np.ptp(position[before]) / np.ptp(frames.t_ns[reports][before]) * 1e9)
+
+
+@pytest.mark.parametrize(("first", "second"), [(signal.SIGINT, signal.SIGTERM), (signal.SIGHUP, signal.SIGINT)])
+def test_twice_stops_quickly(running: Running, first: int, second: int) -> None:
+    running.parent.send_signal(first)
+    running.parent.send_signal(second)
+    said = running.last_words()
+    assert running.parent.returncode == 130, said
+    assert "Traceback" not in said
+    assert speed_at_the_quick_stop_rad_s(running) > math.radians(10)
 
 
 def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> None:
@@ -198,3 +261,4 @@ def test_ctrl_c_decelerates_keeps_the_log_and_exits_130(running: Running) -> Non
     assert "brought to rest" in said
     assert "Traceback" not in said
     assert running.last_run_time_s() > 3.0
+    assert speed_at_the_quick_stop_rad_s(running) < math.radians(2)

@@ -233,3 +233,39 @@ def test_wrong_answers_in_front_of_the_real_driver_name_the_object(make_robot):
         driver.open()
         driver.configure(1000.0, ["0"])
     driver.close()
+
+
+def set_up(setup, after):
+    """Open and configure a drive whose SDO answer after so many is an abort: answers that passed, and the error."""
+    rack = Rack()
+    rack.install(setup)
+    buses = []
+
+    def bus() -> FaultyBus:
+        row = {"kind": "abort", "after": after, "count": 1}
+        buses.append(FaultyBus(LockStepBus(rack, "step"), [row], lambda: rack.now_ns))
+        rack.power_on()
+        return buses[-1]
+
+    driver, ended = Cia402Driver(setup, bus_factory=bus, clock=LockStepClock(rack)), None
+    try:
+        driver.open()
+        driver.check(None)
+        driver.configure(1000.0, ["0"])
+        driver.set_limits("0", torque_nm=10.0, position_min_rad=-1.0, position_max_rad=1.0)
+    except FrictidError as error:
+        ended = error
+    finally:
+        driver.close()
+    assert not any(servo.axis.powered for servo in rack.servos.values())
+    return buses[0]._incoming._frames[0][0]._passed, ended
+
+
+@pytest.mark.slow
+def test_an_abort_at_any_step_of_setting_a_drive_up_is_taken_or_told(make_robot):
+    setup = make_robot(joints=1)
+    steps, ended = set_up(setup, 10**6)
+    assert steps > 50 and ended is None
+    told = [set_up(setup, step)[1] for step in range(steps)]
+    assert all(error.next_step and "0" in error.where for error in told if error is not None)
+    assert sum(error is not None for error in told) > 10
