@@ -15,10 +15,10 @@ from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
-from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
+from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
-from frictid_hil.jobs.gap.write_model import Export, exports, natives, write_model
+from frictid_hil.jobs.gap.write_model import Export, exports, likely, natives, write_model
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.arm import arm_page
 from frictid_hil.report.gap import gap_page
@@ -65,6 +65,8 @@ def diagnose_arm(
         pages[""] = out / ARM_PAGE
     outputs = [*pages.values(), *([write] if write is not None else []), *(wanted.files.values() if wanted else ())]
     refuse_overwriting(outputs, force=force)
+    if wanted is not None:
+        check_targets(arm, wanted)
     found = diagnosed(arm, executor_name)
     joints = {name: _told(arm.joints[name], diagnosis) for name, diagnosis in found.items()}
     result: dict[str, Any] = {
@@ -148,7 +150,7 @@ def _diagnosed(experiments: ExperimentSet) -> Diagnosis:
 def summary(found: Mapping[str, Diagnosis], arm: ArmFindings | None = None) -> str:
     """One sentence about the arm."""
     named = [
-        f"{name} ({' and '.join(c.effect for c in d.causes)})" for name, d in found.items() if d.verdict == "explained"
+        f"{name} ({' and '.join(c.effect for c in likely(d))})" for name, d in found.items() if d.verdict == "explained"
     ]
     open_ones = [f"{name} ({d.verdict})" for name, d in found.items() if d.verdict in ("ambiguous", "unknown")]
     healthy = sum(d.verdict == "none" for d in found.values())

@@ -15,7 +15,7 @@ pytest.importorskip("mujoco", minversion="4.0")
 
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
 from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
-from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
+from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import export_of
 from frictid_hil.simulation.model_replay import Stepper
@@ -63,6 +63,14 @@ def test_every_target_is_measured_where_it_can_be(arm: ArmSet, tmp_path: Path) -
 
 def test_nothing_is_said_of_a_model_that_cannot_be_run(arm: ArmSet) -> None:
     assert figures_of_model(arm, Withheld(arm, ["lift"]), {}, {"reason": "the logs have no position commands"}) == []
+
+
+def test_a_stage_without_the_joints_is_refused_before_anything_is_computed(arm: ArmSet, tmp_path: Path) -> None:
+    pytest.importorskip("pxr.Usd")
+    (tmp_path / "other.usda").write_text('#usda 1.0\ndef PhysicsRevoluteJoint "elbow" {}\n')
+    with pytest.raises(UsageError, match="no joint is called lift"):
+        check_targets(arm, Wanted({"newton": tmp_path / "a.usda"}, stage=tmp_path / "other.usda"))
+    check_targets(arm, Wanted({"newton": tmp_path / "a.usda"}))
 
 
 def test_a_stage_is_only_of_newton(tmp_path: Path) -> None:

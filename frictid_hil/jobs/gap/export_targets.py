@@ -66,6 +66,20 @@ class Wanted:
         return Wanted(files, samples, stage=stage)
 
 
+def check_targets(arm: ArmSet, wanted: Wanted) -> None:
+    """Refuse what cannot be written before anything is computed.
+
+    Raises:
+        ConfigError, InputFileError, UsageError: the stage, or the lack of one; see ``usd``.
+    """
+    if "newton" not in wanted.files:
+        return
+    if wanted.stage is None:
+        usd.stage(arm.robot, {})
+    else:
+        usd.joint_prims(wanted.stage, list(arm.joints))
+
+
 def write_targets(
     arm: ArmSet, found: Mapping[str, Diagnosis], made: Mapping[str, Export], wanted: Wanted, *, force: bool
 ) -> dict[str, Any]:

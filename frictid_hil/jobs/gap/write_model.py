@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnose import UNDECIDED
-from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.diagnosis import Cause, Diagnosis
 from frictid_hil.jobs.gap.closed_loop import fitted, gap_of, why_no_closed_loop
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet
 from frictid_hil.simulation.effects import all_effects
@@ -114,14 +114,11 @@ def _beyond_own_lag(joint: JointSet, effects: Mapping[str, Mapping[str, float]])
 
 
 def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
-    """The effects that the verdict allows to be written, with parameters within their bounds.
-
-    A cause below an even chance is no part of them: its size is hardly more than a guess.
-    """
+    """The effects that the verdict allows to be written, with parameters within their bounds."""
     if found.verdict != "explained" and not (apply and found.verdict in ("ambiguous", "unknown")):
         return {}
     effects: dict[str, dict[str, float]] = {}
-    for cause in [c for c in found.causes if c.confidence >= UNDECIDED] or found.causes[:1]:
+    for cause in likely(found):
         told = {name: value.value for name, value in cause.parameters.items()}
         if "lag_s" in told:
             # A chain from command to position: what lags is an effect of its own, and what no delay holds lags too.
@@ -130,6 +127,11 @@ def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
         if values := _within(cause.effect, told):
             effects[cause.effect] = all_effects()[cause.effect].complete(values)
     return effects
+
+
+def likely(found: Diagnosis) -> Sequence[Cause]:
+    """The causes at an even chance or better, or the first: the size of the others is hardly more than a guess."""
+    return [cause for cause in found.causes if cause.confidence >= UNDECIDED] or found.causes[:1]
 
 
 def _within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
