@@ -130,7 +130,8 @@ STILL = ("check", "reset")
 """Verbs without power."""
 RATES_HZ = (250.0, 250.0, 250.0, 250.0, 500.0, 500.0, 1000.0)
 """Drawn from: most runs are slow, and therefore cheap."""
-SERVO_RATES_HZ = (100.0, 200.0, 200.0, 200.0, 400.0)
+SERVO_RATES_HZ = (200.0,)
+"""Servos are to be kept to it (docs/guides/servos.md)."""
 REST_S, OFF_S, OFF_RAD_S = 0.5, 2.6, 0.02
 """Longest from the host's stop to rest and to the end of power (docs/reference/stops.md), and what counts as rest."""
 SILENT_S = 1.0
