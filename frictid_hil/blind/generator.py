@@ -21,6 +21,7 @@ from frictid_hil.blind.figures import Log, believed_motion, figures, record, tog
 from frictid_hil.blind.joints import Joint, changed, draw_joint, nominal_mapping
 from frictid_hil.blind.outsiders import OUTSIDERS
 from frictid_hil.blind.plant import TICK_S, Physics
+from frictid_hil.blind.score import PRACTICAL
 from frictid_hil.gap.experiments import FULL
 
 ALIASES = (
@@ -233,6 +234,7 @@ def _truth(
         "size_ratio": ratio,
         "size_class": _size_class(ratio, assignment.effects),
         "gap_over_floor": {figure.removesuffix("_nm"): gap[figure] / floor[figure] for figure in SIZED_BY},
+        "practical_over_floor": PRACTICAL * joint.belief.coulomb / max(floor[figure] for figure in SIZED_BY),
         "torque_noise_floor_nm": joint.torque_noise_nm,
         "gap": gap,
         "ideal_residual": floor,

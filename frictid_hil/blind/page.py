@@ -19,7 +19,8 @@ _LABELS = {
     "singles_top_1_or_alias": "... or its alias",
     "singles_top_2": "... among the first two",
     "none_answered_none": "Healthy joints answered `none`",
-    "outside_answered_unknown": "Visible effects from outside answered `unknown`, or `none` below two floors",
+    "outside_answered_unknown": "Visible effects from outside answered `unknown`, or `none` where it is promised",
+    "outside_unknown_alone": "... answered `unknown`",
     "doubles_both_in_top_2": "Both of two effects (each visible alone) in the first two",
     "doubles_all_both_in_top_2": "... of all pairs",
     "invisible_none_or_named": "Invisible effects answered `none` or by their name",
@@ -51,6 +52,7 @@ def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
         "singles_top_2": scores["singles"]["top_2"],
         "none_answered_none": scores["none"]["answered_none"],
         "outside_answered_unknown": scores["outside"]["answered_unknown"],
+        "outside_unknown_alone": scores["outside"]["unknown_alone"],
         "doubles_both_in_top_2": scores["doubles"]["both_in_top_2"],
         "doubles_all_both_in_top_2": scores["doubles"]["both_in_top_2_all"],
         "invisible_none_or_named": scores["invisible"],
@@ -198,7 +200,7 @@ def _confusion(scores: Mapping[str, Any]) -> list[str]:
 
 def _outside(scores: Mapping[str, Any]) -> list[str]:
     return [
-        "### Effects from outside, answered `unknown`, or `none` below two floors",
+        "### Effects from outside, answered `unknown`, or `none` where it is promised",
         "",
         "| effect | right |",
         "|---|---|",

@@ -19,6 +19,8 @@ NAMING = ("explained", "ambiguous")
 CONFIDENT = 0.9
 PROMISED = 2.0
 """Gap over floor below which a verdict may be ``none``, whatever makes it."""
+PRACTICAL = 0.05
+"""The same over the believed friction level."""
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 PARTNERS = (
@@ -157,6 +159,7 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
         },
         "outside": {
             "answered_unknown": Rate.over(not_taken_in(t, a) for t, a in outside).to_json(),
+            "unknown_alone": Rate.over(a.verdict == "unknown" for _, a in outside).to_json(),
             "by_effect": {
                 name: Rate.over(not_taken_in(t, a) for t, a in outside if _name(t) == name).to_json()
                 for name in sorted({_name(t) for t, _ in outside})
@@ -262,7 +265,8 @@ def _both_visible(truth: Mapping[str, Any]) -> bool:
 
 def not_taken_in(truth: Mapping[str, Any], answer: Answer) -> bool:
     """``unknown`` for what the library does not hold; ``none`` is as right below the gap up to which it is promised."""
-    return answer.verdict == "unknown" or (answer.verdict == "none" and truth["size_ratio"] < PROMISED)
+    promised = max(PROMISED, truth.get("practical_over_floor", 0.0))
+    return answer.verdict == "unknown" or (answer.verdict == "none" and truth["size_ratio"] < promised)
 
 
 def _right(truth: Mapping[str, Any], answer: Answer) -> bool:

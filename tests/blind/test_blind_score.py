@@ -116,6 +116,15 @@ def test_a_pair_needs_both_and_both_must_be_visible_alone() -> None:
     assert counts(s["at_least_one_in_top_2"]) == (2, 2)
 
 
+def test_none_is_right_about_an_outsider_as_far_as_it_is_promised() -> None:
+    small = truth("a", "outside", "bumper", ratio=1.9)
+    practical = truth("b", "outside", "bumper", ratio=3.0) | {"practical_over_floor": 3.5}
+    visible = truth("c", "outside", "bumper", ratio=4.0) | {"practical_over_floor": 3.5}
+    s = scored(*((one, answer("none")) for one in (small, practical, visible)))["outside"]
+    assert counts(s["answered_unknown"]) == (2, 3)
+    assert counts(s["unknown_alone"]) == (0, 3)
+
+
 def test_confidence_about_an_outsider_is_wrong_whatever_is_named() -> None:
     s = scored(
         (truth("a", "outside", "bumper"), answer("explained", ("encoder_offset", 0.97))),
