@@ -17,7 +17,7 @@ from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
 from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.write_model import export_of
+from frictid_hil.jobs.gap.write_model import export_of, natives
 from frictid_hil.simulation.model_replay import Stepper
 from frictid_hil.simulation.target_laws import c_compiler
 
@@ -61,8 +61,13 @@ def test_every_target_is_measured_where_it_can_be(arm: ArmSet, tmp_path: Path) -
     assert "not run there" in told["isaaclab"]["figures"][0]["where"]
 
 
-def test_nothing_is_said_of_a_model_that_cannot_be_run(arm: ArmSet) -> None:
-    assert figures_of_model(arm, Withheld(arm, ["lift"]), {}, {"reason": "the logs have no position commands"}) == []
+def test_a_model_that_cannot_be_run_is_judged_by_what_stands_in_it(arm: ArmSet) -> None:
+    made = {"lift": export_of(arm, arm.joints["lift"], {"friction_level_error": {"error_share": 0.5}}, None)}
+    told = closed_loop_gap(arm, natives(made))
+    assert "no position commands" in told["reason"]
+    (row,) = figures_of_model(arm, Withheld(arm, made), natives(made), told)
+    assert row["target"] == "mjcf" and "MuJoCo reads" in row["where"]
+    assert row["before_percent"] > 5.0 and row["after_percent"] < 0.2 * row["before_percent"]
 
 
 def test_a_stage_without_the_joints_is_refused_before_anything_is_computed(arm: ArmSet, tmp_path: Path) -> None:

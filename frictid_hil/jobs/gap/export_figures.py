@@ -24,6 +24,7 @@ from frictid_hil.simulation.model_replay import replayed
 from frictid_hil.simulation.native import Native
 from frictid_hil.simulation.other_engines import in_newton, installed, newton
 from frictid_hil.simulation.rigid_bodies import mujoco_library
+from frictid_hil.simulation.robot_model import RobotModel
 from frictid_hil.simulation.target_laws import Law, c_compiler, laws_of, run_c
 from frictid_hil.simulation.usd import prim_name
 
@@ -149,7 +150,9 @@ def figure_of_target(
 def figures_of_model(
     arm: ArmSet, motion: Withheld, natives: Mapping[str, Native], told: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Rows of the user's improved MJCF: in MuJoCo, and for a short while in the other engines that are installed.
+    """Rows of the user's improved model: in MuJoCo, and for a short while in the other engines that are installed.
+
+    Where it cannot run in closed loop, its friction is read back from the edited file.
 
     Args:
         arm: model and recordings.
@@ -157,8 +160,10 @@ def figures_of_model(
         natives: what was changed.
         told: its ``closed_loop_gap``.
     """
-    if not motion.known or "reason" in told:
+    if not motion.known:
         return []
+    if "reason" in told:
+        return [_row_as_read(arm, motion, natives)]
     before, after = ({n: told[when][n]["torque_nm"] for n in motion.joints} for when in ("before", "after"))
     here = f"MuJoCo {mujoco_library().__version__}, closed loop"
     rows = [Row("mjcf", here, before, after, motion.size, "told with each joint").told()]
@@ -175,6 +180,15 @@ def figures_of_model(
         off = _short_off(arm, motion, short, begin, torque)
         rows.append(Row("mjcf", where, *off, motion.size, "as above").told())
     return rows
+
+
+def _row_as_read(arm: ArmSet, motion: Withheld, natives: Mapping[str, Native]) -> dict[str, Any]:
+    robot = arm.robot
+    improved = RobotModel(robot.path, compiled_with(robot, natives), urdf=robot.urdf)
+    joints = {name: improved.joint(name) for name in motion.joints}
+    laws = {name: Law(b.dry_nm, *b.stribeck, b.damping, b.armature_kg_m2) for name, b in joints.items()}
+    target, where = "urdf" if robot.urdf else "mjcf", "our own evaluation of the friction that MuJoCo reads from it"
+    return Row(target, where, motion.before(), motion.off(laws), motion.size, "told with each joint").told()
 
 
 def figure_in_newton(
