@@ -76,7 +76,7 @@ def some_history(folder: Path) -> ProfileStore:
     """A robot with five promoted nights."""
     store = ProfileStore(folder / "store")
     for day in range(1, 6):
-        store.promote("arm", store.add(profile(1 + 0.03 * day, day)), by="test", reason="night <script>")
+        store.promote("arm", store.add(profile(1 + 0.03 * day, day)), by="test", reason="night")
     return store
 
 
