@@ -11,8 +11,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 from frictid_drivers.virtual import channel
+from frictid_hil.cli.output import Output
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.files import part_of_path, write_whole
 from frictid_hil.jobs import dashboard
@@ -135,6 +138,23 @@ def test_a_run_folder_with_links_in_it_is_refused(tmp_path):
 def test_no_name_leads_out_of_a_folder(name):
     with pytest.raises(UsageError):
         part_of_path(name)
+
+
+def test_what_a_file_says_is_text_on_the_terminal(capsys):
+    hostile = "run[/x] [red]a[/] :bug:"
+    output, table = Output(), folding(hostile, title=hostile)
+    table.add_row(hostile)
+
+    def job():
+        raise UsageError(hostile, where=hostile, cause=hostile, next_step=hostile)
+
+    for console in (output.out, output.err):
+        console.print(hostile)
+        console.print(table)
+    with pytest.raises(typer.Exit):
+        output.run("check", job)
+    shown = capsys.readouterr()
+    assert (shown.out.count(hostile), shown.err.count(hostile)) == (4, 8)
 
 
 @pytest.mark.slow

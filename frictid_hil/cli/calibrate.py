@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.text import Text
 
 from frictid_hil.cli.options import (
     AmplitudeOption,
@@ -72,11 +73,14 @@ def check(
     output = Output(as_json, quiet)
 
     def show(result: Result) -> None:
-        marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "error": "[red]error[/]"}
+        colors = {"ok": "green", "warning": "yellow", "error": "red"}
         table = folding("", "subject", "finding", "next step", whole=("", "subject"))
         for finding in result["findings"]:
             table.add_row(
-                marks[finding["severity"]], finding["subject"], finding["message"], finding.get("next_step", "")
+                Text(finding["severity"], colors[finding["severity"]]),
+                finding["subject"],
+                finding["message"],
+                finding.get("next_step", ""),
             )
         output.out.print(table)
         ready = "ready for a check of the drives, without --dry" if dry else "ready"
@@ -285,7 +289,7 @@ def compare(
             )
         output.out.print(table)
         for warning in result["warnings"]:
-            output.out.print(f"note: {warning}", soft_wrap=True, markup=False)
+            output.out.print(f"note: {warning}", soft_wrap=True)
 
     output.run("compare", lambda: job(profile, other, truth), show)
 
@@ -309,10 +313,10 @@ def print_joints(output: Output, result: Result) -> None:
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)
 
 
-def _row(joint: dict[str, Any]) -> tuple[str, ...]:
+def _row(joint: dict[str, Any]) -> tuple[str | Text, ...]:
     joint = rotary_names(joint)
     outcome = joint["outcome"]
-    shown = "[green]ok[/]" if outcome == "ok" else f"[red]{outcome}[/]"
+    shown = Text(outcome, "green" if outcome == "ok" else "red")
     prismatic = bool(joint.get("prismatic"))
     force = "N" if prismatic else "N m"
     speeds = joint.get("velocity_rad_s") or []

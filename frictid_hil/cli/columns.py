@@ -35,20 +35,19 @@ def columns(
 
     def show(result: Result) -> None:
         for line in result["findings"]:
-            output.out.print(f"- {line}", markup=False, soft_wrap=True)
+            output.out.print(f"- {line}", soft_wrap=True)
         for name, joint in result["joints"].items():
             unit = "m" if joint["prismatic"] else "rad"
             output.out.print(
                 f"joint {name}: {joint['rows']} rows, {joint['duration_s']:.4g} s at {joint['rate_hz']:.4g} Hz, "
                 f"travel {joint['travel']:.4g} {unit}; {', '.join(joint['columns'])}",
-                markup=False,
                 soft_wrap=True,
             )
             for line in [*joint["told"], *joint["doubts"]]:
-                output.out.print(f"  - {line}", markup=False, soft_wrap=True)
+                output.out.print(f"  - {line}", soft_wrap=True)
         if result["map"] and not result.get("written"):
-            output.out.print(result["map"], markup=False, soft_wrap=True)
+            output.out.print(result["map"], soft_wrap=True)
         if result.get("written"):
-            output.out.print(f"column map: {result['written']}", markup=False, soft_wrap=True)
+            output.out.print(f"column map: {result['written']}", soft_wrap=True)
 
     output.run("columns", lambda: job(log, columns=known, out=out, force=force), show)

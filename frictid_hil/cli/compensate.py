@@ -207,10 +207,10 @@ def _show(output: Output, result: Result) -> None:
     if table.row_count:
         output.out.print(table)
     for told in (*result["warnings"], *result["remarks"]):
-        output.out.print(f"note: {told}", soft_wrap=True, markup=False)
+        output.out.print(f"note: {told}", soft_wrap=True)
     for key in ("run", "report"):
         if result.get(key):
-            output.out.print(f"{key}: {result[key]}", soft_wrap=True, markup=False)
+            output.out.print(f"{key}: {result[key]}", soft_wrap=True)
 
 
 def _number(figures: dict[str, Any], key: str, unit: str, scale: float) -> str:

@@ -240,8 +240,8 @@ def draft(
             table.add_row(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}")
         output.out.print(table)
         for warning in result["draft"]["warnings"]:
-            output.out.print(f"warning: {warning}", soft_wrap=True, markup=False)
-        output.out.print(f"nominal: {result['nominal']}", soft_wrap=True, markup=False)
+            output.out.print(f"warning: {warning}", soft_wrap=True)
+        output.out.print(f"nominal: {result['nominal']}", soft_wrap=True)
 
     output.run("gap_draft", lambda: job(Source(logs, columns, joint=joint), out, force=force), show)
 
@@ -277,7 +277,7 @@ def fleet(
                     table.add_row(*row, varies if told["varies"] else f"not seen, below {high:.2g}")
         output.out.print(table)
         if result.get("samples"):
-            output.out.print(f"samples: {result['samples']}", soft_wrap=True, markup=False)
+            output.out.print(f"samples: {result['samples']}", soft_wrap=True)
 
     output.run("gap_fleet", lambda: job(results, samples=randomise, out=out, force=force, seed=seed), show)
 
@@ -411,14 +411,14 @@ def record(
         output.out.print(f"{len(result['experiments'])} experiments: {', '.join(result['experiments'])}")
         output.out.print(f"set: {result['set']}", soft_wrap=True)
         if told := result.get("diagnosis"):
-            output.out.print(told["summary"], markup=False)
-            output.out.print(f"nothing more is recorded: {result['ended_because']}", markup=False)
+            output.out.print(told["summary"])
+            output.out.print(f"nothing more is recorded: {result['ended_because']}")
 
     output.run("gap_record", run, show)
 
 
 def _print_diagnosis(output: Output, result: Result) -> None:
-    output.out.print(f"[bold]{result['summary']}[/]")
+    output.out.print(result["summary"], style="bold")
     causes = folding("cause", "confidence", "closes", "parameters", "confusable with", whole=("cause", "closes"))
     for cause in result["causes"]:
         parameters = ", ".join(
@@ -447,15 +447,15 @@ def _print_diagnosis(output: Output, result: Result) -> None:
         gap.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row))
     output.out.print(gap)
     if asked := result.get("next_experiment"):
-        output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}", markup=False)
+        output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}")
     for subject, why in result["reasons"].items():
-        output.out.print(f"{subject}: {why}", markup=False)
+        output.out.print(f"{subject}: {why}")
     if exported := result.get("mujoco"):
-        output.out.print(f"mujoco: {exported['model']} and {exported['callback_script']}", soft_wrap=True, markup=False)
+        output.out.print(f"mujoco: {exported['model']} and {exported['callback_script']}", soft_wrap=True)
         for lost in exported["lost"]:
-            output.out.print(f"  lost: {lost}", markup=False)
+            output.out.print(f"  lost: {lost}")
     for key in ("model", "report"):
         if result.get(key):
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)
     if result.get("model_refused"):
-        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
+        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True)

@@ -95,9 +95,9 @@ def schedule(
             output.out.print(f"{key}: {result[key]}", soft_wrap=True)
         output.out.print(f"next time: {result['next_elapse'] or 'unknown (systemd-analyze is not installed)'}")
         output.out.print(f"verified by systemd-analyze: {'yes' if result['verified'] else 'no'}")
-        output.out.print(f"turn it on: {result['enable']}", soft_wrap=True, markup=False)
+        output.out.print(f"turn it on: {result['enable']}", soft_wrap=True)
         cron = f"for crontab -e:\n{result['cron']}" if result["cron"] else result["cron_refused"]
-        output.out.print(f"without systemd, {cron}", soft_wrap=True, markup=False)
+        output.out.print(f"without systemd, {cron}", soft_wrap=True)
 
     output.run("schedule", lambda: job(options), show)
 
@@ -119,7 +119,7 @@ def _print_night(output: Output, result: Result) -> None:
     output.err.print(table)
     # One line for whatever reads the log next morning.
     kept = ("outcome", "robot", "promoted", "active", "drifted", "reason", "next_step", "run", "recalibration_report")
-    output.out.print(json.dumps({key: result.get(key) for key in kept}), soft_wrap=True, markup=False)
+    output.out.print(json.dumps({key: result.get(key) for key in kept}), soft_wrap=True)
 
 
 def _with_unit(value: float | None, unit: str, digits: int = 1) -> str:

@@ -91,16 +91,16 @@ def print_arm(output: Output, result: Result) -> None:
             *("-" if value is None else f"{value:.3g} {_units(joint)[0]}" for value in gap),
         )
     output.out.print(table)
-    output.out.print(result["summary"], markup=False, soft_wrap=True)
+    output.out.print(result["summary"], soft_wrap=True)
     _print_arm_cause(output, result)
     _print_export(output, result)
     for line, names in _same_lines(result["joints"]).items():
         who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
-        output.out.print(f"{who}: {line}", markup=False, soft_wrap=True)
+        output.out.print(f"{who}: {line}", soft_wrap=True)
     for name in result["still"]:
-        output.out.print(f"{name}: stands still in every log, so nothing can be said of it", markup=False)
+        output.out.print(f"{name}: stands still in every log, so nothing can be said of it")
     for name, place in result["held"].items():
-        output.out.print(f"{name}: held at {place:.4g}", markup=False)
+        output.out.print(f"{name}: held at {place:.4g}")
 
 
 def _print_arm_cause(output: Output, result: Result) -> None:
@@ -111,12 +111,11 @@ def _print_arm_cause(output: Output, result: Result) -> None:
     if cause := arm["cause"]:
         for name, value in cause["parameters"].items():
             low, high = value["interval_95"]
-            output.out.print(f"  {name} = {value['value']:.4g} ({low:.4g} .. {high:.4g})", markup=False)
+            output.out.print(f"  {name} = {value['value']:.4g} ({low:.4g} .. {high:.4g})")
     base = arm["base_parameters"]
     output.out.print(
         f"the motions tell {base['rank']} combinations of {base['of']} inertial parameters apart (condition "
         f"{base['condition']:.0f})",
-        markup=False,
     )
 
 
@@ -126,7 +125,7 @@ def _print_export(output: Output, result: Result) -> None:
 
     loop = result["closed_loop"]
     if "reason" in loop:
-        output.out.print(f"closed loop of your model: {loop['reason']}", markup=False, soft_wrap=True)
+        output.out.print(f"closed loop of your model: {loop['reason']}", soft_wrap=True)
     else:
         table = folding("your model in MuJoCo", "torque before", "after", "position before", "after")
         for name, before in loop["before"].items():
@@ -136,7 +135,7 @@ def _print_export(output: Output, result: Result) -> None:
             table.add_row(name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states))
         output.out.print(table)
         for line in left_out_words(loop):
-            output.out.print(line, markup=False, soft_wrap=True)
+            output.out.print(line, soft_wrap=True)
     for name, joint in result.get("export", {}).get("joints", {}).items():
         off = joint["torque_difference_percent"]
         how = (
@@ -144,22 +143,22 @@ def _print_export(output: Output, result: Result) -> None:
             if off is None
             else f"{off:.2f} % of torque from our simulation on withheld motion"
         )
-        output.out.print(f"{name}: the export is {how}", markup=False)
+        output.out.print(f"{name}: the export is {how}")
         for effect, where in joint["placed"].items():
-            output.out.print(f"  {effect}: {where}", markup=False, soft_wrap=True)
+            output.out.print(f"  {effect}: {where}", soft_wrap=True)
         for effect, why in joint["lost"].items():
-            output.out.print(f"  lost of {effect}: {why}", markup=False, soft_wrap=True)
+            output.out.print(f"  lost of {effect}: {why}", soft_wrap=True)
     for remark in {r for joint in result.get("export", {}).get("joints", {}).values() for r in joint["remarks"]}:
-        output.out.print(remark, markup=False, soft_wrap=True)
+        output.out.print(remark, soft_wrap=True)
     if result.get("model"):
-        output.out.print(f"model: {result['model']}", soft_wrap=True, markup=False)
+        output.out.print(f"model: {result['model']}", soft_wrap=True)
     for target, told in result.get("targets", {}).items():
-        output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True, markup=False)
+        output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True)
     _print_figures(output, result)
     if result.get("report"):
-        output.out.print(f"report: {result['report']}", soft_wrap=True, markup=False)
+        output.out.print(f"report: {result['report']}", soft_wrap=True)
     if result.get("model_refused"):
-        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True, markup=False)
+        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True)
 
 
 def _print_figures(output: Output, result: Result) -> None:

@@ -18,6 +18,7 @@ from typing import Any, NoReturn, Protocol
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from frictid_hil.errors import Defect, FrictidError, Interrupted
 
@@ -75,14 +76,19 @@ class Output:
     def err(self) -> Console:
         """For people, on stderr; plain without a TTY."""
         return Console(
-            stderr=True, quiet=self.quiet or self.as_json, highlight=False, soft_wrap=not sys.stderr.isatty()
+            stderr=True,
+            quiet=self.quiet or self.as_json,
+            markup=False,
+            emoji=False,
+            highlight=False,
+            soft_wrap=not sys.stderr.isatty(),
         )
 
     @property
     def out(self) -> Console:
         """For results, on stdout; silent with ``--json``."""
         width = None if sys.stdout.isatty() else 120
-        return Console(quiet=self.as_json, highlight=False, width=width)
+        return Console(quiet=self.as_json, markup=False, emoji=False, highlight=False, width=width)
 
     def counting(self, doing: str) -> Callable[[int, int], None]:
         """Something to tell how many of how many are done: a line on stderr every two seconds, none for quick work."""
@@ -171,17 +177,13 @@ class Output:
 
     def _explain(self, error: Mapping[str, Any]) -> None:
         # Errors are never quiet, and never wrapped in the middle of a path.
-        console = Console(stderr=True, highlight=False, soft_wrap=True)
+        console = Console(stderr=True, markup=False, emoji=False, highlight=False, soft_wrap=True)
         where = f"{error['where']}: " if error.get("where") else ""
-        console.print(f"[bold red]error:[/] {_plain(where)}{_plain(str(error.get('what', '')))}")
+        console.print(Text.assemble(("error:", "bold red"), f" {where}{error.get('what', '')}"))
         if error.get("cause"):
-            console.print(f"  likely cause: {_plain(str(error['cause']))}")
+            console.print(f"  likely cause: {error['cause']}")
         if error.get("next_step"):
-            console.print(f"  next step: {_plain(str(error['next_step']))}")
-
-
-def _plain(text: str) -> str:
-    return text.replace("[", "\\[")
+            console.print(f"  next step: {error['next_step']}")
 
 
 def _print_json(value: Mapping[str, Any]) -> None:

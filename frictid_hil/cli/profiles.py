@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
+from rich.text import Text
 
 from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption, profiles, robots
 from frictid_hil.cli.output import READING, Output, Result
@@ -45,8 +45,8 @@ def show(
             force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
             output.out.print(f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
             table = folding()
-            table.add_column(escape(f"V_n [{speed}]"), justify="right")
-            table.add_column(escape(f"F_n [{force}]"), justify="right")
+            table.add_column(f"V_n [{speed}]", justify="right")
+            table.add_column(f"F_n [{force}]", justify="right")
             table.add_column("95 % interval", justify="right")
             intervals = joint.get("torque_interval_nm") or [None] * len(joint["torque_nm"])
             for velocity, torque, interval in zip(joint["velocity_rad_s"], joint["torque_nm"], intervals, strict=True):
@@ -92,9 +92,9 @@ def export(
     output = Output(as_json, quiet)
 
     def told(result: Result) -> None:
-        output.out.print(f"written: {result['written']}", soft_wrap=True, markup=False)
+        output.out.print(f"written: {result['written']}", soft_wrap=True)
         output.out.print(f"off the curve by {result['worst_percent']:.1f} % at most, within what was measured")
-        output.out.print(f"lost: {result['lost']}", soft_wrap=True, markup=False)
+        output.out.print(f"lost: {result['lost']}", soft_wrap=True)
 
     output.run("profile_export", lambda: job(profile, to, out, force=force), told)
 
@@ -142,7 +142,7 @@ def diff(
             )
         output.out.print(table)
         for warning in result["warnings"]:
-            output.out.print(f"[yellow]note:[/] {escape(warning)}", soft_wrap=True)
+            output.out.print(Text.assemble(("note:", "yellow"), f" {warning}"), soft_wrap=True)
 
     output.run("profile_diff", lambda: job(older, newer, robot=robot, store=store), show)
 
@@ -223,15 +223,15 @@ def history(
 
     def show(result: Result) -> None:
         headings = ("profile (* active)", "F_0", "from baseline", "temperature")
-        table = folding(*headings, whole=headings[:2], title=escape(result["robot"]))
+        table = folding(*headings, whole=headings[:2], title=result["robot"])
         for profile in result["profiles"]:
             table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}")
             for name, figures in profile["joints"].items():
-                table.add_row(escape(f"  joint {name}"), *_figures(figures))
+                table.add_row(f"  joint {name}", *_figures(figures))
             table.add_section()
         output.out.print(table)
         for line in _events(result):
-            output.out.print(line, soft_wrap=True, markup=False)
+            output.out.print(line, soft_wrap=True)
         if older := result["profiles_kept"] - len(result["profiles"]):
             output.out.print(f"{older} older profiles are not shown; see them with --last 0")
 

@@ -57,7 +57,7 @@ def answer_dry_run(output: Output, verb: str, planned: Callable[[], Planned]) ->
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
     """Whether it is real, joint order, travel, peaks, limits, locked joints, duration, as a technician reads them."""
     how = ", all joints together" if plan.together else ""
-    console.print(f"[bold]{_which(setup)}[/]", soft_wrap=True)
+    console.print(_which(setup), style="bold", soft_wrap=True)
     table = folding(
         *(
             "joint",
@@ -208,7 +208,7 @@ class TerminalWatcher:
     def note(self, message: str) -> None:
         """A line above the bars."""
         if not self._silent:
-            (self._view.console if self._view else self._console).print(message, markup=False)
+            (self._view.console if self._view else self._console).print(message)
 
     def close(self) -> None:
         """End the bars."""
