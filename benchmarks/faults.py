@@ -601,7 +601,7 @@ class Watched(Silent):
 
     def _follow_servos(self, driver: VirtualServoDriver) -> None:
         servos = driver.chain.servos
-        self.rack, self.stop_ns = driver.chain, None
+        self.rack, self.stop_ns = driver._faulty or driver.chain, None
         self.now = lambda: max(servo._now_ns for servo in servos.values())
         self.axles = [
             _axle(

@@ -30,8 +30,8 @@ MOST_TURNOVER_S = 0.012
 """Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
 MOST_TURNOVER_SEEN_S = 0.004
 """... and where the delay that the data ask for has the same sign and is more than ``MOST_SEEN_S``."""
-TURNOVER_STEPS, MOST_TURNOVER_STEP_S = 3.0, 0.0105
-"""Samples further apart tell no less than so many of them, and those of less than 100 Hz nothing."""
+MOST_COARSE_TURNOVER_S, MOST_TURNOVER_STEP_S, FEW_CYCLES = 0.03, 0.0105, 3
+"""Samples further apart, with the coarse steps of servos, tell no less than this, and below 100 Hz nothing."""
 MOST_APART_S = 0.008
 """Reported velocity against differenced position: a filter that nobody declared does no harm to the curve ..."""
 MOST_UNSTEADY_S = 0.004
@@ -89,16 +89,17 @@ def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
 def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Gate | None:
     """Friction turns over after the same travel at every speed: what it takes longer is lateness."""
     step_s = float(np.median(np.diff(recording.time_s)))
-    if step_s > MOST_TURNOVER_STEP_S:
+    fine = step_s <= 1.05 * MOST_TURNOVER_SEEN_S
+    # Few samples tell it of few cycles only, which need it: many slow ones, with coarse steps, feign a longer travel.
+    if not fine and (step_s > MOST_TURNOVER_STEP_S or recording.procedure.cycles > FEW_CYCLES):
         return None
     late_s = turnover_lateness(recording, motion)
     if late_s.size == 0:
         return None
-    worst_s = float(late_s[np.argmax(np.abs(late_s))])
+    worst_s = float(late_s[np.argmax(np.abs(late_s))] if fine else max(0.0, late_s[-1]))
     # Two witnesses need to say less: inertia alone makes some milliseconds of one of them.
     both = result.figures.get("seen_delay_s", 0.0) * np.sign(worst_s) > MOST_SEEN_S
-    fine = step_s <= 1.05 * MOST_TURNOVER_SEEN_S
-    allowed_s = MOST_TURNOVER_SEEN_S if both and fine else max(MOST_TURNOVER_S, TURNOVER_STEPS * step_s)
+    allowed_s = (MOST_TURNOVER_SEEN_S if both else MOST_TURNOVER_S) if fine else MOST_COARSE_TURNOVER_S
     return Gate.about(
         "turnover",
         abs(worst_s) <= allowed_s,

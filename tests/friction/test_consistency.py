@@ -41,10 +41,10 @@ def thinned(recording, step_s: float):
     return replace(recording, **{name: getattr(recording, name)[::every] for name in columns})
 
 
-@pytest.mark.parametrize(("step_s", "by_s"), [(0.001, 0.02), (0.001, 0.06), (0.005, 0.02)])
-def test_a_torque_that_is_late_in_the_fast_ones_of_few_cycles(plants, step_s, by_s):
+@pytest.mark.parametrize(("step_s", "by_s", "deg"), [(0.001, 0.02, 20), (0.001, 0.06, 20), (0.005, 0.06, 50)])
+def test_a_torque_that_is_late_in_the_fast_ones_of_few_cycles(plants, step_s, by_s, deg):
     """One slow and one fast sine, as `--program quick` has: a fit cannot tell lateness from less inertia."""
-    few = thinned(plants.record(plants.arm[2], replace(plants.procedure(20), cycles=2)), step_s)
+    few = thinned(plants.record(plants.arm[2], replace(plants.procedure(deg), cycles=2)), step_s)
     assert "turnover" not in failed(few)
     spoilt = late(few, "torque_nm", by_s, since_s=float(few.procedure.cycle_starts_s[1]))
     assert "turnover" in failed(spoilt)

@@ -130,6 +130,13 @@ class Line:
             if not data and (self._clock.lock_step or left_s <= 0):
                 return
 
+    def _awaited(self, until_ns: int) -> Iterator[Packet]:
+        """As ``received``; in lock-step, too, time passes until the answer comes."""
+        yield from self.received(until_ns)
+        if self._clock.lock_step:
+            self._clock.wait_until(until_ns)
+            yield from self.received(until_ns)
+
     def tell(self, address: int, data: Mapping[int, bytes]) -> None:
         """Write the same number of bytes to each of these servos; nobody answers.
 
@@ -146,7 +153,7 @@ class Line:
         """
         for _ in range(_TRIES):
             self.send(self._wire.read(servo, address, count))
-            for packet in self.received(self._clock.now_ns() + self._answer_ns):
+            for packet in self._awaited(self._clock.now_ns() + self._answer_ns):
                 if packet.id == servo and len(packet.data) == count:
                     return packet.data
         raise HardwareError(
