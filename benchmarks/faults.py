@@ -948,7 +948,7 @@ def drawn(todo: Sequence[Case], runs: int | None, seed: int) -> list[Case]:
     return picked[:runs]
 
 
-BEGIN, END = "<!-- written by benchmarks/faults.py -->", "<!-- end of what it wrote -->"
+BEGIN, END = "<!-- written by benchmarks/faults.py{part} -->", "<!-- end of what it wrote -->"
 
 
 def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
@@ -973,11 +973,20 @@ def told(verdicts: Sequence[Verdict], command: str, commit: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_counts(folder: Path, verdicts: Sequence[Verdict]) -> None:
+def write(page: Path, part: str, verdicts: Sequence[Verdict], text: str) -> None:
+    """Into a part of the page, and beside it injections by phase and by fault as tables of their own."""
+    begin = BEGIN.format(part=f" --part {part}" if part else "")
+    before, rest = page.read_text().split(begin)
+    after = rest.split(END, 1)[1]
+    page.write_text(f"{before}{begin}\n\n{text}\n{END}{after}")
+    write_counts(page.parent / "data", f"{part}-faults" if part else "faults", verdicts)
+
+
+def write_counts(folder: Path, name: str, verdicts: Sequence[Verdict]) -> None:
     """Injections by phase and by fault, each as a table of its own."""
     for key, named in (("phase", "phase"), ("fault", "name")):
         rows = _by(verdicts, attrgetter(named))
-        with (folder / f"faults-by-{key}.csv").open("w", newline="", encoding="utf-8") as file:
+        with (folder / f"{name}-by-{key}.csv").open("w", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
             table.writerow([key, "injections", "noticed", "failed"])
             table.writerows([name, len(of), sum(row.noticed for row in of), _failed(of)] for name, of in rows)
@@ -1009,6 +1018,7 @@ def main() -> None:
     parser.add_argument(
         "--docs", type=Path, help="page whose marked part is written anew, and data/faults-by-*.csv beside it"
     )
+    parser.add_argument("--part", default="", help="of that page: servos")
     asked = parser.parse_args()
     lines = asked.kept.read_text().splitlines() if asked.kept and asked.kept.exists() else []
     kept = [Verdict(**json.loads(line)) for line in lines]
@@ -1036,10 +1046,8 @@ def main() -> None:
     if asked.kept and asked.again:
         asked.kept.write_text("".join(json.dumps(asdict(verdict)) + "\n" for verdict in kept))
     if asked.docs:
-        before, rest = asked.docs.read_text().split(BEGIN)
         text = told(kept, f"python benchmarks/faults.py --runs {len(kept)}", git_revision()[:8])
-        asked.docs.write_text(f"{before}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}")
-        write_counts(asked.docs.parent / "data", kept)
+        write(asked.docs, asked.part, kept, text)
     failed = sum(bool(verdict.failures) for verdict in kept)
     print(f"{len(kept)} injections, {failed} failed")
 
