@@ -3,12 +3,12 @@
 import gc
 import multiprocessing
 import os
-from pathlib import Path
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from frictid_hil.runner import realtime
 from frictid_hil.runner.realtime import Latency, judged, measure_latency
 
 
@@ -34,21 +34,25 @@ def test_measured_in_a_process_of_its_own_it_leaves_this_one_alone():
     assert gc.isenabled()
 
 
-def moved(isolated: Path, started_on: set[int]) -> tuple[int | None, set[int]]:
-    """Where a process that started on some processors is after it looked for an isolated one; run in its own."""
-    realtime._ISOLATED = isolated
-    os.sched_setaffinity(0, started_on)
-    return realtime.move_to_isolated_cpu(), os.sched_getaffinity(0)
+MOVED = """
+import os, sys
+from pathlib import Path
+from frictid_hil.runner import realtime
+
+realtime._ISOLATED = Path(sys.argv[1])
+os.sched_setaffinity(0, {int(sys.argv[2])})
+print(realtime.move_to_isolated_cpu(), *os.sched_getaffinity(0))
+"""
 
 
 @pytest.mark.parametrize(
     ("kernel_says", "taken"),
-    [("{last}\n", "last"), ("{last}-{last},4000\n", "last"), ("\n", None), ("4000\n", None), (None, None)],
+    [("{last}\n", True), ("{last}-{last},4000\n", True), ("\n", False), ("4000\n", False), (None, False)],
 )
 def test_the_loop_takes_an_isolated_processor_and_no_other(tmp_path, kernel_says, taken):
     first, *_, last = sorted(os.sched_getaffinity(0)) * 2
     if kernel_says is not None:
         (tmp_path / "isolated").write_text(kernel_says.format(last=last))
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        cpu, bound_to = pool.apply(moved, (tmp_path / "isolated", {first}))
-    assert (cpu, bound_to) == ((last, {last}) if taken else (None, {first}))
+    command = [sys.executable, "-c", MOVED, tmp_path / "isolated", str(first)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    assert said.split() == ([str(last), str(last)] if taken else ["None", str(first)])
