@@ -1,12 +1,13 @@
 """Spoilt input for everything that reads, files, frames and bytes of a line: our own refusal or an answer, no more.
 
-    python benchmarks/fuzz.py [--decoders 1000000] [--minutes 60] [--seed 1] [NAME...]
+    python benchmarks/fuzz.py [--decoders 1000000] [--files N] [--minutes 60] [--seed 1] [NAME...]
 
 Every kind begins with input that is good, and spoils it: bits flipped, pieces cut, dropped, doubled, exchanged with
 another good one's, numbers and words put in that readers trip over, lengths made huge; for packed formats within the
-packing, too. A decoder gets so many inputs; the formats of files share the minutes. An input is a find where anything
-but a ``FrictidError`` comes out, where it takes longer than 10 s, or more than 1 GB; or where the process dies. Finds
-are kept in the folder ``fuzz-finds`` and printed.
+packing, too. The first of them are traced, and whatever comes to a line of ours that none came to before is spoilt
+further, as is some of what could be read. A decoder gets so many inputs; the formats of files share the minutes, and
+get so many at most. An input is a find where anything but a ``FrictidError`` comes out, where it takes longer than
+10 s, or more than 1 GB; or where the process dies. Finds are kept in the folder ``fuzz-finds`` and printed.
 """
 
 from __future__ import annotations
@@ -35,8 +36,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import can
+import can.io.player
 import numpy as np
 
 from frictid_drivers.cia402.codec import CommandDecoder, Decoder
@@ -102,17 +105,20 @@ Spoil = Callable[[bytes, random.Random, bytes], bytes]
 
 def within_gzip(data: bytes, dice: random.Random, other: bytes) -> bytes:
     """Mostly what is packed, sometimes the packing."""
-    if dice.random() < 0.2:
-        return spoilt(data, dice, other)
-    return gzip.compress(spoilt(gzip.decompress(data), dice), 1)
+    with contextlib.suppress(OSError, EOFError, zlib.error):
+        if dice.random() > 0.2:
+            return gzip.compress(spoilt(gzip.decompress(data), dice), 1)
+    return spoilt(data, dice, other)
 
 
 def within_zip(data: bytes, dice: random.Random, other: bytes) -> bytes:
-    """One member of an archive."""
-    if dice.random() < 0.3:
-        return spoilt(data, dice, other)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+    """Mostly one member of an archive, sometimes the archive."""
+    members: dict[str, bytes] = {}
+    # The standard library raises ten kinds of errors for a spoilt archive.
+    with contextlib.suppress(Exception), zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
+    if not members or dice.random() < 0.3:
+        return spoilt(data, dice, other)
     chosen = dice.choice(list(members))
     members[chosen] = spoilt(members[chosen], dice)
     told = io.BytesIO()
@@ -557,6 +563,29 @@ def one(kind: Kind, data: bytes, found: Found) -> None:
     found.inputs += 1
 
 
+Line = tuple[str, int]
+TRACED, KEPT = 5000, 200
+"""Inputs that are traced, which takes ten times as long; inputs that could be read and are spoilt further, at most."""
+
+
+@contextlib.contextmanager
+def traced(lines: set[Line]) -> Iterator[None]:
+    """Adds the lines of ours that are come to."""
+
+    def here(frame: Any, event: str, _: object) -> Any:
+        if event == "call":
+            return here if "frictid" in frame.f_code.co_filename else None
+        lines.add((frame.f_code.co_filename, frame.f_lineno))
+        return here
+
+    before = sys.gettrace()
+    sys.settrace(here)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
+
+
 def tried(
     name: str, *, inputs: int = sys.maxsize, lasts_s: float = float("inf"), seed: int = 1, last: Path | None = None
 ) -> Found:
@@ -572,20 +601,26 @@ def tried(
     kind, dice, found = kinds()[name](), random.Random(f"{name} {seed}"), Found(name)
     most = _LONGEST_OF_A_WIRE if kind.decoder else _LONGEST_OF_A_FILE
     before = signal.signal(signal.SIGALRM, _too_slow)
+    # python-can looks through all installed packages for readers, for every log again: 20 times what reading takes.
+    no_search = mock.patch.object(can.io.player, "_update_reader_plugins")
+    no_search.start()
     try:
         for data in kind.seeds:
             one(kind, data, found)
         peak_kb, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
-        good = list(kind.seeds)
+        good, lines = list(kind.seeds), set[Line]()
         while found.inputs < inputs and time.monotonic() - began < lasts_s:
-            data, refused = kind.spoil(dice.choice(good), dice, dice.choice(good)), found.refused
+            data, refused, known = kind.spoil(dice.choice(good), dice, dice.choice(good)), found.refused, len(lines)
             if last is not None:
                 last.write_bytes(data)
-            one(kind, data, found)
+            with traced(lines) if found.inputs < min(TRACED, inputs // 4) else contextlib.nullcontext():
+                one(kind, data, found)
             # What was spoilt and still read leads further than what was refused at its head.
-            if found.refused == refused and len(good) < 200 and len(data) < most and dice.random() < 0.1:
+            further = len(lines) > known or (found.refused == refused and len(good) < KEPT and dice.random() < 0.1)
+            if further and len(data) < most:
                 good.append(data)
     finally:
+        no_search.stop()
         signal.signal(signal.SIGALRM, before)
     found.lasted_s = time.monotonic() - began
     found.grew_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak_kb) / 1024
@@ -634,6 +669,7 @@ def main() -> int:
     asked.add_argument("names", nargs="*", metavar="NAME", help="kinds; all by default")
     asked.add_argument("--decoders", type=int, default=1_000_000, help="inputs for each decoder")
     asked.add_argument("--minutes", type=float, default=60.0, help="for all formats of files together")
+    asked.add_argument("--files", type=int, default=sys.maxsize, help="inputs for each format of files, at most")
     asked.add_argument("--seed", type=int, default=1)
     options = asked.parse_args()
     names = options.names or list(kinds())
@@ -642,7 +678,7 @@ def main() -> int:
     print("| Input | Inputs | Refused, % | A second | Slowest, s | Memory grew, MB | Finds |\n" + "|---" * 7 + "|")
     finds = 0
     for name in names:
-        inputs, seconds = (sys.maxsize, lasts_s) if name in of_files else (options.decoders, float("inf"))
+        inputs, seconds = (options.files, lasts_s) if name in of_files else (options.decoders, float("inf"))
         found = apart(name, inputs=inputs, lasts_s=seconds, seed=options.seed)
         rate = found.inputs / max(found.lasted_s, 1e-9)
         share = 100 * found.refused / max(1, found.inputs)

@@ -24,8 +24,8 @@ def test_a_thousand_spoilt_conversations(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-def test_a_hundred_spoilt_files_or_those_of_one_second(name):
-    found = fuzz.tried(name, inputs=100, lasts_s=1.0, seed=3)
+def test_a_thousand_spoilt_files_or_those_of_four_seconds(name):
+    found = fuzz.tried(name, inputs=1000, lasts_s=4.0, seed=3)
     assert not found.finds and found.inputs > 5
     assert found.refused < found.inputs, "what is good is read"
 
@@ -48,6 +48,24 @@ def test_what_is_no_error_of_ours_is_found_and_kept(monkeypatch):
     (told,) = found.finds
     assert told.startswith("ZeroDivisionError: by accident") and b"\xff" in found.finds[told]
     assert 0 < found.refused < 3000
+
+
+def test_what_comes_to_a_new_line_is_spoilt_further(monkeypatch):
+    """Behind two bytes that chance alone would have to guess at once."""
+    from frictid_hil.units import parse_quantity
+
+    def use(data):
+        if data[:1] != b"q":
+            raise InputFileError("refused")
+        parse_quantity("1 rad", "angle")  # a line of ours, seen by the trace
+        if data[1:2] == b"z":
+            raise ZeroDivisionError("deep inside")
+        raise InputFileError("refused later")
+
+    monkeypatch.setattr(fuzz, "kinds", lambda: {"pdo": lambda: fuzz.Kind((b"abc",), use)})
+    assert fuzz.tried("pdo", inputs=40_000, seed=4).finds
+    monkeypatch.setattr(fuzz, "TRACED", 0)
+    assert not fuzz.tried("pdo", inputs=40_000, seed=4).finds
 
 
 def test_an_input_that_takes_too_long_is_a_find(monkeypatch):

@@ -48,7 +48,7 @@ class Frames:
         length: bytes used, shape (n,).
         data: shape (n, 8), or (n, 64) where a frame is a CAN FD one.
         sent: by the host; False throughout where the format does not tell, shape (n,).
-        skipped: error and remote frames, which carry no data.
+        skipped: error and remote frames, which carry no data, and what no wire can carry.
         damage: where the log ends before its end ("" for a whole one).
     """
 
@@ -259,7 +259,7 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
         with opened() as reader:
             start_s = float(getattr(reader, "start_timestamp", 0.0) or 0.0) if path.suffix.lower() == ".blf" else 0.0
             for message in reader:
-                if message.is_error_frame or message.is_remote_frame or len(message.data) > LONGEST:
+                if message.is_error_frame or message.is_remote_frame or not _possible(message):
                     skipped += 1
                 else:
                     messages.append(message)
@@ -286,6 +286,11 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
         skipped=skipped,
         damage=damage,
     )
+
+
+def _possible(message: can.Message) -> bool:
+    """Of a length and an identifier that a wire can carry; python-can takes what a damaged text says."""
+    return len(message.data) <= LONGEST and message.arbitration_id >> (29 if message.is_extended_id else 11) == 0
 
 
 def _flagged_id(message: can.Message) -> int:

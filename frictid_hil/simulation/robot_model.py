@@ -129,13 +129,13 @@ class RobotModel:
                 compiled = library.MjModel.from_xml_string(urdf_for_mujoco(path.read_text(encoding="utf-8")))
             else:
                 compiled = library.MjModel.from_xml_path(str(path))
+            model = RobotModel(path, compiled, urdf=urdf)  # names that are no UTF-8 are seen here
         except (ValueError, OSError, UnicodeDecodeError, ElementTree.ParseError) as error:
             raise InputFileError(
                 f"MuJoCo {library.__version__} cannot read it: {error}",
                 where=str(path),
                 next_step="open it in `python -m mujoco.viewer` and correct what it says",
             ) from None
-        model = RobotModel(path, compiled, urdf=urdf)
         if not any(model.joints):
             raise InputFileError(
                 "no hinge or slide joint with a name", where=str(path), next_step="name the joints in the file"

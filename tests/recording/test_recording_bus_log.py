@@ -329,3 +329,13 @@ def test_a_frame_beyond_64_bytes_is_damage_and_no_frame(tmp_path):
     path.write_text("\r\n".join(lines) + "\r\n")
     frames = read_frames(path)
     assert list(frames.length) == [8, 8] and frames.skipped == 1
+
+
+@pytest.mark.parametrize("identifier", ["1FFFFFFFFFFFFx", "800"])
+def test_an_identifier_that_no_wire_carries_is_skipped(tmp_path, identifier):
+    lines = ["date Mon Nov 23 09:00:00.000 2026", "base hex  timestamps absolute", "internal events logged"]
+    lines += [f" 0.00{n} 1  {name}             Rx   d 2 01 02" for n, name in enumerate(("181", identifier, "182"))]
+    path = tmp_path / "bus.asc"
+    path.write_text("\n".join(lines) + "\n")
+    frames = read_frames(path)
+    assert list(frames.can_id) == [0x181, 0x182] and frames.skipped == 1

@@ -120,3 +120,11 @@ def test_what_cannot_be_read_is_told(arm: RobotModel, tmp_path: Path) -> None:
             RobotModel.load(tmp_path / "bad.xml")
     with pytest.raises(InputFileError, match="No such file"):
         RobotModel.load(tmp_path / "absent.xml")
+
+
+def test_a_name_that_is_no_utf_8_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    text = b'<mujoco><worldbody><body><joint name="elbo\xe3"/><geom size="0.1"/></body></worldbody></mujoco>'
+    path.write_bytes(text)
+    with pytest.raises(InputFileError, match=r"cannot read it.*utf-8"):
+        RobotModel.load(path)
