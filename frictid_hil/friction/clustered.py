@@ -38,12 +38,14 @@ class Solved:
     Attributes:
         values: of the first target, shape (size,).
         covariance: of the values, shape (size, size).
+        freedom: degrees of freedom behind each variance, shape (size,).
         others: coefficients of the other targets, shape (size, m).
         residual_rms: of what remains of the first target, in its unit.
     """
 
     values: Array
     covariance: Array
+    freedom: Array
     others: Array
     residual_rms: float
 
@@ -82,31 +84,40 @@ def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior
         raise _undetermined(where)
 
     solution = np.linalg.solve(left, right)
-    spread = _spread(left, gram, moment[:, :, 0] - gram @ solution[:, 0])
+    spread, freedom = _spread(left, gram, moment[:, :, 0] - gram @ solution[:, 0])
     pulled = _pulled(left, wished, weights, np.array([p.deviation for p in priors]), solution[:, 0], spread)
     rest = targets[:, 0] - x @ solution[:, 0]
     return Solved(
         solution[:, 0] / scale,
         (spread.T @ spread + pulled.T @ pulled) / np.outer(scale, scale),
+        freedom,
         solution[:, 1:] / scale[:, None],
         float(np.sqrt(np.mean(rest**2))),
     )
 
 
-def _spread(left: Array, gram: Array, scores: Array) -> Array:
-    """What each quarter cycle's misfit adds to the coefficients, shape (quarters, size).
+def _spread(left: Array, gram: Array, scores: Array) -> tuple[Array, Array]:
+    """(what each quarter cycle's misfit adds to the coefficients, shape (quarters, size); their freedom, (size,)).
 
     A quarter that decides a coefficient alone pulls the solution to itself, and its misfit comes out too small by
     (1 - h)^(1/2), h being its share of what is known; each is divided by it (the cluster-robust CR2 of Bell and
     McCaffrey, 2002: unbiased where quarters are alike). Leaving each out instead divides by 1 - h, which made the
-    slowest knots, seen by a few quarters, look four times as uncertain as they are.
+    slowest knots, seen by a few quarters, look four times as uncertain as they are. The freedom is that of the same
+    paper: of the sum of squares that alike and independent rows would give.
     """
     values, vectors = np.linalg.eigh(left)
     root = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))  # root @ root.T is the inverse
     shares, axes = np.linalg.eigh(root.T @ gram @ root)
-    inner = np.einsum("qij,qi->qj", axes, scores @ root) / np.sqrt(np.maximum(1.0 - shares, 1e-3))
+    left_over = np.maximum(1.0 - shares, 1e-3)
+    inner = np.einsum("qij,qi->qj", axes, scores @ root) / np.sqrt(left_over)
     spread: Array = np.einsum("qij,qj->qi", axes, inner) @ root.T
-    return spread
+    turned = np.einsum("qij,ki->qkj", axes, root)
+    own = np.sum(turned**2 * (shares / left_over)[:, None, :], axis=2)
+    pulls = np.einsum("qij,qkj->kqi", axes, turned * (shares / np.sqrt(left_over))[:, None, :])
+    between = own.T[:, :, None] * np.eye(len(gram)) - pulls @ np.swapaxes(pulls, 1, 2)
+    trace = np.einsum("kqq->k", between)
+    freedom: Array = trace**2 / np.maximum(np.sum(between**2, axis=(1, 2)), 1e-300)
+    return spread, np.maximum(freedom, 1.0)
 
 
 def _pulled(left: Array, wished: Array, weights: Array, deviations: Array, solution: Array, spread: Array) -> Array:

@@ -189,7 +189,7 @@ def least_squares_terms(
     first = np.searchsorted(peaks, knots * (1 - 1e-6)).clip(max=peaks.size - 1)
     seen_s = (starts_s[first] + starts_s[-1]) / 2
     return Terms(
-        scatter=np.sqrt(np.diag(solved.covariance)[odd_block])[kept] * float(stdtrit(8, 0.975)) / COVERAGE,
+        scatter=(np.sqrt(np.diag(solved.covariance)) * stdtrit(solved.freedom, 0.975))[odd_block][kept] / COVERAGE,
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
         model=bend[kept],
         drift=(np.abs(odd) * _drift_shares(recording, seen_s, drift))[kept],

@@ -73,6 +73,7 @@ class Fit:
         knots: speeds of the odd hats that were observed, shape (K,).
         values: coefficients, shape (size,).
         covariance: from the misfit of every quarter cycle, shape (size, size).
+        freedom: degrees of freedom behind each variance, shape (size,).
         per_second_of_skew: change of the coefficients per second of undeclared torque delay, shape (size,).
         per_doubt: change of the coefficients for one of each doubtful column less in the torque, shape (size, m).
         unobserved: speeds of the hats that too few samples saw; they were left out.
@@ -83,6 +84,7 @@ class Fit:
     knots: Array
     values: Array
     covariance: Array
+    freedom: Array
     per_second_of_skew: Array
     per_doubt: Array
     unobserved: Array
@@ -152,6 +154,7 @@ def fit(
         knots[observed],
         solved.values,
         solved.covariance,
+        solved.freedom,
         per_second_of_skew=-solved.others[:, 0],
         per_doubt=-solved.others[:, 1:],
         unobserved=knots[~observed],

@@ -132,6 +132,15 @@ def test_a_rate_that_the_line_cannot_carry_is_refused(bench: Bench) -> None:
     bench.driver.configure(most_hz, [])
 
 
+@pytest.mark.parametrize(("cycle_hz", "refused"), [(100.0, True), (199.0, True), (200.0, False)])
+def test_a_rate_at_which_curves_are_wrong_is_refused_before_anything_moves(cycle_hz: float, refused: bool) -> None:
+    setup = replace(setup_of("STS3215"), cycle_hz=cycle_hz)
+    bench = Bench(setup)
+    bench.driver.open()
+    errors = [f for f in bench.driver.check(None) if f.severity is Severity.ERROR]
+    assert [f.subject for f in errors] == (["rate"] if refused else [])
+
+
 @pytest.mark.parametrize(
     ("model", "joints", "most_hz"), [("STS3215", 1, 1500), ("STS3215", 6, 321), ("XL330-M288", 6, 284)]
 )

@@ -43,6 +43,8 @@ from frictid_hil.protocol.driver import (
 from frictid_hil.protocol.rows import RowDecoder
 from frictid_hil.protocol.wishes import Do, Order, Wish
 
+LEAST_HZ = 200.0
+"""Rate below which a healthy joint's curve was called ok and was 3 to 5 % outside its interval (100 Hz)."""
 _SETTLE_S = 1.5
 _BUSIEST = 0.45
 """Share of a cycle that the line may take: the reading begins in its middle."""
@@ -170,6 +172,16 @@ class ServoDriver:
                 "" if fits else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz` in the robot file)",
             )
         ]
+        if cycle_hz < LEAST_HZ:
+            findings.append(
+                Finding(
+                    Severity.ERROR,
+                    "rate",
+                    f"{cycle_hz:g} Hz: so rarely read, the current of a servo that follows goal by goal is not its "
+                    "mean, and a healthy joint's curve may be 5 % outside its interval",
+                    f"use {LEAST_HZ:g} Hz or more (`--rate`, or `cycle_hz` in the robot file), and a baud for it",
+                )
+            )
         for joint, mine in zip(self.setup.joints, self._joints, strict=True):
             findings += joint_findings(joint, mine, self._told[joint.name], plan)
         if not self._registers.watchdog:
