@@ -39,7 +39,13 @@ MODEL = """<mujoco model="one">
 SPRING = 'frictionloss="0" stiffness="3000" springyield="0.0004" springref="0"'
 LOSS = 'frictionloss="1.2" solimpfriction="0.9999 0.9999" solreffriction="0.004 1"'
 LUGRE = '<dcmotor joint="joint" input="none" motorconst="0" resistance="1" lugre="1000 1.5 0.05 0.5 0.05"/>'
-FORMS = {"spring": (SPRING, ""), "loss": (LOSS, ""), "lugre": (SPRING, LUGRE)}
+RAMPS = "".join(
+    f'<general name="fall_{n}" joint="joint" dyntype="dcmotor" dynprm="0" actearly="true" gaintype="dcmotor" '
+    f'gainprm="1 0" input="none" biastype="affine" biasprm="0 0 {fall / knee}" forcelimited="true" '
+    f'forcerange="{-fall} {fall}"/>'
+    for n, (knee, fall) in enumerate(((0.03, 0.1), (0.1, 0.15)), 1)
+)
+FORMS = {"spring": (SPRING, ""), "loss": (LOSS, ""), "lugre": (SPRING, LUGRE), "ramps": (SPRING, RAMPS)}
 STEPS, STEP_S, SETTLED = 3000, 0.001, 300
 
 

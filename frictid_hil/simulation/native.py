@@ -1,20 +1,23 @@
 """Physical effects as MuJoCo's own elements: which effect goes where in an MJCF, and what is lost.
 
 ``native_elements`` says what to change on a joint so that a model without any code beside it moves like the simulated
-joint. Sliding friction has three forms, and whoever writes the file measures which one is nearest:
+joint. Sliding friction has four forms, and whoever writes the file measures which one is nearest:
 
 - ``spring``: a spring that yields (MuJoCo 4) carries the level, ``damping`` of three numbers the rest. No creep.
 - ``lugre``: the same, and a passive ``dcmotor`` with LuGre friction for what rises above the level near standstill.
+- ``ramps``: the spring carries the level at standstill, and dampers that push, each up to a limit, what motion takes.
 - ``loss``: ``frictionloss`` with the solver settings that creep least.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation import packing, plant
@@ -24,7 +27,7 @@ from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.robot_model import ModelJoint
 from frictid_hil.simulation.steady import steady_friction_nm
 
-FORMS = ("spring", "lugre", "loss")
+FORMS = ("spring", "lugre", "ramps", "loss")
 
 FRICTION = {
     "stribeck", "viscous_nonlinearity", "direction_asymmetry", "load_dependent_friction", "directional_efficiency",
@@ -41,6 +44,12 @@ _SMALLEST_RISE = 1e-3
 """Rise at standstill over the level, below which it is rounding."""
 _RISE_BASE = 0.05
 """Level that LuGre needs at speed, over its rise; taken off the spring."""
+_KNEES = (0.12, 0.4, 0.9, 1.8, 3.4)
+"""Speeds at which the ramps of a falling curve end, over that of the curve: a fall of an exponential to 1 %."""
+_HOLDS = 1.2
+"""Damping of what holds the ramps at rest over theirs."""
+_HOLDS_NM = 2e-3
+"""Its level over that of the joint."""
 _LOOP_ENDS = 20.0
 """Travel over that of a presliding loop, after which it is turned over."""
 _LOOP_KNOTS = (0.3, 0.6, 0.85, 0.97)
@@ -114,7 +123,7 @@ def native_elements(believed: ModelJoint, model: JointModel, use: Use, form: str
         _write_friction(native, believed, model, use, form)
     _write_plant(native, believed, model, use)
     _write_drive(native, believed, model, use)
-    _write_transmission(native, believed, model)
+    _write_transmission(native, believed, model, use)
     for name, why in _NOWHERE.items():
         if name in model.effects:
             native.lost[name] = why
@@ -155,8 +164,11 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     speed = _speeds(use, falling=form == "lugre")
     odd, even = _sliding(model, speed, use)
     soft_nm = _soft_nm(model)
+    ramps: list[tuple[float, float]] = []
     dry, rise, at, poly = _with_stribeck(speed, odd, fastest) if form == "lugre" else (0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
-    if rise <= _SMALLEST_RISE * dry:
+    if form == "ramps":
+        dry, ramps, poly = _with_ramps(speed, odd, fastest)
+    elif rise <= _SMALLEST_RISE * dry:
         dry, a, b, c = _level_and_damping(speed, odd, fastest)
         rise, at, poly = 0.0, 0.0, (a, b, c)
     # Friction builds up over a travel that does not depend on the level.
@@ -172,11 +184,13 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         lugre = (sigma, _STEP_RULE * step * sigma, base, base + rise, at)
         native.more_actuators.append(_passive(name, "stribeck", f'lugre="{_words(lugre)}"'))
         dry -= base
-    if form in ("spring", "lugre") and believed.spring_nm_per_rad == 0.0:
+    if ramps:
+        _write_ramps(native, name, ramps, dry, dry / stiffness)
+    if form in ("spring", "lugre", "ramps") and believed.spring_nm_per_rad == 0.0:
         native.joint |= {"stiffness": _word(stiffness), "springyield": _word(dry / stiffness), "springref": "0"}
         where = "joint: springyield and damping of three numbers"
         native.remarks.append(_PLASTIC)
-    elif form in ("spring", "lugre"):
+    elif form in ("spring", "lugre", "ramps"):
         native.more_tendons.append(_slipping(f"{name}_friction", name, stiffness, dry / stiffness))
         where = "tendon with springyield, and damping of three numbers"
         native.remarks.append(_PLASTIC)
@@ -195,6 +209,8 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         where += "; asymmetry: a far spring (constant torque)"
     if rise > 0.0:
         where += "; the rise near standstill: passive dcmotor (LuGre)"
+    if ramps:
+        where += "; the fall above standstill: passive dampers the other way, each up to a limit"
     present = sorted(FRICTION & set(model.effects))
     native.placed |= dict.fromkeys(present or ["friction"], where)
     native.lost |= {effect: why for effect, why in _FRICTION_LOSES.items() if effect in model.effects}
@@ -283,6 +299,54 @@ def _with_stribeck(
         level, a, b, c = _level_and_damping(speed, torque, fastest)
         return level, 0.0, 0.1, (a, b, c)
     return best[1:]
+
+
+def _with_ramps(
+    speed: Array, torque: Array, fastest: float
+) -> tuple[float, list[tuple[float, float]], tuple[float, float, float]]:
+    """(level at standstill, (knee in rad/s, fall in N m) of each ramp, damping) of the nearest falling curve."""
+    best: tuple[float, float, list[tuple[float, float]], tuple[float, float, float]] | None = None
+    beyond = np.linspace(0.0, _STEEP * fastest, 50)
+    for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.3 * fastest, 40):
+        knees = at * np.array(_KNEES)
+        ramps = -np.minimum(speed[:, None] / knees, 1.0)
+        for powers in ((1, 2, 3), (1, 2), (1,)):
+            table = np.column_stack([np.ones_like(speed), ramps, *(speed**p for p in powers)])
+            bounds = ([0.0] * (1 + knees.size) + [-np.inf] * len(powers), np.inf)
+            found = lsq_linear(table, torque, bounds, method="bvls")
+            poly = [0.0, 0.0, 0.0]
+            for p, w in zip(powers, found.x[1 + knees.size :], strict=True):
+                poly[p - 1] = float(w)
+            if np.any(poly[0] + 2.0 * poly[1] * beyond + 3.0 * poly[2] * beyond**2 < -1e-12):
+                continue
+            falls = [(float(v), float(f)) for v, f in zip(knees, found.x[1 : 1 + knees.size], strict=True)]
+            if best is None or found.cost < best[0]:
+                best = (found.cost, float(found.x[0]), falls, (poly[0], poly[1], poly[2]))
+            break
+    if best is None:
+        level, a, b, c = _level_and_damping(speed, torque, fastest)
+        return level, [], (a, b, c)
+    level = best[1]
+    return level, [(v, f) for v, f in best[2] if f > _SMALLEST_RISE * level], best[3]
+
+
+def _write_ramps(
+    native: Native, joint: str, ramps: Sequence[tuple[float, float]], dry: float, yields_rad: float
+) -> None:
+    """Dampers that push instead of holding back, each up to its limit, and one that holds them while the spring bends.
+
+    Friction that falls as soon as the joint moves would let it hum at rest. LuGre's element of next to no level damps
+    along its own travel alone, so that nothing of it is left when the joint slides.
+    """
+    for number, (knee, fall) in enumerate(ramps, 1):
+        native.more_actuators.append(
+            f'<general name="{joint}_fall_{number}" joint="{joint}" dyntype="dcmotor" dynprm="0" actearly="true" '
+            f'gaintype="dcmotor" gainprm="1 0" input="none" biastype="affine" biasprm="0 0 {_word(fall / knee)}" '
+            f'forcelimited="true" forcerange="{_words((-fall, fall))}"/>  <!-- passive: no control -->'
+        )
+    level, held = _HOLDS_NM * dry, _HOLDS * sum(fall / knee for knee, fall in ramps)
+    lugre = (level / yields_rad, held, level, level, 1.0)
+    native.more_actuators.append(_passive(joint, "rest", f'lugre="{_words(lugre)}"'))
 
 
 # -- inertia, gravity, constant and periodic torques ----------------------------------------------------------------
@@ -391,7 +455,7 @@ def largest_torque(model: JointModel) -> float:
 # -- transmission ---------------------------------------------------------------------------------------------------
 
 
-def _write_transmission(native: Native, believed: ModelJoint, model: JointModel) -> None:
+def _write_transmission(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
     effects, name = model.effects, believed.name
     motor = model.motor_inertia_share * model.inertia_kg_m2
     link = model.inertia_kg_m2 - motor
@@ -402,7 +466,8 @@ def _write_transmission(native: Native, believed: ModelJoint, model: JointModel)
         # With an impedance near 0 a limit is a spring and a damper over the inertia that it sees.
         reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
         limits = f'limited="true" range="{_words((-half, half))}" solimplimit="0.001 0.001 0.001"'
-        solver = f'solreflimit="{_words((-stiffness / reduced, -max(damping, 1e-9) / reduced))}"'
+        damping = max(damping, 1e-9) / reduced
+        solver = f'solreflimit="{_words((-_at_step(stiffness / reduced, damping, use.timestep_s), -damping))}"'
         native.more_joints.append(f"{limits} {solver}")
         native.placed["backlash"] = f"a joint {name}_play behind it, with limits"
     elif "joint_elasticity" in effects:
@@ -419,6 +484,17 @@ def _write_transmission(native: Native, believed: ModelJoint, model: JointModel)
     if believed.armature_kg_m2 <= 0.0:
         native.joint.setdefault("armature", _word(motor))
         native.lost[effect] += f"; armature {_word(motor)} kg m2 was assumed for the motor's side"
+
+
+def _at_step(stiffness: float, damping: float, step_s: float) -> float:
+    """Stiffness with which a limit, whose force MuJoCo takes from the start of each step, swings as the contact does.
+
+    Both per inertia. The poles of x'' = -k x - d x' by steps of the velocity first, then of the position, are those of
+    the contact itself, exp(s h).
+    """
+    decay = math.exp(-damping * step_s)
+    turn = cmath.cos(cmath.sqrt(stiffness - 0.25 * damping**2) * step_s).real
+    return (1.0 + decay - 2.0 * math.sqrt(decay) * turn) / step_s**2
 
 
 # -- words ------------------------------------------------------------------------------------------------------------

@@ -374,6 +374,11 @@ def prepare(parameters: Vector, state: Vector, outer_nm: float, step_s: float) -
         if abs(stretch_rad) > 0.5 * state[PLAY]:
             spring_nm = state[COUPLING] * (stretch_rad - math.copysign(0.5 * state[PLAY], stretch_rad))
             pull = state[COUPLING] * half_s + state[COUPLING_DAMPING]
+            opening_nm = state[COUPLING_DAMPING] * (state[MOTOR_VELOCITY] - state[LINK_VELOCITY])
+            if state[PLAY] > 0.0 and (spring_nm + opening_nm) * stretch_rad < 0.0:
+                # The side of a gap pushes and never pulls.
+                spring_nm = 0.0
+                pull = 0.0
         half_link = half_s / link_kg_m2
         link_gain = half_link * pull / (1.0 + half_link * pull)
         link_free = state[LINK_VELOCITY] + half_link * (spring_nm + external_nm - gravity_nm)

@@ -54,12 +54,12 @@ def healthy(arm: ArmSet, **others: Diagnosis) -> dict[str, Diagnosis]:
 @pytest.mark.slow
 def test_the_cause_is_written_into_a_copy_that_is_nearer_to_the_machine(arm: ArmSet, tmp_path: Path) -> None:
     made = exports(arm, healthy(arm, lift=found("explained")))
-    assert list(made) == ["lift"] and made["lift"].form in ("spring", "lugre")
+    assert list(made) == ["lift"] and made["lift"].form in ("spring", "lugre", "ramps")
     out = tmp_path / "better.xml"
     told = write_model(arm, made, out)
     lift = told["joints"]["lift"]
     assert lift["torque_difference_percent"] < 1.0 and "springyield" in lift["placed"]["friction_level_error"]
-    assert set(lift["tried_percent"]) == {"spring", "lugre", "loss"}
+    assert {"spring", "loss"} <= set(lift["tried_percent"]) <= {"spring", "lugre", "ramps", "loss"}
     before, after = arm.robot.path.read_text(), out.read_text()
     assert before != after and "<!-- carries most -->" in after and 'name="pan" class="large" axis="0 0 1"/>' in after
     better = RobotModel.load(out)

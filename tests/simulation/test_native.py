@@ -18,8 +18,8 @@ from frictid_hil.simulation.native_check import in_posture, torque_difference  #
 from frictid_hil.simulation.robot_model import RobotModel  # noqa: E402
 
 STEP_S = 0.001
-LIMITS = {"load_dependent_friction": 0.06, "directional_efficiency": 0.08}
-"""What MuJoCo has no element for; the others are within 2 %."""
+LIMITS = {"load_dependent_friction": 0.06, "directional_efficiency": 0.08, "stiction_breakaway": 0.02}
+"""What MuJoCo has no element for; the others are within 1 %."""
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ EFFECTS = (
 @pytest.mark.parametrize("effect", ["", *EFFECTS])
 def test_the_edited_file_moves_as_our_own_simulation(bench: Any, robot: RobotModel, effect: str) -> None:
     model = bench.joint_named("wrist").with_effects(bench.sizes("wrist", effect))
-    form = "lugre" if effect == "stribeck" else "spring"
+    form = "ramps" if effect == "stribeck" else "spring"
     use = Use(np.linspace(0.01, 1.6, 200), 4.0 * np.cos(np.linspace(0.0, 1.0, 50)), STEP_S)
     native = native_elements(robot.joint("joint"), model, use, form, friction=True)
     exported = compiled_with(robot, {"joint": native})
@@ -56,7 +56,7 @@ def test_the_edited_file_moves_as_our_own_simulation(bench: Any, robot: RobotMod
     posture = robot.posture({})
     ours = in_posture(robot, "joint", model, posture)
     off = torque_difference(robot, exported, "joint", ours, posture, time, command)
-    assert off < LIMITS.get(effect, 0.02)
+    assert off < LIMITS.get(effect, 0.01)
     assert not effect or effect in native.placed
     assert not changed_elsewhere(robot.compiled, exported, {"joint": native})
 
@@ -66,14 +66,14 @@ def test_every_form_of_friction_has_the_curve(bench: Any, robot: RobotModel, for
     model = bench.joint_named("wrist").with_effects({"stribeck": bench.SIZES["stribeck"]})
     use = Use(np.linspace(0.01, 1.6, 200), np.zeros(1), STEP_S)
     native = native_elements(robot.joint("joint"), model, use, form, friction=True)
-    if form != "lugre":
+    if form not in ("lugre", "ramps"):
         assert "fall of friction" in native.lost["stribeck"]
     exported = compiled_with(robot, {"joint": native})
     data = mujoco.MjData(exported)
     for speed in (0.3, 1.0):
         data.qpos[0], data.qvel[0] = 0.5, speed
         if data.plastic.size:
-            data.plastic[:] = 0.5 - 1.0
+            data.plastic[:] = 0.5 - exported.jnt_springyield[0]
         for _ in range(3000):  # held at this speed until every memory has settled
             mujoco.mj_step1(exported, data)
             data.qpos[0], data.qvel[0] = 0.5, speed
@@ -88,7 +88,48 @@ def test_every_form_of_friction_has_the_curve(bench: Any, robot: RobotModel, for
         mujoco.mj_forward(exported, data)
         friction = -(data.qfrc_passive + data.qfrc_constraint + data.qfrc_actuator)[0]
         expected = model.friction.torque(np.array([speed]))[0] + 0.3 * 3.0 * np.exp(-speed / 0.08)
-        assert friction == pytest.approx(expected, rel=0.03 if form == "lugre" else 0.06)
+        assert friction == pytest.approx(expected, rel=0.03 if form in ("lugre", "ramps") else 0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "form", "motion", "step_s", "limit"),
+    [
+        ("small", "stribeck", "ramps", "break-away", 0.001, 0.01),
+        ("small", "stribeck", "ramps", "chirp", 0.001, 0.01),
+        ("wrist", "backlash", "spring", "chirp", 0.001, 0.01),
+        ("large", "backlash", "spring", "chirp", 0.002, 0.04),
+    ],
+)
+def test_the_hard_ones_are_as_near_as_the_page_says(
+    bench: Any, tmp_path: Path, name: str, effect: str, form: str, motion: str, step_s: float, limit: float
+) -> None:
+    """A spring that slips with a level that falls, and a stiff contact, which at 2 ms was 27 % off."""
+    found = {(f, m): off for f, m, off, _ in bench.measured(name, effect, step_s)}
+    assert found[form, motion] < limit
+
+
+@pytest.mark.parametrize("name", ["small", "wrist", "large"])
+@pytest.mark.parametrize("held_share", [0.0, 0.5, 0.9])
+def test_a_joint_whose_friction_falls_stays_at_rest_without_a_controller(
+    bench: Any, tmp_path: Path, name: str, held_share: float
+) -> None:
+    robot = RobotModel.load(bench.model_file(tmp_path, name, STEP_S))
+    model = bench.joint_named(name).with_effects(bench.sizes(name, "stribeck"))
+    use = Use(np.linspace(0.01, 1.6, 200), np.zeros(1), STEP_S)
+    native = native_elements(robot.joint("joint"), model, use, "ramps", friction=True)
+    exported = compiled_with(robot, {"joint": native})
+    assert exported.nu == robot.compiled.nu, "the user's controls stay as they are"
+    data = mujoco.MjData(exported)
+    level = bench.JOINTS[name]["dry"]
+    places, speeds = [], []
+    for _ in range(3000):
+        mujoco.mj_forward(exported, data)
+        data.qfrc_applied[0] = data.qfrc_bias[0] + held_share * level
+        mujoco.mj_step(exported, data)
+        places.append(float(data.qpos[0]))
+        speeds.append(abs(float(data.qvel[0])))
+    assert max(speeds[-500:]) < 0.05 * max(*speeds, 1e-9) + 1e-6, "what swings dies away"
+    assert np.ptp(places[-500:]) < 0.05 * bench.JOINTS[name]["turn"]
 
 
 def test_degrees_and_included_files_and_other_tags_are_edited(bench: Any, tmp_path: Path) -> None:
@@ -136,3 +177,20 @@ def test_friction_is_left_alone_where_no_cause_concerns_it(bench: Any, robot: Ro
     use = Use(np.linspace(0.01, 1.0, 50), np.zeros(1), STEP_S)
     native = native_elements(robot.joint("joint"), model, use, "spring", friction=False)
     assert not native.joint and len(native.more_tendons) == 1 and not FRICTION & set(native.placed)
+
+
+def test_what_elements_do_by_themselves(bench: Any) -> None:
+    """Creep at half of the level goes with level over inertia; a spring that yields stands; a delay is as asked."""
+    import element_figures as figures
+
+    for name, j in bench.JOINTS.items():
+        per_joint = 0.5 * j["dry"] / j["inertia"]
+        assert figures.creep_urad_s(name, "frictionloss, stiff solver") == pytest.approx(0.2 * per_joint, rel=0.2)
+        assert figures.creep_urad_s(name, "springyield") < 1e-3
+        assert figures.creep_urad_s(name, "LuGre, 1.3 times the step rule") < 0.01
+        assert figures.breaks_at(name, "springyield") == pytest.approx(100.0, abs=2.0)
+    assert figures.creep_urad_s("small", "LuGre, half of the step rule") > 100.0
+    assert figures.delay_ms("small", "linear", 0.005, 4, 0.002) == pytest.approx(5.0)
+    assert figures.delay_ms("small", "zoh", 0.005, 4, 0.002) == pytest.approx(6.0)
+    assert figures.delay_ms("small", "linear", 0.010, 5, 0.002) == pytest.approx(10.0)
+    assert figures.cogging_percent("small") < 1e-6 and figures.far_spring_percent("small") < 0.01

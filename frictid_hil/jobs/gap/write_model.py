@@ -185,9 +185,11 @@ def export_of(
     time, command, posture = _withheld(arm, name)
     ours = in_posture(robot, name, model, posture)
     tried: dict[str, float] = {}
-    forms_of = {}
+    forms_of: dict[str, Native] = {}
     for form in forms:
         native = native_elements(joint.believed, model, use, form, friction=rewritten)
+        if native in forms_of.values():
+            continue
         try:
             exported = compiled_with(robot, {name: native})
             tried[form] = torque_difference(robot, exported, name, ours, posture, time, command)
