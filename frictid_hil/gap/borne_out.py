@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects
-from frictid_hil.gap.verdict import DOUBTED, HALF, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, HALF, READ_DIRECTLY, REMAINS, UNNAMED, Verdict
 from frictid_hil.simulation.effects import all_effects
 
 FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors of a parameter that are tried where a motion alone could not tell it."""
 REFUTED = 0.4
 """Most that is claimed of a cause that the closed loop does not bear out."""
+NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +42,13 @@ class Loop:
         return max(self.before_nm**2 - self.floor_nm**2, self.floor_nm**2)
 
 
-def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
+def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[Verdict, str | None]:
     """The verdict as far as the closed loop bears it out, and what to tell of that.
+
+    Args:
+        said: the verdict so far.
+        loop: of the set.
+        open_along: the causes leave half of the visible gap along the measured motion.
 
     Causes are added one by one, the one that helps most first, as long as one takes ``REMAINS`` of the visible gap or
     more; where that leaves a gap, all are added and those taken off that do harm. A cause is refuted that adds
@@ -56,6 +62,9 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     if not refuted:
         read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
         open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
+        if open_along and not kept and not read and said.word != "unknown" and loop.before_nm > FLOORS * loop.floor_nm:
+            # However small the gap along the motion is in practice: these causes are not what makes it.
+            return Verdict("unknown", said.named, NO_NEARER), _told(kept, refuted, loop, gap_nm)
         return (_doubted(said) if kept and not read and open_still else said), None
     stands = [f for f in said.named if f.effect not in refuted]
     falls = [replace(f, chance=min(f.chance, REFUTED)) for f in said.named if f.effect in refuted]
@@ -69,8 +78,7 @@ def borne_out(said: Verdict, loop: Loop) -> tuple[Verdict, str | None]:
     left = max(0.0, gap_nm**2 - loop.floor_nm**2)
     if kept and left <= UNNAMED**2 * loop.visible:
         return Verdict("explained", (*stands, *falls)), told
-    word = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
-    return Verdict("unknown", (*stands, *falls), said.place or word), told
+    return Verdict("unknown", (*stands, *falls), said.place or NO_NEARER), told
 
 
 def _refuted(said: Verdict, values: Effects, beside: Mapping[str, float], gap_nm: float, loop: Loop) -> set[str]:

@@ -32,7 +32,7 @@ from frictid_hil.gap.report_filter import as_meant
 from frictid_hil.gap.residuals import LowPass, Recording, recordings, rms
 from frictid_hil.gap.sanity import checked, completed, one_sided
 from frictid_hil.gap.tracking_channel import tracking_channel
-from frictid_hil.gap.verdict import DOUBTED, FLOORS, FLOORS_AS_STATED, Verdict, as_stated, needed, verdict
+from frictid_hil.gap.verdict import DOUBTED, FLOORS, FLOORS_AS_STATED, HALF, Verdict, as_stated, needed, stays, verdict
 from frictid_hil.gap.where import lives, where
 from frictid_hil.simulation.effects import all_effects
 
@@ -86,7 +86,8 @@ def diagnose(
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
-        said, told = borne_out(said, _loop(replay, logs, runs, gaps))
+        open_along = any(gap.channel == "plant" and stays(gap, HALF) for gap in gaps)
+        said, told = borne_out(said, _loop(replay, logs, runs, gaps), open_along=open_along)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)

@@ -47,6 +47,9 @@ MOST_DOUBT = 3.0
 """Variance that forms may lend to what tells causes apart, at most: more of it shows in the noise itself."""
 ROUNDING = 1e-12
 """Share of a matrix' largest entry that rounding may leave in the others."""
+SURE = 5.0
+"""Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
+shapes may be shared by them."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -216,6 +219,7 @@ class Posterior:
         safe = np.where(self._scale > 0.0, self._scale, np.inf)
         self._centre = (self._mean / safe)[self._first :]
         first = [own[0] for own in self._local]
+        self._whole = np.array([abs(float(t.mean[0])) > SURE * float(t.deviation[0]) for t in candidates], dtype=bool)
         bounds = np.array([[t.least, t.largest] for t in candidates])
         finite = np.isfinite(bounds)
         scaled = np.where(finite, bounds, 0.0) / safe[self._first :][first][:, None]
@@ -238,10 +242,11 @@ class Posterior:
         """What a set adds to the log chance at one point of the grid, its prior included."""
         at = np.concatenate([self._local[t] for t in terms])
         inner = self._grams[g][np.ix_(at, at)] + np.eye(at.size)
-        right = self._rights[g][at] + self._centre[at]
+        centre = self._expected(terms)
+        right = self._rights[g][at] + centre
         covariance = np.linalg.inv(inner)
         mean = covariance @ right
-        gain = 0.5 * float(right @ mean) - 0.5 * float(self._centre[at] @ self._centre[at])
+        gain = 0.5 * float(right @ mean) - 0.5 * float(centre @ centre)
         again = len(terms) - len({self.channel.candidates[t].effect for t in terms})
         gain -= 0.5 * float(np.linalg.slogdet(inner)[1]) - float(np.sum(self._log_prior[list(terms)]))
         gain -= again * self._chance
@@ -260,23 +265,25 @@ class Posterior:
         if terms:
             at = np.concatenate([self._local[t] for t in terms])
             solved = np.linalg.solve(gram[np.ix_(at, at)] + np.eye(at.size), gram[at])
-            right = right - solved.T @ (right[at] + self._centre[at])
+            right = right - solved.T @ (right[at] + self._expected(terms))
             gram = gram - gram[:, at] @ solved
         gains = np.full(len(self._local), -np.inf)
+        held = [self.channel.candidates[t].effect for t in terms]
         for size, block in self._blocks.items():
             columns = np.array([self._local[t] for t in block])
             inner = gram[columns[:, :, None], columns[:, None, :]] + np.eye(size)
-            target = right[columns] + self._centre[columns]
+            again = np.array([self.channel.candidates[t].effect in held for t in block])
+            centre = np.where((again & self._whole[block])[:, None], 0.0, self._centre[columns])
+            target = right[columns] + centre
             covariance = np.linalg.inv(inner)
             mean = np.einsum("bij,bj->bi", covariance, target)
-            found = 0.5 * np.einsum("bi,bi->b", mean, target) - 0.5 * np.sum(self._centre[columns] ** 2, axis=1)
+            found = 0.5 * np.einsum("bi,bi->b", mean, target) - 0.5 * np.sum(centre**2, axis=1)
             found -= 0.5 * np.linalg.slogdet(inner)[1]
             spread = np.sqrt(np.maximum(covariance[:, 0, 0], 1e-300))
             low, high = (self._low[block] - mean[:, 0]) / spread, (self._high[block] - mean[:, 0]) / spread
             bounded = np.isfinite(self._low[block]) | np.isfinite(self._high[block])
             found += np.where(bounded, _log_between(low, high) - self._before[block], 0.0)
             gains[block] = found + self._log_prior[block]
-        held = [self.channel.candidates[t].effect for t in terms]
         counts = Counter(held)
         for t, candidate in enumerate(self.channel.candidates):
             if counts[candidate.effect]:
@@ -342,7 +349,7 @@ class Posterior:
                 grams.append(part.T @ part)
                 rows.append(part.shape[0])
         total = np.sum(grams, axis=0)
-        centre = self._centred(at)
+        centre = self._centred(model)
         left = 0.0
         for gram in grams:
             known = total - gram
@@ -417,7 +424,7 @@ class Posterior:
         gram = self._left[g // len(CARE)]
         inner = gram[np.ix_(at, at)] * care[:, None] * care + np.eye(at.size)
         covariance = np.linalg.inv(inner)
-        mean = covariance @ (gram[at, -1] * care + self._centred(at))
+        mean = covariance @ (gram[at, -1] * care + self._centred(model))
         root = np.linalg.cholesky(covariance + 1e-14 * np.eye(at.size))
         return at, care * mean, care[:, None] * root
 
@@ -429,10 +436,24 @@ class Posterior:
         care[: self._first] = self.settings[g].care
         return at, care
 
-    def _centred(self, at: np.ndarray) -> Array:
-        """Scaled means of coefficients before anything is recorded."""
-        means: Array = self._mean[at] / np.where(self._scale[at] > 0.0, self._scale[at], 1.0)
-        return means
+    def _centred(self, model: Model) -> Array:
+        """Scaled means of a model's coefficients, nuisances first, before anything is recorded."""
+        scale = self._scale[: self._first]
+        nuisances = self._mean[: self._first] / np.where(scale > 0.0, scale, 1.0)
+        return np.concatenate([nuisances, self._expected(model.terms)])
+
+    def _expected(self, terms: Sequence[int]) -> Array:
+        """The same of candidates. A second shape of what is a whole cause by itself shares with the first one.
+
+        Two that were whole each would be the cause twice, wherever the recordings do not say so.
+        """
+        means, held = [np.zeros(0)], set[str]()
+        for t in terms:
+            effect = self.channel.candidates[t].effect
+            shared = effect in held and bool(self._whole[t])
+            means.append(np.zeros(self._local[t].size) if shared else self._centre[self._local[t]])
+            held.add(effect)
+        return np.concatenate(means)
 
     def fitted(self, terms: Sequence[int]) -> Array:
         """Mean coefficients of a set, at its likeliest point of the grid, for all columns of the channel's table."""

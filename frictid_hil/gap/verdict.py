@@ -97,12 +97,12 @@ def verdict(
     doubtful = all(f.chance < EVEN for f in named)
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
-    new = any(gap.appeared is not None and _stays(gap, REMAINS) for gap in gaps)
+    new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
     # Where what has no name is the larger part, the names tell the gap only if they close it.
-    untold = unnamed and any(_stays(gap, REMAINS if generic_wins else UNNAMED) for gap in gaps)
+    untold = unnamed and any(stays(gap, REMAINS if generic_wins else UNNAMED) for gap in gaps)
     if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
-    if unnamed or any(_stays(gap, REMAINS) for gap in gaps):
+    if unnamed or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause.
         named = tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
     first = named[0]
@@ -156,7 +156,7 @@ def _unnamed(loud: Sequence[Sampled]) -> bool:
     return float(np.mean(generic > np.maximum(VISIBLE, REMAINS * explained))) > 0.5
 
 
-def _stays(gap: Closed, part: float) -> bool:
+def stays(gap: Closed, part: float) -> bool:
     """Whether the named causes leave more than a part of a channel's visible gap."""
     visible = max(0.0, gap.before**2 - gap.floor**2)
     return gap.before > FLOORS * gap.floor and gap.after**2 - gap.floor**2 > part**2 * visible

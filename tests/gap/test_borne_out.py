@@ -99,6 +99,16 @@ def test_causes_that_the_loop_hardly_feels_stay_as_they_are() -> None:
     assert borne_out(verdict, loop({"friction_level_error": 0.99})) == (verdict, None)
 
 
+def test_causes_that_close_the_gap_neither_along_the_motion_nor_in_the_loop_explain_nothing() -> None:
+    verdict = Verdict("explained", (cause("joint_elasticity"),))
+    said, told = borne_out(verdict, loop({"joint_elasticity": 1.05}), open_along=True)
+    assert said.word == "unknown" and said.named == verdict.named and "no cause helps" in (told or "")
+    assert borne_out(verdict, loop({"joint_elasticity": 1.05}), open_along=False)[0].word == "explained"
+    assert borne_out(verdict, loop({"joint_elasticity": 0.5}), open_along=True)[0].word == "explained"
+    in_the_noise = loop({"joint_elasticity": 0.031}, before_nm=0.03)
+    assert borne_out(verdict, in_the_noise, open_along=True)[0].word == "explained"
+
+
 def test_play_leads_where_the_motion_told_half_of_it() -> None:
     experiments = gap_sets.make({"backlash": BACKLASH}, only=("sines_small", "sines_large", "moves_payload"))
     replay = Replay(experiments)

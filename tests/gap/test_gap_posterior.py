@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from frictid_hil.gap import noise
-from frictid_hil.gap.channel import Term
+from frictid_hil.gap.channel import Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import Finding, _nearest, _opposed, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
@@ -55,6 +55,25 @@ def test_what_may_not_be_drawn_is_made_up_for_by_what_is_like_it() -> None:
     told = _put_inside(np.array([-3.0, 3.0, 0.5]), root, np.array([0, 2]), np.array([-1.0, -np.inf]), np.full(2, 9.0))
     # The two are nearly one cause with opposite signs: the second gives back what the first may not make.
     np.testing.assert_allclose(told, [-1.0, 3.0 - 0.9 * 2.0, 0.5])
+
+
+@pytest.mark.parametrize("strength", [0.02, 30.0])
+def test_two_shapes_of_a_whole_cause_are_that_cause_once(strength: float) -> None:
+    """Where the recordings hardly show it, too: told twice, it would be as large again in the validation logs."""
+    random = np.random.default_rng(3)
+    near = random.standard_normal(800)
+    shapes = np.column_stack([near, near + 0.05 * random.standard_normal(800)]) * strength
+    logs = []
+    for k, validation in enumerate((False, False, True)):
+        y = shapes.mean(axis=1) + 0.1 * random.standard_normal(800)
+        logs.append(Rows(str(k), validation, 0.0, y, shapes, np.zeros(800), np.ones(800, dtype=bool)))
+    candidates = [
+        Term("torque_saturation", {"limit_share": value}, (k,), np.ones(1), np.full(1, 0.1))
+        for k, value in enumerate((0.3, 0.31))
+    ]
+    posterior = Posterior(Channel("actuation", 0.01, tuple(logs), (), tuple(candidates), 1.0, 20.0), 20)
+    assert float(np.sum(posterior.fitted((0, 1)))) == pytest.approx(1.0, abs=0.2)
+    assert float(np.sum(posterior.fitted((0,)))) == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_whitened_row_is_white_and_of_unit_size() -> None:
