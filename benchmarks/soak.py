@@ -38,6 +38,7 @@ import psutil
 from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
+from frictid_hil.errors import FrictidError
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
 from frictid_hil.jobs.compensation.wanted import Wanted
@@ -132,13 +133,16 @@ def robot_file(place: Path) -> str:
 
 
 def one_round(robot: str, place: Path, number: int, *, wall_clock: bool = False) -> list[str]:
-    """Each of the four once; returns their outcomes."""
+    """Each of the four once, or the first alone where it is stopped; returns their outcomes."""
     runs, store = place / "runs", place / "store"
     shutil.rmtree(runs, ignore_errors=True)
     runs.mkdir()
     measured = runs / "calibrated"
     options = CalibrateOptions(robot, out=measured, seed=number, realtime=wall_clock, store=store)
-    done: list[dict[str, Any]] = [calibrate(options, Silent()).to_json()]
+    try:
+        done: list[dict[str, Any]] = [calibrate(options, Silent()).to_json()]
+    except FrictidError as error:  # a busy computer may starve a run until it is stopped
+        return [type(error).__name__]
     if not wall_clock:
         wanted = Wanted("hand", ("nc", "mop"), duration_s=2.0)
         profile = measured / "profile.yaml"
