@@ -11,6 +11,7 @@ classical and on one that is not.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import multiprocessing
 import subprocess
@@ -36,6 +37,7 @@ COULOMB_NM = 5.0
 PASSIVE = can.Message(arbitration_id=0x04, data=bytes([0, 0x30, 0, 0, 0, 0, 0, 0]), is_error_frame=True)
 BUS_OFF = can.Message(arbitration_id=0x40, data=bytes(8), is_error_frame=True)
 READY_S = 60.0
+TRIES = 3
 
 
 def robot_file(folder: Path, *, fd: bool = False) -> Path:
@@ -127,20 +129,37 @@ def told(action: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return {**result, "took_s": time.monotonic() - began}
 
 
+def calibrated_at_last(
+    robot: str, place: Path, action: Callable[[], None], ends_with: tuple[int, ...]
+) -> dict[str, Any]:
+    """A run with the action when its cycles begin; once more where a stall of this kernel ended it in another way."""
+
+    def attempt(number: int) -> dict[str, Any]:
+        return calibrate(CalibrateOptions(robot, out=place / str(number)), At("cycles", action)).to_json()
+
+    for number in range(1, TRIES + 1):
+        run = told(functools.partial(attempt, number))
+        if run["exit_code"] in ends_with:
+            break
+        print(f"{place.name}, try {number}: {run['outcome']}: {run['error']}", flush=True)
+        link("up")
+        told(lambda: reset(robot, ask=lambda faults: True))
+    return run | {"tries": number}
+
+
 def main(folder: Path) -> dict[str, Any]:
     """All steps."""
     robot, fd = str(robot_file(folder)), str(robot_file(folder, fd=True))
 
-    def calibrated(name: str, phase: str, action: Callable[[], None]) -> dict[str, Any]:
-        options = CalibrateOptions(robot, out=folder / name)
-        return told(lambda: calibrate(options, At(phase, action)).to_json())
+    def calibrated(name: str, action: Callable[[], None], ends_with: tuple[int, ...]) -> dict[str, Any]:
+        return calibrated_at_last(robot, folder / name, action, ends_with)
 
     found = {}
     with drives(Path(robot)):
         found["check"] = told(lambda: check(robot))
-        found["calibrated"] = calibrated("calibrated", "cycles", lambda: send(PASSIVE))
-        found["bus off"] = calibrated("bus off", "cycles", lambda: send(BUS_OFF))
-        found["link down"] = calibrated("link down", "cycles", lambda: link("down"))
+        found["calibrated"] = calibrated("calibrated", lambda: send(PASSIVE), (0, 5))
+        found["bus off"] = calibrated("bus off", lambda: send(BUS_OFF), (3,))
+        found["link down"] = calibrated("link down", lambda: link("down"), (3,))
         found["check while down"] = told(lambda: check(robot))
         link("up")
         found["reset"] = told(lambda: reset(robot, ask=lambda faults: True))

@@ -18,6 +18,7 @@ guest = importlib.import_module("socketcan_guest")
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.timeout(600),
     pytest.mark.skipif(bool(kernel_with_can.missing()), reason=f"no SocketCAN here: {kernel_with_can.missing()}"),
 ]
 
@@ -29,7 +30,7 @@ def found(tmp_path_factory):
     rack = Rack()
     rack.install(load_robot(guest.robot_file(folder)).to_setup())
     rack.warm_up()  # compiled here, where it is quick
-    kernel_with_can.run(FOLDER / "socketcan_guest.py", folder, timeout_s=280.0)
+    kernel_with_can.run(FOLDER / "socketcan_guest.py", folder, timeout_s=570.0)
     return json.loads((folder / "found.json").read_text())
 
 

@@ -87,8 +87,9 @@ class Running:
 
     def child(self) -> psutil.Process:
         """The process of the cyclic loop."""
-        (loop,) = [c for c in psutil.Process(self.parent.pid).children() if "spawn_main" in " ".join(c.cmdline())]
-        return loop
+        loops = [c for c in psutil.Process(self.parent.pid).children() if "spawn_main" in " ".join(c.cmdline())]
+        assert loops, f"the run ended early: {self.last_words()}"
+        return loops[0]
 
     def last_run_time_s(self) -> float:
         """Run time of the newest readable sample."""
