@@ -19,6 +19,7 @@ FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 """Factors of a parameter that are tried where a motion alone could not tell it."""
 REFUTED = 0.4
 """Most that is claimed of a cause that the closed loop does not bear out."""
+LITTLE = "closed loop: most of its gap stays"
 NO_NEARER = "closed loop: what describes the torque along the motion brings the simulated joint no nearer"
 
 
@@ -30,11 +31,13 @@ class Loop:
         gap_nm: RMS of its torque gap with effects added to the believed joint; infinite where it runs away.
         before_nm: the same with none.
         floor_nm: RMS that noise alone leaves of it.
+        negligible_nm: gap that means nothing to the user.
     """
 
     gap_nm: Callable[[Effects], float]
     before_nm: float
     floor_nm: float
+    negligible_nm: float = 0.0
 
     @property
     def visible(self) -> float:
@@ -59,12 +62,13 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     refuted = _refuted(said, values, beside, gap_nm, loop)
     if not refuted and said.word == "unknown" and kept == [said.named[0].effect]:
         return _rescued(said, values, loop, gap_nm)
+    open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
+    read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
+    shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
+    if open_along and open_still and shows and not read and said.word != "unknown":
+        # However small the gap along the motion is in practice: these causes are not what makes it.
+        return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER), _told(kept, refuted, loop, gap_nm)
     if not refuted:
-        read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
-        open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
-        if open_along and not kept and not read and said.word != "unknown" and loop.before_nm > FLOORS * loop.floor_nm:
-            # However small the gap along the motion is in practice: these causes are not what makes it.
-            return Verdict("unknown", said.named, NO_NEARER), _told(kept, refuted, loop, gap_nm)
         return (_doubted(said) if kept and not read and open_still else said), None
     stands = [f for f in said.named if f.effect not in refuted]
     falls = [replace(f, chance=min(f.chance, REFUTED)) for f in said.named if f.effect in refuted]

@@ -86,8 +86,8 @@ def diagnose(
     if (warning := below_first_pair([f.effect for f in said.named], nominal.curve)) is not None:
         reasons["stribeck"] = warning
     if replay is not None and runs is not None and said.named:
-        open_along = any(gap.channel == "plant" and stays(gap, HALF) for gap in gaps)
-        said, told = borne_out(said, _loop(replay, logs, runs, gaps), open_along=open_along)
+        open_along = any(gap.channel == "plant" and stays(gap, HALF, floors=1.0) for gap in gaps)
+        said, told = borne_out(said, _loop(replay, logs, runs, gaps, nothing_nm), open_along=open_along)
         if told is not None:
             reasons["closed_loop"] = told
             gaps = _closed(channels, said.named)
@@ -210,7 +210,13 @@ def _tolerable(
     return {f.effect: {name: v.value for name, v in f.parameters.items()} for f in likely}
 
 
-def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed], gaps: Sequence[Closed]) -> Loop:
+def _loop(
+    replay: Replay,
+    logs: Sequence[Recording],
+    bare: Mapping[str, Replayed],
+    gaps: Sequence[Closed],
+    negligible_nm: float,
+) -> Loop:
     """The closed loop on the logs a gap is told of, as it judges causes."""
     role = _judged_role(logs)
     noise_nm = max([_white_nm(logs), *(gap.floor for gap in gaps if gap.channel == "actuation")])
@@ -221,7 +227,7 @@ def _loop(replay: Replay, logs: Sequence[Recording], bare: Mapping[str, Replayed
         # A joint that no controller holds is as far off as can be.
         return gap if math.isfinite(gap) else math.inf
 
-    return Loop(gap_nm, settled_nm(bare), noise_nm)
+    return Loop(gap_nm, settled_nm(bare), noise_nm, negligible_nm)
 
 
 def _cautious(said: Verdict, reasons: Mapping[str, str], judged_apart: bool) -> Verdict:

@@ -10,7 +10,7 @@ import numpy as np
 
 from frictid_hil.gap.channel import FAMILY, Term
 from frictid_hil.gap.findings import VISIBLE, Finding, Sampled
-from frictid_hil.gap.how_far import Closed
+from frictid_hil.gap.how_far import Closed, coefficients
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
 
@@ -38,6 +38,8 @@ LISTED = 0.25
 """Chance from which a cause is listed."""
 NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
+CERTAIN = 0.95
+"""Chance of a cause, and of being the largest one, from which it is told although the gap is within noise."""
 EVEN = 0.5
 """Chance below which a cause is likelier not there: no reason to call a gap within noise anything but none."""
 LEADS = 0.6
@@ -84,7 +86,8 @@ def verdict(
     place = _place(channels)
     if any(f.where == READ_DIRECTLY for f in named):
         return Verdict("explained", named)
-    nothing = not named or float(np.median(explained)) < STANDS_OUT
+    sure = not _unnamed(channels) and any(_certain(f, channels, gaps) for f in named)
+    nothing = not named or (float(np.median(explained)) < STANDS_OUT and not sure)
     generic_wins = float(np.mean(generic > explained)) > 0.5 and float(np.median(generic)) > STANDS_OUT
     unnamed = _unnamed([c for c, gap in zip(channels, gaps, strict=True) if gap.before > FLOORS * gap.floor])
     # A gap that is small beside the noise and small in practice is none, whatever tolerance explains it.
@@ -93,7 +96,7 @@ def verdict(
     shows = any(gap.before > math.hypot(1.0, STANDS_OUT) * gap.floor for gap in gaps)
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     told = any(f in unreached for f in named)
-    tiny = tiny and not told and not (shows and any(needed(f, channels) for f in named))
+    tiny = tiny and not told and not sure and not (shows and any(needed(f, channels) for f in named))
     doubtful = all(f.chance < EVEN for f in named)
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
@@ -102,6 +105,8 @@ def verdict(
     untold = unnamed and any(stays(gap, REMAINS if generic_wins else UNNAMED) for gap in gaps)
     if nothing or untold or new or any(_open(gap, negligible) for gap in gaps):
         return Verdict("unknown", named, place)
+    if (varies := next((f for f in named if f.chance >= EVEN and _varies(f, channels)), None)) is not None:
+        return Verdict("unknown", named, f"{varies.where}: {varies.effect} that comes and goes")
     if unnamed or any(stays(gap, REMAINS) for gap in gaps):
         # What stays may be of another cause.
         named = tuple(replace(f, chance=min(f.chance, DOUBTED)) for f in named)
@@ -114,9 +119,18 @@ def verdict(
 
 def needed(cause: Finding, channels: Sequence[Sampled]) -> bool:
     """Whether a cause stands out and hardly any draw does without it beyond what its tolerance allows."""
-    if cause.chance < NEEDED or cause.size < STANDS_OUT:
-        return False
-    return any(np.mean([cause.effect in draw.model.effects for draw in c.draws]) >= NEEDED for c in channels)
+    return cause.chance >= NEEDED and cause.size >= STANDS_OUT and _beyond_tolerance(cause, channels) >= NEEDED
+
+
+def _beyond_tolerance(cause: Finding, channels: Sequence[Sampled]) -> float:
+    """Share of the draws that do not make up for a cause by what its tolerance allows."""
+    return max(float(np.mean([cause.effect in draw.model.effects for draw in c.draws])) for c in channels)
+
+
+def _certain(cause: Finding, channels: Sequence[Sampled], gaps: Sequence[Closed]) -> bool:
+    """Whether no doubt is left of a cause and of its name, small as it is, and the gap of its channel falls with it."""
+    falls = any(gap.channel == cause.where and gap.high < gap.before for gap in gaps)
+    return falls and min(cause.chance, cause.leads, _beyond_tolerance(cause, channels)) >= CERTAIN
 
 
 def as_stated(found: Sequence[Finding], channels: Sequence[Sampled]) -> bool:
@@ -150,16 +164,44 @@ def _unreached(cause: Finding, channels: Sequence[Sampled]) -> bool:
     return False
 
 
+def _varies(cause: Finding, channels: Sequence[Sampled]) -> bool:
+    """Whether a cause between demand and torque is as strong at one moment as at another, to about half of itself.
+
+    That channel is replayed exactly, so that what stays has the size of noise. If instead its square grows with the
+    square of what the cause makes, by a share v, then the cause's strength has a spread of sqrt(v) of itself.
+    """
+    for channel in (c for c in channels if c.posterior.channel.name == "actuation" == cause.where):
+        draw = next((d for d in channel.draws if cause.effect in d.model.effects), None)
+        if draw is None:
+            continue
+        columns, values = channel.posterior.contributions(draw)[cause.effect]
+        theta = coefficients(channel, draw)
+        made, rest = [], []
+        for log in channel.posterior.channel.logs:
+            made.append(_level(log.x[:, columns] @ values, log.told))
+            rest.append(_level(log.y - log.x @ theta, log.told))
+        squares = np.concatenate(made) ** 2
+        about = squares - np.mean(squares)
+        return float(about @ np.concatenate(rest) ** 2) > HALF**2 * float(about @ about)
+    return False
+
+
+def _level(values: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """The rows that tell something, less their mean."""
+    rows: np.ndarray = values[told] - np.mean(values[told])
+    return rows
+
+
 def _unnamed(loud: Sequence[Sampled]) -> bool:
     """Whether what has no name is a fair part of what channels with a gap hold."""
     generic, explained = _root_sum([c.generic for c in loud]), _root_sum([c.explained for c in loud])
     return float(np.mean(generic > np.maximum(VISIBLE, REMAINS * explained))) > 0.5
 
 
-def stays(gap: Closed, part: float) -> bool:
-    """Whether the named causes leave more than a part of a channel's visible gap."""
+def stays(gap: Closed, part: float, floors: float = FLOORS) -> bool:
+    """Whether the named causes leave more than a part of a channel's visible gap, if that has so many floors."""
     visible = max(0.0, gap.before**2 - gap.floor**2)
-    return gap.before > FLOORS * gap.floor and gap.after**2 - gap.floor**2 > part**2 * visible
+    return gap.before > floors * gap.floor and gap.after**2 - gap.floor**2 > part**2 * visible
 
 
 def _faint(channel: Sampled, gap: Closed) -> bool:

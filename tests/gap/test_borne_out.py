@@ -8,7 +8,7 @@ from dataclasses import replace
 import gap_sets
 import pytest
 
-from frictid_hil.gap.borne_out import REFUTED, Loop, borne_out
+from frictid_hil.gap.borne_out import LITTLE, REFUTED, Loop, borne_out
 from frictid_hil.gap.diagnosis import Value
 from frictid_hil.gap.findings import Finding
 from frictid_hil.gap.forward import Effects, Replay, settled_nm
@@ -104,7 +104,11 @@ def test_causes_that_close_the_gap_neither_along_the_motion_nor_in_the_loop_expl
     said, told = borne_out(verdict, loop({"joint_elasticity": 1.05}), open_along=True)
     assert said.word == "unknown" and said.named == verdict.named and "no cause helps" in (told or "")
     assert borne_out(verdict, loop({"joint_elasticity": 1.05}), open_along=False)[0].word == "explained"
-    assert borne_out(verdict, loop({"joint_elasticity": 0.5}), open_along=True)[0].word == "explained"
+    assert borne_out(verdict, loop({"joint_elasticity": 0.45}), open_along=True)[0].word == "explained"
+    little = loop({"joint_elasticity": 0.85})
+    assert borne_out(verdict, little, open_along=True)[0].place == LITTLE
+    assert borne_out(verdict, replace(little, negligible_nm=0.9), open_along=True)[0].word == "explained"
+    assert borne_out(verdict, little, open_along=False)[0].word == "explained"
     in_the_noise = loop({"joint_elasticity": 0.031}, before_nm=0.03)
     assert borne_out(verdict, in_the_noise, open_along=True)[0].word == "explained"
 

@@ -104,6 +104,36 @@ def test_a_large_delay_is_explained_whatever_it_leaves_in_the_plant() -> None:
 
 
 @pytest.mark.slow
+def test_a_cause_within_noise_is_told_where_no_doubt_is_left_of_it() -> None:
+    d = diagnose(gap_sets.make({"torque_ripple": {"amplitude_nm": 0.02, "cycles_per_motor_revolution": 2.0}}))
+    assert d.before.inverse_nm is not None and d.noise_floor.inverse_nm is not None
+    assert d.before.inverse_nm < 2.0 * d.noise_floor.inverse_nm
+    assert d.verdict == "explained" and d.causes[0].effect == "torque_ripple" and d.causes[0].confidence >= 0.95
+
+
+def drive_that_is_late_at_times(share: float) -> ExperimentSet:
+    """A drive whose torque comes two rows late in a share of all spans of 25 rows."""
+    random, made = np.random.default_rng(5), gap_sets.make(noise_nm=0.0)
+    experiments = []
+    for one in made.experiments:
+        assert one.torque_nm is not None
+        rows = one.torque_nm.size
+        late = np.repeat(random.random(rows // 25 + 1) < share, 25)[:rows]
+        torque = np.where(late, np.concatenate([one.torque_nm[:2], one.torque_nm[:-2]]), one.torque_nm)
+        noise = gap_sets.NOISE_NM * random.standard_normal(rows)
+        experiments.append(replace(one, torque_nm=np.round((torque + noise) / 0.012) * 0.012))
+    return replace(made, experiments=tuple(experiments))
+
+
+@pytest.mark.slow
+def test_a_drive_that_is_late_at_times_has_no_delay() -> None:
+    d = diagnose(drive_that_is_late_at_times(0.6))
+    assert d.verdict == "unknown" and "comes and goes" in d.reasons["cause"]
+    d = diagnose(drive_that_is_late_at_times(1.0))
+    assert d.verdict == "explained" and d.causes[0].effect == "torque_delay" and d.causes[0].confidence >= 0.9
+
+
+@pytest.mark.slow
 def test_two_effects_are_both_named() -> None:
     d = diagnose(gap_sets.make({n: SINGLES[n] for n in ("torque_ripple", "torque_bias")}))
     assert {c.effect for c in d.causes[:2]} == {"torque_ripple", "torque_bias"}
