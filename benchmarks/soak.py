@@ -42,6 +42,7 @@ from frictid_hil.config.provenance import git_revision
 from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.errors import FrictidError
+from frictid_hil.friction.trajectory import Array
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.compensate import CompensateOptions, compensate
 from frictid_hil.jobs.compensation.wanted import Wanted
@@ -52,6 +53,7 @@ from frictid_hil.jobs.watch import Silent
 JOINT = "5"
 WITHIN = 0.01
 SHORT_LIVED_NAMES = 200_000
+MOST_ROUNDS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,9 +180,9 @@ class Soaked:
         lasted_s: all rounds.
     """
 
-    memory_mb: list[float]
-    with_freed_mb: list[float]
-    in_use_mb: list[float]
+    memory_mb: Array
+    with_freed_mb: Array
+    in_use_mb: Array
     steady_from: int
     before: Held
     after: Held
@@ -203,34 +205,36 @@ class Soaked:
         return _growth(self.in_use_mb[self.steady_from :])
 
 
-def _growth(memory_mb: list[float]) -> float:
-    tenth = max(1, len(memory_mb) // 10)
+def _growth(memory_mb: Array) -> float:
+    tenth = max(1, memory_mb.size // 10)
     return float(np.median(memory_mb[-tenth:]) / np.median(memory_mb[:tenth])) - 1.0
 
 
 def soak(lasts_s: float, *, wall_clock_every: int = 5, tell: Callable[[str], None] = print) -> Soaked:
     """Rounds for so long, and at least one after the second of either kind."""
     began, outcomes, before = time.monotonic(), dict[str, int](), held()
-    memory_mb, with_freed_mb, used_mb, steady_from = list[float](), list[float](), list[float](), wall_clock_every + 2
+    # All at once: a number kept on the heap after every round would hold a page of it.
+    figures_mb, rounds, steady_from = np.full((MOST_ROUNDS, 3), np.nan), 0, wall_clock_every + 2
     fill_the_table_of_names()
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary)
         robot = robot_file(place)
-        while len(memory_mb) <= steady_from or time.monotonic() - began < lasts_s:
-            number = len(memory_mb)
-            wall_clock = wall_clock_every > 0 and number % wall_clock_every == 1
-            for outcome in one_round(robot, place, number, wall_clock=wall_clock):
+        while rounds < MOST_ROUNDS and (rounds <= steady_from or time.monotonic() - began < lasts_s):
+            wall_clock = wall_clock_every > 0 and rounds % wall_clock_every == 1
+            for outcome in one_round(robot, place, rounds, wall_clock=wall_clock):
                 outcomes[outcome] = outcomes.get(outcome, 0) + 1
-            with_freed_mb.append(own_memory_mb())
+            with_freed_mb = own_memory_mb()
             give_back_freed()
-            memory_mb.append(own_memory_mb())
-            used_mb.append(in_use_mb())
-            if number == steady_from - 1:
+            figures_mb[rounds] = own_memory_mb(), with_freed_mb, in_use_mb()
+            if rounds == steady_from - 1:
                 before = held()
             minutes, clock = (time.monotonic() - began) / 60, " on the wall clock" if wall_clock else ""
-            figures = f"{memory_mb[-1]:.2f} MB ({with_freed_mb[-1]:.1f} with what was freed), {used_mb[-1]:.2f} in use"
-            tell(f"{minutes:.1f} min, round {number}{clock}: {figures}, {astuple(held())}, {outcomes}")
-    return Soaked(memory_mb, with_freed_mb, used_mb, steady_from, before, held(), outcomes, time.monotonic() - began)
+            now_mb = figures_mb[rounds]
+            figures = f"{now_mb[0]:.2f} MB ({now_mb[1]:.1f} with what was freed), {now_mb[2]:.2f} in use"
+            tell(f"{minutes:.1f} min, round {rounds}{clock}: {figures}, {astuple(held())}, {outcomes}")
+            rounds += 1
+    mb, with_freed, used = figures_mb[:rounds].T
+    return Soaked(mb, with_freed, used, steady_from, before, held(), outcomes, time.monotonic() - began)
 
 
 def main() -> int:
