@@ -170,8 +170,8 @@ def test_a_round_of_the_soak_keeps_nothing(benchmark_named: Callable[[str], Any]
 def test_memory_is_compared_from_early_to_late(benchmark_named: Callable[[str], Any]) -> None:
     soak = benchmark_named("soak")
     held = soak.held()
-    rounds = [200.0] * 7 + [250.0] * 17 + [255.0] * 3
-    soaked = soak.Soaked(rounds, [300.0] * 27, [90.0] * 24 + [99.0] * 3, 7, held, held, {}, 1.0)
+    rounds = np.array([200.0] * 7 + [250.0] * 17 + [255.0] * 3)
+    soaked = soak.Soaked(rounds, np.full(27, 300.0), np.array([90.0] * 24 + [99.0] * 3), 7, held, held, {}, 1.0)
     assert (soaked.growth, soaked.growth_with_freed, soaked.growth_in_use) == pytest.approx((0.02, 0.0, 0.1))
 
 
