@@ -24,6 +24,7 @@ from frictid_hil.config.robot import Robot, interface_of, load_robot
 from frictid_hil.errors import FrictidError, UsageError
 from frictid_hil.files import write_whole
 from frictid_hil.jobs.cron import cron_fields
+from frictid_hil.runner.realtime import WAKE_TIME
 
 _EXAMPLE = 'for example --on-calendar "Mon..Fri 02:30"'
 _STOP_S = 60
@@ -217,7 +218,7 @@ KillMode=mixed
 TimeoutStartSec={options.time_limit_s:.0f}
 TimeoutStopSec={_STOP_S}
 
-# Real time: the cyclic loop asks for SCHED_FIFO 60 and locked memory.
+# Real time: the cyclic loop asks for SCHED_FIFO 60, locked memory and awake processors.
 LimitRTPRIO=99
 LimitMEMLOCK=infinity
 RestrictRealtime=no
@@ -254,7 +255,9 @@ Environment=XDG_STATE_HOME={folder}/state
 Environment=NUMBA_CACHE_DIR={folder}/numba
 AmbientCapabilities=CAP_SYS_NICE
 CapabilityBoundingSet=CAP_SYS_NICE
+ExecStartPre=-+setfacl -m u:{options.user}:rw {WAKE_TIME}
 DevicePolicy=closed
+DeviceAllow={WAKE_TIME} rw
 {port}ProtectHome=read-only
 ProtectKernelTunables=yes
 ProtectKernelModules=yes

@@ -53,10 +53,11 @@ def test_a_night_missed_on_a_real_bus_stays_missed(tmp_path: Path, real_robot: P
     assert "Persistent=false" in timer and "Persistent=true" not in timer
 
 
-def test_a_port_is_the_only_device_that_a_service_may_open(tmp_path: Path, real_robot: Path) -> None:
+def test_a_service_opens_its_port_the_bound_of_wake_times_and_no_other_device(tmp_path: Path, real_robot: Path) -> None:
     options = ScheduleOptions(str(real_robot), "daily", bus="serial:/dev/ttyUSB0", system=True, out=tmp_path)
     service = Path(schedule(options)["service"]).read_text()
-    assert "DevicePolicy=closed\nDeviceAllow=/dev/ttyUSB0 rw\n" in service
+    allowed = [line for line in service.splitlines() if line.startswith("Device")]
+    assert allowed == ["DevicePolicy=closed", "DeviceAllow=/dev/cpu_dma_latency rw", "DeviceAllow=/dev/ttyUSB0 rw"]
 
 
 def test_an_account_that_does_not_exist_is_refused(tmp_path: Path) -> None:

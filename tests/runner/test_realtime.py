@@ -56,3 +56,40 @@ def test_the_loop_takes_an_isolated_processor_and_no_other(tmp_path, kernel_says
     command = [sys.executable, "-c", MOVED, tmp_path / "isolated", str(first)]
     said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
     assert said.split() == ([str(last), str(last)] if taken else ["None", str(first)])
+
+
+PUNCTUAL = """
+import os, sys
+from pathlib import Path
+from frictid_hil.runner import realtime
+
+realtime.WAKE_TIME = Path(sys.argv[1])
+told = realtime.make_punctual()
+held = any(os.path.realpath(f"/proc/self/fd/{number}") == sys.argv[1] for number in os.listdir("/proc/self/fd"))
+print(held, any("awake" in line for line in told), bool(told))
+"""
+
+
+def punctual(wake_time) -> list[str]:
+    command = [sys.executable, "-c", PUNCTUAL, str(wake_time)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.split()
+
+
+def test_idle_processors_are_kept_awake_while_the_process_lives(tmp_path):
+    wake_time = tmp_path / "cpu_dma_latency"
+    wake_time.write_bytes(b"")
+    held, complained, _ = punctual(wake_time)
+    assert (held, complained) == ("True", "False")
+    assert wake_time.read_bytes() == bytes(4)
+
+
+def test_a_computer_without_a_bound_of_wake_times_is_not_complained_about(tmp_path):
+    assert punctual(tmp_path / "nothing")[:2] == ["False", "False"]
+
+
+def test_processors_that_may_sleep_are_told_with_the_remedy(tmp_path):
+    # A folder cannot be opened for writing by anybody, root included.
+    held, complained, anything = punctual(tmp_path)
+    assert held == "False" and anything == "True"
+    # Where real-time scheduling is not permitted either, that is told first and alone.
+    assert complained == "True" or os.geteuid() != 0
