@@ -115,17 +115,19 @@ class MessageFrames:
         self._bus.send(_message(can_id, data))
 
     def receive(self, timeout_s: float) -> list[Heard] | None:
-        """The next one."""
+        """All that has come."""
         message = self._bus.recv(timeout_s)
         if message is None:
             return None
-        if message.is_error_frame:
-            self.controller = controller_state(message.arbitration_id, message.data) or self.controller
-            return []
-        if message.is_extended_id or message.is_remote_frame:
-            return []
-        can_id = message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
-        return [(can_id, bytes(message.data), message.timestamp)]
+        heard: list[Heard] = []
+        while message is not None:
+            if message.is_error_frame:
+                self.controller = controller_state(message.arbitration_id, message.data) or self.controller
+            elif not message.is_extended_id and not message.is_remote_frame:
+                can_id = message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
+                heard.append((can_id, bytes(message.data), message.timestamp))
+            message = self._bus.recv(0.0)
+        return heard
 
 
 def _message(can_id: int, data: bytes) -> can.Message:
@@ -210,8 +212,12 @@ class SocketFrames:
         # These calls never wait, so that the interpreter's lock need not be let go.
         library = ctypes.PyDLL(None, use_errno=True)
         self._sendmmsg, self._recvmmsg = library.sendmmsg, library.recvmmsg
-        self._sendmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
-        self._recvmmsg.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+        # Arguments as the system wants them, made once: to turn numbers into them takes as long as the call.
+        self._whose, self._at_once = ctypes.c_int(self._fd), ctypes.c_int(socket.MSG_DONTWAIT)
+        self._counts = [ctypes.c_uint(count) for count in range(MOST + 1)]
+        self._first = ctypes.c_void_p(self._out.address)
+        room = ctypes.c_void_p(self._in.address)
+        self._into = (self._whose, room, self._counts[MOST], self._at_once, ctypes.c_void_p(None))
 
     def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
         """All of them; a full transmit buffer is an error at once."""
@@ -225,13 +231,13 @@ class SocketFrames:
             packing = self._packing[fd]
             packing.pack_into(room, at * stride, can_id & ~FD_FRAME, len(data), fd and _BIT_RATE_SWITCH, data, *stamp)
             sizes[at] = packing.size
-        done = 0
+        done, first = 0, self._first
         while done < len(frames):
-            first = self._out.address + done * ctypes.sizeof(_Message)
-            sent = self._sendmmsg(self._fd, first, len(frames) - done, socket.MSG_DONTWAIT)
+            sent = self._sendmmsg(self._whose, first, self._counts[len(frames) - done], self._at_once)
             if sent < 0:
                 raise _failed()
             done += sent
+            first = ctypes.c_void_p(self._out.address + done * ctypes.sizeof(_Message))
         return None
 
     def send_alone(self, can_id: int, data: bytes) -> None:
@@ -243,11 +249,11 @@ class SocketFrames:
 
     def receive(self, timeout_s: float) -> list[Heard] | None:
         """All that has come."""
-        count = self._recvmmsg(self._fd, self._in.address, MOST, socket.MSG_DONTWAIT, None)
+        count = self._recvmmsg(*self._into)
         if count < 0 and ctypes.get_errno() == errno.EAGAIN:
             if timeout_s <= 0.0 or not select.select((self._fd,), (), (), timeout_s)[0]:
                 return None
-            count = self._recvmmsg(self._fd, self._in.address, MOST, socket.MSG_DONTWAIT, None)
+            count = self._recvmmsg(*self._into)
         if count < 0:
             raise _failed()
         now_s = time.time()

@@ -89,7 +89,7 @@ class Ring:
             whole = memoryview(bytearray(size))
         self._buffer: memoryview[int] = whole
         self._pack_into = pack.pack_into
-        self._row = row
+        self._row, self._row_bytes = row, row.itemsize
         self._capacity = capacity
         self._head = 0
         self._checked = shared or name is not None
@@ -123,7 +123,7 @@ class Ring:
         if head - self._counters[_TAIL] >= self._capacity:
             self._counters[_DROPPED] += 1
             return
-        slot, size = head % self._capacity, self._row.itemsize
+        slot, size = head % self._capacity, self._row_bytes
         at = _HEADER_BYTES + slot * size
         self._pack_into(self._buffer, at, *values)
         self._head = head + 1

@@ -4,6 +4,9 @@
 
     drain what came late -> RPDOs -> SYNC -> receive until all awaited reports are here or the window ends -> checks
 
+On the wall clock, what comes after the awaited reports is of the next cycle: heartbeats, and reports that are due only
+now and then.
+
 Commands and reports are CAN FD frames where the layout says so; SYNC and heartbeats never are. A drive that answers in
 the other kind of frame ends the run: the bus load was computed for this one, and its set-points are not heard.
 
@@ -166,8 +169,10 @@ class Cycle:
             decoder.begin(now_ns)
             begun = True
             self._window_end_ns = now_ns + self._timing.window_ns
-            self._log_sent(frames, now_ns)
-            self._frames.send(frames)
+            try:
+                self._frames.send(frames)
+            finally:
+                self._log_sent(frames, now_ns)  # the drives answer meanwhile
             for outgoing, (_, data) in zip(due, frames, strict=False):
                 outgoing.told = data
                 outgoing.told_cycle = decoder.cycle
@@ -334,18 +339,15 @@ class Cycle:
     def _receive(self) -> None:
         receive, now_ns, decoder = self._frames.receive, self._clock.now_ns, self._decoder
         end_ns = self._window_end_ns
-        lock_step = self._lock_step
+        if self._lock_step:
+            # The answers were there before ``send`` returned: what is not there will not come.
+            while (heard := receive(0.0)) is not None:
+                self._take(heard, now_ns())
+            return
         while decoder.missing > 0:
-            # In lock-step the answers were there before ``send`` returned: what is not there will not come.
-            timeout_s = 0.0 if lock_step else (end_ns - now_ns()) * 1e-9
-            if timeout_s < 0.0:
+            timeout_s = (end_ns - now_ns()) * 1e-9
+            if timeout_s < 0.0 or (heard := receive(timeout_s)) is None:
                 return
-            heard = receive(timeout_s)
-            if heard is None:
-                return
-            self._take(heard, now_ns())
-        # Reports that are due on this SYNC only now and then.
-        while (heard := receive(0.0)) is not None:
             self._take(heard, now_ns())
 
     def _take(self, heard: Sequence[Heard], t_ns: int) -> None:
