@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from frictid_hil.friction.consistency import MOST_SEEN_S
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
 
@@ -48,6 +49,25 @@ def test_a_torque_that_is_late_in_the_fast_ones_of_few_cycles(plants, step_s, by
     assert "turnover" not in failed(few)
     spoilt = late(few, "torque_nm", by_s, since_s=float(few.procedure.cycle_starts_s[1]))
     assert "turnover" in failed(spoilt)
+
+
+@pytest.mark.slow
+def test_a_torque_that_is_late_in_the_fastest_cycle_is_told_although_it_looks_like_a_soft_link(plants):
+    """The link that is found takes most of the delay away that the data would ask for."""
+    few = plants.record(plants.arm[4], replace(plants.procedure(10), cycles=3))
+    assert "turnover" not in failed(few)
+    spoilt = late(few, "torque_nm", 0.01, since_s=float(few.procedure.cycle_starts_s[2]))
+    found = estimate(spoilt)
+    assert found.link_resonance_hz is not None and found.figures["seen_delay_s"] < MOST_SEEN_S
+    assert "turnover" in failed(spoilt)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cycles", [3, 10])
+@pytest.mark.parametrize("frequency_hz", [28.0, 45.0])
+def test_a_soft_link_alone_is_not_taken_for_lateness(plants, frequency_hz, cycles):
+    soft = replace(plants.arm[1], link_share=0.5, link_frequency_hz=frequency_hz)
+    assert not failed(plants.record(soft, replace(plants.procedure(20), cycles=cycles))) & {"turnover", "seen_delay"}
 
 
 @pytest.mark.slow
