@@ -17,6 +17,8 @@ from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 
 _BRAKE_NS = 1_000_000_000
+_STOP_NS = 400_000_000
+"""After a stop: whoever moves longer does not obey, because another sender commands it, say."""
 _FRESH_CYCLES = 3
 _STANDING_RAD_S = 0.1
 
@@ -69,7 +71,7 @@ class Wish:
         self._locked = False
         self._hold_rad = math.nan
         self._since_rad: float | None = None
-        self._brake_until_ns = 0
+        self._brake_until_ns = self._stopped_ns = 0
         self._had_power = False
         self.limit(joint.max_torque_nm, joint.position_min_rad, joint.position_max_rad)
 
@@ -85,14 +87,17 @@ class Wish:
         self.mode, self._target, self._had_power = mode, JointState.ENABLED, False
 
     def disable(self) -> None:
-        """No power, after coming to rest; a joint that does not come to rest in a second loses it all the same."""
+        """No power, after coming to rest; a joint that does not loses it all the same, 0.4 s after a stop or in 1 s."""
+        if self._target is JointState.STOPPING:
+            self._brake_until_ns = self._stopped_ns + _STOP_NS
+        elif self._target is JointState.ENABLED:
+            self._brake_until_ns = self.feedback.t_ns + _BRAKE_NS
         self._target = JointState.DISABLED
-        self._brake_until_ns = self.feedback.t_ns + _BRAKE_NS
 
     def stop(self) -> None:
         """Come to rest and stay under power until ``disable``; a joint without power stays without."""
         if self._target is JointState.ENABLED:
-            self._target = JointState.STOPPING
+            self._target, self._stopped_ns = JointState.STOPPING, self.feedback.t_ns
 
     def lock(self) -> None:
         """Hold the present target in position mode."""
