@@ -14,6 +14,7 @@ from frictid_drivers.cia402 import driver as cia402
 from frictid_drivers.cia402.settings import read_settings
 from frictid_hil.errors import FrictidError, GateFailed, HardwareError, Interrupted, SafetyAbort
 from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.protocol import wishes
 from frictid_hil.runner import process
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.stopping import DURATIONS_S
@@ -128,6 +129,9 @@ def page() -> str:
             "",
             "A CiA-402 drive that stops by itself brings the joint to rest and holds it there **with power**, so that",
             "no arm falls (605A = 6). With `abort_option: 2` in the robot file it takes the power away instead.",
+            "",
+            "MIT-mode actuators and bus servos have no quick stop of their own: they are told to brake. One that still",
+            f"moves {wishes.STOP_NS * 1e-9:g} s later, because another sender commands it, loses its power, too.",
             "",
             "This page is generated from the code by `python -m frictid_drivers.stop_paths docs/reference/stops.md`.",
             "",

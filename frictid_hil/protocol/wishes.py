@@ -17,7 +17,7 @@ from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Feedback, JointState, SetPoint
 
 _BRAKE_NS = 1_000_000_000
-_STOP_NS = 400_000_000
+STOP_NS = 400_000_000
 """After a stop: whoever moves longer does not obey, because another sender commands it, say."""
 _FRESH_CYCLES = 3
 _STANDING_RAD_S = 0.1
@@ -89,7 +89,7 @@ class Wish:
     def disable(self) -> None:
         """No power, after coming to rest; a joint that does not loses it all the same, 0.4 s after a stop or in 1 s."""
         if self._target is JointState.STOPPING:
-            self._brake_until_ns = self._stopped_ns + _STOP_NS
+            self._brake_until_ns = self._stopped_ns + STOP_NS
         elif self._target is JointState.ENABLED:
             self._brake_until_ns = self.feedback.t_ns + _BRAKE_NS
         self._target = JointState.DISABLED
