@@ -60,6 +60,7 @@ class Sampled:
         draws: samples.
         sizes: by cause, its size over the floor in every draw less what others take back, (draws,); 0 if not in.
         blurs: by cause, one-sigma of what the forms of the others may have put on it, in the same unit.
+        believed: by cause, one-sigma of its size before anything is recorded, in the same unit.
         generic: the same of all generic functions together.
         explained: the same of all causes together.
         gram: mean products of the channel's columns over all its rows, shape (m, m).
@@ -69,6 +70,7 @@ class Sampled:
     draws: Sequence[Draw]
     sizes: Mapping[str, Array]
     blurs: Mapping[str, Array]
+    believed: Mapping[str, Array]
     generic: Array
     explained: Array
     gram: Array
@@ -83,6 +85,7 @@ def sampled(posterior: Posterior) -> Sampled:
     gram = x.T @ x / x.shape[0]
     sizes: dict[str, Array] = {}
     blurs: dict[str, Array] = {}
+    believed: dict[str, Array] = {}
     generic, explained = np.zeros(len(draws)), np.zeros(len(draws))
 
     def size_of(parts: Sequence[tuple[np.ndarray, Array]]) -> float:
@@ -100,9 +103,11 @@ def sampled(posterior: Posterior) -> Sampled:
         for effect, net, blur in zip(causes, *_net([*causes.values(), *unnamed], gram), strict=False):
             sizes.setdefault(effect, np.zeros(len(draws)))[k] = net / posterior.floor
             blurs.setdefault(effect, np.zeros(len(draws)))[k] = blur / posterior.floor
+        for effect, square in posterior.believed(draw, np.diag(gram)).items():
+            believed.setdefault(effect, np.zeros(len(draws)))[k] = math.sqrt(square) / posterior.floor
         explained[k] = size_of(list(causes.values()))
         generic[k] = size_of([part for name, part in parts.items() if name.startswith(FAMILY)])
-    return Sampled(posterior, draws, sizes, blurs, generic, explained, gram)
+    return Sampled(posterior, draws, sizes, blurs, believed, generic, explained, gram)
 
 
 def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array, Array]:
@@ -136,7 +141,9 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
         return []
     table = np.array([_joined([c.sizes.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
     blurs = np.array([_joined([c.blurs.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
+    believed = np.array([_joined([c.believed.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
     shown = np.where(table > VISIBLE, table, 0.0)
+    errors = {t.effect for c in channels for t in c.posterior.channel.nuisances if not t.shape}
     leads = np.bincount(np.argmax(shown, axis=0)[np.max(shown, axis=0) > 0.0], minlength=len(names)) / DRAWS
     result = []
     for row, name in enumerate(names):
@@ -144,7 +151,9 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
         if not there.any():
             continue
         blur = np.maximum(blurs[row], FORM)
-        chance = float(np.mean(special.ndtr((table[row] - VISIBLE) / blur) * (table[row] > 0.0)))
+        told, other = (float(np.mean(c)) for c in _chances(table[row], blur, believed[row]))
+        # An error of the belief may as well be the other way round.
+        chance = told + other if name in errors else told
         values = _values(name, channels)
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
@@ -159,6 +168,19 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             )
         )
     return sorted(result, key=lambda f: -f.size)
+
+
+def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
+    """(That a cause shows as it is told, that it shows the other way round), one a draw, (draws,) each.
+
+    A draw knows the size as if all forms were right; they blur it, and what was believed of it holds against that.
+    """
+    held = believed**2 / (believed**2 + blur**2)
+    middle, spread = held * size, np.maximum(np.sqrt(held) * blur, 1e-9)
+    there = size > 0.0
+    told: Array = np.where(there, special.ndtr((middle - VISIBLE) / spread), 0.0)
+    other: Array = np.where(there, special.ndtr((-middle - VISIBLE) / spread), 0.0)
+    return told, other
 
 
 def _joined(sizes: Sequence[Array]) -> Array:

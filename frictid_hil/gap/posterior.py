@@ -496,6 +496,22 @@ class Posterior:
             at += len(term.columns)
         return {name: (np.array(c, dtype=int), np.array(v)) for name, (c, v) in result.items()}
 
+    def believed(self, draw: Draw, squares: Array) -> dict[str, float]:
+        """By cause: mean square of what it makes of the residual before anything is recorded.
+
+        Args:
+            draw: whose causes, under whose care of the belief.
+            squares: mean square of every column of the channel's table.
+        """
+        care = self.settings[draw.setting].care
+        terms = [(term, care) for term in self.channel.nuisances]
+        terms += [(self.channel.candidates[t], 1.0) for t in draw.model.terms]
+        result: dict[str, float] = {}
+        for term, widened in terms:
+            made = float((widened * term.deviation) ** 2 @ squares[np.array(term.columns, dtype=int)])
+            result[term.effect] = result.get(term.effect, 0.0) + made
+        return result
+
 
 @dataclass(frozen=True, slots=True)
 class Draw:

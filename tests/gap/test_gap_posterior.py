@@ -13,7 +13,7 @@ import pytest
 from frictid_hil.gap import noise
 from frictid_hil.gap.channel import Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.findings import Finding, _nearest, _opposed, findings, sampled
+from frictid_hil.gap.findings import DRAWS, VISIBLE, Finding, _chances, _nearest, _opposed, findings, sampled
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Posterior, _integrated, _put_inside
 from frictid_hil.gap.residuals import recordings
@@ -127,3 +127,21 @@ def test_shapes_that_oppose_each_other_are_told_as_the_one_nearest_to_their_sum(
     together = table[:, 0] * 2.0 - table[:, 3] * 0.5
     told = table[:, terms.index(term)] * values[0]
     assert np.std(together - told) < 0.1 * np.std(together)
+
+
+@pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])
+def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(believed: float, blur: float) -> None:
+    rng = np.random.default_rng(5)
+    true = believed * rng.normal(size=2_000_000)
+    seen = true + blur * rng.normal(size=true.size)
+    for size in (0.1, 0.6, 1.2):
+        alike = true[np.abs(seen - size) < 0.02]
+        told, other = (np.mean(c) for c in _chances(*(np.full(DRAWS, value) for value in (size, blur, believed))))
+        assert told == pytest.approx(np.mean(alike > VISIBLE), abs=0.02)
+        assert other == pytest.approx(np.mean(alike < -VISIBLE), abs=0.02)
+
+
+def test_what_the_forms_of_others_may_have_made_is_no_error_beyond_its_tolerance() -> None:
+    size, blur = np.full(DRAWS, 0.3), np.full(DRAWS, 3.0)
+    narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))) for s in (0.1, 10.0))
+    assert narrow < 0.01 < 0.8 < wide
