@@ -508,7 +508,8 @@ class Posterior:
         terms += [(self.channel.candidates[t], 1.0) for t in draw.model.terms]
         result: dict[str, float] = {}
         for term, widened in terms:
-            made = float((widened * term.deviation) ** 2 @ squares[np.array(term.columns, dtype=int)])
+            expected = term.mean**2 + (widened * term.deviation) ** 2
+            made = float(expected @ squares[np.array(term.columns, dtype=int)])
             result[term.effect] = result.get(term.effect, 0.0) + made
         return result
 
