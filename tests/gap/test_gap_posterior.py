@@ -145,3 +145,18 @@ def test_what_the_forms_of_others_may_have_made_is_no_error_beyond_its_tolerance
     size, blur = np.full(DRAWS, 0.3), np.full(DRAWS, 3.0)
     narrow, wide = (sum(np.mean(c) for c in _chances(size, blur, np.full(DRAWS, s))) for s in (0.1, 10.0))
     assert narrow < 0.01 < 0.8 < wide
+
+
+@pytest.mark.parametrize(("mean", "deviation"), [(0.0, 2.0), (1.0, 0.1)])
+def test_a_cause_is_believed_to_show_at_its_strength_and_what_that_may_be_off(mean: float, deviation: float) -> None:
+    """A cause whose shape holds its number has strength one: a motor that lost 30 % of its torque did so as a whole."""
+    random = np.random.default_rng(4)
+    shape = random.standard_normal((600, 1))
+    y = shape[:, 0] + 0.1 * random.standard_normal(600)
+    logs = [Rows(str(k), k == 2, 0.0, y, shape, np.zeros(600), np.ones(600, dtype=bool)) for k in range(3)]
+    term = Term("torque_saturation", {"limit_share": 0.3}, (0,), np.full(1, mean), np.full(1, deviation))
+    posterior = Posterior(Channel("actuation", 0.01, tuple(logs), (), (term,), 1.0, 20.0), 20)
+    draw = posterior.draws(posterior.search(), 1)[0]
+    drawn = mean + deviation * random.standard_normal(100_000)
+    found = posterior.believed(draw, np.full(1, np.mean(shape**2)))["torque_saturation"]
+    assert found == pytest.approx(float(np.mean(drawn**2) * np.mean(shape**2)), rel=0.05)
