@@ -19,7 +19,7 @@ from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.command_timing import in_force
 from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment, Raw, Value
 from frictid_hil.gap.experiment_set import ExperimentSet, Nominal
-from frictid_hil.gap.findings import Finding, Sampled, findings, sampled, whole_draws
+from frictid_hil.gap.findings import Finding, Sampled, either_way, findings, sampled, whole_draws
 from frictid_hil.gap.forward import Effects, Replay, Replayed, settled_nm, why_not
 from frictid_hil.gap.how_far import Closed, Simulated, closed, held_out, simulated
 from frictid_hil.gap.kinematics import KinematicFit, fit_kinematics
@@ -287,7 +287,7 @@ def _told(
         after=after,
         noise_floor=floor,
         per_log=runs.per_log() if runs is not None else {},
-        next_experiment=_next(said, experiments.nominal, logs, plant),
+        next_experiment=_next(said, experiments.nominal, logs, channels),
         reasons=reasons,
         summary=_summary(experiments.name, said, lives(places), gaps, reasons.get("closed_loop")),
         model=replay.model(effects if applied else {}) if replay is not None else None,
@@ -352,13 +352,16 @@ def _explain(said: Verdict, gaps: Sequence[Closed], reasons: dict[str, str], exp
         reasons["gap"] = "the set has no validation log; figures are of the logs that were fitted"
 
 
-def _next(said: Verdict, nominal: Nominal, logs: Sequence[Recording], plant: Sampled | None) -> NextExperiment | None:
+def _next(
+    said: Verdict, nominal: Nominal, logs: Sequence[Recording], channels: Sequence[Sampled]
+) -> NextExperiment | None:
     if said.word != "ambiguous":
         return None
     open_ones = [f for f in said.named if f.chance <= DOUBTED] or list(said.named)
     first = open_ones[0]
-    others = [*first.rivals, *(f.effect for f in (*open_ones[1:], *said.named) if f is not first), first.effect]
-    of_torque = plant if plant is not None and plant.posterior.channel.name == "plant" else None
+    others = [*first.rivals, *(f.effect for f in (*open_ones[1:], *said.named) if f is not first)]
+    others += [*either_way(channels), first.effect]
+    of_torque = next((c for c in channels if c.posterior.channel.name == "plant"), None)
     return next_experiment(first.effect, others[0], nominal, logs, of_torque)
 
 

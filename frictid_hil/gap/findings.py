@@ -22,6 +22,11 @@ VISIBLE = 0.5
 """Size, over the noise floor, from which a cause shows: below, it adds an eighth to what noise alone leaves."""
 ALIKE = 0.05
 """Chance of another cause in the place of one from which the two are called confusable."""
+EVEN = 0.5
+"""Chance below which a cause is likelier not there."""
+SIDED = 0.75
+"""Share of the chance on the side that is told, below which an error of the belief may as well be the other way round:
+it is no cause that could be told."""
 SURE = 0.99
 """Most that is claimed: one world in a hundred is of a kind that nobody thought of."""
 UNTOLD = 0.8
@@ -136,30 +141,24 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
 
 def findings(channels: Sequence[Sampled]) -> list[Finding]:
     """All causes of all channels, the one that is expected to make most first."""
-    names = sorted({name for channel in channels for name in channel.sizes})
+    names = _names(channels)
     if not names:
         return []
-    table = np.array([_joined([c.sizes.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
-    blurs = np.array([_joined([c.blurs.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
-    believed = np.array([_joined([c.believed.get(name, np.zeros(DRAWS)) for c in channels]) for name in names])
+    table = np.array([_over_channels("sizes", name, channels) for name in names])
     shown = np.where(table > VISIBLE, table, 0.0)
-    errors = {t.effect for c in channels for t in c.posterior.channel.nuisances if not t.shape}
     leads = np.bincount(np.argmax(shown, axis=0)[np.max(shown, axis=0) > 0.0], minlength=len(names)) / DRAWS
     result = []
     for row, name in enumerate(names):
         there = shown[row] > 0.0
-        if not there.any():
+        told, other = _sides(name, channels)
+        if not there.any() or told < SIDED * (told + other):
             continue
-        blur = np.maximum(blurs[row], FORM)
-        told, other = (float(np.mean(c)) for c in _chances(table[row], blur, believed[row]))
-        # An error of the belief may as well be the other way round.
-        chance = told + other if name in errors else told
         values = _values(name, channels)
         home = max(channels, key=lambda c: float(np.mean(c.sizes.get(name, np.zeros(1)) ** 2)))
         result.append(
             Finding(
                 name,
-                min(SURE if values else UNTOLD, chance),
+                min(SURE if values else UNTOLD, told + other),
                 math.sqrt(float(np.mean(shown[row] ** 2))),
                 float(leads[row]),
                 values,
@@ -168,6 +167,34 @@ def findings(channels: Sequence[Sampled]) -> list[Finding]:
             )
         )
     return sorted(result, key=lambda f: -f.size)
+
+
+def either_way(channels: Sequence[Sampled]) -> list[str]:
+    """Errors of the belief that are likely to show, as well one way as the other; first what others pass for most."""
+    blurs = {}
+    for name in _names(channels):
+        told, other = _sides(name, channels)
+        if told < SIDED * (told + other) and told + other >= EVEN:
+            blurs[name] = rms(_over_channels("blurs", name, channels))
+    return sorted(blurs, key=lambda name: -blurs[name])
+
+
+def _names(channels: Sequence[Sampled]) -> list[str]:
+    return sorted({name for channel in channels for name in channel.sizes})
+
+
+def _over_channels(what: str, name: str, channels: Sequence[Sampled]) -> Array:
+    """Root of the squares of ``sizes``, ``blurs`` or ``believed`` of a cause over the channels, one a draw."""
+    nothing = np.zeros(DRAWS)
+    return np.sqrt(sum((getattr(c, what).get(name, nothing) ** 2 for c in channels), nothing))
+
+
+def _sides(name: str, channels: Sequence[Sampled]) -> tuple[float, float]:
+    """(Chance that a cause shows as it is told, that it shows the other way round, which only an error can)."""
+    size, blur, believed = (_over_channels(what, name, channels) for what in ("sizes", "blurs", "believed"))
+    told, other = (float(np.mean(c)) for c in _chances(size, np.maximum(blur, FORM), believed))
+    is_error = any(t.effect == name and not t.shape for c in channels for t in c.posterior.channel.nuisances)
+    return told, other if is_error else 0.0
 
 
 def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
@@ -181,10 +208,6 @@ def _chances(size: Array, blur: Array, believed: Array) -> tuple[Array, Array]:
     told: Array = np.where(there, special.ndtr((middle - VISIBLE) / spread), 0.0)
     other: Array = np.where(there, special.ndtr((-middle - VISIBLE) / spread), 0.0)
     return told, other
-
-
-def _joined(sizes: Sequence[Array]) -> Array:
-    return np.sqrt(sum((size**2 for size in sizes), np.zeros(DRAWS)))
 
 
 def _rivals(row: int, names: Sequence[str], there: np.ndarray, shown: Array) -> tuple[str, ...]:
@@ -216,8 +239,7 @@ def _values(effect: str, channels: Sequence[Sampled]) -> dict[str, Value]:
 
 def _lent(effect: str, channels: Sequence[Sampled]) -> Array:
     """Factors by which a cause's numbers may be off because no joint is quite as its formula, one a draw, (draws,)."""
-    size = rms(_joined([c.sizes.get(effect, np.zeros(DRAWS)) for c in channels]))
-    blur = rms(_joined([c.blurs.get(effect, np.zeros(DRAWS)) for c in channels]))
+    size, blur = (rms(_over_channels(what, effect, channels)) for what in ("sizes", "blurs"))
     spread = math.hypot(FORM, blur / max(size, FORM * VISIBLE))
     normal = special.ndtri((np.arange(DRAWS) + 0.5) / DRAWS)
     factors: Array = 1.0 + spread * np.random.default_rng(0).permutation(normal)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from frictid_hil.gap.channel import FAMILY, Term
-from frictid_hil.gap.findings import VISIBLE, Finding, Sampled
+from frictid_hil.gap.findings import EVEN, VISIBLE, Finding, Sampled
 from frictid_hil.gap.how_far import Closed, coefficients
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
@@ -40,8 +40,6 @@ NEEDED = 0.85
 """Chance that no tolerance makes up for a cause, from which it is told however small the gap is in practice."""
 CERTAIN = 0.95
 """Chance of a cause, and of being the largest one, from which it is told although the gap is within noise."""
-EVEN = 0.5
-"""Chance below which a cause is likelier not there: no reason to call a gap within noise anything but none."""
 LEADS = 0.6
 """Chance of being the largest cause below which a rival makes the answer ambiguous."""
 
@@ -97,7 +95,7 @@ def verdict(
     # What identification logs plainly hold is no "none" because the validation logs never came to it.
     told = any(f in unreached for f in named)
     tiny = tiny and not told and not sure and not (shows and any(needed(f, channels) for f in named))
-    doubtful = all(f.chance < EVEN for f in named)
+    doubtful = all(f.chance < EVEN for f in named)  # no reason to call a gap within noise anything but none
     if tiny or (quiet and not told and (nothing or generic_wins or doubtful)):
         return Verdict("none", ())
     new = any(gap.appeared is not None and stays(gap, REMAINS) for gap in gaps)
