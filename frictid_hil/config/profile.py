@@ -369,7 +369,7 @@ class JointProfile(Strict):
         if not isinstance(given, Mapping):
             return given
         completed = dict(given)
-        with suppress(TypeError, ValueError, KeyError):
+        with suppress(TypeError, ValueError, KeyError, OverflowError):
             velocity, torque = (tuple(map(rounded, as_tuple(given[name]))) for name in ("velocity_rad_s", "torque_nm"))
             for name, sign in (("forward", 1.0), ("backward", -1.0)):
                 if completed.get(name) is not None:

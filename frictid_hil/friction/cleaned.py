@@ -16,6 +16,7 @@ from frictid_hil.friction.coupling import Pull, pull
 from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs
 from frictid_hil.friction.link import Link, soft_link, without
+from frictid_hil.friction.missed import without_shakes
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.skew import TimeSkew, measured_skew
 
@@ -63,6 +64,9 @@ def cleaned(recording: CycleRecording, notes: list[str]) -> Cleaned:
     Raises:
         IdentificationError: a window is empty, or columns do not fit together.
     """
+    recording, shaken = without_shakes(recording)
+    if shaken:
+        notes.append(f"{shaken} missed set-points shook the joint; its torque was taken from beside them")
     motion = synchronised(recording)
     others = pull(recording, motion)
     if others is not None:

@@ -215,6 +215,13 @@ def test_a_spoilt_profile_is_refused_with_the_place(tmp_path: Path, old: str, ne
     assert error.where == where
 
 
+@pytest.mark.parametrize("name", ["torque_nm: [8.5", "torque_plus_minus_nm: [0.1"])
+def test_a_number_that_no_float_holds_is_refused(tmp_path: Path, name: str) -> None:
+    before, _, number = name.rpartition("[")
+    error = edited(tmp_path, name, f"{before}[{number.replace('.', '')}{'9' * 400}")
+    assert "expected a" in str(error) and error.where is not None and error.where.startswith("p.yaml:")
+
+
 def test_errors_on_a_linear_axis_use_the_names_of_the_file(tmp_path: Path) -> None:
     text = profile(axis=joint(prismatic=True)).to_yaml()
     path = tmp_path / "p.yaml"
