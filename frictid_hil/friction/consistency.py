@@ -46,6 +46,12 @@ FLAT_SHARE = 0.003
 FLAT_SPIKE = 6.0
 """Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
 
+CONTINUED = 2.0
+"""The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair of the curve,
+which is only continued to there ..."""
+SLOWEST_SHARE = 0.5
+"""... down to this share of that pair's speed."""
+
 _STEPS = 1000.0
 _LEAST_SAMPLES = 50
 
@@ -193,28 +199,30 @@ def _flat(recording: CycleRecording) -> Gate:
 
 def _elsewhere(recording: CycleRecording, result: Estimate, most: float) -> Gate | None:
     """Half of forward minus backward torque in other stretches of the run, against the curve at the same speeds."""
-    worst = 0.0
-    told = ""
+    slowest = float(result.curve.velocity_rad_s[0])
+    judged = []
     for name, velocity, torque in recording.elsewhere:
-        ratio = _friction_against(result, velocity, torque)
-        if ratio is not None and abs(ratio - 1.0) >= worst:
-            worst, told = abs(ratio - 1.0), f"{name}: friction is {100 * ratio:.0f} % of the curve at the same speed"
-    if not told:
+        continued = float(np.abs(velocity).max(initial=0.0)) < slowest
+        ratio = _friction_against(result, velocity, torque, SLOWEST_SHARE * slowest if continued else slowest)
+        if ratio is not None:
+            judged.append((abs(ratio - 1.0), most * (CONTINUED if continued else 1.0), ratio, name))
+    if not judged:
         return None
+    worst, allowed, ratio, name = max(judged, key=lambda one: one[0] / one[1])
     return Gate.about(
         "other_stretches",
-        worst <= most,
+        worst <= allowed,
         worst,
-        most,
-        f"{told} (allowed {100 * most:.3g} % off)",
+        allowed,
+        f"{name}: friction is {100 * ratio:.0f} % of the curve at the same speed (allowed {100 * allowed:.3g} % off)",
         "the torque's scale or the friction changed during the run: a cold joint (`--warm-up`), a drive that switched "
         "its current range, or wrong reports",
     )
 
 
-def _friction_against(result: Estimate, velocity: Array, torque: Array) -> float | None:
-    """Measured over identified friction; None where the stretch does not go both ways at speeds of the curve."""
-    slowest, fastest = result.curve.velocity_rad_s[0], result.curve.velocity_rad_s[-1]
+def _friction_against(result: Estimate, velocity: Array, torque: Array, slowest: float) -> float | None:
+    """Measured over identified friction; None where the stretch does not go both ways from this speed on."""
+    fastest = result.curve.velocity_rad_s[-1]
     steady = (np.abs(velocity) >= max(slowest, 0.9 * float(np.abs(velocity).max(initial=0.0)))) & (
         np.abs(velocity) <= fastest
     )

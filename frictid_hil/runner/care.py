@@ -29,6 +29,8 @@ class Care:
         settling_rad: how far a joint may be from its place while power comes on, or before it is seen to stand.
         settling_rad_s: its speed meanwhile.
         following_error_rad: bound on the following error, beyond what the driver's own delay makes at full speed.
+        following_error_s: unless a robot file sets that bound, it is no more than the joint covers in this time at its
+            highest speed: a drive that hears its set-points again after a silence then catches up no faster.
         velocity_margin: measured speed may exceed the planned peak by this factor ...
         velocity_slack_rad_s: ... plus this.
         travel_slack_rad: measured position may leave the planned travel by this.
@@ -45,6 +47,7 @@ class Care:
     settling_rad: float = math.radians(1.0)
     settling_rad_s: float = math.radians(15.0)
     following_error_rad: float = math.radians(5.0)
+    following_error_s: float = 0.015
     velocity_margin: float = 1.25
     velocity_slack_rad_s: float = math.radians(10.0)
     travel_slack_rad: float = math.radians(2.0)
@@ -55,7 +58,9 @@ class Care:
 
     def of_robot(self, bounds: Mapping[str, float], droop_rad: Mapping[str, float]) -> Care:
         """The same care with the bounds that a robot file sets and the droop that its driver declares."""
-        return replace(self, droop_rad=dict(droop_rad), **cast("dict[str, Any]", dict(bounds)))
+        longest_s = math.inf if "following_error_rad" in bounds else self.following_error_s
+        wanted = {"following_error_s": longest_s, "droop_rad": dict(droop_rad), **bounds}
+        return replace(self, **cast("dict[str, Any]", wanted))
 
     def still_of(self, joint: str) -> float:
         """How far a joint may be from its set-point while it stands."""
@@ -81,7 +86,7 @@ class Care:
             position_max_rad=high,
             velocity_rad_s=velocity,
             torque_nm=joint.max_torque_nm * _OVER_MAXIMUM,
-            following_error_rad=self.following_error_rad
+            following_error_rad=min(self.following_error_rad, self.following_error_s * joint.max_velocity_rad_s)
             + plan.peak_velocity_rad_s * command_delay_s
             + self.droop_rad.get(joint.name, 0.0),
             still_rad=self.still_of(joint.name),

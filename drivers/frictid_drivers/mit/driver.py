@@ -270,7 +270,10 @@ class MitDriver:
                 self.may_be_powered = cycle.may_be_powered
 
     def close(self) -> None:
-        """Everything to rest, settings as they were, the bus released; safe to call twice and after errors."""
+        """Everything to rest, settings as they were, the bus released; safe to call twice and after errors.
+
+        A motor that was not seen to be off keeps its watchdog: somebody else may have switched it on again.
+        """
         if self._line is None:
             return
         if self._cycle is not None:
@@ -278,8 +281,10 @@ class MitDriver:
             with contextlib.suppress(FrictidError):
                 self.stop_cycling()
         for name, parameter, value in reversed(self._restore):
+            settings = self._settings[name]
+            if name in self.may_be_powered and parameter == settings.family.watchdog:
+                continue
             with contextlib.suppress(FrictidError):
-                settings = self._settings[name]
                 self._line.send(*settings.family.write(settings.motor, parameter, value))
         self._restore.clear()
         self._line.close()

@@ -328,7 +328,8 @@ class ServoDriver:
     def quick_stop(self) -> None:
         """Every joint holds the goal that it has, or where it was last seen; never raises.
 
-        A goal that goes back to a reading would send the joint wherever a reading that jumped says.
+        A goal that goes back to a reading would send the joint wherever a reading that jumped says. One that is far
+        away may not have been heard yet, and would be now: the joint is told half of that way.
         """
         line, reader = self._line, self._reader
         if line is None or reader is None:
@@ -341,6 +342,7 @@ class ServoDriver:
             if reader.takes_currents(at):
                 with contextlib.suppress(Exception):
                     self._modes[at].stop(self._places[at].counts)
+            self._goals[at] = self._places[at].nearer(self._goals[at])
             counts = self._counts(at, math.nan)
             if counts is not None:
                 goals[self._joints[at].id] = to_bytes(counts, self._registers.goal_bytes, self._joints[at].model)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from frictid_hil.protocol.driver import Feedback
 
 _SHARE, _COUNTS = 2.0, 4
+_FAR_S = 0.02
+"""At its highest speed a joint covers what lies between it and a goal that is near in this time."""
 
 
 class Place:
@@ -30,3 +32,9 @@ class Place:
         within = self._most_counts_s * (report.t_ns - self._seen_ns) * 1e-9 + _COUNTS
         if self.counts is None or abs(counts - self.counts) <= within:
             self.counts, self._seen_ns = counts, report.t_ns
+
+    def nearer(self, goal: int | None) -> int | None:
+        """A goal that is far away, at half of that way."""
+        if goal is None or self.counts is None or abs(goal - self.counts) <= _FAR_S * self._most_counts_s / _SHARE:
+            return goal
+        return (goal + self.counts) // 2
