@@ -47,8 +47,8 @@ FLAT_SPIKE = 6.0
 """Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
 
 CONTINUED = 2.0
-"""The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair of the curve,
-which is only continued to there ..."""
+"""The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair, where the
+curve is only continued ..."""
 SLOWEST_SHARE = 0.5
 """... down to this share of that pair's speed."""
 

@@ -21,7 +21,7 @@ from frictid_hil.friction.regression import fit
 DRAGGED = 3.0
 """Standard deviations by which effects outside the model may have moved the delay that is seen."""
 CONTRADICTS = 2.0
-"""Standard deviations, the delay's own and the declared one's, from which on the interval no longer trusts the latter."""
+"""Standard deviations, the delay's own and the declared one's, from which on an interval trusts the latter no more."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from frictid_hil.protocol.wishes import Do, Order, Wish
 
 SETTLE_S = 1.5
 """How long all joints may take to come to rest and off."""
+_LAST_WORDS = 2
 
 
 class CanCycle:
@@ -95,6 +96,8 @@ class CanCycle:
     def stop(self) -> None:
         """Cycle until every joint is at rest and off; in the end all are told twice, for a frame may be lost.
 
+        What they say to that counts: somebody else may have switched one on again.
+
         Raises:
             SafetyAbort: a joint still reports power, or does not report.
         """
@@ -110,14 +113,25 @@ class CanCycle:
                 if not powered:
                     break
         finally:
-            on = [wish.joint.name for wish in self.wishes if wish.feedback.state is JointState.ENABLED]
-            self.may_be_powered = tuple(on)
-            for at in (*range(len(self.wishes)), *range(len(self.wishes))):
-                with contextlib.suppress(FrictidError):
-                    self._line.send(*self._frame(at, Order(Do.REST)))
+            for _ in range(_LAST_WORDS):
+                self._all_off()
+            self.may_be_powered = tuple(
+                wish.joint.name for wish in self.wishes if wish.feedback.state is JointState.ENABLED
+            )
+        powered = powered or list(self.may_be_powered)
         if powered:
             raise SafetyAbort(
                 f"did not come to rest and off within {SETTLE_S:g} s",
                 where=", ".join(f"joint {name}" for name in powered),
                 next_step="switch its supply off, then look at the drive",
             )
+
+    def _all_off(self) -> None:
+        """Every joint is told, and heard for one cycle; never raises ``FrictidError``."""
+        for at in range(len(self.wishes)):
+            with contextlib.suppress(FrictidError):
+                frame = self._frame(at, Order(Do.REST))
+                self._rows.feed(self._line.send(*frame), *frame)
+        with contextlib.suppress(FrictidError):
+            for heard in self._line.received(self._clock.now_ns() + self._period_ns):
+                self._rows.feed(*heard)

@@ -126,3 +126,15 @@ def test_a_late_half_cycle_of_joints_that_move_together_is_not_excused_by_doubt(
         for coupled in (False, True)
     }
     assert told[False].passed and not told[True].passed
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.7, None), (0.7, 0.67), (0.7, 1.4), (0.3, 0.67)])
+def test_a_stretch_slower_than_the_slowest_pair_is_judged_too(sound, share, told):
+    """A rehearsal that was slower than every cycle was not compared: a torque times 1.5 from then on was called ok."""
+    found = estimate(sound)
+    speed = share * found.curve.velocity_rad_s[0]
+    velocity = np.repeat([speed, -speed], 100)
+    torque = (told or 1.1) * np.sign(velocity) * found.curve.magnitude(np.abs(velocity))
+    judged = {gate.name: gate for gate in gates(replace(sound, elsewhere=(("rehearsal", velocity, torque),)), found)}
+    # Below half of that speed the curve says nothing.
+    assert judged["other_stretches"].passed is (told is None) if share > 0.5 else "other_stretches" not in judged

@@ -127,3 +127,18 @@ def test_where_the_bus_is_gone_every_joint_may_have_power(tmp_path: Path) -> Non
     with pytest.raises(HardwareError):
         run.driver.stop_cycling()
     assert run.driver.may_be_powered == ("0", "1")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_motor_that_somebody_else_switches_on_again_lets_go_by_its_watchdog(tmp_path: Path, family: str) -> None:
+    """Its watchdog was put back to what it had been, and it kept its power for ever."""
+    run = Running(tmp_path, family, {"kind": "foreign", "frames": "command", "joint": "1", "at_s": 0.0})
+    run.cycles(20)
+    with pytest.raises(SafetyAbort):
+        run.driver.stop_cycling()
+    assert run.driver.may_be_powered == ("1",)
+    run.driver.close()
+    motors = run.driver.rack.actuators
+    assert motors["1"].timeout_ns and not motors["0"].timeout_ns
+    run.driver.rack.advance(motors["1"]._now_ns + 1_000_000_000)
+    assert not motors["1"].on

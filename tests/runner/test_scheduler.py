@@ -399,3 +399,15 @@ def test_what_breaks_while_stopping_never_hides_what_ended_the_run() -> None:
         finally:
             arm.stop()
     assert driver.stops == 2
+
+
+def test_a_joint_that_hears_its_set_points_again_catches_up_no_faster_than_it_may() -> None:
+    """A drive closes a following error within some 15 ms: unless a robot file sets the bound, that is its measure."""
+    setup = ROBOT.to_setup()
+    plan = calibration_plan(
+        ROBOT, setup, {"3": Procedure(6 * DEG, 40 * DEG, cycles=2)}, expected_of(ROBOT), rehearse=()
+    )
+    for max_velocity_rad_s, bound_rad in ((2.0, 0.03), (20.0, 5 * DEG)):
+        joint = replace(setup.joint("3"), max_velocity_rad_s=max_velocity_rad_s)
+        limits = Care().of_robot({}, {}).limits(joint, plan.joints[0], 0.0)
+        assert limits.following_error_rad == pytest.approx(bound_rad)

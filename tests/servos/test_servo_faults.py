@@ -125,6 +125,18 @@ def test_a_stop_does_not_follow_a_reading_that_jumped(mode: Mode) -> None:
     assert abs(run.servo(FIRST).plant.position_rad - before_rad) < 0.1
 
 
+def test_a_stop_after_lost_goals_does_not_send_the_joint_to_a_far_one() -> None:
+    """The stop told a goal that none of 60 lost ones had told before, and the joint went there at its full speed."""
+    run = Running("STS3215", {"kind": "drop", "frames": "write", "at_s": 0.2, "count": 60})
+    run.cycles(100, step_rad=0.006)
+    servo = run.servo(FIRST)
+    before_rad, behind_rad = servo.plant.position_rad, 100 * 0.006 - servo.plant.position_rad
+    assert behind_rad > 0.3
+    run.driver.quick_stop()
+    run.cycles(60)
+    assert servo.plant.position_rad - before_rad < 0.6 * behind_rad
+
+
 @pytest.mark.parametrize("cycle_hz", [50.0, 100.0, 200.0, 400.0])
 def test_a_velocity_is_no_older_than_20_ms_at_any_rate(cycle_hz: float) -> None:
     """At 100 Hz it was 40 ms old, and a healthy joint was stopped because position and velocity disagreed."""
