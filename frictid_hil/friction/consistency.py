@@ -30,9 +30,9 @@ MOST_TURNOVER_S = 0.012
 """Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
 MOST_TURNOVER_SEEN_S = 0.004
 """... and where the delay that the data ask for has the same sign and is more than ``MOST_SEEN_S``."""
-MOST_SEEN_DRAGGED_S = 0.00075
-"""The same where a link was found, which drags that delay down, if the data are sure of it: soft joints that are not
-late ask for 0.06 ms."""
+MOST_SEEN_DRAGGED_S, SURE_BESIDE = 0.00075, 2.0
+"""The same where a link was found, which drags that delay down, if the data are sure of it by so many standard
+deviations: soft joints that are not late ask for 0.06 ms."""
 MOST_COARSE_TURNOVER_S, MOST_TURNOVER_STEP_S, FEW_CYCLES = 0.03, 0.0105, 3
 """Samples further apart, with the coarse steps of servos, tell no less than this, and below 100 Hz nothing."""
 MOST_APART_S = 0.008
@@ -108,7 +108,7 @@ def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Ga
     worst_s = float(late_s[np.argmax(np.abs(late_s))] if fine else max(0.0, late_s[-1]))
     # Two witnesses need to say less: inertia alone makes some milliseconds of one of them.
     seen_s, deviation_s = (result.figures.get(f"seen_delay{part}_s", 0.0) for part in ("", "_deviation"))
-    least_s = MOST_SEEN_S if result.link_resonance_hz is None else max(MOST_SEEN_DRAGGED_S, SURE * deviation_s)
+    least_s = MOST_SEEN_S if result.link_resonance_hz is None else max(MOST_SEEN_DRAGGED_S, SURE_BESIDE * deviation_s)
     both = seen_s * np.sign(worst_s) > least_s
     allowed_s = (MOST_TURNOVER_SEEN_S if both else MOST_TURNOVER_S) if fine else MOST_COARSE_TURNOVER_S
     return Gate.about(

@@ -3,8 +3,7 @@
 The least-squares model with one more column, the torque's own rate, shows what delay the data would ask for. Effects
 that the model lacks drag that figure by milliseconds, so that it corrects nothing. But where it lies near zero, a wrong
 declaration can hardly hide: what the declaration leaves open then shrinks to the delay seen and its own uncertainty,
-tripled, for what the model lacks drags the figure by about that (`benchmarks/interval_coverage.py`, ripple). And where
-it contradicts the declaration, the interval is as wide as the delay that is seen would make it.
+tripled, for what the model lacks drags the figure by about that (`benchmarks/interval_coverage.py`, ripple).
 """
 
 from __future__ import annotations
@@ -20,8 +19,6 @@ from frictid_hil.friction.regression import fit
 
 DRAGGED = 3.0
 """Standard deviations by which effects outside the model may have moved the delay that is seen."""
-CONTRADICTS = 2.0
-"""Standard deviations, the delay's own and the declared one's, from which on an interval trusts the latter no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,12 +34,7 @@ class SeenDelay:
     deviation_s: float
 
     def open_s(self, declared_s: float) -> float:
-        """One standard deviation of the skew that may remain.
-
-        Never more than the declared one, unless the data contradict it: then what they ask for, in full.
-        """
-        if abs(self.delay_s) > CONTRADICTS * math.hypot(self.deviation_s, declared_s):
-            return abs(self.delay_s)
+        """One standard deviation of the skew that may remain; never more than the declared one."""
         return min(declared_s, math.hypot(self.delay_s, DRAGGED * self.deviation_s))
 
 

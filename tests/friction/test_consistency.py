@@ -8,6 +8,7 @@ import pytest
 from frictid_hil.friction.consistency import MOST_SEEN_S
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
+from frictid_hil.friction.rigid_body import Measured
 
 
 def failed(recording) -> set[str]:
@@ -126,6 +127,15 @@ def test_a_late_half_cycle_of_joints_that_move_together_is_not_excused_by_doubt(
         for coupled in (False, True)
     }
     assert told[False].passed and not told[True].passed
+
+
+@pytest.mark.parametrize(("seen_s", "passed"), [(0.0, True), (0.0025, True), (0.0032, False)])
+def test_a_late_turnover_and_a_delay_that_is_not_quite_sure_are_two_witnesses(sound, monkeypatch, seen_s, passed):
+    """A torque late by 6 ms looked like a link at 18 Hz; 3.2 +- 2.8 ms of it were seen, and a turnover 8.1 ms late."""
+    monkeypatch.setattr("frictid_hil.friction.consistency.turnover_lateness", lambda *_: np.array([0.0081]))
+    figures = {"seen_delay_s": seen_s, "seen_delay_deviation_s": 0.00141}
+    soft = replace(estimate(sound), figures=figures, link_resonance_hz=Measured(18.0, 0.1))
+    assert {gate.name: gate.passed for gate in gates(sound, soft)}["turnover"] is passed
 
 
 @pytest.mark.parametrize(("share", "told"), [(0.7, None), (0.7, 0.67), (0.7, 1.4), (0.3, 0.67)])

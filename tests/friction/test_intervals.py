@@ -66,12 +66,8 @@ def test_skew_that_is_left_open_widens_the_fast_knots_only(plants):
     assert terms.skew[-1] == pytest.approx(predicted, rel=0.15)
 
 
-@pytest.mark.parametrize(
-    ("wrong_s", "left_open_s"), [(0.0, (0.0, 3e-4)), (5e-4, (3e-4, 8e-4)), (4e-3, (3.5e-3, 4.5e-3))]
-)
-def test_data_narrow_what_the_declaration_leaves_open_and_widen_it_where_they_contradict_it(
-    plants, wrong_s, left_open_s
-):
+@pytest.mark.parametrize(("wrong_s", "left_open_s"), [(0.0, (0.0, 3e-4)), (5e-4, (3e-4, 8e-4)), (4e-3, (1e-3, 1e-3))])
+def test_data_narrow_what_the_declaration_leaves_open_but_never_widen_it(plants, wrong_s, left_open_s):
     recording = plants.record(plants.arm[1], plants.procedure(10))
     recording = replace(recording, skew=Skew(torque_delay_s=5e-4 + wrong_s, uncertainty_s=1e-3))
     motion = synchronised(recording)
