@@ -30,8 +30,8 @@ MOST_TURNOVER_S = 0.012
 """Friction that turns over later, or sooner, after a fast turning point than after the same slow travel ..."""
 MOST_TURNOVER_SEEN_S = 0.004
 """... and where the delay that the data ask for has the same sign and is more than ``MOST_SEEN_S``."""
-MOST_SEEN_DRAGGED_S, SURE_BESIDE = 0.00075, 2.0
-"""The same where a link was found, which drags that delay down, if the data are sure of it by so many standard
+MOST_SEEN_DRAGGED_S, SURE_BESIDE = 0.00075, 1.0
+"""The same where a link was found, which drags that delay down, if it is more than so many standard
 deviations: soft joints that are not late ask for 0.06 ms."""
 MOST_COARSE_TURNOVER_S, MOST_TURNOVER_STEP_S, FEW_CYCLES = 0.03, 0.0105, 3
 """Samples further apart, with the coarse steps of servos, tell no less than this, and below 100 Hz nothing."""
