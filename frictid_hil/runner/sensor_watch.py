@@ -11,7 +11,7 @@ from collections import deque
 from typing import NamedTuple
 
 from frictid_hil.protocol.driver import Feedback
-from frictid_hil.units import format_angle, format_torque
+from frictid_hil.units import format_angle, format_torque, format_velocity
 
 _WINDOW_S = 0.1
 _OFF_SHARE = 0.25
@@ -26,6 +26,9 @@ _JUMP_RAD = math.radians(0.3)
 _BOTH_WAYS_RAD_S = math.radians(4.0)
 _BOTH_WAYS_RAD = math.radians(0.5)
 """A torque has been seen in a direction once the joint moved so far at such a speed."""
+_AT_ONCE_RAD_S, _AT_ONCE_SHARE, _AT_ONCE_REPORTS = math.radians(15.0), 0.1, 3
+"""No joint under torque control stands from such a speed from one report to the next, to the last digit for so many:
+its encoder does, or it has hit something."""
 _SAME_RAD = math.radians(1.0)
 """A set-point that went so far changes the torque of a joint that stands, unless its reports are old ones."""
 
@@ -86,6 +89,8 @@ class SensorWatch:
         self._same_since_ns, self._same_asked_rad = 0, math.nan
         self._torque_nm = math.nan
         self._seen_rad = [0.0, 0.0]
+        self._stands: tuple[float, float] | None = None
+        self._stood, self._from_rad_s = 0, 0.0
 
     def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
         """Say in a sentence what is wrong; an empty string while all is well.
@@ -118,7 +123,7 @@ class SensorWatch:
         if t_ns - rows[0].t_ns >= 0.9e9 * _WINDOW_S and (wrong := self._disagreement()):
             return wrong
         if math.isnan(asked_rad):
-            return ""
+            return self._at_once(last, report) if step_s < 2.0 * self._period_s else ""
         return self._old(report, asked_rad) or self._frozen(report.torque_nm, velocity, jump_rad)
 
     def _disagreement(self) -> str:
@@ -137,6 +142,19 @@ class SensorWatch:
             f"position went {format_angle(went_rad)} within {_WINDOW_S:g} s, its reported velocity says "
             f"{format_angle(said_rad)} (may differ by {format_angle(allowed_rad)})"
         )
+
+    def _at_once(self, last: _Row, report: Feedback) -> str:
+        """Say that a joint that nothing holds stood at once: the torque would go on, and nobody would see the speed."""
+        figures, before_rad_s = (report.position_rad, report.velocity_rad_s), abs(last.velocity_rad_s)
+        if figures == self._stands:
+            self._stood += 1
+        elif before_rad_s >= _AT_ONCE_RAD_S and abs(report.velocity_rad_s) <= _AT_ONCE_SHARE * before_rad_s:
+            self._stands, self._stood, self._from_rad_s = figures, 1, last.velocity_rad_s
+        else:
+            self._stands = None
+        if self._stands is None or self._stood != _AT_ONCE_REPORTS:
+            return ""
+        return f"stood within one report, from {format_velocity(self._from_rad_s)}"
 
     def _old(self, report: Feedback, asked_rad: float) -> str:
         """Say that the same report comes again and again: a loop whose set-point moves has another torque at least."""

@@ -131,7 +131,7 @@ def test_a_late_half_cycle_of_joints_that_move_together_is_not_excused_by_doubt(
 
 @pytest.mark.parametrize(("seen_s", "passed"), [(0.0, True), (0.001, True), (0.0022, False)])
 def test_a_late_turnover_and_a_delay_that_is_not_quite_sure_are_two_witnesses(sound, monkeypatch, seen_s, passed):
-    """A torque late by 6 ms looked like a link at 18 Hz; 2.2 to 3.2 +- 2.8 ms of it were seen, and a turnover 8 ms late."""
+    """A torque late by 6 ms looked like a link at 18 Hz; 3.2 +- 2.8 ms of it were seen, and a turnover 8 ms late."""
     monkeypatch.setattr("frictid_hil.friction.consistency.turnover_lateness", lambda *_: np.array([0.0081]))
     figures = {"seen_delay_s": seen_s, "seen_delay_deviation_s": 0.00141}
     soft = replace(estimate(sound), figures=figures, link_resonance_hz=Measured(18.0, 0.1))

@@ -143,3 +143,28 @@ def test_a_torque_that_stands_whichever_way_the_joint_moves_is_told(stuck_nm):
     assert "torque stands at exactly" in told
     assert verdict(swinging(lambda n, velocity: math.copysign(5.0, velocity))) == ""
     assert verdict(swinging(lambda n, velocity: math.nan)) == "", "nobody reports a torque"
+
+
+@pytest.mark.parametrize(
+    ("speeds_deg_s", "told"),
+    [
+        ([30, 30, 0, 0, 0], True),  # an encoder that stands, or a stop that was hit
+        ([30, 30, 0, 0, 1], False),
+        ([30, 20, 10, 0, 0], False),  # braked
+        ([10, 10, 0, 0, 0], False),  # friction may do that to a light joint
+        ([30, 30, 30, 30, 30], False),
+    ],
+)
+@pytest.mark.parametrize("held", [False, True])
+def test_a_joint_under_torque_that_stands_at_once_is_told(speeds_deg_s, told, held):
+    """An encoder stood in motion; the joint was driven on until its position loop snapped at 424 deg/s."""
+    watch, position_rad, said = SensorWatch(0.002), 0.0, []
+    for n, speed in enumerate([speeds_deg_s[0]] * 30 + speeds_deg_s):
+        velocity_rad_s = math.radians(speed)
+        position_rad += velocity_rad_s * 0.002
+        report = Feedback(
+            position_rad=position_rad, velocity_rad_s=velocity_rad_s, torque_nm=0.1 * n, t_ns=n * 2_000_000
+        )
+        said.append(watch.verdict(report, 5.0, asked_rad=position_rad if held else math.nan))
+    # A position loop has a following error to tell it by.
+    assert any("stood within one report" in one for one in said) is (told and not held)
