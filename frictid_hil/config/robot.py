@@ -196,7 +196,8 @@ class CareFile(Strict):
         approach_rad_s: speed of moves to locked and start positions; usually 20 deg/s.
         still_rad: how far a joint may move from where it was locked; usually 0.25 deg.
         still_rad_s: speed below which a joint stands; usually 0.5 deg/s.
-        following_error_rad: largest following error, beyond what the driver's own delay makes; usually 5 deg.
+        following_error_rad: largest following error, beyond what the driver's own delay makes; usually 5 deg,
+            and no more than the joint covers in 15 ms at its highest speed.
         velocity_margin: measured speed may exceed the planned peak by this factor; usually 1.25 ...
         velocity_slack_rad_s: ... plus this; usually 10 deg/s.
         travel_slack_rad: measured position may leave the planned travel by this; usually 2 deg.
