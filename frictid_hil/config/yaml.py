@@ -217,6 +217,8 @@ def _syntax_error(error: yaml.YAMLError, text: str, path: Path) -> ConfigError:
         line = source[mark.line] if mark.line < len(source) else ""
         if line[: mark.column + 1].strip(" ").startswith("\t") or line[mark.column : mark.column + 1] == "\t":
             return ConfigError("a tab where YAML wants spaces", where=str(where), next_step="indent with spaces")
+        if "nesting depth" in str(error.problem):  # libyaml 0.2.6 and later has a bound of its own, and meets it first
+            return ConfigError(f"nested deeper than {MAX_DEPTH} levels", where=str(where))
         context = f" ({error.context})" if error.context else ""
         return ConfigError(f"not valid YAML: {error.problem}{context}", where=str(where))
     if isinstance(error, yaml.reader.ReaderError):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +23,12 @@ from frictid_hil.config.write import dump
 pytestmark = pytest.mark.slow
 
 QUESTION = "Is the cell clear?"
+
+
+def _at_a_terminal() -> None:
+    """In the child: the terminal is its own, and Ctrl-C is heard even where the tests run in a shell's background."""
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Terminal:
@@ -36,7 +44,7 @@ class Terminal:
             cwd=cwd,
             env={**os.environ, "TERM": "dumb", "COLUMNS": "150"},
             start_new_session=True,
-            preexec_fn=lambda: __import__("fcntl").ioctl(0, __import__("termios").TIOCSCTTY, 0),
+            preexec_fn=_at_a_terminal,
         )
         os.close(theirs)
         self.said = ""
