@@ -220,6 +220,7 @@ class Bounds:
         velocity_rad_s: largest measured speed.
         power_w: largest mechanical power.
         growth_s: speed that grows for longer than this is a runaway; see ``runner.runaway``.
+        withstands_nm: commanded torque that changes by more than this moves the joint.
     """
 
     position_min_rad: float
@@ -227,6 +228,7 @@ class Bounds:
     velocity_rad_s: float
     power_w: float
     growth_s: float = math.inf
+    withstands_nm: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -162,4 +162,5 @@ class LawRunner:
             velocity_rad_s=min(bounds.velocity_rad_s, self._joint.max_velocity_rad_s),
             torque_nm=torque_nm,
             power_w=bounds.power_w,
+            withstands_nm=bounds.withstands_nm,
         )

@@ -29,6 +29,8 @@ _BOTH_WAYS_RAD = math.radians(0.5)
 _AT_ONCE_RAD_S, _AT_ONCE_SHARE, _AT_ONCE_REPORTS = math.radians(15.0), 0.1, 3
 """No joint under torque control stands from such a speed from one report to the next, to the last digit for so many:
 its encoder does, or it has hit something."""
+_YIELDS_S = 0.02
+"""A torque that a joint cannot stand moves it within this time, reports included."""
 _SAME_RAD = math.radians(1.0)
 """A set-point that went so far changes the torque of a joint that stands, unless its reports are old ones."""
 
@@ -91,6 +93,7 @@ class SensorWatch:
         self._seen_rad = [0.0, 0.0]
         self._stands: tuple[float, float] | None = None
         self._stood, self._from_rad_s = 0, 0.0
+        self._at_rad, self._commanded_nm, self._beyond_ns = math.nan, (0.0, 0.0), 0
 
     def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
         """Say in a sentence what is wrong; an empty string while all is well.
@@ -125,6 +128,32 @@ class SensorWatch:
         if math.isnan(asked_rad):
             return self._at_once(last, report) if step_s < 2.0 * self._period_s else ""
         return self._old(report, asked_rad) or self._frozen(report.torque_nm, velocity, jump_rad)
+
+    def withstood(self, report: Feedback, commanded_nm: float, withstands_nm: float) -> str:
+        """Say that a joint under torque control stands, to the last digit, although its torque changed far too much.
+
+        An encoder may freeze while the joint stands, and no figure of its own tells: its friction does.
+
+        Args:
+            report: new.
+            commanded_nm: torque of this cycle; what does not change of it, gravity for one, does not matter.
+            withstands_nm: the largest change that the joint can stand.
+        """
+        lowest_nm, highest_nm = self._commanded_nm
+        if report.position_rad != self._at_rad:
+            self._at_rad, self._commanded_nm = report.position_rad, (commanded_nm, commanded_nm)
+            self._beyond_ns = 0
+            return ""
+        self._commanded_nm = lowest_nm, highest_nm = min(lowest_nm, commanded_nm), max(highest_nm, commanded_nm)
+        if highest_nm - lowest_nm <= withstands_nm:
+            return ""
+        self._beyond_ns = self._beyond_ns or report.t_ns
+        if report.t_ns - self._beyond_ns < _YIELDS_S * 1e9:
+            return ""
+        return (
+            f"stands at {format_angle(report.position_rad)} to the last digit, whether it is given "
+            f"{format_torque(lowest_nm)} or {format_torque(highest_nm)}"
+        )
 
     def _disagreement(self) -> str:
         """Say how position and velocity contradict each other within the window; an empty string where they agree."""

@@ -23,7 +23,7 @@ from frictid_hil.runner.sensor_watch import SensorWatch
 from frictid_hil.runner.workspace_watch import WorkspaceWatch
 from frictid_hil.units import degrees, format_angle, format_torque, format_velocity
 
-_POSITION = (Mode.POSITION,)
+_POSITION, _TORQUE = (Mode.POSITION,), (Mode.TORQUE,)
 _WITHOUT_POWER = (JointState.DISABLED, JointState.FAULT)
 
 
@@ -43,6 +43,7 @@ class JointLimits:
         power_w: largest mechanical power, torque times speed.
         torque_s: how long the torque may stay above its limit.
         silence_s: how old a report may be; never less than three cycles.
+        withstands_nm: under torque control, a joint whose commanded torque changes by more than this does not stand.
     """
 
     position_min_rad: float
@@ -56,6 +57,7 @@ class JointLimits:
     power_w: float = math.inf
     torque_s: float = 0.02
     silence_s: float = 0.02
+    withstands_nm: float = math.inf
 
 
 class Supervisor:
@@ -237,6 +239,8 @@ class Supervisor:
         if not report.age_cycles:
             asked_rad = _in_force(set_point, report) if in_position else math.nan
             wrong = self._sensors[index].verdict(report, limits.velocity_rad_s, asked_rad=asked_rad)
+            if not wrong and self._modes == _TORQUE:
+                wrong = self._sensors[index].withstood(report, set_point.torque_nm, limits.withstands_nm)
             if wrong:
                 raise self._abort(
                     index,

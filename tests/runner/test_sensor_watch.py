@@ -168,3 +168,21 @@ def test_a_joint_under_torque_that_stands_at_once_is_told(speeds_deg_s, told, he
         said.append(watch.verdict(report, 5.0, asked_rad=position_rad if held else math.nan))
     # A position loop has a following error to tell it by.
     assert any("stood within one report" in one for one in said) is (told and not held)
+
+
+def standing(torques_nm, position_rad=lambda n: 0.1):
+    """A joint under torque control, asked for by its watch every 5 ms; it withstands 1.5 N m from end to end."""
+    watch = SensorWatch(0.005)
+    for n, torque_nm in enumerate(torques_nm):
+        report = Feedback(t_ns=(n + 1) * 5 * MS, position_rad=position_rad(n), velocity_rad_s=0.0, torque_nm=torque_nm)
+        if wrong := watch.withstood(report, torque_nm, 1.5):
+            return wrong
+    return ""
+
+
+def test_a_joint_that_stands_whatever_torque_it_is_given_has_an_encoder_that_stands():
+    """A servo's position froze at a turning point; its joint went 650 deg, and snapped back at 1577 deg/s."""
+    rising = [3.0 + 0.01 * n for n in range(200)]  # gravity takes the 3 N m
+    assert "stands at 5.7" in standing(rising)
+    assert standing(rising[:151]) == ""
+    assert standing(rising, lambda n: 0.1 + 0.001 * (n > 100)) == "", "it gave way by one encoder step"

@@ -28,6 +28,8 @@ _STAND_SLACK_RAD = math.radians(1.0)
 _STAND_RAD_S = math.radians(5.0)
 _TOLD_SHARE = 0.999
 """The plan says that R falls where it falls below this share of its full value."""
+_WITHSTANDS_SHARE = 3.0
+"""A joint stands from -F_0 to F_0; static friction may be half as large again. Of F_0, from end to end."""
 _POWER_SHARE = 0.8
 """Of the product of the bounds of torque and speed."""
 _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
@@ -147,15 +149,22 @@ def _motions(
         Hold(centre_rad, _PAUSE_S),
     ]
     for mode, law in laws.items():
-        motions += _task(joint, wanted, centre_rad, mode, law, hunts)
+        withstands_nm = _WITHSTANDS_SHARE * entry.curve().coulomb_nm
+        motions += _task(joint, wanted, centre_rad, mode, law, withstands_nm, hunts)
         motions.append(Hold(centre_rad, _PAUSE_S))
     return [*motions, Move.within(centre_rad, home_rad, APPROACH_RAD_S, name="return"), Hold(home_rad, 0.2)]
 
 
 def _task(
-    joint: JointSetup, wanted: Wanted, centre_rad: float, mode: str, law: ControlLaw, hunts: bool
+    joint: JointSetup,
+    wanted: Wanted,
+    centre_rad: float,
+    mode: str,
+    law: ControlLaw,
+    withstands_nm: float,
+    hunts: bool,
 ) -> list[Motion]:
-    bounds = _bounds(joint, wanted, centre_rad, law)
+    bounds = replace(_bounds(joint, wanted, centre_rad, law), withstands_nm=withstands_nm)
     drive_mode = wanted.drive_mode
     if wanted.task == "track":
         path = triangle(centre_rad, wanted.amplitude_rad, wanted.peak_rad_s, wanted.cycles)
