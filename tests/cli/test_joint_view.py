@@ -24,7 +24,10 @@ PERIOD_S = 0.001
 
 
 def terminal() -> Console:
-    return Console(file=io.StringIO(), force_terminal=True, width=160, legacy_windows=False, color_system=None)
+    environ = {"TERM": "xterm"}  # also where the tests themselves run on a dumb one
+    return Console(
+        file=io.StringIO(), force_terminal=True, width=160, legacy_windows=False, color_system=None, _environ=environ
+    )
 
 
 def shown(console: Console) -> str:

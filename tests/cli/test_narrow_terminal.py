@@ -80,7 +80,7 @@ def test_tables_fold_and_cut_nothing(words: str, whole: tuple[str, ...], narrow:
 def test_the_time_left_is_whole_beside_a_long_name() -> None:
     setup = load_robot("hp3j").to_setup()
     drawn = io.StringIO()
-    console = Console(file=drawn, force_terminal=True, width=NARROW, color_system=None)
+    console = Console(file=drawn, force_terminal=True, width=NARROW, color_system=None, _environ={"TERM": "xterm"})
     view = JointView(console, setup, 0.001, {"5": 600.0}, {"5": ["5"]})
     view.phase("5", "measure skew", 0.0)
     rows = np.zeros(3, SAMPLE_ROW)
