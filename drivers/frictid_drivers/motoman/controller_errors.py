@@ -26,148 +26,52 @@ class ControllerError(HardwareError):
     remedy: ClassVar[str] = "look the number up in the controller's manual"
 
 
-class UnknownCommand(ControllerError):
-    """1010."""
-
-    number, meaning, remedy = 1010, "the controller does not know this command", "check `options.controller`"
+_KNOWN: dict[int, type[ControllerError]] = {}
 
 
-class WrongOperandCount(ControllerError):
-    """1011."""
-
-    number, meaning, remedy = 1011, "wrong number of operands", "check `options.controller`"
-
-
-class OperandOutOfRange(ControllerError):
-    """1012."""
-
-    number, meaning, remedy = 1012, "an operand is out of range", "check the limits in the robot file"
+def _known(name: str, number: int, meaning: str, remedy: str) -> type[ControllerError]:
+    named = {"number": number, "meaning": meaning, "remedy": remedy, "__module__": __name__}
+    _KNOWN[number] = type(name, (ControllerError,), named)
+    return _KNOWN[number]
 
 
-class WrongOperandLength(ControllerError):
-    """1013."""
-
-    number, meaning, remedy = 1013, "an operand has the wrong length", "check `options.controller`"
-
-
-class ManipulatorOperating(ControllerError):
-    """2010."""
-
-    number, meaning, remedy = 2010, "the manipulator is operating", "wait until the running job has ended"
-
-
-class PendantHold(ControllerError):
-    """2020."""
-
-    number, meaning, remedy = 2020, "hold by the programming pendant", "release HOLD on the pendant"
-
-
-class PanelHold(ControllerError):
-    """2030."""
-
-    number, meaning, remedy = 2030, "hold by the playback panel", "release HOLD on the panel"
-
-
-class ExternalHold(ControllerError):
-    """2040."""
-
-    number, meaning, remedy = 2040, "external hold", "clear the external hold input"
-
-
-class CommandHold(ControllerError):
-    """2050."""
-
-    number, meaning, remedy = 2050, "hold by command", "find out what stopped the arm, then release with HOLD 0"
-
-
-class AlarmOrError(ControllerError):
-    """2060."""
-
-    number, meaning, remedy = 2060, "an alarm or error is pending", "clear its cause, then reset on the pendant"
-
-
-class ServoOff(ControllerError):
-    """2070."""
-
-    number, meaning, remedy = 2070, "servo power is off", "turn servo power on"
-
-
-class WrongMode(ControllerError):
-    """2080."""
-
-    number, meaning, remedy = 2080, "wrong mode", "turn the key to play"
-
-
-class NotCommandRemote(ControllerError):
-    """2100."""
-
-    number, meaning, remedy = 2100, "command remote is not set", "enable remote mode and command remote on the pendant"
-
-
-class ServoOnNeeded(ControllerError):
-    """3010."""
-
-    number, meaning, remedy = 3010, "servo power must be on for this", "turn servo power on"
-
-
-class HomeNeeded(ControllerError):
-    """3040."""
-
-    number, meaning, remedy = 3040, "home position return or check is needed", "check the home position on the pendant"
-
-
-class CurrentValueNotMade(ControllerError):
-    """3070."""
-
-    number, meaning, remedy = 3070, "the current position value is not made", "turn servo power on once"
-
-
-class ServoCannotTurnOn(ControllerError):
-    """3450."""
-
-    number, meaning, remedy = (
-        3450,
-        "servo power cannot be turned on",
-        "close the safety circuit and release the e-stops",
-    )
-
-
-class NoSuchJob(ControllerError):
-    """4040."""
-
-    number, meaning, remedy = 4040, "no such job", "check the job's name"
-
-
-class FormatMistake(ControllerError):
-    """5170."""
-
-    number, meaning, remedy = 5170, "the message has a wrong format", "check that both sides speak the same version"
-
-
-_KNOWN: dict[int, type[ControllerError]] = {
-    kind.number: kind
-    for kind in (
-        UnknownCommand,
-        WrongOperandCount,
-        OperandOutOfRange,
-        WrongOperandLength,
-        ManipulatorOperating,
-        PendantHold,
-        PanelHold,
-        ExternalHold,
-        CommandHold,
-        AlarmOrError,
-        ServoOff,
-        WrongMode,
-        NotCommandRemote,
-        ServoOnNeeded,
-        HomeNeeded,
-        CurrentValueNotMade,
-        ServoCannotTurnOn,
-        NoSuchJob,
-        FormatMistake,
-    )
-}
+UnknownCommand = _known(
+    "UnknownCommand", 1010, "the controller does not know this command", "check `options.controller`"
+)
+WrongOperandCount = _known("WrongOperandCount", 1011, "wrong number of operands", "check `options.controller`")
+OperandOutOfRange = _known(
+    "OperandOutOfRange", 1012, "an operand is out of range", "check the limits in the robot file"
+)
+WrongOperandLength = _known("WrongOperandLength", 1013, "an operand has the wrong length", "check `options.controller`")
+ManipulatorOperating = _known(
+    "ManipulatorOperating", 2010, "the manipulator is operating", "wait until the running job has ended"
+)
+PendantHold = _known("PendantHold", 2020, "hold by the programming pendant", "release HOLD on the pendant")
+PanelHold = _known("PanelHold", 2030, "hold by the playback panel", "release HOLD on the panel")
+ExternalHold = _known("ExternalHold", 2040, "external hold", "clear the external hold input")
+CommandHold = _known("CommandHold", 2050, "hold by command", "find out what stopped the arm, then release with HOLD 0")
+AlarmOrError = _known(
+    "AlarmOrError", 2060, "an alarm or error is pending", "clear its cause, then reset on the pendant"
+)
+ServoOff = _known("ServoOff", 2070, "servo power is off", "turn servo power on")
+WrongMode = _known("WrongMode", 2080, "wrong mode", "turn the key to play")
+NotCommandRemote = _known(
+    "NotCommandRemote", 2100, "command remote is not set", "enable remote mode and command remote on the pendant"
+)
+ServoOnNeeded = _known("ServoOnNeeded", 3010, "servo power must be on for this", "turn servo power on")
+HomeNeeded = _known(
+    "HomeNeeded", 3040, "home position return or check is needed", "check the home position on the pendant"
+)
+CurrentValueNotMade = _known(
+    "CurrentValueNotMade", 3070, "the current position value is not made", "turn servo power on once"
+)
+ServoCannotTurnOn = _known(
+    "ServoCannotTurnOn", 3450, "servo power cannot be turned on", "close the safety circuit and release the e-stops"
+)
+NoSuchJob = _known("NoSuchJob", 4040, "no such job", "check the job's name")
+FormatMistake = _known(
+    "FormatMistake", 5170, "the message has a wrong format", "check that both sides speak the same version"
+)
 
 
 def controller_error(number: int, *, where: str) -> ControllerError:
