@@ -9,8 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frictid_drivers.motoman.bsc import BlockReceived, BscLink, BscTiming, Event, Failed, Received, Sent
-from frictid_drivers.motoman.bsc_block import Message, decode_block, encode_blocks
+from frictid_drivers.motoman.bsc import BscLink
+from frictid_drivers.motoman.bsc_block import (
+    BlockReceived,
+    BscTiming,
+    Event,
+    Failed,
+    Message,
+    Received,
+    Sent,
+    decode_block,
+    encode_blocks,
+)
 from frictid_drivers.motoman.emulator.station import Parameters, Station, _pieces, _read
 
 GOLDEN = {

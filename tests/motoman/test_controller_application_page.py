@@ -18,7 +18,7 @@ from serial_bench import make_bench
 
 from frictid_drivers.motoman import stream_frames as frames
 from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder
+from frictid_drivers.motoman.batch_messages import JobOrder, friction_table
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.emulator.build import _DEFAULTS as EMULATOR_OPTIONS
 from frictid_drivers.motoman.emulator.faults import OCCASIONS
@@ -27,7 +27,6 @@ from frictid_drivers.motoman.emulator.streaming import StreamApplication
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
 from frictid_drivers.motoman.joint_units import axis_units
 from frictid_drivers.motoman.settings import SerialOptions
-from frictid_drivers.motoman.table import friction_table
 from frictid_hil.friction.curve import FrictionCurve
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
@@ -64,7 +63,7 @@ class Wire:
             PROFILES["nx"],
             sink=lambda data, ours: self.portions.append((data, ours)),
         )
-        self.client = BatchClient(self.host, lambda: self.bench.emulator.now_s)
+        self.client = BatchClient(self.host)
 
     def written(self, action: Callable[[], object]) -> str:
         self.host.listen(0.05)
@@ -87,7 +86,7 @@ def batch_examples() -> dict[str, str]:
 
     made = {"FHELLO": asked("FHELLO 1"), "FREAD-known": wire.written(client._reads_while_running)}
     made |= {"FJOB": wire.written(lambda: client.send(ORDER))}
-    host.servo(True)
+    host.order("SVON 1")
     made["FRUN"] = wire.written(lambda: client.start(7))
     emulator.advance(emulator.now_s + 2.0)
     made["FRUN-refused"] = wire.written(refused)

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from serial_bench import START_RAD, make_bench
 
 from frictid_drivers.motoman import controller_errors
-from frictid_drivers.motoman.bsc import BscTiming
-from frictid_drivers.motoman.bsc_block import Message, encode_blocks
+from frictid_drivers.motoman.bsc_block import BscTiming, Message, encode_blocks
 from frictid_drivers.motoman.controller_errors import (
     AlarmOrError,
     BadReply,
@@ -160,19 +159,19 @@ def test_everyday_commands_against_the_emulated_controller() -> None:
     bench = make_bench()
     host = bench.host()
     assert not host.status().servo_on
-    host.servo(True)
+    host.order("SVON 1")
     assert host.status().servo_on
     assert host.pulses()[0] == bench.emulator.axes[0].pulses == round(START_RAD * 57295.77951308232)
-    host.hold(True)
+    host.order("HOLD 1")
     assert host.status().holds == ["command hold"]
-    host.hold(False)
+    host.order("HOLD 0")
     bench.emulator.panel.raise_alarm(4107)
-    assert host.alarms().startswith("4107")
+    assert host.ask("RALARM").startswith("4107")
     assert host.status().faulty
     with pytest.raises(AlarmOrError):
-        host.servo(True)
-    host.reset()
-    host.servo(True)
+        host.order("SVON 1")
+    host.order("RESET")
+    host.order("SVON 1")
     with pytest.raises(UnknownCommand):
         host.order("JWAIT -1")
 
@@ -182,10 +181,10 @@ def test_conditions_of_the_pendant_refuse_by_name() -> None:
     host = bench.host()
     bench.emulator.panel.servo_blocked = True
     with pytest.raises(ServoCannotTurnOn, match="cannot be turned on"):
-        host.servo(True)
+        host.order("SVON 1")
     bench.emulator.panel.remote = False
     with pytest.raises(NotCommandRemote):
-        host.servo(True)
+        host.order("SVON 1")
     bench.emulator.panel.position_known = False
     with pytest.raises(CurrentValueNotMade):
         host.pulses()

@@ -14,7 +14,7 @@ from serial_bench import START_RAD, make_bench
 
 from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder
+from frictid_drivers.motoman.batch_messages import JobOrder, friction_table
 from frictid_drivers.motoman.batch_record import BlockCollector, JobRecord
 from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold, WrongMode
 from frictid_drivers.motoman.emulator import jobs
@@ -24,7 +24,6 @@ from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.segments import motion_segments
 from frictid_drivers.motoman.stream_frames import crc16
-from frictid_drivers.motoman.table import friction_table
 from frictid_hil.errors import HardwareError, Interrupted, PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
@@ -115,7 +114,7 @@ def test_the_job_is_one_message_closed_by_its_crc() -> None:
 )
 def test_the_controller_checks_the_job_as_well(changes: dict[str, object], error: type[Exception] | None) -> None:
     bench = make_bench()
-    client = BatchClient(bench.host(), lambda: bench.emulator.now_s)
+    client = BatchClient(bench.host())
     if error is None:
         client.send(order(**changes))
     else:
@@ -220,11 +219,11 @@ def test_figures_beyond_24_bits_are_shifted_and_come_back(speed: int, torque: in
     bench.emulator.batch._job = job
     host = bench.host()
     record = JobRecord(host, 1, while_running=while_running)
-    record.complete(BatchClient(host, lambda: bench.emulator.now_s).state(1), lambda share: None)
-    kept = record.samples()
-    assert list(kept.pulses) == [-5, 2**31 - 1]
-    assert kept.speed_tenths[1] == pytest.approx(-speed, abs=2**velocity_shift)
-    assert kept.torque_micro[0] == pytest.approx(torque, abs=2**torque_shift)
+    record.complete(BatchClient(host).state(1), lambda share: None)
+    kept = record.samples(0, record.count)
+    assert list(kept[:, 0]) == [-5, 2**31 - 1]
+    assert kept[1, 1] == pytest.approx(-speed, abs=2**velocity_shift)
+    assert kept[0, 2] == pytest.approx(torque, abs=2**torque_shift)
 
 
 # -- the record, while the job runs ----------------------------------------------------------------------------------

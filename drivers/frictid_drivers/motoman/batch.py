@@ -34,16 +34,10 @@ _STOP_REASONS: Final = {
 
 
 class BatchClient:
-    """Talks to the batch application.
+    """Talks to the batch application, beside the stock commands of ``host``."""
 
-    Args:
-        host: link and stock commands.
-        now_s: clock of the port.
-    """
-
-    def __init__(self, host: HostControl, now_s: Callable[[], float]) -> None:
-        self._host = host
-        self.now_s = now_s
+    def __init__(self, host: HostControl) -> None:
+        self.host = host
 
     def hello(self) -> BatchHello:
         """FHELLO, and whether FREAD 2 is known.
@@ -51,7 +45,7 @@ class BatchClient:
         Raises:
             ControllerError: 1010 where there is no such application.
         """
-        reply = self._host.ask("FHELLO 1")
+        reply = self.host.ask("FHELLO 1")
         try:
             version, tick_us, axes, most_ticks, source, averaging, points, name = reply.split(",", 7)
             if int(version) != 1:
@@ -67,26 +61,26 @@ class BatchClient:
                 reads_while_running=self._reads_while_running(),
             )
         except ValueError:
-            raise self._host.bad_reply(f"{reply!r} instead of a greeting", "FHELLO") from None
+            raise self.host.bad_reply(f"{reply!r} instead of a greeting", "FHELLO") from None
 
     def _reads_while_running(self) -> bool:
         """Asked for a job that cannot be: who knows the command finds the job missing, anybody else the command."""
         try:
-            reply = self._host.ask("FREAD 2,0,0,1")
+            reply = self.host.ask("FREAD 2,0,0,1")
         except NoSuchJob:
             return True
         except ControllerError:
             return False
-        raise self._host.bad_reply(f"{reply!r} instead of a refusal", "FREAD 2,0,0,1")
+        raise self.host.bad_reply(f"{reply!r} instead of a refusal", "FREAD 2,0,0,1")
 
     def send(self, order: JobOrder) -> None:
         """FJOB. ``ControllerError`` where the controller refuses it."""
-        self._host.order(order.text())
+        self.host.order(order.text())
 
     def start(self, number: int) -> None:
         """FRUN; the arm moves."""
         try:
-            self._host.order(f"FRUN 1,{number}")
+            self.host.order(f"FRUN 1,{number}")
         except ManipulatorOperating:
             # Asked twice because an acknowledgement was lost: the first one was heard.
             if self.state(number).state != 2:
@@ -94,18 +88,18 @@ class BatchClient:
 
     def state(self, number: int, *, within_s: float | None = None) -> JobState:
         """FSTAT."""
-        reply = self._host.ask(f"FSTAT 1,{number}", within_s=within_s)
+        reply = self.host.ask(f"FSTAT 1,{number}", within_s=within_s)
         try:
             state = JobState(*map(int, reply.split(",")))
         except (ValueError, TypeError):
-            raise self._host.bad_reply(f"{reply!r} instead of a job's state", "FSTAT") from None
+            raise self.host.bad_reply(f"{reply!r} instead of a job's state", "FSTAT") from None
         if state.number != number:
             raise BadReply(f"state of job {state.number} instead of {number}", where="FSTAT")
         return state
 
     def stop(self, number: int, *, within_s: float | None = None) -> None:
         """FSTOP: decelerate."""
-        self._host.order(f"FSTOP 1,{number}", within_s=within_s)
+        self.host.order(f"FSTOP 1,{number}", within_s=within_s)
 
     def watch(
         self,
@@ -135,19 +129,17 @@ class BatchClient:
                 says that it did something; the line is free then.
             watchdog_s: the job stops when it hears nothing for so long.
 
-        Returns:
-            The state of the finished job.
-
         Raises:
             Interrupted: ``stop`` asked for it.
             SafetyAbort: the controller stopped it.
             HardwareError: it does not come to an end, or the line is dead.
         """
+        now_s = self.host.port.now_s
         within_s, patience_s = watchdog_s / 3, duration_s * 1.2 + 10.0
-        until_s = self.now_s() + patience_s
-        answered_s, stopping, told = self.now_s(), False, False
+        until_s = now_s() + patience_s
+        answered_s, stopping, told = now_s(), False, False
         wrong: SafetyAbort | None = None
-        with self._host.impatient(watchdog_s / 6):
+        with self.host.impatient(watchdog_s / 6):
             while True:
                 stopping = stopping or stop()
                 try:
@@ -157,12 +149,12 @@ class BatchClient:
                     state = self.state(number, within_s=within_s)
                     if not stopping and state.state not in (_FINISHED, _STOPPED):
                         look(within_s)
-                    answered_s = self.now_s()
+                    answered_s = now_s()
                 except SafetyAbort as seen:
                     wrong, stopping = seen, True
                     continue
                 except (LinkError, BadReply):
-                    if self.now_s() > answered_s + self._host.patience_s:
+                    if now_s() > answered_s + self.host.patience_s:
                         raise
                     continue
                 progress(state.done_ticks / max(1, state.total_ticks))
@@ -170,13 +162,13 @@ class BatchClient:
                     return state
                 if state.state == _STOPPED:
                     raise wrong or _why_stopped(state, number, asked=stopping)
-                if self.now_s() > until_s:
+                if now_s() > until_s:
                     self.stop(number)
                     raise _not_over(number, patience_s, duration_s)
-                pause_until_s = self.now_s() + min(_POLL_S, watchdog_s / 10)
-                while self.now_s() < pause_until_s and (stopping or not stop()):
+                pause_until_s = now_s() + min(_POLL_S, watchdog_s / 10)
+                while now_s() < pause_until_s and (stopping or not stop()):
                     if not follow(state, within_s):
-                        self._host.listen(min(0.05, pause_until_s - self.now_s()))
+                        self.host.listen(min(0.05, pause_until_s - now_s()))
 
     def download(self, table: FrictionTable) -> None:
         """FTABLE, read back and compared.
@@ -185,13 +177,13 @@ class BatchClient:
             BadReply: what comes back is not what was sent.
         """
         coded = table.encoded()
-        self._host.order(f"FTABLE 1,{coded}")
-        if self._host.ask(f"FTREAD 1,{table.axis}") != coded:
+        self.host.order(f"FTABLE 1,{coded}")
+        if self.host.ask(f"FTREAD 1,{table.axis}") != coded:
             raise BadReply("the friction table reads back differently", where=f"axis {table.axis}")
 
     def compensate(self, axis_mask: int) -> None:
         """FCOMP: apply the tables of these axes from now on; 0 ends it."""
-        self._host.order(f"FCOMP 1,{axis_mask}")
+        self.host.order(f"FCOMP 1,{axis_mask}")
 
 
 def _not_over(number: int, patience_s: float, planned_s: float) -> HardwareError:

@@ -6,12 +6,17 @@ The data of a BSC block may hold no control codes, so binary travels as base64 t
 from __future__ import annotations
 
 import base64
+import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Final
 
+import numpy as np
+
+from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_drivers.motoman.stream_frames import crc16
+from frictid_hil.friction.curve import FrictionCurve
 
 TABLE_POINTS: Final = 21
 
@@ -43,14 +48,11 @@ class BatchHello:
 
 @dataclass(frozen=True, slots=True)
 class JobOrder:
-    """One job of one axis; positions in pulses.
+    """One job of one axis; positions and bounds in pulses.
 
     Attributes:
         number: 1..65535, to tell it from the job before.
-        axis: index on the controller.
         start: where it begins; the axis must stand there.
-        lowest: bound of the travel.
-        highest: bound of the travel.
         step: most pulses per tick.
         torque_micro: torque limit at the motor shaft, uN m.
         watchdog_ticks: ticks without a word from the host after which it stops.
@@ -69,9 +71,8 @@ class JobOrder:
 
     def text(self) -> str:
         """The FJOB command, with its CRC over everything up to and including the last comma."""
-        figures = (self.number, self.axis, self.start, self.lowest, self.highest, self.step)
-        body = ",".join([*map(str, (*figures, self.torque_micro, self.watchdog_ticks)), *self.segments])
-        covered = f"FJOB 1,{body},"
+        *figures, segments = astuple(self)
+        covered = f"FJOB 1,{','.join(map(str, [*figures, *segments]))},"
         return f"{covered}{crc16(covered.encode('ascii')):04X}"
 
 
@@ -95,7 +96,6 @@ class FrictionTable:
     """One axis's compensation: the curve at equal steps of speed from standstill, and how to apply it.
 
     Attributes:
-        axis: index on the controller.
         ratio: R of (24c).
         step_tenths: 0.1 pulse/s between two points.
         stiffness_nano: K of (24a) at the motor shaft, nN m per pulse.
@@ -123,3 +123,29 @@ class FrictionTable:
         )
         raw += struct.pack(f"<{len(self.points_micro)}i", *self.points_micro)
         return base64.b64encode(raw + crc16(raw).to_bytes(2, "little")).decode("ascii")
+
+
+def friction_table(
+    units: AxisUnits,
+    curve: FrictionCurve,
+    ratio: float,
+    stiffness_nm_per_rad: float,
+    gravity_cos_nm: float,
+    gravity_sin_nm: float,
+) -> FrictionTable:
+    """21 points from standstill to the fastest identified speed, in the controller's units; see ``download_table``."""
+    pulses_per_rad = abs(units.pulses_per_rad)
+    fastest_rad_s = curve.measured_range_rad_s[1]
+    step_tenths = max(1, round(fastest_rad_s / (TABLE_POINTS - 1) * pulses_per_rad * 10.0))
+    speeds_rad_s = np.arange(TABLE_POINTS) * step_tenths * 0.1 / pulses_per_rad
+    return FrictionTable(
+        axis=units.axis,
+        ratio=ratio,
+        step_tenths=step_tenths,
+        stiffness_nano=max(1, round(stiffness_nm_per_rad / units.gear_ratio / pulses_per_rad * 1e9)),
+        turn_pulses=round(2 * math.pi * pulses_per_rad),
+        # Where positive pulses turn the joint backwards, torque and angle change sign: cosine flips, sine stays.
+        gravity_cos_micro=units.motor_micro(gravity_cos_nm) * units.direction,
+        gravity_sin_micro=units.motor_micro(gravity_sin_nm),
+        points_micro=[units.motor_micro(float(torque)) for torque in curve.magnitude(speeds_rad_s)],
+    )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -32,22 +31,7 @@ _HEAD: Final = struct.Struct("<HIB")
 _SHIFTS: Final = struct.Struct("<BB")
 
 Rows = dict[int, tuple[int, int, int]]
-"""Samples by number: pulses, 0.1 pulse/s, uN m."""
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """Samples of a job; arrays of shape (n,), one row per tick.
-
-    Attributes:
-        pulses: encoder position.
-        speed_tenths: 0.1 pulse/s.
-        torque_micro: uN m at the motor shaft.
-    """
-
-    pulses: NDArray[np.int64]
-    speed_tenths: NDArray[np.int64]
-    torque_micro: NDArray[np.int64]
+"""Samples by number: encoder position in pulses, 0.1 pulse/s, uN m at the motor shaft."""
 
 
 class JobRecord:
@@ -82,16 +66,9 @@ class JobRecord:
         self.dropped_pulses = 0
 
     def follow(self, state: JobState, within_s: float) -> bool:
-        """While the job runs: fetch some of what waits, where it fills a block of the link.
+        """While the job runs: fetch some of what waits, where it fills a block of the link; whether any came.
 
         Nothing that goes wrong here may end the job: what is missing is fetched afterwards.
-
-        Args:
-            state: of the job; it may have recorded more since.
-            within_s: give up after this time.
-
-        Returns:
-            Whether any came.
 
         Raises:
             HardwareError: the port is gone.
@@ -110,10 +87,6 @@ class JobRecord:
     def complete(self, state: JobState, progress: Callable[[float], None]) -> None:
         """Fetch what is missing of a job that is over; goes on after a broken transfer.
 
-        Args:
-            state: of the job.
-            progress: told the share that is here.
-
         Raises:
             LinkError: a part cannot be transferred in several attempts.
             BadReply: what arrives instead is not this job's record.
@@ -122,9 +95,8 @@ class JobRecord:
         failures = 0
         while self.count < state.done_ticks:
             before = len(self._rows)
-            failure: HardwareError = BadReply(
-                "no intact block in the reply", where=f"FREAD from sample {self.count} on"
-            )
+            where = f"FREAD from sample {self.count} on"
+            failure: HardwareError = BadReply("no intact block in the reply", where=where)
             try:
                 self._read(_SAMPLES_PER_REQUEST, state)
             except (LinkError, BadReply) as error:
@@ -134,11 +106,9 @@ class JobRecord:
                 raise failure
             progress(self.count / state.done_ticks)
 
-    def samples(self, first: int = 0, last: int | None = None) -> Record:
-        """Those from ``first`` up to ``last``, or up to the first that is missing."""
-        numbers = range(first, self.count if last is None else last)
-        table = np.array([self._rows[k] for k in numbers], dtype=np.int64).reshape(len(numbers), 3)
-        return Record(table[:, 0], table[:, 1], table[:, 2])
+    def samples(self, first: int, last: int) -> NDArray[np.int64]:
+        """Rows [first, last), shape (n, 3); see ``Rows``."""
+        return np.array([self._rows[k] for k in range(first, last)], dtype=np.int64).reshape(last - first, 3)
 
     def _read(self, count: int, state: JobState, within_s: float | None = None) -> None:
         """FREAD from the first sample that is missing; whole blocks are kept also where the rest never comes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,7 @@ from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_messages import JobOrder
 from frictid_drivers.motoman.batch_record import JobRecord
 from frictid_drivers.motoman.controller_errors import BadReply, ControllerError, LinkError
-from frictid_drivers.motoman.host_control import HostControl
-from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.joint_units import AxisUnits, Limits
 from frictid_drivers.motoman.segments import JobMotion, motion_segments
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.plan.plan import JointPlan
@@ -27,94 +26,60 @@ _COMES_BACK_S = 10.0
 """How long after the job's watchdog a lost port may be there again; the record is fetched then."""
 
 
-@dataclass(frozen=True, slots=True)
-class JobBounds:
-    """What the job may do.
-
-    Attributes:
-        position_min_rad: of the travel.
-        position_max_rad: of the travel.
-        torque_nm: joint side.
-        watchdog_s: it stops when it hears nothing for so long.
-    """
-
-    position_min_rad: float
-    position_max_rad: float
-    torque_nm: float
-    watchdog_s: float
-
-
+@dataclass
 class BatchRun:
     """Runs one job.
 
-    Args:
+    Attributes:
         batch: the controller application.
-        host: stock commands on the same line.
         joint: who moves.
         units: of its axis.
-        bounds: see there.
+        limits: of its travel and torque.
+        watchdog_s: the job stops when the controller hears nothing for so long.
         tick_s: interpolation clock.
         number: of the job.
         now_ns: run time.
         while_running: the controller application hands samples over while the job runs.
-
-    Attributes:
-        number: of the job.
+        stop: see ``MotomanDriver.run_batch``; so are ``progress`` and ``arrived``.
+        look: called once per question about the running job, with how long it may take.
         running: the controller may be moving the arm for this job.
         columns: what was fetched; filled in also where the job was stopped, or its transfer broke.
     """
 
-    def __init__(
-        self,
-        batch: BatchClient,
-        host: HostControl,
-        joint: JointSetup,
-        units: AxisUnits,
-        bounds: JobBounds,
-        tick_s: float,
-        number: int,
-        now_ns: Callable[[], int],
-        *,
-        while_running: bool,
-    ) -> None:
-        self._batch = batch
-        self._host = host
-        self._joint = joint
-        self._units = units
-        self._bounds = bounds
-        self._tick_s = tick_s
-        self._now_ns = now_ns
-        self._while_running = while_running
-        self._started_ns = 0
-        self.number = number
-        self.running = False
-        self.columns: dict[str, Any] = {}
+    batch: BatchClient
+    joint: JointSetup
+    units: AxisUnits
+    limits: Limits
+    watchdog_s: float
+    tick_s: float
+    number: int
+    now_ns: Callable[[], int]
+    while_running: bool
+    stop: Callable[[], bool]
+    progress: Callable[[str, float], None]
+    look: Callable[[float], None]
+    arrived: Callable[[Mapping[str, Any]], None]
+    running: bool = False
+    columns: dict[str, Any] = field(default_factory=dict)
+    _started_ns: int = 0
 
-    def run(
-        self,
-        plan: JointPlan,
-        power_on: Callable[[], None],
-        stop: Callable[[], bool],
-        progress: Callable[[str, float], None],
-        look: Callable[[float], None],
-        arrived: Callable[[Mapping[str, Any]], None],
-    ) -> None:
-        """The whole job; see ``MotomanDriver.run_batch``."""
-        motion = motion_segments(plan.motions, self._units, self._tick_s)
-        self._batch.send(self._order(motion))
+    def run(self, plan: JointPlan, power_on: Callable[[], None]) -> None:
+        """The whole job."""
+        motion = motion_segments(plan.motions, self.units, self.tick_s)
+        self.batch.send(self._order(motion))
         self._stand_at(motion.start)
         power_on()
         self.running = True
 
         def pass_on(first: int, last: int) -> None:
-            arrived(self._samples(motion, record, first, last))
+            self.arrived(self._samples(motion, record, first, last))
 
-        record = JobRecord(self._host, self.number, while_running=self._while_running, arrived=pass_on)
+        record = JobRecord(self.batch.host, self.number, while_running=self.while_running, arrived=pass_on)
         try:
-            self._run(record, len(motion.command) * self._tick_s, stop, progress, look)
+            self._run(record, len(motion.command) * self.tick_s)
         finally:
             if record.count:
-                tick_ns = round(self._tick_s * 1e9)
+                tick_ns = round(self.tick_s * 1e9)
                 starts_ns = self._started_ns + np.array(motion.motion_ticks, dtype=np.int64) * tick_ns
                 self.columns = {
                     **self._samples(motion, record, 0, record.count),
@@ -122,58 +87,53 @@ class BatchRun:
                     "dropped_pulses": record.dropped_pulses,
                 }
 
-    def _run(
-        self,
-        record: JobRecord,
-        duration_s: float,
-        stop: Callable[[], bool],
-        progress: Callable[[str, float], None],
-        look: Callable[[float], None],
-    ) -> None:
+    def _run(self, record: JobRecord, duration_s: float) -> None:
         """Start it, see it end, and have its record, also where it was stopped."""
         try:
-            self._batch.start(self.number)
-            self._started_ns = self._now_ns()
-            self._batch.watch(
-                *(self.number, duration_s, stop, lambda share: progress("motion", share), look, record.follow),
-                watchdog_s=self._bounds.watchdog_s,
+            self.batch.start(self.number)
+            self._started_ns = self.now_ns()
+            self.batch.watch(
+                *(self.number, duration_s, self.stop, lambda share: self.progress("motion", share)),
+                *(self.look, record.follow),
+                watchdog_s=self.watchdog_s,
             )
         except HardwareError:
             # The controller stops by its watchdog, and keeps what it recorded.
             with contextlib.suppress(FrictidError):
-                self._come_back(record, stop, progress)
+                self._come_back(record)
             raise
         except FrictidError:
             self.running = False
             with contextlib.suppress(FrictidError):
-                self._fetch(record, progress)
+                self._fetch(record)
             raise
         self.running = False
-        self._fetch(record, progress)
+        self._fetch(record)
 
-    def _come_back(self, record: JobRecord, stop: Callable[[], bool], progress: Callable[[str, float], None]) -> None:
+    def _come_back(self, record: JobRecord) -> None:
         """After a lost port: if it is there again soon, see that the joint stands, and fetch its record."""
-        self._reconnect(stop)
+        self._reconnect(self.stop)
         with contextlib.suppress(Interrupted, SafetyAbort):
-            self._batch.watch(self.number, 0.0, lambda: True, lambda share: None)
+            self.batch.watch(self.number, 0.0, lambda: True, lambda share: None)
         self.running = False
-        self._fetch(record, progress)
+        self._fetch(record)
 
     def _reconnect(self, stop: Callable[[], bool]) -> None:
-        until_s = self._batch.now_s() + self._bounds.watchdog_s + _COMES_BACK_S
+        host = self.batch.host
+        until_s = host.port.now_s() + self.watchdog_s + _COMES_BACK_S
         while True:
             try:
-                self._host.reconnect()
-                self._batch.state(self.number, within_s=_ANSWERS_WITHIN_S)
+                host.reconnect()
+                self.batch.state(self.number, within_s=_ANSWERS_WITHIN_S)
                 return
             except FrictidError:
-                if stop() or self._batch.now_s() > until_s:
+                if stop() or host.port.now_s() > until_s:
                     raise
 
     def _order(self, motion: JobMotion) -> JobOrder:
-        units, bounds, where = self._units, self._bounds, f"joint {self._joint.name}"
-        lowest, highest = sorted((units.pulses(bounds.position_min_rad), units.pulses(bounds.position_max_rad)))
-        step = int(abs(self._joint.max_velocity_rad_s * self._tick_s * units.pulses_per_rad)) + 1
+        units, where = self.units, f"joint {self.joint.name}"
+        lowest, highest = units.travel(self.limits)
+        step = int(abs(self.joint.max_velocity_rad_s * self.tick_s * units.pulses_per_rad)) + 1
         if int(motion.command.min()) < lowest or int(motion.command.max()) > highest:
             raise PlanRefused("the job leaves the joint's travel", where=where)
         if int(np.abs(np.diff(motion.command)).max(initial=0)) > step:
@@ -185,25 +145,25 @@ class BatchRun:
             lowest=lowest,
             highest=highest,
             step=step,
-            torque_micro=units.motor_micro(bounds.torque_nm),
-            watchdog_ticks=round(bounds.watchdog_s / self._tick_s),
+            torque_micro=units.motor_micro(self.limits.torque_nm),
+            watchdog_ticks=round(self.watchdog_s / self.tick_s),
             segments=motion.segments,
         )
 
     def _stand_at(self, start: int) -> None:
-        units = self._units
-        here = self._host.pulses()[units.axis]
+        units = self.units
+        here = self.batch.host.pulses()[units.axis]
         if abs(here - start) > abs(_AT_START_RAD * units.pulses_per_rad):
             raise HardwareError(
                 f"stands at {degrees(units.position_rad(here)):.2f} deg, "
                 f"the job starts at {degrees(units.position_rad(start)):.2f} deg",
-                where=f"joint {self._joint.name}",
+                where=f"joint {self.joint.name}",
                 next_step="bring it there first, or let the plan begin with a move from where it stands",
             )
 
-    def _fetch(self, record: JobRecord, progress: Callable[[str, float], None]) -> None:
+    def _fetch(self, record: JobRecord) -> None:
         def fetch() -> None:
-            record.complete(self._batch.state(self.number), lambda share: progress("transfer", share))
+            record.complete(self.batch.state(self.number), lambda share: self.progress("transfer", share))
 
         try:
             fetch()
@@ -215,14 +175,15 @@ class BatchRun:
 
     def _samples(self, motion: JobMotion, record: JobRecord, first: int, last: int) -> dict[str, Any]:
         """Columns of the samples [first, last), joint side."""
-        units, kept = self._units, record.samples(first, last)
+        units = self.units
+        pulses, speed_tenths, torque_micro = record.samples(first, last).T
         numbers = np.arange(first, last, dtype=np.int64)
         # A job that was stopped early goes on recording while it decelerates: its command ends before its samples.
         command = motion.command[np.minimum(numbers, len(motion.command) - 1)]
         return {
-            "time_ns": self._started_ns + numbers * round(self._tick_s * 1e9),
-            "position_rad": kept.pulses / units.pulses_per_rad,
-            "velocity_rad_s": kept.speed_tenths * 0.1 / units.pulses_per_rad,
-            "torque_nm": kept.torque_micro * (1e-6 * units.gear_ratio * units.direction),
+            "time_ns": self._started_ns + numbers * round(self.tick_s * 1e9),
+            "position_rad": pulses / units.pulses_per_rad,
+            "velocity_rad_s": speed_tenths * 0.1 / units.pulses_per_rad,
+            "torque_nm": torque_micro * (1e-6 * units.gear_ratio * units.direction),
             "position_command_rad": command / units.pulses_per_rad,
         }

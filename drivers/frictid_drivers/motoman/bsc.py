@@ -15,20 +15,9 @@ The line is idle, ours (``bsc_sender``) or the other side's (``bsc_receiver``).
 
 from __future__ import annotations
 
-from frictid_drivers.motoman.bsc_block import ENQ, EOT, Message, encode_blocks
-from frictid_drivers.motoman.bsc_events import (
-    ACK,
-    BlockReceived,
-    BscTiming,
-    Event,
-    Failed,
-    Received,
-    Sent,
-)
+from frictid_drivers.motoman.bsc_block import ENQ, EOT, BscTiming, Event, Message, encode_blocks
 from frictid_drivers.motoman.bsc_receiver import Receiver
 from frictid_drivers.motoman.bsc_sender import Outcome, Sender, Yielded
-
-__all__ = ["ACK", "BlockReceived", "BscLink", "BscTiming", "Event", "Failed", "Received", "Sent"]
 
 
 class BscLink:
@@ -36,9 +25,6 @@ class BscLink:
 
     ``send`` and ``receive`` are what happens to it, ``advance`` lets time pass, ``take_output`` and ``take_events`` are
     what it wants; ``deadline_s`` says when it wants to be advanced at the latest. It never blocks and owns no clock.
-
-    Args:
-        timing: timers and retries.
     """
 
     def __init__(self, timing: BscTiming | None = None) -> None:

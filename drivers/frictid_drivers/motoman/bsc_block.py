@@ -1,4 +1,4 @@
-"""Blocks of the BSC-like link: how a message is cut into them, and how one is read back from bytes.
+"""What both ends of the BSC-like link share: its codes, timers, events and blocks.
 
 ``SOH hh,sss STX data (CR ETX | ETB) BCC`` comes first, ``STX data (CR ETX | ETB) BCC`` continues it. The block check is
 a 16-bit **sum** of everything after the leading SOH (STX in a continuation) up to and including ETX or ETB, low byte
@@ -20,6 +20,8 @@ CR: Final = 0x0D
 DLE: Final = 0x10
 NAK: Final = 0x15
 ETB: Final = 0x17
+ACK: Final = (bytes([DLE, 0x30]), bytes([DLE, 0x31]))
+"""The two acknowledgements, which alternate from block to block."""
 
 MAX_DATA_BYTES: Final = 256
 _HEADER_BYTES: Final = 6
@@ -28,12 +30,7 @@ _LONGEST: Final = 1 + _HEADER_BYTES + 1 + MAX_DATA_BYTES + 1
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One whole message.
-
-    Attributes:
-        header: ``hh,sss``, e.g. ``01,000``.
-        text: the data without the CR that ends it; printable ASCII.
-    """
+    """One whole message: a header ``hh,sss``, and printable ASCII without the CR that ends it."""
 
     header: str
     text: str
@@ -41,17 +38,60 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One block, read and checked.
-
-    Attributes:
-        header: ``hh,sss`` on a first block, "" on a continuation.
-        text: its data, without the final CR.
-        last: it ended in ETX.
-    """
+    """One block, read and checked: header "" on a continuation, text without the final CR, last where ETX ended it."""
 
     header: str
     text: str
     last: bool
+
+
+@dataclass(frozen=True, slots=True)
+class BscTiming:
+    """Timers and retries, defaults of the controller's parameters RS034-RS037.
+
+    Attributes:
+        sequence_s: timer A (RS034): how long an answer may take.
+        text_end_s: timer B (RS035): how long the rest of a text, or the next block, may take.
+        response_retries: retry 1 (RS036): invalid or missing answers before giving up.
+        text_retries: retry 2 (RS037): NAKs to the same text before giving up.
+        quiet_s: silence after which garbage on the line is considered over (our choice, no controller parameter).
+    """
+
+    sequence_s: float = 3.0
+    text_end_s: float = 20.0
+    response_retries: int = 10
+    text_retries: int = 3
+    quiet_s: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class BlockReceived:
+    """One block of a message arrived intact; worth keeping even when the rest of the message never comes."""
+
+    text: str
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """The last block of a message arrived intact and was acknowledged."""
+
+    message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """Our message was acknowledged to its last block."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The link gave up on a message; ``reason`` says why."""
+
+    reason: str
+
+
+Event = BlockReceived | Received | Sent | Failed
 
 
 def block_check(covered: bytes) -> bytes:

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from frictid_drivers.motoman.bsc_block import ENQ, EOT, NAK, SOH, STX, BlockReader, Message, decode_block
-from frictid_drivers.motoman.bsc_events import ACK, BlockReceived, BscTiming, Event, Failed, Received
+from frictid_drivers.motoman.bsc_block import (
+    ACK,
+    ENQ,
+    EOT,
+    NAK,
+    SOH,
+    STX,
+    BlockReader,
+    BlockReceived,
+    BscTiming,
+    Event,
+    Failed,
+    Message,
+    Received,
+    decode_block,
+)
 
 
 class Receiver:
-    """The other side's messages, one after another.
-
-    Args:
-        timing: timers and retries.
-        output: what goes on the wire is appended here.
-        events: what happens is appended here.
+    """The other side's messages, one after another; what to say, and what happens, is appended to the lists given.
 
     Attributes:
-        timing: as given; may be exchanged.
+        timing: may be exchanged.
         deadline_s: when ``expire`` must be called at the latest.
         over: the line is free again.
     """

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from frictid_drivers.motoman.bsc_block import DLE, ENQ, EOT, NAK
-from frictid_drivers.motoman.bsc_events import BscTiming, Failed, Sent
+from frictid_drivers.motoman.bsc_block import DLE, ENQ, EOT, NAK, BscTiming, Failed, Sent
 
 
 class Yielded:
@@ -17,14 +16,10 @@ Outcome = Sent | Failed | Yielded | None
 
 
 class Sender:
-    """One message on its way.
-
-    Args:
-        timing: timers and retries.
-        output: what goes on the wire is appended here.
+    """One message on its way, once ``bid`` for; what to say is appended to ``output``.
 
     Attributes:
-        timing: as given; may be exchanged.
+        timing: may be exchanged.
         deadline_s: when ``expire`` must be called at the latest.
         contended: the other side bid at the same moment.
     """
@@ -32,22 +27,13 @@ class Sender:
     def __init__(self, timing: BscTiming, output: bytearray) -> None:
         self.timing = timing
         self._output = output
-        self._blocks: Sequence[bytes] = ()
-        self._index = -1
-        """The block under way, -1 while bidding."""
-        self._response_retries = 0
-        self._text_retries = 0
-        self._asked_again = False
-        self._answer_due_s = 0.0
-        self._contentions = 0
-        self._dle_seen = False
-        self.deadline_s = 0.0
-        self.contended = False
+        self.contended = self._dle_seen = False
 
     def bid(self, blocks: Sequence[bytes], now_s: float) -> None:
         """Ask for the line, to send these."""
         self._blocks = blocks
         self._index = -1
+        """The block under way, -1 while bidding."""
         self._response_retries = self._text_retries = self._contentions = 0
         self._asked_again = False
         self._output.append(ENQ)

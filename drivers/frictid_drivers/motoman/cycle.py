@@ -11,7 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from frictid_drivers.motoman.joint_units import AxisUnits
+from frictid_drivers.motoman.joint_units import AxisUnits, Limits
 from frictid_drivers.motoman.stream import StreamSession
 from frictid_drivers.motoman.stream_frames import Flag, TickReport
 from frictid_hil.errors import SafetyAbort
@@ -93,7 +93,7 @@ class StreamCycle:
         session: greeted, no target sent yet.
         joints: order of set-points and feedback.
         units: by joint name.
-        limits: by joint name: lowest and highest position, torque.
+        limits: by joint name.
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
         lead_ticks: between a report and the tick that its answer is due at.
@@ -104,7 +104,7 @@ class StreamCycle:
         session: StreamSession,
         joints: Sequence[JointSetup],
         units: Mapping[str, AxisUnits],
-        limits: Mapping[str, tuple[float, float, float]],
+        limits: Mapping[str, Limits],
         pulses: Sequence[int],
         clock: TickClock,
         lead_ticks: int,
@@ -133,8 +133,7 @@ class StreamCycle:
         self._tick_s = welcome.tick_us * 1e-6
         self._bounds = [(0, 0, 0)] * len(self._joints)
         for joint in joints:
-            low, high, _ = limits[joint.name]
-            self.limit(joint.name, low, high)
+            self.limit(joint.name, limits[joint.name])
         clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
         # Targets in the order of the axes; axes without a joint stay where they are.
         self._targets = [axis.pulses for axis in first.axes]
@@ -145,11 +144,11 @@ class StreamCycle:
                 report.position_rad = unit.position_rad(pulses[unit.axis])
                 report.mode, report.valid, report.age_cycles = Mode.POSITION, True, 1
 
-    def limit(self, joint: str, position_min_rad: float, position_max_rad: float) -> None:
+    def limit(self, joint: str, limits: Limits) -> None:
         """No target beyond these from here on."""
         k = self._index[joint]
         unit = self._units[k]
-        lowest, highest = sorted((unit.pulses(position_min_rad), unit.pulses(position_max_rad)))
+        lowest, highest = unit.travel(limits)
         step = abs(self._joints[k].max_velocity_rad_s * self._tick_s * unit.pulses_per_rad) * _STEP_MARGIN
         self._bounds[k] = (lowest, highest, int(step) + 1)
 

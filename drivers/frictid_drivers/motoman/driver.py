@@ -11,16 +11,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from frictid_drivers.motoman import inspection
-from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_run import BatchRun, JobBounds
+from frictid_drivers.motoman.batch_messages import friction_table
+from frictid_drivers.motoman.batch_run import BatchRun
 from frictid_drivers.motoman.cycle import StreamCycle, TickClock
-from frictid_drivers.motoman.host_control import PROFILES, HostControl
-from frictid_drivers.motoman.joint_units import axis_units
-from frictid_drivers.motoman.layers import Layer, Line, Reach, find_layer, streamed_mask
+from frictid_drivers.motoman.joint_units import Limits, axis_units
+from frictid_drivers.motoman.layers import Line, Reach, find_layer, streamed_mask
 from frictid_drivers.motoman.port import BytePort, SerialPort
-from frictid_drivers.motoman.power import ServoPower
 from frictid_drivers.motoman.settings import serial_options
-from frictid_drivers.motoman.table import friction_table
 from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan.mode import Mode
@@ -77,15 +74,15 @@ class MotomanDriver:
         self._port_factory = port_factory or SerialPort
         self._tick_us = round(1e6 / setup.cycle_hz)
         self._line: Line | None = None
-        self._reach = Reach(Layer.HOST)
-        self._batch: BatchClient | None = None
+        self._reach = Reach()
         self._cycle: StreamCycle | None = None
         self._sink: FrameSink | None = None
         self._active: list[str] = []
         self._job: BatchRun | None = None
         self._job_number = 0
         self._limits = {
-            joint.name: (joint.position_min_rad, joint.position_max_rad, joint.max_torque_nm) for joint in setup.joints
+            joint.name: Limits(joint.position_min_rad, joint.position_max_rad, joint.max_torque_nm)
+            for joint in setup.joints
         }
         self._batching = False
         self.clock = TickClock(lock_step=port_factory is not None)
@@ -100,14 +97,9 @@ class MotomanDriver:
         parity = options.parity_on(self._path)
         port = self._port_factory(self._path, options.baud, parity)
         try:
-            host = HostControl(
-                port, PROFILES[options.controller], options.link, reply_s=options.reply_s, sink=self._log
-            )
-            self._line = Line(port, host, options, parity, self._tick_us, self._log)
-            self._batch = BatchClient(host, port.now_s)
-            self._power = ServoPower(host, port.now_s)
-            host.status()
-            self._reach = find_layer(self._line, self._batch, options, self._mask(self._units))
+            self._line = Line(port, options, parity, self._tick_us, self._log)
+            self._line.host.status()
+            self._reach = find_layer(self._line, options, self._mask(self._units))
         except BaseException:
             self._line = None
             port.close()
@@ -140,7 +132,7 @@ class MotomanDriver:
         Raises:
             PlanRefused: the controller cannot do this, or not at this rate.
         """
-        if self._reach.layer is Layer.HOST:
+        if self._reach.layer == "host":
             raise PlanRefused(
                 "this controller offers no torque: " + "; ".join(self._reach.reasons.values()),
                 next_step="install the controller application (docs/reference/motoman-controller-application.md)",
@@ -157,15 +149,15 @@ class MotomanDriver:
         Raises:
             HardwareError: the controller's own travel is narrower.
         """
-        self._limits[joint] = (position_min_rad, position_max_rad, torque_nm)
+        limits = self._limits[joint] = Limits(position_min_rad, position_max_rad, torque_nm)
         if self._cycle is not None:
-            self._cycle.limit(joint, position_min_rad, position_max_rad)
+            self._cycle.limit(joint, limits)
         welcome = self._reach.welcome
         if welcome is None:
             return
         units = self._units[joint]
         bound = welcome.limits[(welcome.axis_mask & ((1 << units.axis) - 1)).bit_count()]
-        low, high = sorted((units.pulses(position_min_rad), units.pulses(position_max_rad)))
+        low, high = units.travel(limits)
         if low < bound.lowest or high > bound.highest:
             raise HardwareError(
                 f"the controller allows {bound.lowest}..{bound.highest} pulses, the robot file {low}..{high}",
@@ -181,8 +173,8 @@ class MotomanDriver:
         In batch, power stays on from here on, between the jobs as well, and run time starts now.
         """
         line = self._open_line()
-        if self._reach.layer is Layer.BATCH:
-            self._power.on()
+        if self._reach.layer == "batch":
+            line.power.on()
             self._batching = True
             self.clock.start(line.port.now_s)
             return
@@ -191,7 +183,7 @@ class MotomanDriver:
             raise HardwareError("this controller does not stream", next_step="see `frictid-hil check`")
         active = self._mask(self._active or self._units)
         mask = streamed_mask(self._mask(self._units), active, self._options.stream_baud, welcome.tick_us)
-        self._power.on()
+        line.power.on()
         pulses = line.host.pulses()
         session = line.begin_stream(mask)
         self._cycle = StreamCycle(
@@ -232,16 +224,13 @@ class MotomanDriver:
     def stop_cycling(self) -> None:
         """Back to host control, servo power off."""
         cycle, self._cycle = self._cycle, None
-        if self._batching:
-            self._batching = False
-            self.clock.release()
-            self._power.off()
-        if cycle is None:
+        if cycle is None and not self._batching:
             return
-        line = self._open_line()
+        line, self._batching = self._open_line(), False
         self.clock.release()
-        line.end_stream(cycle.session)
-        self._power.off()
+        if cycle is not None:
+            line.end_stream(cycle.session)
+        line.power.off()
 
     def quick_stop(self) -> None:
         """Stop. A stream is told without waiting; a job by host control, whose handshake may take half a second.
@@ -251,8 +240,8 @@ class MotomanDriver:
         with contextlib.suppress(FrictidError):
             if self._cycle is not None:
                 self._cycle.session.halt()
-            elif self._job is not None and self._job.running and self._batch is not None:
-                self._batch.stop(self._job.number, within_s=_URGENT_S)
+            elif self._job is not None and self._job.running:
+                self._job.batch.stop(self._job.number, within_s=_URGENT_S)
 
     def close(self) -> None:
         """Everything to rest, servo power off, port released; safe to call twice and after errors."""
@@ -266,10 +255,10 @@ class MotomanDriver:
         try:
             if cycle is not None:
                 line.end_stream(cycle.session)
-            if job is not None and job.running and self._batch is not None:
-                self._batch.stop(job.number, within_s=_URGENT_S)
-            if self._power.ours:
-                self._power.off(urgent=True)
+            if job is not None and job.running:
+                job.batch.stop(job.number, within_s=_URGENT_S)
+            if line.power.ours:
+                line.power.off(urgent=True)
         except FrictidError:
             # The line itself failed; the controller's watchdog stops the arm.
             return
@@ -287,19 +276,10 @@ class MotomanDriver:
         look: Callable[[Sequence[Feedback]], None] | None = None,
         arrived: Callable[[Mapping[str, Any]], None] = lambda samples: None,
     ) -> Mapping[str, Any]:
-        """One joint's motions as one job on the controller.
+        """One joint's motions as one job on the controller; see ``Batched.run_batch``.
 
-        Args:
-            plan: the joint must stand where its first motion begins; all others are held by the controller.
-            stop: asked often; True brings the joint to rest and raises ``Interrupted``.
-            progress: told ``motion`` or ``transfer`` and the share that is done.
-            look: given what ``standing`` says, about twice a second while the job runs; its ``SafetyAbort`` stops it.
-            arrived: given every portion of samples as it comes, in order, as the first five columns below.
-
-        Returns:
-            Columns of shape (n,): ``time_ns``, ``position_rad``, ``velocity_rad_s``, ``torque_nm``,
-            ``position_command_rad``; ``motion_starts_ns``, shape (motions + 1,), the last one the end; and
-            ``dropped_pulses``. Times are run time, from the controller's answer to the start on.
+        ``look`` is given what ``standing`` says about twice a second. Times are run time, from the controller's answer
+        to the start on.
 
         Raises:
             PlanRefused: a motion that the controller cannot make.
@@ -308,35 +288,34 @@ class MotomanDriver:
             HardwareError: the line failed (``batch_columns`` then hold what had come), or the joint does not stand at
                 the start.
         """
-        line, batch, reach = self._open_line(), self._batch, self._reach
-        if batch is None or reach.batch is None:
+        line, hello = self._open_line(), self._reach.batch
+        if hello is None:
             raise HardwareError("this controller has no batch application", next_step="see `frictid-hil check`")
-        if reach.batch.tick_us != self._tick_us:
-            raise PlanRefused(f"the controller ticks every {reach.batch.tick_us} us, the plan every {self._tick_us} us")
-        low_rad, high_rad, torque_nm = self._limits[plan.joint]
+        if hello.tick_us != self._tick_us:
+            raise PlanRefused(f"the controller ticks every {hello.tick_us} us, the plan every {self._tick_us} us")
         self._job_number = self._job_number % 65535 + 1
         self._job = BatchRun(
-            batch,
-            line.host,
-            self._setup.joint(plan.joint),
-            self._units[plan.joint],
-            JobBounds(low_rad, high_rad, torque_nm, self._options.watchdog_s),
-            self._tick_us * 1e-6,
-            self._job_number,
-            self.clock.now_ns,
-            while_running=reach.batch.reads_while_running,
+            batch=line.batch,
+            joint=self._setup.joint(plan.joint),
+            units=self._units[plan.joint],
+            limits=self._limits[plan.joint],
+            watchdog_s=self._options.watchdog_s,
+            tick_s=self._tick_us * 1e-6,
+            number=self._job_number,
+            now_ns=self.clock.now_ns,
+            while_running=hello.reads_while_running,
+            stop=stop,
+            progress=progress,
+            look=lambda within_s: look(self.standing(within_s=within_s)) if look else None,
+            arrived=arrived,
         )
         self.batch_columns = {}
         try:
-            self._job.run(
-                *(plan, self._power.on, stop, progress),
-                (lambda within_s: look(self.standing(within_s=within_s))) if look else (lambda within_s: None),
-                arrived,
-            )
+            self._job.run(plan, line.power.on)
         finally:
             self.batch_columns = self._job.columns
         if not self._batching:
-            self._power.off()
+            line.power.off()
         return self.batch_columns
 
     def standing(self, *, within_s: float | None = None) -> Sequence[Feedback]:
@@ -383,18 +362,15 @@ class MotomanDriver:
         Raises:
             HardwareError: no such application, or the table reads back differently.
         """
-        batch = self._batch
-        if batch is None or not self.capabilities().table_download:
+        if not self.capabilities().table_download:
             raise HardwareError("this controller takes no friction table", where=f"joint {joint}")
-        batch.download(
+        self._open_line().batch.download(
             friction_table(self._units[joint], curve, ratio, stiffness_nm_per_rad, gravity_cos_nm, gravity_sin_nm)
         )
 
     def compensate_by_table(self, joints: Sequence[str]) -> None:
         """Apply the downloaded tables of these joints from now on; none ends it."""
-        if self._batch is None:
-            raise HardwareError("the port is not open")
-        self._batch.compensate(self._mask(joints))
+        self._open_line().batch.compensate(self._mask(joints))
 
     # -- inside ------------------------------------------------------------------------------------------------
 
@@ -412,10 +388,10 @@ class MotomanDriver:
         return self._cycle
 
     def _log(self, data: bytes, sent: bool) -> None:
-        sink = self._sink
-        if sink is not None:
-            now_ns = self.clock.now_ns()
-            while data:
-                size = next(length for length in _LOGGED_LENGTHS if length <= len(data))
-                sink(now_ns, _SERIAL_BYTES_ID, data[:size], sent)
-                data = data[size:]
+        if self._sink is None:
+            return
+        now_ns = self.clock.now_ns()
+        while data:
+            size = next(length for length in _LOGGED_LENGTHS if length <= len(data))
+            self._sink(now_ns, _SERIAL_BYTES_ID, data[:size], sent)
+            data = data[size:]

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Final
 
-from frictid_drivers.motoman.bsc import BlockReceived, BscLink, BscTiming, Event, Failed, Received, Sent
-from frictid_drivers.motoman.bsc_block import Message
+from frictid_drivers.motoman.bsc import BscLink
+from frictid_drivers.motoman.bsc_block import BlockReceived, BscTiming, Event, Failed, Message, Received, Sent
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError, controller_error
-from frictid_drivers.motoman.port import BytePort
+from frictid_drivers.motoman.port import BytePort, Sink, unheard
 
 _COMMAND: Final = "01,000"
 _RESULT: Final = "90,000"
@@ -25,21 +25,15 @@ _DATA: Final = "90,001"
 _FAREWELL_S: Final = 0.3
 """How long the EOT of a reply may take before the port goes to another protocol without it."""
 
+_USUAL_TIMING: Final = BscTiming()
 _LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that is off"
 _LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerProfile:
-    """What differs between controller generations.
+    """What differs between controller generations: the meaning of bits 0.. of both figures of RSTATS; "" is unused."""
 
-    Attributes:
-        name: as written in the robot file.
-        data_1: meaning of bits 0.. of the first figure of RSTATS.
-        data_2: meaning of bits 0.. of the second; "" is unused.
-    """
-
-    name: str
     data_1: tuple[str, ...]
     data_2: tuple[str, ...]
 
@@ -48,21 +42,16 @@ _MODES_1: Final = ("step", "1-cycle", "auto", "running", "safe speed", "teach", 
 _MODES_2: Final = ("", "pendant hold", "external hold", "command hold", "alarm", "error", "servo on")
 
 PROFILES: Final = {
-    "erc": ControllerProfile("erc", _MODES_1[:5], ("panel hold", "teach box hold", *_MODES_2[2:])),
-    "xrc": ControllerProfile("xrc", _MODES_1, _MODES_2),
-    "nx": ControllerProfile("nx", _MODES_1, _MODES_2),
-    "dx": ControllerProfile("dx", _MODES_1, _MODES_2),
+    "erc": ControllerProfile(_MODES_1[:5], ("panel hold", "teach box hold", *_MODES_2[2:])),
+    **dict.fromkeys(("xrc", "nx", "dx"), ControllerProfile(_MODES_1, _MODES_2)),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The reply to RSTATS.
+    """The reply to RSTATS: both figures as sent, and the names of the bits that are set.
 
     Attributes:
-        data_1: first figure as sent.
-        data_2: second figure as sent.
-        conditions: names of the bits that are set.
         reports_mode: this generation reports teach, play and command remote at all.
     """
 
@@ -106,21 +95,21 @@ class HostControl:
         profile: generation of the controller.
         timing: of the link.
         reply_s: how long the controller may think about a command before it bids to reply.
-        sink: told of every portion of bytes on the wire, with True for ours.
+        sink: of the bytes on the wire.
     """
 
     def __init__(
         self,
         port: BytePort,
         profile: ControllerProfile,
-        timing: BscTiming | None = None,
+        timing: BscTiming = _USUAL_TIMING,
         *,
         reply_s: float = 10.0,
-        sink: Callable[[bytes, bool], None] | None = None,
+        sink: Sink = unheard,
     ) -> None:
-        self._port = port
-        self._profile = profile
-        self._timing = timing or BscTiming()
+        self.port = port
+        self.profile = profile
+        self._timing = timing
         self._reply_s = reply_s
         self._sink = sink
         self._link = BscLink(self._timing)
@@ -131,28 +120,11 @@ class HostControl:
 
     def status(self, *, within_s: float | None = None) -> Status:
         """RSTATS."""
-        figures = self._figures("RSTATS", 2, within_s)
-        return decode_status(self._profile, *figures)
+        return decode_status(self.profile, *self._figures("RSTATS", 2, within_s))
 
     def pulses(self, *, within_s: float | None = None) -> list[int]:
         """RPOSJ: the joints' positions in pulses; axes that the robot lacks read 0."""
         return self._figures("RPOSJ", 12, within_s)
-
-    def servo(self, on: bool) -> None:
-        """SVON."""
-        self.order(f"SVON {int(on)}")
-
-    def hold(self, on: bool) -> None:
-        """HOLD."""
-        self.order(f"HOLD {int(on)}")
-
-    def reset(self) -> None:
-        """RESET an alarm."""
-        self.order("RESET")
-
-    def alarms(self) -> str:
-        """RALARM, as sent: the layout of its reply is not public, so it is shown and not interpreted."""
-        return self.ask("RALARM")
 
     # -- how patient it is -------------------------------------------------------------------------------------
 
@@ -231,7 +203,7 @@ class HostControl:
             # The port failed in the middle of the message before this one.
             self._link.abort()
         self._owed += 1
-        self._link.send(Message(_COMMAND, text), self._port.now_s())
+        self._link.send(Message(_COMMAND, text), self.port.now_s())
         reply = self._await_reply(where, on_text, within_s)
         if reply.header == _RESULT and reply.text.strip() != "0000":
             number = reply.text.strip()
@@ -244,11 +216,11 @@ class HostControl:
         """Until the reply is here, the link gives up, or the controller has thought too long about it."""
         sent = False
         # The link's own timers end every wait; this ends a controller that keeps it busy with something else.
-        give_up_s = self._port.now_s() + (self.patience_s if within_s is None else within_s)
+        give_up_s = self.port.now_s() + (self.patience_s if within_s is None else within_s)
         thinking_until_s = give_up_s
         while True:
             limit_s = thinking_until_s if sent and self._link.idle else give_up_s
-            if self._port.now_s() >= limit_s:
+            if self.port.now_s() >= limit_s:
                 self._link.abort()
                 self._flush()
                 raise LinkError("no reply" if sent else "the line is never free", where=where, next_step=_LOOK_AT_LINE)
@@ -256,7 +228,7 @@ class HostControl:
                 match event:
                     case Sent():
                         sent = True
-                        thinking_until_s = min(give_up_s, self._port.now_s() + self._reply_s)
+                        thinking_until_s = min(give_up_s, self.port.now_s() + self._reply_s)
                     case Failed(reason):
                         raise LinkError(reason, where=where, cause=_LINK_CAUSE, next_step=_LOOK_AT_LINE)
                     case BlockReceived(block, index) if sent and on_text is not None:
@@ -266,16 +238,16 @@ class HostControl:
 
     def _settle(self, within_s: float | None) -> None:
         """Take late replies off the line; in a hurry only for a quarter of the time that the next one may take."""
-        until_s = self._port.now_s() + (self._timing.sequence_s if within_s is None else within_s / 4)
-        while self._owed and self._port.now_s() < until_s:
+        until_s = self.port.now_s() + (self._timing.sequence_s if within_s is None else within_s / 4)
+        while self._owed and self.port.now_s() < until_s:
             self._step(until_s)
         if within_s is None:
             self._owed = 0  # what has not come by now never will
 
     def listen(self, duration_s: float) -> None:
         """Serve the link and drop whatever it brings."""
-        until_s = self._port.now_s() + duration_s
-        while self._port.now_s() < until_s:
+        until_s = self.port.now_s() + duration_s
+        while self.port.now_s() < until_s:
             self._step(until_s)
 
     def reconnect(self) -> None:
@@ -284,14 +256,14 @@ class HostControl:
         Raises:
             HardwareError: it is not there (yet).
         """
-        self._port.reopen()
+        self.port.reopen()
         self._link = BscLink(self._timing)
         self._owed = 1  # what the controller still says of before belongs to no command of ours
 
     def leave(self) -> None:
         """Let the link finish, then forget it: the port goes to another protocol."""
-        until_s = self._port.now_s() + _FAREWELL_S
-        while not self._link.idle and self._port.now_s() < until_s:
+        until_s = self.port.now_s() + _FAREWELL_S
+        while not self._link.idle and self.port.now_s() < until_s:
             self._step(until_s)
         self._link = BscLink(self._timing)
         self._owed = 0
@@ -299,12 +271,11 @@ class HostControl:
     def _step(self, until_s: float) -> list[Event]:
         """Write what the link wants, wait for bytes or its next timer, and return what happened."""
         self._flush()
-        link, port = self._link, self._port
+        link, port = self._link, self.port
         wake_s = until_s if link.deadline_s is None else min(until_s, link.deadline_s)
         data = port.read(max(0.0, wake_s - port.now_s()))
         if data:
-            if self._sink is not None:
-                self._sink(data, False)
+            self._sink(data, False)
             link.receive(data, port.now_s())
         link.advance(port.now_s())
         self._flush()
@@ -315,6 +286,5 @@ class HostControl:
     def _flush(self) -> None:
         output = self._link.take_output()
         if output:
-            if self._sink is not None:
-                self._sink(output, True)
-            self._port.write(output)
+            self._sink(output, True)
+            self.port.write(output)

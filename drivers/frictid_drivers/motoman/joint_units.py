@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup
@@ -16,6 +16,14 @@ from frictid_hil.protocol.driver import unknown_options
 
 JOINT_OPTIONS: Final = frozenset({"pulses_per_degree", "digital_inputs"})
 """``digital_inputs`` is asked of every driver by unattended jobs; this one reports none, and the runner says so."""
+
+
+class Limits(NamedTuple):
+    """What a joint may do, joint side."""
+
+    position_min_rad: float
+    position_max_rad: float
+    torque_nm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +47,11 @@ class AxisUnits:
     def pulses(self, position_rad: float) -> int:
         """The nearest pulse."""
         return round(position_rad * self.pulses_per_rad)
+
+    def travel(self, limits: Limits) -> tuple[int, int]:
+        """Lowest and highest pulse."""
+        ends = self.pulses(limits.position_min_rad), self.pulses(limits.position_max_rad)
+        return min(ends), max(ends)
 
     def position_rad(self, pulses: float) -> float:
         """Joint angle."""

@@ -7,22 +7,18 @@ C. streaming        every tick, 115200 baud and up
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
 
 from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_messages import BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import PROFILES, HostControl
-from frictid_drivers.motoman.port import BytePort
+from frictid_drivers.motoman.port import BytePort, Sink
+from frictid_drivers.motoman.power import ServoPower
 from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.stream import StreamSession
 from frictid_drivers.motoman.stream_frames import Welcome, feedback_bytes, set_point_bytes
 from frictid_hil.errors import HardwareError, PlanRefused
-
-Sink = Callable[[bytes, bool], None]
-"""Told of every portion of bytes on the wire, with True for ours."""
 
 STREAM_PARITY = "N"
 _BITS_PER_BYTE = 10
@@ -30,52 +26,50 @@ _USABLE_SHARE = 0.9
 """Of a tick may be spent on either direction's frames."""
 
 
-class Layer(Enum):
-    """What is used."""
-
-    HOST = "host"
-    BATCH = "batch"
-    STREAM = "stream"
-
-
 @dataclass(frozen=True, slots=True)
 class Reach:
     """What the controller can do.
 
     Attributes:
-        layer: the one to use.
         reasons: why each better layer is not available, by its name.
         welcome: of the streaming application, all axes; None where there is none.
         batch: of the batch application; None where there is none.
     """
 
-    layer: Layer
     reasons: dict[str, str] = field(default_factory=dict)
     welcome: Welcome | None = None
     batch: BatchHello | None = None
 
+    @property
+    def application(self) -> Welcome | BatchHello | None:
+        """The better one of them."""
+        return self.welcome or self.batch
+
+    @property
+    def layer(self) -> str:
+        """The one to use: host, batch or stream."""
+        if self.welcome is not None:
+            return "stream"
+        return "host" if self.batch is None else "batch"
+
 
 class Line:
-    """One port that is either in host control or in a stream.
+    """One port that is either in host control or in a stream, and what can be asked for on it.
 
     Args:
         port: open, at the host control's speed.
-        host: on that port.
         options: of the robot file.
         parity: of host control.
         tick_us: interpolation clock that we ask for.
-        sink: of the stream's bytes.
+        sink: of all bytes on the wire.
     """
 
-    def __init__(
-        self, port: BytePort, host: HostControl, options: SerialOptions, parity: str, tick_us: int, sink: Sink
-    ) -> None:
+    def __init__(self, port: BytePort, options: SerialOptions, parity: str, tick_us: int, sink: Sink) -> None:
         self.port = port
-        self._parity = parity
-        self.host = host
-        self._options = options
-        self._tick_us = tick_us
-        self._sink = sink
+        self.host = HostControl(port, PROFILES[options.controller], options.link, reply_s=options.reply_s, sink=sink)
+        self.batch = BatchClient(self.host)
+        self.power = ServoPower(self.host)
+        self._options, self._parity, self._tick_us, self._sink = options, parity, tick_us, sink
         self._session_number = int(port.now_s() * 10.0) % 255
 
     def begin_stream(self, axis_mask: int) -> StreamSession:
@@ -91,7 +85,7 @@ class Line:
         self.port.set_line(options.stream_baud, STREAM_PARITY)
         session = StreamSession(
             self.port,
-            PROFILES[options.controller],
+            self.host.profile,
             lead_ticks=options.lead_ticks,
             silence_s=options.silence_ms * 1e-3,
             sink=self._sink,
@@ -110,7 +104,7 @@ class Line:
         self.port.set_line(self._options.baud, self._parity)
 
 
-def find_layer(line: Line, batch: BatchClient, options: SerialOptions, axis_mask: int) -> Reach:
+def find_layer(line: Line, options: SerialOptions, axis_mask: int) -> Reach:
     """Ask for streaming, then for batch, unless the robot file insists on one.
 
     Raises:
@@ -119,42 +113,33 @@ def find_layer(line: Line, batch: BatchClient, options: SerialOptions, axis_mask
     reasons: dict[str, str] = {}
     welcome: Welcome | None = None
     hello: BatchHello | None = None
-    if options.layer in ("auto", "stream"):
-        welcome = _try_stream(line, options, axis_mask, reasons)
-    else:
-        reasons["stream"] = f"the robot file says layer: {options.layer}"
-    if options.layer == "host":
-        reasons["batch"] = reasons["stream"]
+    insisted = f"the robot file says layer: {options.layer}"
+    if options.layer not in ("auto", "stream"):
+        reasons["stream"] = insisted
+    elif not options.stream_baud:
+        reasons["stream"] = "no `stream_baud` in the robot file: not a gateway port"
     else:
         try:
-            hello = batch.hello()
+            session = line.begin_stream(axis_mask)
+            line.end_stream(session)
+            welcome = session.welcome
+        except ControllerError as refused:
+            reasons["stream"] = f"the controller answers {refused.what}"
+    if options.layer == "host":
+        reasons["batch"] = insisted
+    else:
+        try:
+            hello = line.batch.hello()
         except ControllerError as refused:
             reasons["batch"] = f"the controller answers {refused.what}"
-    layer = Layer.HOST
-    if welcome is not None:
-        layer = Layer.STREAM
-    elif hello is not None:
-        layer = Layer.BATCH
-    if options.layer not in ("auto", layer.value):
+    reach = Reach(reasons, welcome, hello)
+    if options.layer not in ("auto", reach.layer):
         raise HardwareError(
             f"the robot file insists on layer {options.layer}: {reasons[options.layer]}",
             where="options.layer",
             next_step="install the controller application, or say `layer: auto`",
         )
-    return Reach(layer, reasons, welcome, hello)
-
-
-def _try_stream(line: Line, options: SerialOptions, axis_mask: int, reasons: dict[str, str]) -> Welcome | None:
-    if not options.stream_baud:
-        reasons["stream"] = "no `stream_baud` in the robot file: not a gateway port"
-        return None
-    try:
-        session = line.begin_stream(axis_mask)
-    except ControllerError as refused:
-        reasons["stream"] = f"the controller answers {refused.what}"
-        return None
-    line.end_stream(session)
-    return session.welcome
+    return reach
 
 
 def streamed_mask(all_axes: int, active_axes: int, baud: int, tick_us: int) -> int:

@@ -9,6 +9,7 @@ import errno
 import select
 import termios
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 import serial
@@ -18,24 +19,28 @@ from frictid_hil.errors import HardwareBusy, HardwareError
 _REOPEN_EVERY_S = 0.5
 
 
+Sink = Callable[[bytes, bool], None]
+"""Told of every portion of bytes on the wire, with True for ours."""
+
+
+def unheard(data: bytes, ours: bool) -> None:
+    """The sink where nobody wants to be told."""
+
+
 class BytePort(Protocol):
     """Bytes both ways, and the clock they run on."""
 
     def now_s(self) -> float:
         """Time now, from any origin."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Put bytes on the wire. ``HardwareError`` when the port is gone."""
-        ...
 
     def read(self, timeout_s: float) -> bytes:
         """What has arrived, waiting at most this long for a first byte. ``HardwareError`` when the port is gone."""
-        ...
 
     def set_line(self, baud: int, parity: str) -> None:
         """Change speed and parity; bytes under way are sent first."""
-        ...
 
     def reopen(self) -> None:
         """Try to have a port back that was lost; takes half a second at least where it is not there.
@@ -43,11 +48,9 @@ class BytePort(Protocol):
         Raises:
             HardwareError: it is not there (yet).
         """
-        ...
 
     def close(self) -> None:
         """Release the port; safe to call twice."""
-        ...
 
 
 class SerialPort:

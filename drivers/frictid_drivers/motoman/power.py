@@ -7,7 +7,6 @@ its standstill is looked for first - in the positions, which every controller re
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from typing import Final
 
 from frictid_drivers.motoman.host_control import HostControl
@@ -22,17 +21,12 @@ _URGENT_S: Final = 0.5
 class ServoPower:
     """Switches it.
 
-    Args:
-        host: stock commands.
-        now_s: clock of the port.
-
     Attributes:
         ours: we switched it on and have not switched it off yet.
     """
 
-    def __init__(self, host: HostControl, now_s: Callable[[], float]) -> None:
+    def __init__(self, host: HostControl) -> None:
         self._host = host
-        self._now_s = now_s
         self.ours = False
 
     def on(self) -> None:
@@ -44,14 +38,14 @@ class ServoPower:
         """
         status = self._host.status()
         if "command hold" in status.conditions:
-            self._host.hold(False)
+            self._host.order("HOLD 0")
         self.ours = True
         if status.servo_on:
             return
-        self._host.servo(True)
-        until_s = self._now_s() + _ON_WITHIN_S
+        self._host.order("SVON 1")
+        until_s = self._host.port.now_s() + _ON_WITHIN_S
         while not self._host.status().servo_on:
-            if self._now_s() > until_s:
+            if self._host.port.now_s() > until_s:
                 raise HardwareError(
                     f"servo power is not on {_ON_WITHIN_S:g} s after it was ordered",
                     where="controller",
@@ -65,18 +59,15 @@ class ServoPower:
             urgent: something failed: half a second per command, and power goes off also where the arm cannot be seen.
         """
         within_s = _URGENT_S if urgent else None
-        if urgent:
-            with contextlib.suppress(FrictidError):
-                self._await_rest(within_s)
-        else:
+        with contextlib.suppress(FrictidError) if urgent else contextlib.nullcontext():
             self._await_rest(within_s)
         self._host.order("SVON 0", within_s=within_s)
         self.ours = False
 
     def _await_rest(self, within_s: float | None) -> None:
-        until_s = self._now_s() + _AT_REST_WITHIN_S
+        until_s = self._host.port.now_s() + _AT_REST_WITHIN_S
         before = self._host.pulses(within_s=within_s)
-        while self._now_s() < until_s:
+        while self._host.port.now_s() < until_s:
             here = self._host.pulses(within_s=within_s)
             if max(abs(a - b) for a, b in zip(here, before, strict=True)) <= _STILL_PULSES:
                 return

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from frictid_drivers.motoman.bsc import BscTiming
+from frictid_drivers.motoman.bsc_block import BscTiming
 from frictid_drivers.motoman.host_control import PROFILES
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.protocol.driver import Timing, unknown_options

@@ -9,11 +9,11 @@ controller goes straight on for one tick, slows down, and at the third missed ti
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError
 from frictid_drivers.motoman.host_control import ControllerProfile, decode_status
-from frictid_drivers.motoman.port import BytePort
+from frictid_drivers.motoman.port import BytePort, Sink, unheard
 from frictid_drivers.motoman.stream_frames import (
     Flag,
     Frame,
@@ -54,7 +54,7 @@ class StreamSession:
         profile: generation of the controller, for the bits of its status.
         lead_ticks: between the newest report and the tick that a target is due at.
         silence_s: without any report for so long, the controller counts as lost.
-        sink: told of every portion of bytes on the wire, with True for ours.
+        sink: of the bytes on the wire.
 
     Attributes:
         welcome: what the controller answered to HELLO.
@@ -71,7 +71,7 @@ class StreamSession:
         *,
         lead_ticks: int,
         silence_s: float,
-        sink: Callable[[bytes, bool], None] | None = None,
+        sink: Sink = unheard,
     ) -> None:
         self._port = port
         self._profile = profile
@@ -240,8 +240,7 @@ class StreamSession:
         data = self._port.read(max(0.0, timeout_s))
         if not data:
             return
-        if self._sink is not None:
-            self._sink(data, False)
+        self._sink(data, False)
         for frame in self._reader.take(data):
             self._take(frame)
 
@@ -278,8 +277,7 @@ class StreamSession:
             raise self._error
 
     def _write(self, data: bytes) -> None:
-        if self._sink is not None:
-            self._sink(data, True)
+        self._sink(data, True)
         self._port.write(data)
 
 
