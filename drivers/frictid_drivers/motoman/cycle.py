@@ -97,6 +97,10 @@ class StreamCycle:
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
         lead_ticks: between a report and the tick that its answer is due at.
+
+    Attributes:
+        wanted: joints that follow their set-points; the others hold.
+        locked: those of them that hold at their last target all the same.
     """
 
     def __init__(
@@ -120,10 +124,10 @@ class StreamCycle:
         self._index = {joint.name: k for k, joint in enumerate(joints)}
         self._units = [units[joint.name] for joint in joints]
         self._feedback = [Feedback() for _ in joints]
-        self._wanted: set[int] = set()
+        self.wanted: set[str] = set()
+        self.locked: set[str] = set()
         # Once armed, a session must be fed until it is stopped, or the controller takes us for dead.
         self._following = False
-        self._locked: set[int] = set()
         self._last_tick = -1
         self._alive_until_tick = first.tick + _KEEP_ALIVE_TICKS
         self._under_way: deque[tuple[int, tuple[int, ...]]] = deque()
@@ -152,32 +156,12 @@ class StreamCycle:
         step = abs(self._joints[k].max_velocity_rad_s * self._tick_s * unit.pulses_per_rad) * _STEP_MARGIN
         self._bounds[k] = (lowest, highest, int(step) + 1)
 
-    # -- who follows -------------------------------------------------------------------------------------------
-
-    def enable(self, joint: str) -> None:
-        """Follow set-points from here on."""
-        self._wanted.add(self._index[joint])
-
-    def disable(self, joint: str) -> None:
-        """Hold, and follow no more."""
-        self._wanted.discard(self._index[joint])
-
-    def lock(self, joint: str) -> None:
-        """Hold at the last target."""
-        self._locked.add(self._index[joint])
-
-    def unlock(self, joint: str) -> None:
-        """Follow set-points again."""
-        self._locked.discard(self._index[joint])
-
-    # -- the exchange ------------------------------------------------------------------------------------------
-
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """Targets for the deadline that was waited for; the newest report."""
         session = self.session
         report = session.wait_for_tick(0)
         session.raise_if_stopped()
-        self._following = self._following or bool(self._wanted)
+        self._following = self._following or bool(self.wanted)
         if self._following and not session.halted:
             self._aim(set_points, ticks=max(1, report.tick - self._last_tick) if self._last_tick >= 0 else 1)
             feed_forward = self._may_feed_forward and any(self._torques)
@@ -191,13 +175,13 @@ class StreamCycle:
         return self._feedback
 
     def _aim(self, set_points: Sequence[SetPoint], ticks: int) -> None:
-        for k in self._wanted - self._locked:
+        for k, joint in enumerate(self._joints):
             place = self._place.get(k)
-            if place is None:
+            if place is None or joint.name not in self.wanted - self.locked:
                 continue
             unit, set_point = self._units[k], set_points[k]
             if not (math.isfinite(set_point.position_rad) and math.isfinite(set_point.torque_offset_nm)):
-                raise SafetyAbort("the set-point is no number", where=f"joint {self._joints[k].name}")
+                raise SafetyAbort("the set-point is no number", where=f"joint {joint.name}")
             target = unit.pulses(set_point.position_rad)
             lowest, highest, step = self._bounds[k]
             moved = abs(target - self._targets[place])
@@ -206,7 +190,7 @@ class StreamCycle:
                     f"set-point {degrees(set_point.position_rad):.3f} deg, after "
                     f"{degrees(unit.position_rad(self._targets[place])):.3f} deg, "
                     + ("is too large a step for one tick" if moved > step * ticks else "leaves the joint's travel"),
-                    where=f"joint {self._joints[k].name}",
+                    where=f"joint {joint.name}",
                 )
             self._targets[place] = target
             self._torques[place] = unit.feed_forward(set_point.torque_offset_nm)
@@ -240,7 +224,7 @@ class StreamCycle:
     def _state(self, k: int, report: TickReport) -> JointState:
         if report.alarm:
             return JointState.FAULT
-        if k not in self._wanted or not report.data_2 & _SERVO_ON:
+        if self._joints[k].name not in self.wanted or not report.data_2 & _SERVO_ON:
             return JointState.DISABLED
         if Flag.ARMED in report.flags:
             return JointState.ENABLED

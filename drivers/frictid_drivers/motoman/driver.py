@@ -198,19 +198,19 @@ class MotomanDriver:
         """
         if mode is not Mode.POSITION:
             raise HardwareError(f"a serial controller cannot do mode {mode.name}", where=f"joint {joint}")
-        self._cycling().enable(joint)
+        self._cycling().wanted.add(joint)
 
     def disable(self, joint: str) -> None:
         """Hold the joint and no longer follow its set-points; servo power goes off with ``stop_cycling``."""
-        self._cycling().disable(joint)
+        self._cycling().wanted.discard(joint)
 
     def lock(self, joint: str) -> None:
         """Hold the joint where it stands, whatever its set-point."""
-        self._cycling().lock(joint)
+        self._cycling().locked.add(joint)
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
-        self._cycling().unlock(joint)
+        self._cycling().locked.discard(joint)
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """Targets out, newest report in.

@@ -111,7 +111,7 @@ class HostControl:
         self.profile = profile
         self._timing = timing
         self._reply_s = reply_s
-        self._sink = sink
+        self.sink = sink
         self._link = BscLink(self._timing)
         self._owed = 0
         """Replies that may still come. They carry no name: a late one must not be taken for that of another command."""
@@ -275,7 +275,7 @@ class HostControl:
         wake_s = until_s if link.deadline_s is None else min(until_s, link.deadline_s)
         data = port.read(max(0.0, wake_s - port.now_s()))
         if data:
-            self._sink(data, False)
+            self.sink(data, False)
             link.receive(data, port.now_s())
         link.advance(port.now_s())
         self._flush()
@@ -286,5 +286,5 @@ class HostControl:
     def _flush(self) -> None:
         output = self._link.take_output()
         if output:
-            self._sink(output, True)
+            self.sink(output, True)
             self.port.write(output)

@@ -69,7 +69,7 @@ class Line:
         self.host = HostControl(port, PROFILES[options.controller], options.link, reply_s=options.reply_s, sink=sink)
         self.batch = BatchClient(self.host)
         self.power = ServoPower(self.host)
-        self._options, self._parity, self._tick_us, self._sink = options, parity, tick_us, sink
+        self._options, self._parity, self._tick_us = options, parity, tick_us
         self._session_number = int(port.now_s() * 10.0) % 255
 
     def begin_stream(self, axis_mask: int) -> StreamSession:
@@ -83,13 +83,7 @@ class Line:
         self.host.order(f"FSTREAM 1,{options.stream_baud},{self._tick_us},{axis_mask}")
         self.host.leave()
         self.port.set_line(options.stream_baud, STREAM_PARITY)
-        session = StreamSession(
-            self.port,
-            self.host.profile,
-            lead_ticks=options.lead_ticks,
-            silence_s=options.silence_ms * 1e-3,
-            sink=self._sink,
-        )
+        session = StreamSession(self.host, lead_ticks=options.lead_ticks, silence_s=options.silence_ms * 1e-3)
         self._session_number = self._session_number % 255 + 1
         try:
             session.begin(self._session_number, axis_mask)
@@ -100,7 +94,7 @@ class Line:
 
     def end_stream(self, session: StreamSession) -> None:
         """STOP, and back to the host control's speed."""
-        session.leave()
+        session.halt(leave=True)
         self.port.set_line(self._options.baud, self._parity)
 
 

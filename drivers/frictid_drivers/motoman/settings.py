@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 from frictid_drivers.motoman.bsc_block import BscTiming
 from frictid_drivers.motoman.host_control import PROFILES
@@ -15,7 +15,19 @@ from frictid_hil.protocol.driver import Timing, unknown_options
 
 _PSEUDO_TERMINALS = "/dev/pts/"
 _ASSUMED = Timing(uncertainty_s=0.0005)
-LAYERS = ("auto", "stream", "batch", "host")
+_DELAYS: Mapping[str, tuple[float, float]] = {
+    **dict.fromkeys(("position_delay_s", "velocity_delay_s", "torque_delay_s"), (-1, 1)),
+    "uncertainty_s": (1e-6, 0.1),
+}
+_Usual = TypeVar("_Usual")
+
+
+def _choice(usual: str, choices: tuple[str, ...]) -> str:
+    return field(default=usual, metadata={"choices": choices})
+
+
+def _number(usual: _Usual, low: float, high: float) -> _Usual:
+    return field(default=usual, metadata={"bounds": (low, high)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +52,20 @@ class SerialOptions:
         timing: when reported figures were true.
     """
 
-    controller: str = "nx"
-    layer: str = "auto"
-    baud: int = 19200
-    parity: str = ""
-    stream_baud: int = 0
-    lead_ticks: int = 8
-    silence_ms: float = 300.0
-    command_delay_ms: float = 300.0
-    watchdog_s: float = 5.0
-    reply_s: float = 10.0
-    timer_a_s: float = 3.0
-    timer_b_s: float = 20.0
-    retry_1: int = 10
-    retry_2: int = 3
+    controller: str = _choice("nx", tuple(PROFILES))
+    layer: str = _choice("auto", ("auto", "stream", "batch", "host"))
+    baud: int = _number(19200, 300, 4_000_000)
+    parity: str = _choice("", ("E", "O", "N"))
+    stream_baud: int = _number(0, 0, 4_000_000)
+    lead_ticks: int = _number(8, 2, 60)
+    silence_ms: float = _number(300.0, 10, 10_000)
+    command_delay_ms: float = _number(300.0, 0, 2_000)
+    watchdog_s: float = _number(5.0, 0.5, 60)
+    reply_s: float = _number(10.0, 0.1, 120)
+    timer_a_s: float = _number(3.0, 0.1, 10)
+    timer_b_s: float = _number(20.0, 0.1, 25.5)
+    retry_1: int = _number(10, 0, 30)
+    retry_2: int = _number(3, 0, 10)
     timing: Timing = _ASSUMED
 
     def parity_on(self, path: str) -> str:
@@ -66,77 +78,41 @@ class SerialOptions:
         return BscTiming(self.timer_a_s, self.timer_b_s, self.retry_1, self.retry_2)
 
 
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "controller": tuple(PROFILES),
-    "layer": LAYERS,
-    "parity": ("E", "O", "N"),
-}
-_BOUNDS: Mapping[str, tuple[float, float]] = {
-    "baud": (300, 4_000_000),
-    "stream_baud": (0, 4_000_000),
-    "lead_ticks": (2, 60),
-    "silence_ms": (10, 10_000),
-    "command_delay_ms": (0, 2_000),
-    "watchdog_s": (0.5, 60),
-    "reply_s": (0.1, 120),
-    "timer_a_s": (0.1, 10),
-    "timer_b_s": (0.1, 25.5),
-    "retry_1": (0, 30),
-    "retry_2": (0, 10),
-}
-_DELAYS: Mapping[str, tuple[float, float]] = {
-    "position_delay_s": (-1, 1),
-    "velocity_delay_s": (-1, 1),
-    "torque_delay_s": (-1, 1),
-    "uncertainty_s": (1e-6, 0.1),
-}
-_OTHERS = frozenset({"emulator"})
-"""Read by the emulator only."""
-
-
 def serial_options(mapping: Mapping[str, Any]) -> SerialOptions:
-    """The options, every one checked.
+    """The options, every one checked; ``emulator`` is read by the emulator only.
 
     Raises:
         InvalidFields: an unknown option, or a value that is not possible.
     """
-    types = {entry.name: entry.type for entry in fields(SerialOptions)}
-    problems = unknown_options(mapping, {*types, *_OTHERS}, ("options",), "motoman")
-    values: dict[str, Any] = {}
-    for name, value in mapping.items():
-        if name not in types:
-            continue
-        if name == "timing":
-            values[name] = _timing(value, problems)
-            continue
-        problem = _problem(name, value, types)
-        if problem:
-            problems.append(FieldProblem(("options", name), problem))
-        else:
-            values[name] = value
+    known = {entry.name: entry for entry in fields(SerialOptions)}
+    problems = unknown_options(mapping, {*known, "emulator"}, ("options",), "motoman")
+    values = {name: value for name, value in mapping.items() if name in known}
+    timing = values.pop("timing", {})
+    for name, value in values.items():
+        problems += _wrong(("options", name), _problem(value, known[name]))
+    if not isinstance(timing, Mapping):
+        problems.append(FieldProblem(("options", "timing"), "must be a mapping"))
+        timing = {}
+    for name, value in timing.items():
+        unknown = f"is no delay; there are {', '.join(_DELAYS)}"
+        problem = _out_of_bounds(value, *_DELAYS[name]) if name in _DELAYS else unknown
+        problems += _wrong(("options", "timing", str(name)), problem)
     if problems:
         raise InvalidFields(problems)
+    if "timing" in mapping:
+        values["timing"] = replace(_ASSUMED, **timing, source="robot file")
     return SerialOptions(**values)
 
 
-def _timing(value: Any, problems: list[FieldProblem]) -> Timing:
-    path = ("options", "timing")
-    if not isinstance(value, Mapping):
-        problems.append(FieldProblem(path, "must be a mapping"))
-        return Timing()
-    for name in value.keys() - _DELAYS.keys():
-        problems.append(FieldProblem((*path, str(name)), f"is no delay; there are {', '.join(_DELAYS)}"))
-    wrong = [(name, _out_of_bounds(value[name], *bounds)) for name, bounds in _DELAYS.items() if name in value]
-    problems += [FieldProblem((*path, name), problem) for name, problem in wrong if problem]
-    if any(problem for _, problem in wrong) or value.keys() - _DELAYS.keys():
-        return Timing()
-    return replace(_ASSUMED, **value, source="robot file")
+def _wrong(path: tuple[str, ...], problem: str) -> list[FieldProblem]:
+    return [FieldProblem(path, problem)] if problem else []
 
 
-def _problem(name: str, value: Any, types: Mapping[str, Any]) -> str:
-    if name in _CHOICES:
-        return "" if value in _CHOICES[name] else f"must be one of {', '.join(_CHOICES[name])}, found {value!r}"
-    return _out_of_bounds(value, *_BOUNDS[name], whole=types[name] == "int")
+def _problem(value: Any, option: Field[Any]) -> str:
+    choices = option.metadata.get("choices")
+    if choices is None:
+        return _out_of_bounds(value, *option.metadata["bounds"], whole=option.type == "int")
+    return "" if value in choices else f"must be one of {', '.join(choices)}, found {value!r}"
 
 
 def _out_of_bounds(value: Any, low: float, high: float, *, whole: bool = False) -> str:

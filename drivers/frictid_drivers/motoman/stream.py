@@ -9,11 +9,10 @@ controller goes straight on for one tick, slows down, and at the third missed ti
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError
-from frictid_drivers.motoman.host_control import ControllerProfile, decode_status
-from frictid_drivers.motoman.port import BytePort, Sink, unheard
+from frictid_drivers.motoman.host_control import HostControl, decode_status
 from frictid_drivers.motoman.stream_frames import (
     Flag,
     Frame,
@@ -37,7 +36,7 @@ _SHORTEST_WAIT_TICKS = 2
 """A target must reach the controller this many ticks before it is due."""
 
 _RECOVERABLE = frozenset({Refusal.CRC, Refusal.GAP, Refusal.LATE})
-_REFUSED = {
+_REFUSED: Mapping[int, tuple[str, str]] = {
     Refusal.VERSION: ("it speaks another version of the protocol", "update the controller application"),
     Refusal.SESSION: ("it knows of no such session", "start again"),
     Refusal.LIMIT: ("a target exceeds its limits of position or step", "compare the limits of both sides with `check`"),
@@ -50,34 +49,21 @@ class StreamSession:
     """One session, from HELLO to STOP.
 
     Args:
-        port: already at the stream's speed.
-        profile: generation of the controller, for the bits of its status.
+        host: has left its port, which is at the stream's speed.
         lead_ticks: between the newest report and the tick that a target is due at.
         silence_s: without any report for so long, the controller counts as lost.
-        sink: of the bytes on the wire.
 
     Attributes:
         welcome: what the controller answered to HELLO.
         report: the one that is to be answered now.
-        arrived_s: when the newest came, port time.
-        nacks: refused frames by reason.
         halted: we asked it to stop; a latched controller is no surprise.
     """
 
-    def __init__(
-        self,
-        port: BytePort,
-        profile: ControllerProfile,
-        *,
-        lead_ticks: int,
-        silence_s: float,
-        sink: Sink = unheard,
-    ) -> None:
-        self._port = port
-        self._profile = profile
+    def __init__(self, host: HostControl, *, lead_ticks: int, silence_s: float) -> None:
+        self._host = host
+        self._port = host.port
         self._lead_ticks = lead_ticks
         self._silence_s = silence_s
-        self._sink = sink
         self._reader = FrameReader()
         self._seq = 0
         self._session = 0
@@ -89,20 +75,15 @@ class StreamSession:
         self.report: TickReport | None = None
         self._newest: TickReport | None = None
         self._reports: deque[TickReport] = deque()
-        self.arrived_s = 0.0
-        self.nacks: Counter[str] = Counter()
+        self._arrived_s = 0.0
+        self._nacks: Counter[str] = Counter()
         self.halted = False
-
-    @property
-    def damaged(self) -> int:
-        """Frames from the controller that arrived damaged."""
-        return self._reader.damaged
 
     def overdue_ns(self) -> int:
         """How long ago the report came that is to be answered now; 0 while others wait behind it."""
-        return 0 if self._reports else round((self._port.now_s() - self.arrived_s) * 1e9)
+        return 0 if self._reports else round((self._port.now_s() - self._arrived_s) * 1e9)
 
-    def begin(self, session: int, axis_mask: int) -> Welcome:
+    def begin(self, session: int, axis_mask: int) -> None:
         """Say HELLO until the controller answers.
 
         Raises:
@@ -117,11 +98,11 @@ class StreamSession:
             again_s = self._port.now_s() + _HELLO_EVERY_S
             while self._port.now_s() < again_s:
                 self._collect(again_s - self._port.now_s())
-                self._raise_error()
-                welcome = self.welcome
-                if welcome is not None and welcome.session == session:
-                    self._check_welcome(welcome, axis_mask)
-                    return welcome
+                if self._error is not None:
+                    raise self._error
+                if self.welcome is not None and self.welcome.session == session:
+                    self._check_welcome(self.welcome, axis_mask)
+                    return
         raise LinkError(
             f"no HELLO within {_HELLO_FOR_S:g} s after streaming was granted",
             where="FSTREAM",
@@ -150,7 +131,7 @@ class StreamSession:
             self._go_on_to(tick)
             if self.report is not None and self.report.tick >= tick:
                 return self.report
-            quiet_until_s = self.arrived_s + self._silence_s
+            quiet_until_s = self._arrived_s + self._silence_s
             if self._port.now_s() >= quiet_until_s:
                 raise HardwareError(
                     f"no feedback for {self._silence_s * 1e3:.0f} ms",
@@ -201,46 +182,38 @@ class StreamSession:
             raise self._error
 
     def _latched(self, report: TickReport) -> SafetyAbort:
-        holds = set(decode_status(self._profile, report.data_1, report.data_2).holds) - {"command hold"}
+        holds = set(decode_status(self._host.profile, report.data_1, report.data_2).holds) - {"command hold"}
+        refused = ", ".join(f"{count} for {reason}" for reason, count in self._nacks.items()) or "none"
+        lost = f"refused by it: {refused}; damaged on the way here: {self._reader.damaged}"
+        cause = f"its watchdog missed set-points ({lost})"
+        next_step = "check the cable; free this machine's processor, or raise `options.lead_ticks`"
         if holds:
-            return SafetyAbort(
-                "the controller stopped the arm and latched",
-                where="controller",
-                cause=f"somebody pressed hold ({', '.join(sorted(holds))})",
-                next_step="release it at the controller, then start again",
-            )
-        refused = ", ".join(f"{count} for {reason}" for reason, count in self.nacks.items()) or "none"
-        return SafetyAbort(
-            "the controller stopped the arm and latched",
-            where="controller",
-            cause=f"its watchdog missed set-points (refused by it: {refused}; damaged on the way here: {self.damaged})",
-            next_step="check the cable; free this machine's processor, or raise `options.lead_ticks`",
-        )
+            cause = f"somebody pressed hold ({', '.join(sorted(holds))})"
+            next_step = "release it at the controller, then start again"
+        what = "the controller stopped the arm and latched"
+        return SafetyAbort(what, where="controller", cause=cause, next_step=next_step)
 
-    def halt(self) -> None:
-        """STOP, several times over, waiting for nothing; the session is dead after it."""
+    def halt(self, *, leave: bool = False) -> None:
+        """STOP, several times over, waiting for nothing; the session is dead after it.
+
+        Args:
+            leave: give the line back to host control, and wait a moment for the controller's goodbye.
+        """
         self.halted = True
         for _ in range(_STOP_REPEATS):
             self._seq = (self._seq + 1) & 0xFFFF
-            self._write(encode_stop(self._seq, self._session, leave=False))
-
-    def leave(self) -> None:
-        """Give the line back to host control."""
-        self.halted = True
-        for _ in range(_STOP_REPEATS):
-            self._seq = (self._seq + 1) & 0xFFFF
-            self._write(encode_stop(self._seq, self._session, leave=True))
+            self._write(encode_stop(self._seq, self._session, leave=leave))
             until_s = self._port.now_s() + _GOODBYE_S / _STOP_REPEATS
-            while not self._goodbye and self._port.now_s() < until_s:
+            while leave and not self._goodbye and self._port.now_s() < until_s:
                 self._collect(until_s - self._port.now_s())
-            if self._goodbye:
+            if leave and self._goodbye:
                 return
 
     def _collect(self, timeout_s: float) -> None:
         data = self._port.read(max(0.0, timeout_s))
         if not data:
             return
-        self._sink(data, False)
+        self._host.sink(data, False)
         for frame in self._reader.take(data):
             self._take(frame)
 
@@ -250,15 +223,15 @@ class StreamSession:
                 if frame.session == self._session and (self._newest is None or frame.tick > self._newest.tick):
                     self._newest = frame
                     self._reports.append(frame)
-                    self.arrived_s = self._port.now_s()
+                    self._arrived_s = self._port.now_s()
             case Nack():
-                self.nacks[frame.reason] += 1
+                self._nacks[frame.reason] += 1
                 if frame.code not in _RECOVERABLE and self._error is None:
                     self._error = _refused(frame)
                     self._refused_at_tick = self._newest.tick if self._newest is not None else -1
             case Welcome():
                 self.welcome = frame
-                self.arrived_s = self._port.now_s()
+                self._arrived_s = self._port.now_s()
             case Stopped():
                 self._goodbye = self._goodbye or frame.leaving
 
@@ -272,22 +245,16 @@ class StreamSession:
             self.report = newest
             reports.clear()
 
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
-
     def _write(self, data: bytes) -> None:
-        self._sink(data, True)
+        self._host.sink(data, True)
         self._port.write(data)
 
 
 def _refused(nack: Nack) -> FrictidError:
-    what, next_step = "", ""
-    if nack.code in _REFUSED:
-        what, next_step = _REFUSED[Refusal(nack.code)]
+    what, next_step = _REFUSED.get(nack.code, (nack.reason, ""))
     axis = "" if nack.axis == 0xFF else f", axis {nack.axis}"
     return SafetyAbort(
-        f"the controller refused a frame: {what or nack.reason} (due tick {nack.due_tick}, now {nack.now_tick}{axis})",
+        f"the controller refused a frame: {what} (due tick {nack.due_tick}, now {nack.now_tick}{axis})",
         where="streaming",
         next_step=next_step,
     )

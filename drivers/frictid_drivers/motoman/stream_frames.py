@@ -11,7 +11,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import Final
+from typing import Final, NamedTuple
 
 VERSION: Final = 1
 _SYNC: Final = b"\xa5\x5a"
@@ -53,23 +53,15 @@ class Flag(IntFlag):
     COMPENSATED = 32
 
 
-@dataclass(frozen=True, slots=True)
-class AxisFeedback:
-    """One axis in one tick.
-
-    Attributes:
-        pulses: encoder position.
-        speed_tenths: 0.1 pulse/s.
-        torque: in the unit that HELLO named.
-    """
+class AxisFeedback(NamedTuple):
+    """One axis in one tick: encoder position, 0.1 pulse/s, torque in the unit that HELLO named."""
 
     pulses: int
     speed_tenths: int
     torque: int
 
 
-@dataclass(frozen=True, slots=True)
-class TickReport:
+class TickReport(NamedTuple):
     """FEEDBACK."""
 
     tick: int
@@ -84,8 +76,7 @@ class TickReport:
     axes: tuple[AxisFeedback, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Nack:
+class Nack(NamedTuple):
     """NACK."""
 
     refused_seq: int
@@ -98,14 +89,12 @@ class Nack:
     @property
     def reason(self) -> str:
         """In words."""
-        try:
+        if self.code in set(Refusal):
             return Refusal(self.code).name.lower().replace("_", " ")
-        except ValueError:
-            return f"code {self.code}"
+        return f"code {self.code}"
 
 
-@dataclass(frozen=True, slots=True)
-class AxisLimits:
+class AxisLimits(NamedTuple):
     """The controller's own bounds of one axis, in pulses and pulses per tick."""
 
     lowest: int
@@ -148,8 +137,7 @@ class Welcome:
     limits: tuple[AxisLimits, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Stopped:
+class Stopped(NamedTuple):
     """STOP, echoed."""
 
     session: int
@@ -158,9 +146,9 @@ class Stopped:
 
 Frame = TickReport | Nack | Welcome | Stopped
 
-_FEEDBACK_HEAD: Final = struct.Struct("<IHBBHBBBBH")
+_FEEDBACK_HEAD: Final = struct.Struct("<IHBBHBBBB2x")
 _AXIS: Final = struct.Struct("<iii")
-_NACK: Final = struct.Struct("<HBBHBBH")
+_NACK: Final = struct.Struct("<HBBHBxH")
 _WELCOME_HEAD: Final = struct.Struct("<BBBBHBBHHI")
 _HEAD_OF_LIST: Final = 16
 _UNKNOWN_AVERAGING: Final = 0xFFFF
@@ -220,10 +208,6 @@ class FrameReader:
         self._buffer = bytearray()
         self.damaged = 0
 
-    def clear(self) -> None:
-        """Forget the bytes so far."""
-        self._buffer.clear()
-
     def take(self, data: bytes) -> list[Frame]:
         """The frames that these bytes complete, in order."""
         buffer = self._buffer
@@ -267,33 +251,21 @@ def _decode(version: int, kind: int, payload: bytes) -> Frame | None:
     if version != VERSION:
         return None
     if kind == FrameType.FEEDBACK:
-        *figures, mask, _ = _FEEDBACK_HEAD.unpack_from(payload)
-        tick, echo, data_1, data_2, alarm, queue, flags, session = figures
-        axes = tuple(AxisFeedback(*row) for row in _AXIS.iter_unpack(payload[_HEAD_OF_LIST:]))
+        tick, echo, data_1, data_2, alarm, queue, flags, session, mask = _FEEDBACK_HEAD.unpack_from(payload)
+        axes = tuple(map(AxisFeedback._make, _AXIS.iter_unpack(payload[_HEAD_OF_LIST:])))
         if mask.bit_count() != len(axes):
             return None
         return TickReport(tick, echo, data_1, data_2, alarm, queue, Flag(flags), session, mask, axes)
     if kind == FrameType.NACK:
-        seq, code, session, due, axis, _, now = _NACK.unpack(payload)
-        return Nack(seq, code, session, due, axis, now)
+        return Nack(*_NACK.unpack(payload))
     if kind == FrameType.STOP:
         return Stopped(payload[0], payload[1] == 1)
     version, session, mask, flags, tick_us, watchdog, queue, averaging, unit, tick = _WELCOME_HEAD.unpack_from(payload)
-    limits = tuple(AxisLimits(*row) for row in _AXIS.iter_unpack(payload[_HEAD_OF_LIST:]))
+    limits = tuple(map(AxisLimits._make, _AXIS.iter_unpack(payload[_HEAD_OF_LIST:])))
     if mask.bit_count() != len(limits):
         return None
+    known_ms = None if averaging == _UNKNOWN_AVERAGING else averaging
+    feeds, measures, compensates = (bool(flags & bit) for bit in (1, 2, 4))
     return Welcome(
-        version=version,
-        session=session,
-        axis_mask=mask,
-        feed_forward=bool(flags & 1),
-        torque_measured=bool(flags & 2),
-        compensated=bool(flags & 4),
-        tick_us=tick_us,
-        watchdog_ticks=watchdog,
-        queue_limit=queue,
-        averaging_ms=None if averaging == _UNKNOWN_AVERAGING else averaging,
-        torque_unit=unit,
-        tick=tick,
-        limits=limits,
+        version, session, mask, feeds, measures, compensates, tick_us, watchdog, queue, known_ms, unit, tick, limits
     )
