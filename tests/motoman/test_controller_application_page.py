@@ -113,9 +113,7 @@ def stream_examples() -> dict[str, str]:
     emulator: Emulator = make_bench(axes=2).emulator
     emulator.panel.power(True)
     said: list[bytes] = []
-    app = StreamApplication(
-        emulator.panel, emulator.axes, 3, 0.004, lambda kind, frame: said.append(frame), lambda: None
-    )
+    app = StreamApplication(emulator.panel, 3, lambda kind, frame: said.append(frame), lambda: None)
 
     def exchanged(frame: bytes, *, ticks: int = 0) -> str:
         said.clear()

@@ -41,9 +41,7 @@ class Application:
         self.emulator.panel.power(True)
         self.app = StreamApplication(
             self.emulator.panel,
-            self.emulator.axes,
             (1 << axes) - 1,
-            0.004,
             lambda kind, frame: self.said.append(frame),
             lambda: None,
         )

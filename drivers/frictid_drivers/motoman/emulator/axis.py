@@ -7,6 +7,7 @@ really issued.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,35 +25,28 @@ class Servo(Protocol):
     @property
     def measured_position_rad(self) -> float:
         """The encoder's position."""
-        ...
 
     @property
     def velocity_rad_s(self) -> float:
         """The drive's own estimate."""
-        ...
 
     @property
     def torque_nm(self) -> float:
         """Torque as reported."""
-        ...
 
     def power(self, on: bool) -> None:
         """Switch the power stage."""
-        ...
 
     def brake(self, engaged: bool) -> None:
         """Close or open the holding brake."""
-        ...
 
     def set_mode(self, mode: int) -> None:
         """8 position, 10 torque."""
-        ...
 
     def advance(
         self, duration_s: float, *, position_rad: float = 0.0, torque_nm: float = 0.0, torque_offset_nm: float = 0.0
     ) -> None:
         """Let time pass; the position is approached linearly."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +57,7 @@ class Plate:
         pulses_per_rad: signed; negative where positive pulses turn the joint backwards.
         gear_ratio: motor revolutions per joint revolution.
         rated_torque_nm: joint side.
-        lowest: software limit, pulses.
-        highest: software limit, pulses.
+        lowest: software limit, pulses; so is ``highest``.
         step: most pulses per tick.
     """
 
@@ -74,6 +67,11 @@ class Plate:
     lowest: int
     highest: int
     step: int
+
+    @property
+    def sign(self) -> float:
+        """-1 where positive pulses turn the joint backwards."""
+        return math.copysign(1.0, self.pulses_per_rad)
 
 
 class Axis:
@@ -113,8 +111,7 @@ class Axis:
     @property
     def torque_micro(self) -> int:
         """uN m at the motor shaft, positive towards positive pulses."""
-        sign = 1.0 if self.plate.pulses_per_rad > 0 else -1.0
-        return round(sign * self.servo.torque_nm / self.plate.gear_ratio * 1e6)
+        return round(self.plate.sign * self.servo.torque_nm / self.plate.gear_ratio * 1e6)
 
     def power(self, on: bool) -> None:
         """Servo power; switched on, the axis holds where it stands."""

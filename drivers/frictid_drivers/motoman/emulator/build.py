@@ -1,20 +1,7 @@
 """From a robot file to the controller that a supplier would have set up for it.
 
 Every joint's ``simulated`` mapping becomes the joint behind an axis; pulses per degree, gear ratio and limits become
-what the controller knows of the axis. ``options.emulator`` says what kind of controller it is:
-
-===================  ========  ==================================================================================
-key                  default   meaning
-===================  ========  ==================================================================================
-averaging_ms         0         moving average on the command
-batch                true      the batch application is installed
-stream               true      the streaming application is installed
-thinking_ms          12        between a command and the bid to reply
-table_delay_ms       0         by which the torque of a friction table comes late, whole ticks
-reads_while_running  true      the batch application hands samples over while a job runs
-hand_amplitude_rad   0.349     a person guides a floating joint by this much, about where it stands
-hand_frequency_hz    0.5       so many times a second
-===================  ========  ==================================================================================
+what the controller knows of the axis. ``options.emulator`` says what kind of controller it is.
 """
 
 from __future__ import annotations
@@ -26,7 +13,8 @@ from typing import Any
 
 from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import FaultPlan
-from frictid_drivers.motoman.emulator.machine import Emulator, Settings
+from frictid_drivers.motoman.emulator.machine import Emulator
+from frictid_drivers.motoman.emulator.panel import Settings
 from frictid_drivers.motoman.emulator.station import Parameters
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
@@ -37,14 +25,14 @@ CONTROL_PERIOD_S = 0.001
 _SPEED_MARGIN = 1.1
 
 _DEFAULTS: Mapping[str, float | bool] = {
-    "averaging_ms": 0,
-    "batch": True,
-    "stream": True,
-    "thinking_ms": 12,
-    "table_delay_ms": 0,
-    "reads_while_running": True,
-    "hand_amplitude_rad": 0.349,
-    "hand_frequency_hz": 0.5,
+    "averaging_ms": 0,  # moving average on the command
+    "batch": True,  # the batch application is installed
+    "stream": True,  # the streaming application is installed
+    "thinking_ms": 12,  # between a command and the bid to reply
+    "table_delay_ms": 0,  # by which the torque of a friction table comes late, whole ticks
+    "reads_while_running": True,  # the batch application hands samples over while a job runs
+    "hand_amplitude_rad": 0.349,  # a person guides a floating joint by this much, about where it stands
+    "hand_frequency_hz": 0.5,  # so many times a second
 }
 
 
@@ -56,17 +44,14 @@ def build(setup: RobotSetup, faults: FaultPlan | None = None) -> Emulator:
     """
     options = _options(setup.options.get("emulator", {}))
     settings = _settings(setup, options)
-    by_axis = {joint.address: joint for joint in setup.joints}
-    loops: list[ServoLoop] = []
-    axes: list[Axis] = []
-    for number in range(max(by_axis) + 1):
-        joint = by_axis.get(number)
-        if joint is None:
+    joints = [joint for _, joint in sorted({joint.address: joint for joint in setup.joints}.items())]
+    for number, joint in enumerate(joints):
+        if joint.address != number:
             path = ("joints", setup.joints[0].name, "axis")
             raise InvalidFields([FieldProblem(path, f"axes must be numbered without gaps; no joint has axis {number}")])
-        loop = _loop(setup, joint)
-        loops.append(loop)
-        axes.append(Axis(_plate(joint, settings.tick_s), loop, settings.averaging_ticks))
+    loops = [_loop(setup, joint) for joint in joints]
+    plates = [_plate(joint, settings.tick_s) for joint in joints]
+    axes = [Axis(plate, loop, settings.averaging_ticks) for plate, loop in zip(plates, loops, strict=True)]
 
     def on_guided(number: int, guided: bool) -> None:
         loop = loops[number]
@@ -100,6 +85,7 @@ def _options(given: Any) -> dict[str, float | bool]:
 def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Settings:
     tick_s = 1.0 / setup.cycle_hz
     stream_baud = int(setup.options.get("stream_baud", 0))
+    timers = ("timer_a_s", "timer_b_s", "retry_1", "retry_2")
     return Settings(
         generation=str(setup.options.get("controller", "nx")),
         baud=int(setup.options.get("baud", 19200)),
@@ -111,12 +97,7 @@ def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Setting
         thinking_s=options["thinking_ms"] * 1e-3,
         table_delay_ticks=round(options["table_delay_ms"] * 1e-3 / tick_s),
         reads_while_running=bool(options["reads_while_running"]),
-        parameters=Parameters(
-            timer_a_s=float(setup.options.get("timer_a_s", 3.0)),
-            timer_b_s=float(setup.options.get("timer_b_s", 20.0)),
-            retry_1=int(setup.options.get("retry_1", 10)),
-            retry_2=int(setup.options.get("retry_2", 3)),
-        ),
+        parameters=Parameters(**{name: setup.options[name] for name in timers if name in setup.options}),
     )
 
 

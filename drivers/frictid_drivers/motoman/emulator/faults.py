@@ -1,32 +1,7 @@
 """Faults on command: what shall go wrong, and at which of the things that the controller does.
 
 A fault is written ``kind@n``, ``kind@nxK`` or ``kind@n:value``: at the n-th occasion (from 0), K times in a row, with a
-figure. Which occasions are counted depends on the kind:
-
-=============  =======================  ====================================================================
-kind           counts                   does
-=============  =======================  ====================================================================
-lost_ack       acknowledgements said    swallows it
-wrong_ack      acknowledgements said    says the other parity
-nak            blocks heard             rejects an intact block
-bad_bcc        blocks said              falsifies the block check
-lost_block     blocks said              swallows it
-garble         all utterances           flips a bit in the middle of it
-silence        all utterances           says nothing for ``value`` seconds
-enq            ENQs heard               bids against it; ``value`` 1: and does not yield
-split          all utterances           from here on, byte by byte
-merge          all utterances           from here on, utterances within ``value`` seconds arrive together
-close          all utterances           the port disappears, for good or for ``value`` seconds
-bad_crc        stream frames said       falsifies the CRC
-lost_frame     stream frames said       swallows it
-deaf           stream frames heard      does not hear it
-noise          stream frames heard      hears it with a flipped bit
-late           ticks of motion          the feedback of this tick comes ``value`` seconds late
-alarm          ticks of motion          alarm number ``value``: servo power off
-hold           ticks of motion          somebody presses hold on the pendant
-drop           ticks of motion          the speed limiter drops ``value`` pulses of every moving axis
-unplug         ticks of motion          the port disappears, for good or for ``value`` seconds
-=============  =======================  ====================================================================
+figure. ``OCCASIONS`` says which occasions are counted for each kind.
 """
 
 from __future__ import annotations
@@ -39,27 +14,29 @@ from dataclasses import dataclass
 from frictid_hil.errors import UsageError
 
 OCCASIONS = {
-    "lost_ack": "ack",
-    "wrong_ack": "ack",
-    "nak": "block heard",
-    "bad_bcc": "block",
-    "lost_block": "block",
-    "garble": "utterance",
-    "silence": "utterance",
-    "enq": "enq heard",
-    "split": "utterance",
-    "merge": "utterance",
-    "close": "utterance",
-    "bad_crc": "frame",
-    "lost_frame": "frame",
-    "deaf": "frame heard",
-    "noise": "frame heard",
-    "late": "tick",
-    "alarm": "tick",
-    "hold": "tick",
-    "drop": "tick",
-    "unplug": "tick",
+    "lost_ack": "ack",  # swallows it
+    "wrong_ack": "ack",  # says the other parity
+    "nak": "block heard",  # rejects an intact block
+    "bad_bcc": "block",  # falsifies the block check
+    "lost_block": "block",  # swallows it
+    "garble": "utterance",  # flips a bit in the middle of it
+    "silence": "utterance",  # says nothing for ``value`` seconds
+    "enq": "enq heard",  # bids against it; ``value`` 1: and does not yield
+    "split": "utterance",  # from here on, byte by byte
+    "merge": "utterance",  # from here on, utterances within ``value`` seconds arrive together
+    "close": "utterance",  # the port disappears, for good or for ``value`` seconds
+    "bad_crc": "frame",  # falsifies the CRC
+    "lost_frame": "frame",  # swallows it
+    "deaf": "frame heard",  # does not hear it
+    "noise": "frame heard",  # hears it with a flipped bit
+    "late": "tick",  # the feedback of this tick comes ``value`` seconds late
+    "alarm": "tick",  # alarm number ``value``: servo power off
+    "hold": "tick",  # somebody presses hold on the pendant
+    "drop": "tick",  # the speed limiter drops ``value`` pulses of every moving axis
+    "unplug": "tick",  # the port disappears, for good or for ``value`` seconds
 }
+"""What is counted, by kind: what the controller says (acks, blocks, any utterance; stream frames), what it hears, ticks
+of motion."""
 _FROM_HERE_ON = {"split", "merge"}
 _WRITTEN = re.compile(r"^([a-z_]+)@(\d+)(?:x(\d+))?(?::(-?\d+(?:\.\d+)?))?$", re.ASCII)
 
@@ -69,7 +46,7 @@ class Fault:
     """One thing that shall go wrong.
 
     Attributes:
-        kind: see the table above.
+        kind: see ``OCCASIONS``.
         at: first occasion, from 0.
         times: occasions in a row.
         value: figure of the kind (seconds, alarm number, pulses).

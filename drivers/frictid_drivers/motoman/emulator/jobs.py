@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from frictid_drivers.motoman.emulator.axis import Axis
 from frictid_drivers.motoman.emulator.compensation import Compensator, Table
 from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, data, refusal
 
@@ -70,35 +69,17 @@ class BatchApplication:
     """FHELLO, FJOB, FRUN, FSTAT, FSTOP, FREAD, FTABLE, FTREAD, FCOMP.
 
     Args:
-        panel: state of the controller.
-        axes: the arm.
-        tick_s: interpolation clock.
-        averaging_ms: of the command, as FHELLO tells.
-        table_delay_ticks: between the tick that a table's torque is computed in and the tick that it acts in.
-        reads_while_running: it knows FREAD 2.
+        panel: the controller.
         on_guided: told when an axis is given into a person's hands, and taken back.
 
     Attributes:
         compensated: mask of axes whose table is applied every tick.
     """
 
-    def __init__(
-        self,
-        panel: Panel,
-        axes: Sequence[Axis],
-        tick_s: float,
-        *,
-        averaging_ms: int = 0,
-        table_delay_ticks: int = 0,
-        reads_while_running: bool = True,
-        on_guided: Callable[[int, bool], None] | None = None,
-    ) -> None:
+    def __init__(self, panel: Panel, on_guided: Callable[[int, bool], None]) -> None:
         self._panel = panel
-        self._axes = axes
-        self._tick_s = tick_s
-        self._averaging_ms = averaging_ms
-        self._table_delay_ticks = table_delay_ticks
-        self._reads_while_running = reads_while_running
+        self._axes = panel.axes
+        self._settings = panel.settings
         self._on_guided = on_guided
         self._job: Job | None = None
         self._tables: dict[int, tuple[bytes, Table]] = {}
@@ -120,9 +101,13 @@ class BatchApplication:
         }
 
     @property
+    def _running(self) -> Job | None:
+        return self._job if self._job is not None and self._job.state == RUNNING else None
+
+    @property
     def moving(self) -> bool:
         """A job is running."""
-        return self._job is not None and self._job.state == RUNNING
+        return self._running is not None
 
     def knows(self, command: str) -> bool:
         """Whether this is a command of this application."""
@@ -133,7 +118,7 @@ class BatchApplication:
         command, _, rest = text.partition(" ")
         version, *operands = rest.split(",")
         action = self._commands[command]
-        if (command, version) == ("FREAD", "2") and self._reads_while_running:
+        if (command, version) == ("FREAD", "2") and self._settings.reads_while_running:
             action = self._read_so_far
         elif version != "1":
             return refusal(5170)
@@ -148,8 +133,8 @@ class BatchApplication:
 
     def stop(self, reason: str) -> None:
         """End the running job by deceleration; an alarm or lost servo power ends it at once."""
-        job = self._job
-        if job is None or job.state != RUNNING:
+        job = self._running
+        if job is None:
             return
         if reason in ("alarm", "servo off"):
             job.reason = reason
@@ -158,15 +143,15 @@ class BatchApplication:
             job.reason = reason
             issued = self._axes[job.axis].issued
             speed = job.path[job.done] - job.path[job.done - 1] if 0 < job.done < len(job.path) else 0
-            ahead = [round(issued + speed * (k - k * k / (2 * STOPPING_TICKS))) for k in range(1, STOPPING_TICKS + 1)]
-            self._stopping = ahead
+            ticks = range(1, STOPPING_TICKS + 1)
+            self._stopping = [round(issued + speed * (k - k * k / (2 * STOPPING_TICKS))) for k in ticks]
 
     # -- the interpolation clock -------------------------------------------------------------------------------
 
     def tick(self, dropped: int) -> None:
         """One tick of a running job: latch, then issue the next command."""
-        job = self._job
-        if job is None or job.state != RUNNING:
+        job = self._running
+        if job is None:
             return
         axis = self._axes[job.axis]
         self._unheard_ticks += 1
@@ -177,21 +162,15 @@ class BatchApplication:
         if self._overload_ticks > 5:
             self.stop("torque")
         job.done += 1
-        if self._stopping is not None:
-            if not self._stopping:
-                self._end(job, STOPPED)
-            else:
-                axis.ask(self._stopping.pop(0))
-            return
-        if job.done >= len(job.path):
+        if self._stopping:
+            axis.ask(self._stopping.pop(0))
+        elif self._stopping is not None:
+            self._end(job, STOPPED)
+        elif job.done >= len(job.path):
             self._end(job, FINISHED)
-            return
-        floating = job.floating[job.done]
-        if floating != axis.floating:
-            axis.set_floating(floating)
-            if self._on_guided is not None:
-                self._on_guided(job.axis, floating)
-        job.dropped += axis.ask(job.path[job.done], dropped)
+        else:
+            self._guide(job, job.floating[job.done])
+            job.dropped += axis.ask(job.path[job.done], dropped)
 
     def compensate(self) -> None:
         """Every tick: the tables' torque on every compensated axis."""
@@ -200,27 +179,30 @@ class BatchApplication:
                 continue
             compensator = self._compensators.get(number)
             if compensator is None:
-                compensator = self._compensators[number] = Compensator(
-                    self._tables[number][1], axis.pulses, self._table_delay_ticks
-                )
+                table, delay_ticks = self._tables[number][1], self._settings.table_delay_ticks
+                compensator = self._compensators[number] = Compensator(table, axis.pulses, delay_ticks)
             micro = compensator.torque_micro(axis.pulses, axis.speed_tenths, gravity=axis.floating)
-            sign = 1.0 if axis.plate.pulses_per_rad > 0 else -1.0
-            axis.feed_forward_nm = sign * micro * 1e-6 * axis.plate.gear_ratio
+            axis.feed_forward_nm = axis.plate.sign * micro * 1e-6 * axis.plate.gear_ratio
+
+    def _guide(self, job: Job, floating: bool) -> None:
+        axis = self._axes[job.axis]
+        if floating != axis.floating:
+            axis.set_floating(floating)
+            self._on_guided(job.axis, floating)
 
     def _end(self, job: Job, state: int) -> None:
-        axis = self._axes[job.axis]
-        if axis.floating:
-            axis.set_floating(False)
-            if self._on_guided is not None:
-                self._on_guided(job.axis, False)
+        self._guide(job, False)
         job.state = state
         self._stopping = None
         self._panel.operating = False
 
     # -- commands ----------------------------------------------------------------------------------------------
 
+    def _asked_for(self, number: int) -> Job | None:
+        return self._job if self._job is not None and self._job.number == number else None
+
     def _hello(self, text: str, operands: list[str]) -> Reply:
-        figures = (1, round(self._tick_s * 1e6), len(self._axes), MOST_TICKS, 1, self._averaging_ms, 21)
+        figures = (1, self._settings.tick_us, len(self._axes), MOST_TICKS, 1, self._settings.averaging_ms, 21)
         return data(",".join(map(str, figures)) + ",EMULATED")
 
     def _accept(self, text: str, operands: list[str]) -> Reply:
@@ -249,8 +231,8 @@ class BatchApplication:
 
     def _run(self, text: str, operands: list[str]) -> Reply:
         (number,) = map(int, operands)
-        job = self._job
-        if job is None or job.number != number:
+        job = self._asked_for(number)
+        if job is None:
             return refusal(4040)
         forbidden = self._panel.moving_forbidden()
         if forbidden:
@@ -267,8 +249,8 @@ class BatchApplication:
 
     def _stat(self, text: str, operands: list[str]) -> Reply:
         (number,) = map(int, operands)
-        job = self._job
-        if job is None or job.number != number:
+        job = self._asked_for(number)
+        if job is None:
             return data(f"{number},0,0,0,{self._panel.alarm},0,0,0,0")
         velocity_shift, torque_shift = job.shifts() if job.state != RUNNING else (0, 0)
         figures = (
@@ -285,38 +267,32 @@ class BatchApplication:
         """FREAD 1: of a job that is over, every block shifted alike."""
         if self.moving:
             return refusal(2010)
-        return self._blocks(operands, lambda job, rows: (job.shifts(), b""))
+        return self._blocks(operands, each_shifted=False)
 
     def _read_so_far(self, text: str, operands: list[str]) -> Reply:
         """FREAD 2: what is there already, also of a running job; every block says how it is shifted."""
+        return self._blocks(operands, each_shifted=True)
 
-        def shifted(job: Job, rows: Sequence[tuple[int, int, int]]) -> tuple[tuple[int, int], bytes]:
-            shifts = _shifts(rows)
-            return shifts, bytes(shifts)
-
-        return self._blocks(operands, shifted)
-
-    def _blocks(
-        self,
-        operands: list[str],
-        shifted: Callable[[Job, Sequence[tuple[int, int, int]]], tuple[tuple[int, int], bytes]],
-    ) -> Reply:
+    def _blocks(self, operands: list[str], *, each_shifted: bool) -> Reply:
         number, first, count = map(int, operands)
-        job = self._job
-        if job is None or job.number != number:
+        job = self._asked_for(number)
+        if job is None:
             return refusal(4040)
         if not (0 <= first < len(job.samples) and count > 0):
             return refusal(1012)
         blocks = []
+        shifts = (0, 0) if each_shifted else job.shifts()
         last = min(first + count, len(job.samples))
         for begin in range(first, last, SAMPLES_PER_BLOCK):
             rows = job.samples[begin : min(begin + SAMPLES_PER_BLOCK, last)]
-            (velocity_shift, torque_shift), told = shifted(job, rows)
-            raw = number.to_bytes(2, "little") + begin.to_bytes(4, "little") + bytes([len(rows)]) + told
+            raw = struct.pack("<HIB", number, begin, len(rows))
+            if each_shifted:
+                shifts = _shifts(rows)
+                raw += bytes(shifts)
             for pulses, speed, torque in rows:
                 raw += pulses.to_bytes(4, "little", signed=True)
-                raw += (speed >> velocity_shift).to_bytes(3, "little", signed=True)
-                raw += (torque >> torque_shift).to_bytes(3, "little", signed=True)
+                raw += (speed >> shifts[0]).to_bytes(3, "little", signed=True)
+                raw += (torque >> shifts[1]).to_bytes(3, "little", signed=True)
             raw += crc16(raw).to_bytes(2, "little")
             blocks.append(base64.b64encode(raw).decode("ascii"))
         return data(",".join(blocks))
@@ -359,38 +335,29 @@ class BatchApplication:
 def _append_segment(segment: str, path: list[int], floating: list[bool]) -> None:
     """Commands of one segment, one per tick."""
     kind, *figures = segment.split(":")
-    numbers = [int(figure) for figure in figures]
     here = path[-1]
-    if kind == "H" and len(numbers) == 1:
-        made = [here] * _ticks(numbers[0])
-    elif kind == "G" and len(numbers) == 1:
-        path += [here] * _ticks(numbers[0])
-        floating += [True] * numbers[0]
-        return
-    elif kind == "L" and len(numbers) == 2:
-        ticks, goal = _ticks(numbers[0]), numbers[1]
-        made = [round(here + (goal - here) * k / ticks) for k in range(1, ticks + 1)]
-    elif kind == "M" and len(numbers) == 2:
-        ticks, goal = _ticks(numbers[0]), numbers[1]
-        made = []
-        for k in range(1, ticks + 1):
-            u = k / ticks
-            made.append(round(here + (goal - here) * (10 * u**3 - 15 * u**4 + 6 * u**5)))
-    elif kind == "C" and len(numbers) >= 2:
-        travel = numbers[0]
-        made = []
-        for ticks in map(_ticks, numbers[1:]):
-            made += [round(here + travel / 2 * (1 - math.cos(2 * math.pi * k / ticks))) for k in range(1, ticks + 1)]
-    else:
-        raise ValueError(segment)
+    match (kind, *map(int, figures)):
+        case ("H" | "G", int(count)):
+            made = [here for _ in _ticks(count)]
+        case ("L", int(count), int(goal)):
+            made = [round(here + (goal - here) * k / count) for k in _ticks(count)]
+        case ("M", int(count), int(goal)):
+            shares = (k / count for k in _ticks(count))
+            made = [round(here + (goal - here) * (10 * u**3 - 15 * u**4 + 6 * u**5)) for u in shares]
+        case ("C", int(travel), int(), *_):
+            counts = map(int, figures[1:])
+            angles = [2 * math.pi * k / count for count in counts for k in _ticks(count)]
+            made = [round(here + travel / 2 * (1 - math.cos(angle))) for angle in angles]
+        case _:
+            raise ValueError(segment)
     path += made
-    floating += [False] * len(made)
+    floating += [kind == "G"] * len(made)
 
 
-def _ticks(number: int) -> int:
-    if not 0 < number <= MOST_TICKS:
-        raise ValueError(f"{number} ticks")
-    return number
+def _ticks(count: int) -> range:
+    if not 0 < count <= MOST_TICKS:
+        raise ValueError(f"{count} ticks")
+    return range(1, count + 1)
 
 
 def _shifts(samples: Sequence[tuple[int, int, int]]) -> tuple[int, int]:

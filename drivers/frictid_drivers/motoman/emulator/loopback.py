@@ -9,10 +9,7 @@ from frictid_hil.errors import HardwareError
 class LoopbackPort:
     """Looks like a serial port to a driver; time passes only while somebody reads.
 
-    Args:
-        emulator: the controller at the other end.
-        baud: the host's speed; at another speed than the controller's, bytes are lost both ways.
-        parity: the host's parity.
+    At another speed or parity than the controller's, bytes are lost both ways.
     """
 
     def __init__(self, emulator: Emulator, baud: int, parity: str) -> None:

@@ -9,50 +9,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from frictid_drivers.motoman.emulator.axis import Axis
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.jobs import BatchApplication
-from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, refusal
-from frictid_drivers.motoman.emulator.station import Parameters, Station
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, Settings, refusal
+from frictid_drivers.motoman.emulator.station import Station
 from frictid_drivers.motoman.emulator.streaming import StreamApplication
 
 _LONGEST_REST_S = 0.1
 
 Line = tuple[int, str]
 """Speed and parity."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How this controller is made.
-
-    Attributes:
-        generation: erc, xrc, nx or dx.
-        baud: of host control.
-        parity: E, O or N; a byte costs 11 bits with, 10 without.
-        stream_bauds: speeds that FSTREAM may ask for; none on an ordinary port.
-        batch: the batch application is installed.
-        tick_s: interpolation clock.
-        averaging_ticks: moving average on the command; 1 is none.
-        thinking_s: between a command and the bid to reply.
-        table_delay_ticks: by which the torque of a friction table comes late.
-        reads_while_running: the batch application hands samples over while a job runs.
-        parameters: of the link.
-    """
-
-    generation: str = "nx"
-    baud: int = 19200
-    parity: str = "E"
-    stream_bauds: tuple[int, ...] = (115200, 921600)
-    batch: bool = True
-    tick_s: float = 0.004
-    averaging_ticks: int = 1
-    thinking_s: float = 0.012
-    table_delay_ticks: int = 0
-    reads_while_running: bool = True
-    parameters: Parameters = field(default_factory=Parameters)
 
 
 class Emulator:
@@ -73,38 +41,27 @@ class Emulator:
     def __init__(
         self,
         axes: Sequence[Axis],
-        settings: Settings | None = None,
+        settings: Settings,
         faults: FaultPlan | None = None,
         *,
-        on_guided: Callable[[int, bool], None] | None = None,
+        on_guided: Callable[[int, bool], None] = lambda axis, guided: None,
     ) -> None:
-        self.settings = settings or Settings()
+        self.settings = settings
         self.faults = faults or FaultPlan()
-        self.axes = list(axes)
-        self.panel = Panel(self.axes, self.settings.generation)
-        self.panel.on_stop = self._stop_motion
-        averaging_ms = round((self.settings.averaging_ticks - 1) * self.settings.tick_s * 1000)
-        self._averaging_ms = averaging_ms
-        self.batch = BatchApplication(
-            self.panel,
-            self.axes,
-            self.settings.tick_s,
-            averaging_ms=averaging_ms,
-            table_delay_ticks=self.settings.table_delay_ticks,
-            reads_while_running=self.settings.reads_while_running,
-            on_guided=on_guided,
-        )
+        self.panel = Panel(axes, settings, self._stop_motion)
+        self.axes = self.panel.axes
+        self.batch = BatchApplication(self.panel, on_guided)
         self.station = Station(self.settings.parameters, self, self._message)
         self.stream: StreamApplication | None = None
         self._on_stream_line = False
-        self.line = (self.settings.baud, self.settings.parity)
+        self.line: Line = (self.settings.baud, self.settings.parity)
         self._gone_until_s = -math.inf
         self.now_s = 0.0
         self._incoming: deque[tuple[float, bytes]] = deque()
         self._outgoing: deque[tuple[float, bytes, Line]] = deque()
         self._in_free_s = self._out_free_s = 0.0
         self._replies: deque[tuple[float, Reply]] = deque()
-        self._next_line: tuple[int, str, int] | None = None
+        self._next_line: tuple[Line, int] | None = None
         self._next_tick_s = 0.0
         self._settling_ticks = 0
         self._physics_s = 0.0
@@ -149,12 +106,9 @@ class Emulator:
     def next_event_s(self) -> float:
         """When something happens next, at the latest a moment from now."""
         times = [self.now_s + _LONGEST_REST_S]
-        if self._incoming:
-            times.append(self._incoming[0][0])
+        times += [queue[0][0] for queue in (self._incoming, self._replies) if queue]
         if self._outgoing and self._outgoing[0][0] > self.now_s:
             times.append(self._outgoing[0][0])
-        if self._replies:
-            times.append(self._replies[0][0])
         if self.station.deadline_s is not None:
             times.append(self.station.deadline_s)
         if self._ticking:
@@ -164,15 +118,11 @@ class Emulator:
     @property
     def starving(self) -> bool:
         """Nothing is under way on the wire, and the coming tick finds hardly a target in the queue."""
-        dry = self.stream is not None and self.stream.running_dry
-        return dry and self.next_event_s() >= self._next_tick_s
+        return bool(self.stream and self.stream.running_dry and self.next_event_s() >= self._next_tick_s)
 
     def advance(self, to_s: float) -> None:
         """Let everything happen that happens until then."""
-        while True:
-            event_s = self.next_event_s()
-            if event_s > to_s:
-                break
+        while (event_s := self.next_event_s()) <= to_s:
             self.now_s = event_s
             self._happen()
         self.now_s = max(self.now_s, to_s)
@@ -198,27 +148,22 @@ class Emulator:
         struck = self.faults.occasion("frame heard")
         if "deaf" in struck:
             return
-        if "noise" in struck:
-            middle = len(chunk) // 2
-            chunk = chunk[:middle] + bytes([chunk[middle] ^ 0x10]) + chunk[middle + 1 :]
         assert self.stream is not None
-        self.stream.hear(chunk)
+        self.stream.hear(_flipped(chunk, 0x10) if "noise" in struck else chunk)
+
+    @property
+    def _moving(self) -> bool:
+        return self.batch.moving or (self.stream is not None and self.stream.moving)
 
     @property
     def _ticking(self) -> bool:
-        return (
-            self._on_stream_line
-            or self.batch.moving
-            or (self.stream is not None and self.stream.moving)
-            or self._settling_ticks > 0
-            or (self.batch.compensated != 0 and self.panel.servo_on)
-        )
+        compensating = self.batch.compensated != 0 and self.panel.servo_on
+        return self._on_stream_line or self._moving or self._settling_ticks > 0 or compensating
 
     def _tick(self) -> None:
         tick_s = self.settings.tick_s
-        moving = self.batch.moving or (self.stream is not None and self.stream.moving)
         late_s, dropped = 0.0, 0
-        if moving:
+        if self._moving:
             self._settling_ticks = self.settings.averaging_ticks + 1
             late_s, dropped = self._strike_motion()
         elif self._settling_ticks:
@@ -238,11 +183,12 @@ class Emulator:
         """Nothing moves: physics in one portion up to now, and the next tick from here."""
         self._next_tick_s = self.now_s
         passed_s = self.now_s - self._physics_s
-        if passed_s >= 0.001:
-            self._physics_s = self.now_s
-            if self.panel.servo_on or passed_s < 1.0:
-                for axis in self.axes:
-                    axis.rest(passed_s)
+        if passed_s < 0.001:
+            return
+        self._physics_s = self.now_s
+        if self.panel.servo_on or passed_s < 1.0:
+            for axis in self.axes:
+                axis.rest(passed_s)
 
     def _strike_motion(self) -> tuple[float, int]:
         """Faults of this tick: seconds of lateness, dropped pulses; the others strike at once."""
@@ -289,29 +235,23 @@ class Emulator:
             version, baud, tick_us, mask = map(int, operands)
         except ValueError:
             return refusal(5170)
-        if version != 1 or baud not in self.settings.stream_bauds or tick_us != round(self.settings.tick_s * 1e6):
+        if version != 1 or baud not in self.settings.stream_bauds or tick_us != self.settings.tick_us:
             return refusal(1012)
         if not 0 < mask < 1 << len(self.axes):
             return refusal(1012)
         if self.batch.moving:
             return refusal(2010)
-        self._next_line = (baud, "N", mask)
+        self._next_line = ((baud, "N"), mask)
         return DONE
 
-    def _switch_to_stream(self, baud: int, parity: str, mask: int) -> None:
+    def _switch_to_stream(self, line: Line, mask: int) -> None:
         """The line changes with the EOT that ends the granting reply."""
-        self.line = (baud, parity)
+        self.line = line
         self._on_stream_line = True
         self._in_free_s = self._out_free_s
+        compensated = self.batch.compensated != 0
         self.stream = StreamApplication(
-            self.panel,
-            self.axes,
-            mask,
-            self.settings.tick_s,
-            self.say,
-            self._switch_to_host_control,
-            averaging_ms=self._averaging_ms,
-            compensated=self.batch.compensated != 0,
+            self.panel, mask, self.say, self._switch_to_host_control, compensated=compensated
         )
         self._next_tick_s = self._physics_s = self.now_s + self.settings.tick_s
 
@@ -354,16 +294,14 @@ class Emulator:
 
     def delivered(self, arrived: bool) -> None:
         """See ``station.Voice``: a granted stream begins once the host has the grant."""
-        line, self._next_line = self._next_line, None
-        if arrived and line is not None:
-            self._switch_to_stream(*line)
+        granted, self._next_line = self._next_line, None
+        if arrived and granted is not None:
+            self._switch_to_stream(*granted)
 
     def hears_enq(self) -> str:
         """See ``station.Voice``."""
         fault = self.faults.occasion("enq heard").get("enq")
-        if fault is None:
-            return ""
-        return "insist" if fault.value else "bid"
+        return "" if fault is None else "insist" if fault.value else "bid"
 
     def doubts_block(self) -> bool:
         """See ``station.Voice``."""
@@ -378,10 +316,14 @@ class Emulator:
 def _damaged(chunk: bytes, struck: Mapping[str, Fault]) -> bytes:
     """The utterance as the faults leave it."""
     if "wrong_ack" in struck:
-        chunk = chunk[:-1] + bytes([chunk[-1] ^ 1])
+        chunk = _flipped(chunk, 1, -1)
     if struck.keys() & {"bad_bcc", "bad_crc"}:
-        chunk = chunk[:-1] + bytes([chunk[-1] ^ 0x40])
-    if "garble" in struck:
-        middle = len(chunk) // 2
-        chunk = chunk[:middle] + bytes([chunk[middle] ^ 0x04]) + chunk[middle + 1 :]
-    return chunk
+        chunk = _flipped(chunk, 0x40, -1)
+    return _flipped(chunk, 0x04) if "garble" in struck else chunk
+
+
+def _flipped(chunk: bytes, bits: int, at: int | None = None) -> bytes:
+    """With some bits of one byte flipped, usually that in the middle."""
+    flipped = bytearray(chunk)
+    flipped[len(chunk) // 2 if at is None else at] ^= bits
+    return bytes(flipped)

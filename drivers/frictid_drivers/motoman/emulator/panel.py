@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from frictid_drivers.motoman.emulator.axis import Axis
+from frictid_drivers.motoman.emulator.station import Parameters
 
 Reply = tuple[str, str]
 DONE: Reply = ("90,000", "0000")
@@ -23,27 +25,65 @@ def data(text: str) -> Reply:
     return "90,001", text
 
 
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How this controller is made.
+
+    Attributes:
+        generation: erc, xrc, nx or dx; decides the bits of RSTATS.
+        baud: of host control.
+        parity: E, O or N; a byte costs 11 bits with, 10 without.
+        stream_bauds: speeds that FSTREAM may ask for; none on an ordinary port.
+        batch: the batch application is installed.
+        tick_s: interpolation clock.
+        averaging_ticks: moving average on the command; 1 is none.
+        thinking_s: between a command and the bid to reply.
+        table_delay_ticks: between the tick that a table's torque is computed in and the tick that it acts in.
+        reads_while_running: the batch application hands samples over while a job runs (FREAD 2).
+        parameters: of the link.
+    """
+
+    generation: str = "nx"
+    baud: int = 19200
+    parity: str = "E"
+    stream_bauds: tuple[int, ...] = (115200, 921600)
+    batch: bool = True
+    tick_s: float = 0.004
+    averaging_ticks: int = 1
+    thinking_s: float = 0.012
+    table_delay_ticks: int = 0
+    reads_while_running: bool = True
+    parameters: Parameters = field(default_factory=Parameters)
+
+    @property
+    def tick_us(self) -> int:
+        """Interpolation clock."""
+        return round(self.tick_s * 1e6)
+
+    @property
+    def averaging_ms(self) -> int:
+        """Moving average on the command; 0 is none."""
+        return round((self.averaging_ticks - 1) * self.tick_s * 1000)
+
+
 class Panel:
     """State of the controller and its stock commands.
 
-    Args:
-        axes: the arm.
-        generation: erc, xrc, nx or dx; decides the bits of RSTATS.
-
     Attributes:
+        axes: the arm.
+        settings: how the controller is made.
         teach: key switch at teach.
         remote: command remote is set.
         holds: pendant, external, command - whichever are on.
         alarm: its number, 0 for none.
         servo_blocked: an e-stop keeps servo power off.
-        servo_on: servo power.
         operating: something is moving the arm.
         on_stop: called when motion must end at once; told why.
     """
 
-    def __init__(self, axes: Sequence[Axis], generation: str = "nx") -> None:
-        self.axes = axes
-        self._generation = generation
+    def __init__(self, axes: Sequence[Axis], settings: Settings, on_stop: Callable[[str], None]) -> None:
+        self.axes = list(axes)
+        self.settings = settings
         self.teach = False
         self.remote = True
         self.holds: set[str] = set()
@@ -52,16 +92,17 @@ class Panel:
         self.servo_on = False
         self.operating = False
         self.position_known = True
-        self.on_stop: Callable[[str], None] = _nobody
-        self._commands: dict[str, Callable[[list[str]], Reply]] = {
-            "RSTATS": self._rstats,
-            "RPOSJ": self._rposj,
-            "RALARM": self._ralarm,
-            "SVON": self._svon,
-            "HOLD": self._hold,
-            "RESET": self._reset,
-            "CANCEL": self._cancel,
+        self.on_stop = on_stop
+        self._commands: dict[str, tuple[int, Callable[..., Reply]]] = {
+            "RSTATS": (0, lambda: data(",".join(map(str, self.words())))),
+            "RPOSJ": (0, self._rposj),
+            "RALARM": (0, lambda: data(f"{self.alarm},0,0,0,0")),
+            "SVON": (1, self._svon),
+            "HOLD": (1, self._hold),
+            "RESET": (0, self._reset),
+            "CANCEL": (0, lambda: DONE),
         }
+        """With how many operands they have."""
 
     def knows(self, command: str) -> bool:
         """Whether this is a stock command."""
@@ -69,20 +110,17 @@ class Panel:
 
     def obey(self, command: str, operands: list[str]) -> Reply:
         """Execute one stock command."""
-        return self._commands[command](operands)
+        count, action = self._commands[command]
+        return action(*operands) if len(operands) == count else refusal(1011)
 
     def words(self) -> tuple[int, int]:
         """The two figures of RSTATS."""
-        first = 0b100 | (0b1000 if self.operating else 0)
-        second = (
-            (0b10 if "pendant" in self.holds else 0)
-            | (0b100 if "external" in self.holds else 0)
-            | (0b1000 if "command" in self.holds else 0)
-            | (0b10000 if self.alarm else 0)
-            | (0b1000000 if self.servo_on else 0)
-        )
-        if self._generation != "erc":
-            first |= (0b100000 if self.teach else 0b1000000) | (0b10000000 if self.remote else 0)
+        first = 1 << 2 | self.operating << 3
+        second = (bool(self.alarm) << 4) | self.servo_on << 6
+        for bit, hold in enumerate(("pendant", "external", "command"), start=1):
+            second |= (hold in self.holds) << bit
+        if self.settings.generation != "erc":
+            first |= 1 << (5 if self.teach else 6) | self.remote << 7
         return first, second
 
     def moving_forbidden(self) -> int:
@@ -119,63 +157,35 @@ class Panel:
 
     # -- stock commands ----------------------------------------------------------------------------------------
 
-    def _rstats(self, operands: list[str]) -> Reply:
-        return refusal(1011) if operands else data(",".join(map(str, self.words())))
-
-    def _rposj(self, operands: list[str]) -> Reply:
-        if operands:
-            return refusal(1011)
+    def _rposj(self) -> Reply:
         if not self.position_known:
             return refusal(3070)
         pulses = [axis.pulses for axis in self.axes]
         return data(",".join(f"{value:>8d}" for value in pulses + [0] * (12 - len(pulses))))
 
-    def _ralarm(self, operands: list[str]) -> Reply:
-        return refusal(1011) if operands else data(f"{self.alarm},0,0,0,0")
-
-    def _svon(self, operands: list[str]) -> Reply:
-        wanted = _switch(operands)
-        if isinstance(wanted, int):
-            return refusal(wanted)
+    def _svon(self, wanted: str) -> Reply:
+        if wanted not in ("0", "1"):
+            return refusal(1012)
         if not self.remote:
             return refusal(2100)
-        if wanted == "on":
-            if self.alarm:
-                return refusal(2060)
-            if self.servo_blocked:
-                return refusal(3450)
-            self.power(True)
-        else:
+        if wanted == "0":
             self.on_stop("servo off")
-            self.power(False)
+        elif self.alarm:
+            return refusal(2060)
+        elif self.servo_blocked:
+            return refusal(3450)
+        self.power(wanted == "1")
         return DONE
 
-    def _hold(self, operands: list[str]) -> Reply:
-        wanted = _switch(operands)
-        if isinstance(wanted, int):
-            return refusal(wanted)
-        if wanted == "on":
+    def _hold(self, wanted: str) -> Reply:
+        if wanted not in ("0", "1"):
+            return refusal(1012)
+        if wanted == "1":
             self.press_hold("command")
         else:
             self.holds.discard("command")
         return DONE
 
-    def _reset(self, operands: list[str]) -> Reply:
-        if operands:
-            return refusal(1011)
+    def _reset(self) -> Reply:
         self.alarm = 0
         return DONE
-
-    def _cancel(self, operands: list[str]) -> Reply:
-        return refusal(1011) if operands else DONE
-
-
-def _switch(operands: list[str]) -> str | int:
-    """on or off, or an error number."""
-    if len(operands) != 1:
-        return 1011
-    return {"1": "on", "0": "off"}.get(operands[0], 1012)
-
-
-def _nobody(reason: str) -> None:
-    """Nothing is moving yet."""

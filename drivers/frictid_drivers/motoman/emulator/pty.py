@@ -36,12 +36,7 @@ _PATIENCE_S = 0.2
 
 @dataclass(slots=True)
 class Waits:
-    """How often time stood still for set-points that were late.
-
-    Attributes:
-        count: stretches of waiting.
-        longest_s: the longest of them.
-    """
+    """How often time stood still for set-points that were late, and for how long at most."""
 
     count: int = 0
     longest_s: float = 0.0
@@ -172,10 +167,7 @@ def _run(emulator: Emulator, terminal: Terminal, stop: Callable[[], bool], waits
             return
         if emulator.gone != gone:
             gone = emulator.gone
-            if gone:
-                terminal.pull_out()
-            else:
-                terminal.plug_in()
+            (terminal.pull_out if gone else terminal.plug_in)()
         wait_s = min(_LONGEST_WAIT_S, emulator.next_event_s() - emulator.now_s)
         starving = emulator.starving and not gone
         # A writer that fills the terminal's buffer must not make us spin.

@@ -42,19 +42,15 @@ class Voice(Protocol):
 
     def say(self, kind: str, data: bytes) -> None:
         """Put ``data`` on the wire; kinds are enq, ack, nak, block, eot."""
-        ...
 
     def hears_enq(self) -> str:
         """An ENQ arrived; ``bid`` makes the station bid against it, ``insist`` not give way either (faults)."""
-        ...
 
     def delivered(self, arrived: bool) -> None:
         """A message of the controller has been delivered and ended by EOT, or was given up."""
-        ...
 
     def doubts_block(self) -> bool:
         """An intact block arrived; True makes the station reject it all the same (a fault)."""
-        ...
 
 
 class Station:
@@ -64,6 +60,9 @@ class Station:
         parameters: timers and retries.
         voice: where utterances go.
         on_message: called with header and text (without CR) of every whole message.
+
+    Attributes:
+        deadline_s: when ``tick`` is wanted, None while only bytes matter.
     """
 
     def __init__(self, parameters: Parameters, voice: Voice, on_message: Callable[[str, str], None]) -> None:
@@ -71,26 +70,18 @@ class Station:
         self._voice = voice
         self._on_message = on_message
         self._outbox: deque[tuple[str, str]] = deque()
-        self._now_s = 0.0
-        self._story = self._life()
-        self._wake_s: float | None = None
         self._yields = True
-        self._note_wait(next(self._story))
-
-    @property
-    def deadline_s(self) -> float | None:
-        """When ``tick`` is wanted, None while only bytes matter."""
-        return self._wake_s
+        self.reset(0.0)
 
     @property
     def quiet(self) -> bool:
         """Nothing under way and nothing to say."""
-        return self._wake_s is None and not self._outbox
+        return self.deadline_s is None and not self._outbox
 
     def post(self, header: str, text: str, now_s: float) -> None:
         """Say this when the line is free."""
         self._outbox.append((header, text))
-        if self._wake_s is None:
+        if self.deadline_s is None:
             self._go_on(None, now_s)
 
     def hear(self, data: bytes, now_s: float) -> None:
@@ -100,7 +91,7 @@ class Station:
 
     def tick(self, now_s: float) -> None:
         """Time passes."""
-        while self._wake_s is not None and now_s >= self._wake_s:
+        while self.deadline_s is not None and now_s >= self.deadline_s:
             self._go_on(None, now_s)
 
     def reset(self, now_s: float) -> None:
@@ -115,7 +106,7 @@ class Station:
         self._note_wait(self._story.send(byte))
 
     def _note_wait(self, wait_s: float | None) -> None:
-        self._wake_s = None if wait_s is None else self._now_s + wait_s
+        self.deadline_s: float | None = None if wait_s is None else self._now_s + wait_s
 
     # -- the story ---------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from frictid_drivers.motoman.emulator.jobs import STOPPING_TICKS, crc16
 from frictid_drivers.motoman.emulator.panel import Panel
 
 SET_POINT, FEEDBACK, NACK, HELLO, STOP = 1, 2, 3, 4, 5
+NAMES = {FEEDBACK: "feedback", NACK: "nack", HELLO: "hello", STOP: "stop"}
 BAD_CRC, BAD_VERSION, BAD_SESSION, LATE, GAP, LIMIT, NOT_ARMED, ALARM = 1, 2, 3, 4, 5, 6, 7, 8
 ARMED, LATCHED, DROPPED, EXTRAPOLATED, STRAYED, COMPENSATED = 1, 2, 4, 8, 16, 32
 
@@ -30,12 +31,11 @@ class StreamApplication:
     """One streaming session after another, until the host leaves.
 
     Args:
-        panel: state of the controller.
-        axes: the arm.
+        panel: the controller.
         mask: axes granted by FSTREAM.
-        tick_s: interpolation clock.
         say: puts a frame on the wire; told kind and bytes.
         on_leave: the line goes back to host control.
+        compensated: a friction table is being applied.
 
     Attributes:
         tick_number: of the interpolation clock, since streaming began.
@@ -44,29 +44,25 @@ class StreamApplication:
     def __init__(
         self,
         panel: Panel,
-        axes: Sequence[Axis],
         mask: int,
-        tick_s: float,
         say: Callable[[str, bytes], None],
         on_leave: Callable[[], None],
         *,
-        averaging_ms: int = 0,
         compensated: bool = False,
     ) -> None:
         self._panel = panel
-        self._axes = axes
+        self._axes = panel.axes
         self._granted = mask
-        self._tick_s = tick_s
         self._say = say
         self._on_leave = on_leave
-        self._averaging_ms = averaging_ms
         self._compensated = compensated
         self._heard = bytearray()
         self._sequence = 0
         self._session = 0
         self._old_session = 0
         self._mask = 0
-        self._numbers: list[int] = []
+        self._moved: list[Axis] = []
+        """Axes of the session, in the order of its frames."""
         self._last_heard: int | None = None
         self._last_due = 0
         self._last_asked: list[int] = []
@@ -122,12 +118,11 @@ class StreamApplication:
     def _send(self, kind: int, payload: bytes) -> None:
         body = bytes([VERSION << 4 | kind, len(payload)]) + self._sequence.to_bytes(2, "little") + payload
         self._sequence = (self._sequence + 1) & 0xFFFF
-        name = {FEEDBACK: "feedback", NACK: "nack", HELLO: "hello", STOP: "stop"}[kind]
-        self._say(name, b"\xa5\x5a" + body + crc16(body).to_bytes(2, "little"))
+        self._say(NAMES[kind], b"\xa5\x5a" + body + crc16(body).to_bytes(2, "little"))
 
     def _nack(self, sequence: int, code: int, axis: int = 0xFF, due: int = 0) -> None:
         now = self.tick_number & 0xFFFF
-        self._send(NACK, struct.pack("<HBBHBB", sequence, code, self._session, due, axis, 0) + struct.pack("<H", now))
+        self._send(NACK, struct.pack("<HBBHBxH", sequence, code, self._session, due, axis, now))
 
     def _take(self, version: int, kind: int, sequence: int, payload: bytes) -> None:
         self._idle_ticks = 0
@@ -159,26 +154,26 @@ class StreamApplication:
                 return
             self._old_session, self._session = self._session, session
             self._mask = mask
-            self._numbers = [number for number in range(len(self._axes)) if mask >> number & 1]
+            self._moved = [axis for number, axis in enumerate(self._axes) if mask >> number & 1]
             self._last_heard = sequence
             self._queue.clear()
             self._armed = self._latched = False
             self._misses = self._stopping = 0
-            self._last_asked = [self._axes[number].issued for number in self._numbers]
+            self._last_asked = [axis.issued for axis in self._moved]
             self._home = [axis.pulses for axis in self._axes]
         self._greet()
 
     def _greet(self) -> None:
-        flags = 1 | 2 | (4 if self._compensated else 0)
+        flags = 1 | 2 | self._compensated << 2
+        settings = self._panel.settings
         payload = struct.pack(
             "<BBBBHBBHHI",
-            *(VERSION, self._session, self._mask, flags, round(self._tick_s * 1e6), WATCHDOG_TICKS, QUEUE),
-            *(self._averaging_ms, 0, self.tick_number),
+            *(VERSION, self._session, self._mask, flags, settings.tick_us, WATCHDOG_TICKS, QUEUE),
+            *(settings.averaging_ms, 0, self.tick_number),
         )
-        for number in self._numbers:
-            plate = self._axes[number].plate
-            payload += struct.pack("<iii", plate.lowest, plate.highest, plate.step)
-        self._send(HELLO, payload)
+        plates = [axis.plate for axis in self._moved]
+        limits = [struct.pack("<iii", plate.lowest, plate.highest, plate.step) for plate in plates]
+        self._send(HELLO, payload + b"".join(limits))
 
     def _stop(self, sequence: int, payload: bytes) -> None:
         if len(payload) != 4:
@@ -207,7 +202,7 @@ class StreamApplication:
     # -- set-points --------------------------------------------------------------------------------------------
 
     def _set_point(self, sequence: int, payload: bytes) -> None:
-        count = len(self._numbers)
+        count = len(self._moved)
         if len(payload) not in (4 + 4 * count, 4 + 6 * count) or not count:
             self._nack(sequence, BAD_SESSION)
             return
@@ -219,39 +214,37 @@ class StreamApplication:
             return
         assert self._last_heard is not None
         ahead = (sequence - self._last_heard) & 0xFFFF
+        if ahead != 1:
+            self._nack(sequence, GAP, due=due)
         if not 0 < ahead < 0x8000:
-            self._nack(sequence, GAP, due=due)
             return
-        if ahead > 1:
-            self._nack(sequence, GAP, due=due)
         self._last_heard = sequence
-        if self._panel.alarm:
-            self._nack(sequence, ALARM, due=due)
+        wide_due = self.tick_number + ((due - self.tick_number) & 0xFFFF)
+        code, axis = self._judge(targets, wide_due)
+        if code:
+            self._nack(sequence, code, axis=axis, due=due)
             return
-        if self._latched or self._panel.moving_forbidden() not in (0, 2010):
-            self._nack(sequence, NOT_ARMED, due=due)
-            return
-        wait = (due - self.tick_number) & 0xFFFF
-        if not 2 <= wait <= QUEUE:
-            self._nack(sequence, LATE, due=due)
-            return
-        wide_due = self.tick_number + wait
-        if self._armed and wide_due <= self._last_due:
-            self._nack(sequence, LATE, due=due)
-            return
-        ticks = wide_due - self._last_due if self._armed else 1
-        for place, number in enumerate(self._numbers):
-            plate = self._axes[number].plate
-            moved = targets[place] - self._last_asked[place]
-            if not plate.lowest <= targets[place] <= plate.highest or abs(moved) > plate.step * ticks:
-                self._nack(sequence, LIMIT, axis=number, due=due)
-                return
         if not self._armed:
             self._armed = self._panel.operating = True
             self._misses = 0
             self._speed = [0.0] * count
         self._last_due, self._last_asked = wide_due, targets
         self._queue[wide_due] = (targets, torques)
+
+    def _judge(self, targets: Sequence[int], due: int) -> tuple[int, int]:
+        """Why these targets are refused (0: they are not), and the axis that is to blame."""
+        if self._panel.alarm:
+            return ALARM, 0xFF
+        if self._latched or self._panel.moving_forbidden() not in (0, 2010):
+            return NOT_ARMED, 0xFF
+        if not 2 <= due - self.tick_number <= QUEUE or (self._armed and due <= self._last_due):
+            return LATE, 0xFF
+        ticks = due - self._last_due if self._armed else 1
+        for axis, target, before in zip(self._moved, targets, self._last_asked, strict=True):
+            plate = axis.plate
+            if not plate.lowest <= target <= plate.highest or abs(target - before) > plate.step * ticks:
+                return LIMIT, self._axes.index(axis)
+        return 0, 0xFF
 
     # -- the interpolation clock -------------------------------------------------------------------------------
 
@@ -285,20 +278,22 @@ class StreamApplication:
             self._miss(due, dropped)
 
     def _go(self, targets: Sequence[float], dropped: int = 0) -> None:
-        for place, number in enumerate(self._numbers):
-            axis = self._axes[number]
+        for place, axis in enumerate(self._moved):
             before = axis.issued
             if axis.ask(round(targets[place]), dropped):
                 self._dropped = True
             self._speed[place] = axis.issued - before
 
+    def _go_by(self, steps: Sequence[float], dropped: int = 0) -> None:
+        self._go([axis.issued + step for axis, step in zip(self._moved, steps, strict=True)], dropped)
+
     def _between(self, due: int, dropped: int) -> None:
         """A tick that the host left out, between here and its next target: a straight line."""
         later = min(self._queue)
         targets = self._queue[later][0]
-        here = [self._axes[number].issued for number in self._numbers]
         share = 1.0 / (later - due + 1)
-        self._go([a + (b - a) * share for a, b in zip(here, targets, strict=True)], dropped)
+        steps = [(goal - axis.issued) * share for goal, axis in zip(targets, self._moved, strict=True)]
+        self._go_by(steps, dropped)
 
     def _miss(self, due: int, dropped: int) -> None:
         """Nothing to do: one tick straight on, then slower, and at the third the watchdog latches."""
@@ -310,16 +305,14 @@ class StreamApplication:
         self._extrapolated = True
         if self._misses > 1:
             self._slow_down()
-        here = [self._axes[number].issued for number in self._numbers]
-        self._go([a + b for a, b in zip(here, self._speed, strict=True)], dropped)
+        self._go_by(self._speed, dropped)
 
     def _decelerate(self) -> None:
         if self._stopping > 0:
             self._slow_down()
             self._stopping -= 1
             speed = list(self._speed)
-            here = [self._axes[number].issued for number in self._numbers]
-            self._go([a + b for a, b in zip(here, speed, strict=True)])
+            self._go_by(speed)
             self._speed = speed
         if self._stopping == 0:
             self._panel.operating = False
@@ -330,32 +323,22 @@ class StreamApplication:
         self._speed = [speed * (left - 1) / left for speed in self._speed]
 
     def _feed_forward(self, torques: Sequence[int]) -> None:
-        for place, number in enumerate(self._numbers):
-            axis = self._axes[number]
-            sign = 1.0 if axis.plate.pulses_per_rad > 0 else -1.0
-            axis.feed_forward_nm = sign * torques[place] * 1e-4 * axis.plate.rated_torque_nm if torques else 0.0
+        for axis, torque in zip(self._moved, torques or [0] * len(self._moved), strict=True):
+            axis.feed_forward_nm = axis.plate.sign * torque * 1e-4 * axis.plate.rated_torque_nm
 
     def _report(self) -> None:
         first, second = self._panel.words()
         strayed = any(
             abs(axis.pulses - self._home[number]) > abs(_STRAY_RAD * axis.plate.pulses_per_rad)
             for number, axis in enumerate(self._axes)
-            if number not in self._numbers
+            if not self._mask >> number & 1
         )
-        flags = (
-            (ARMED if self._armed and not self._latched else 0)
-            | (LATCHED if self._latched else 0)
-            | (DROPPED if self._dropped else 0)
-            | (EXTRAPOLATED if self._extrapolated else 0)
-            | (STRAYED if strayed else 0)
-            | (COMPENSATED if self._compensated else 0)
-        )
+        flags = self._latched * LATCHED | self._dropped * DROPPED | self._extrapolated * EXTRAPOLATED
+        flags |= (self._armed and not self._latched) * ARMED | strayed * STRAYED | self._compensated * COMPENSATED
         payload = struct.pack(
             "<IHBBHBBBBH",
             *(self.tick_number, self._last_heard or 0, first, second, self._panel.alarm, len(self._queue), flags),
             *(self._session, self._mask, 0),
         )
-        for number in self._numbers:
-            axis = self._axes[number]
-            payload += struct.pack("<iii", axis.pulses, axis.speed_tenths, axis.torque_micro)
-        self._send(FEEDBACK, payload)
+        axes = [struct.pack("<iii", axis.pulses, axis.speed_tenths, axis.torque_micro) for axis in self._moved]
+        self._send(FEEDBACK, payload + b"".join(axes))
