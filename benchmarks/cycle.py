@@ -182,7 +182,7 @@ class OurDrives:
         axes = [self._axis(joint, scale, at) for joint, at in zip(joints, decoder.feedback, strict=True)]
         settings, _ = read_settings(RobotSetup("cycle", f"frictid:{channel}", cycle_hz, ()))
         self._cycle = Cycle(
-            self.bus, self.clock, self._keep, frame_map, layout, axes, decoder, settings, lock_step=False,
+            self.bus, self.clock, self._keep, frame_map, layout, axes, decoder, settings,
             other=lambda *frame: None,
         )  # fmt: skip
         self.exchange = self._cycle.exchange
@@ -191,10 +191,7 @@ class OurDrives:
 
     @staticmethod
     def _axis(joint: JointFrames, scale: Scale, feedback: Feedback) -> Axis:
-        command, other = joint.commands
-        return Axis(
-            joint.name, scale, command, other, feedback, max_torque_nm=10.0, standstill_rad_s=0.02, reset_cycles=100
-        )
+        return Axis(joint, scale, feedback, max_torque_nm=10.0, standstill_rad_s=0.02, reset_cycles=100)
 
     def _keep(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
         self.frames.append(t_ns, can_id, len(data), sent, 0, data)

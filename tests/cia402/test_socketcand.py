@@ -28,20 +28,11 @@ guest = importlib.import_module("socketcan_guest")
 Gateway = importlib.import_module("socketcand_gateway").Gateway
 
 
-class Owner:
-    """Of drives in a thread of the test."""
-
-    gone = dismissed = False
-
-    def listen(self) -> None:
-        """It sets the attributes itself."""
-
-
 class Drives:
     """The drives behind their gateway, in a thread."""
 
     def __init__(self, robot: Path) -> None:
-        self.gateway, self._owner, self.rack = Gateway(), Owner(), Rack()
+        self.gateway, self._over, self.rack = Gateway(), threading.Event(), Rack()
         values = yaml.safe_load(robot.read_text())
         values["bus"] = "socketcand:can0"
         values["options"] |= {"host": "127.0.0.1", "port": self.gateway.port, "tcp_tune": True}
@@ -49,7 +40,7 @@ class Drives:
         self.rack.install(load_robot(robot).to_setup(), sync_gap_tenths=SYNC_GAP_TENTHS)
         self.rack.warm_up()
         process = RackProcess(self.rack, BusWire(self.gateway))
-        self._thread = threading.Thread(target=process.run, args=(self._owner,))
+        self._thread = threading.Thread(target=process.run, args=(lambda now_ns, resting: self._over.is_set(),))
         self._thread.start()
 
     def stopped_by_themselves(self) -> bool:
@@ -62,7 +53,7 @@ class Drives:
         return False
 
     def close(self) -> None:
-        self._owner.dismissed = True
+        self._over.set()
         self._thread.join(10.0)
         self.gateway.shutdown()
 

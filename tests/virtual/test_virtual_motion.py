@@ -324,5 +324,5 @@ def test_stuck_encoder_reports_one_position_for_ever(desk):
     desk.servo.axis.encoder_stuck = True
     assert cycle(200) == 100 and cycle(300) == 100
     assert desk.read(0x606C) == 0
-    desk.servo.reset(desk.rack.now_ns)
+    desk.servo.boot(desk.rack.now_ns)
     assert desk.read(0x6064) == 300

@@ -65,7 +65,7 @@ def test_the_shipped_eds_is_the_object_dictionary():
     loaded = canopen.import_od(str(EDS_FILE), node_id=5)
     for record in OBJECTS:
         for entry in record.entries:
-            found = loaded[record.index] if record.is_variable else loaded[record.index][entry.key & 0xFF]
+            found = loaded[record.index] if len(record.entries) == 1 else loaded[record.index][entry.key & 0xFF]
             assert found.data_type == entry.kind and found.access_type == entry.access
             assert found.default == (entry.default + 5 if entry.node_relative else entry.default)
             assert found.pdo_mappable == (entry.receive or entry.transmit)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from frictid_drivers.cia402.codec import Command
-from frictid_drivers.cia402.frame_map import Frame
+from frictid_drivers.cia402.frame_map import JointFrames
 from frictid_drivers.cia402.objects import INTERPOLATED
 from frictid_drivers.cia402.scale import Scale
 from frictid_drivers.cia402.state import (
@@ -43,24 +43,25 @@ class Axis:
     """Wishes and commands of one joint.
 
     Args:
-        joint: name.
+        frames: as read back: RPDO1 (controlword, target position, torque offset), RPDO2 (mode, target torque, target
+            velocity).
         scale: joint-side worth of the drive's units.
-        primary: RPDO1 as read back (controlword, target position, torque offset).
-        secondary: RPDO2 as read back (mode, target torque, target velocity).
         feedback: the decoder's own object of this joint.
         max_torque_nm: no torque beyond this is commanded.
         standstill_rad_s: below this the joint stands.
         reset_cycles: how long the drive may take to leave a fault; a quick stop is looked at five times as often.
         position_mode: 6060 for positions: 8, or 7 (interpolated position).
         mode_when_enabled: the drive shows its mode only once power is on; until then nothing is followed.
+
+    Attributes:
+        alarm: a fault that its reset did not end; whoever raises it clears it.
+        power_was_cut: the quick stop did not slow the joint down, so that its voltage was disabled in motion.
     """
 
     def __init__(
         self,
-        joint: str,
+        frames: JointFrames,
         scale: Scale,
-        primary: Frame,
-        secondary: Frame,
         feedback: Feedback,
         *,
         max_torque_nm: float,
@@ -69,10 +70,10 @@ class Axis:
         position_mode: int = Mode.POSITION,
         mode_when_enabled: bool = False,
     ) -> None:
-        self.joint = joint
+        self.joint = frames.name
         self.feedback = feedback
-        self.primary = Command(primary)
-        self.secondary = Command(secondary)
+        self.primary, self.secondary = map(Command, frames.commands)
+        self._emergency = tuple(map(Command, frames.commands))
         self.target = Target.DISABLED
         self.mode = Mode.POSITION
         self._locked = False
@@ -80,7 +81,7 @@ class Axis:
         self._following_status = _NEVER
         self.alarm: HardwareError | None = None
         self._scale = scale
-        self._torque_units = math.floor(max_torque_nm / abs(scale.torque_nm))
+        self.limit_torque(max_torque_nm)
         self._standstill_rad_s = standstill_rad_s
         self._reset_cycles = reset_cycles
         self._position_mode = position_mode
@@ -89,12 +90,11 @@ class Axis:
         self._resetting = 0
         self._target_units: int | None = None
         self._held_at_rad: float | None = None
-        self._emergency = (Command(primary), Command(secondary))
         self._secondary_told: tuple[int, int, int, int] | None = None
         self._stop_look_cycles = max(2, reset_cycles // 5)
         self._stop_cycles = 0
         self._stop_from_rad_s = 0.0
-        self._power_cut = False
+        self.power_was_cut = False
 
     def limit_torque(self, torque_nm: float) -> None:
         """No torque beyond this is commanded from now on."""
@@ -104,15 +104,18 @@ class Axis:
         """Ask for power in a mode; a fault that stands now is reset once."""
         self.mode = mode
         self.target = Target.ENABLED
-        self._power_cut = False
+        self.power_was_cut = False
         self._reset_wanted = True
         self._forget_status()
 
     def disable(self) -> None:
         """Ask for power off."""
+        self._stop(Target.DISABLED)
+
+    def _stop(self, target: Target) -> None:
         if self.target is Target.ENABLED:
             self._stop_cycles = 0
-        self.target = Target.DISABLED
+        self.target = target
         self._reset_wanted = False
         self._forget_status()
 
@@ -140,11 +143,6 @@ class Axis:
     def state(self) -> DriveState:
         """As last reported."""
         return drive_state(self.feedback.status_raw)
-
-    @property
-    def power_was_cut(self) -> bool:
-        """Its quick stop did not slow it down, so that its voltage was disabled in motion."""
-        return self._power_cut
 
     @property
     def standing(self) -> bool:
@@ -179,7 +177,6 @@ class Axis:
         if follows and self._locked:
             self._steady_status = self.feedback.status_raw
         elif follows:
-            scale = self._scale
             offset = self._torque(set_point.torque_offset_nm)
             if mode is Mode.POSITION:
                 self._follow(set_point.position_rad)
@@ -188,13 +185,13 @@ class Axis:
             elif mode is Mode.TORQUE:
                 torque, offset = self._torque(set_point.torque_nm + set_point.torque_offset_nm), 0
             else:
-                velocity = self._units(set_point.velocity_rad_s, scale.velocity_rad_s)
+                velocity = self._units(set_point.velocity_rad_s, self._scale.velocity_rad_s)
         else:
             self._held_at_rad = None
         if enabled and self.target is Target.ENABLED and mode is Mode.TORQUE and not follows:
             # Going over to torque mode while enabled: the torque must be there when the mode changes.
             torque = self._torque(set_point.torque_nm + set_point.torque_offset_nm)
-        primary, secondary = self.primary, self.secondary
+        primary = self.primary
         if controlword == ENABLE and enabled and self._mode_value(mode) == INTERPOLATED:
             controlword |= _INTERPOLATE
         primary.set("controlword", controlword)
@@ -205,8 +202,8 @@ class Axis:
         if told != self._secondary_told:
             self._secondary_told = told
             for meaning, value in zip(_SECONDARY, told, strict=True):
-                secondary.set(meaning, value)
-            secondary.pack()
+                self.secondary.set(meaning, value)
+            self.secondary.pack()
 
     def _goes_on(self, set_point: SetPoint) -> bool:
         """The same status as when it followed a position in the last cycle: only place and torque are new."""
@@ -238,11 +235,7 @@ class Axis:
 
     def emergency(self) -> tuple[Command, Command]:
         """Frames of a quick stop: no torque, no speed, controlword 02; in buffers that the cycle does not touch."""
-        if self.target is Target.ENABLED:
-            self._stop_cycles = 0
-        self.target = Target.STOPPED
-        self._reset_wanted = False
-        self._forget_status()
+        self._stop(Target.STOPPED)
         primary, secondary = self._emergency
         primary.set("controlword", QUICK_STOP)
         primary.set("target_position", self._target_units or 0)
@@ -253,18 +246,18 @@ class Axis:
 
     def _runs_on(self) -> bool:
         """The quick stop does not slow the joint down: only taking its power away will."""
-        if self._power_cut or self.feedback.age_cycles:
-            return self._power_cut
+        if self.power_was_cut or self.feedback.age_cycles:
+            return self.power_was_cut
         speed = abs(self.feedback.velocity_rad_s)
         before = self._stop_from_rad_s
         look = self._stop_cycles % self._stop_look_cycles == 0
         if self._stop_cycles:
             faster = speed > _FASTER_SHARE * before + _FASTER_RAD_S
-            self._power_cut = faster or (look and speed > _SLOWED_SHARE * before and speed > _SLOWED_RAD_S)
+            self.power_was_cut = faster or (look and speed > _SLOWED_SHARE * before and speed > _SLOWED_RAD_S)
         if look:
             self._stop_from_rad_s = speed
         self._stop_cycles += 1
-        return self._power_cut
+        return self.power_was_cut
 
     def _mode_value(self, mode: Mode) -> int:
         return self._position_mode if mode is Mode.POSITION else mode
@@ -280,23 +273,22 @@ class Axis:
 
     def _in_fault(self) -> int:
         """Bit 7 rises once where a reset was asked for; a fault that stays, or comes later, ends the wish for power."""
-        if self._resetting:
+        if self._resetting > 1:
             self._resetting -= 1
-            if self._resetting:
-                return FAULT_RESET
-            self.target = Target.DISABLED
+            return FAULT_RESET
+        if self._reset_wanted and not self._resetting:
+            self._reset_wanted = False
+            self._resetting = self._reset_cycles
+            # This cycle bit 7 is low, so that the next one is an edge.
+            return DISABLE_VOLTAGE
+        if self._resetting:
+            self._resetting = 0
             self.alarm = HardwareError(
                 f"still in fault {told_error(self.feedback.error_code)} after one fault reset",
                 where=f"joint {self.joint}",
                 cause="the cause of the fault is still there, or this fault needs more than a reset of the fault",
                 next_step="clear the cause (the code is in the drive's manual), then `frictid-hil reset`",
             )
-            return DISABLE_VOLTAGE
-        if self._reset_wanted:
-            self._reset_wanted = False
-            self._resetting = self._reset_cycles
-            # This cycle bit 7 is low, so that the next one is an edge.
-            return DISABLE_VOLTAGE
         self.target = Target.DISABLED
         return DISABLE_VOLTAGE
 

@@ -9,6 +9,7 @@ Nothing here allocates objects of its own per frame, blocks, or raises on what a
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import fields
@@ -66,10 +67,10 @@ class _Report:
         self.cycle = -1
         self.t_ns = 0
         self.values: tuple[int, ...] = (0,) * len(frame.entries)
-        self.status_at = _position_of(STATUS, frame)
-        self.mode_at = _position_of(MODE, frame)
-        self.error_at = _position_of(ERROR, frame)
-        self.inputs_at = _position_of(INPUTS, frame)
+        self.status_at, self.mode_at, self.error_at, self.inputs_at = (
+            frame.meanings.index(meaning) if meaning in frame.meanings else -1
+            for meaning in (STATUS, MODE, ERROR, INPUTS)
+        )
         self.figures = tuple(
             (at, _ATTRIBUTES[meaning], float(getattr(joint, FIGURES[meaning])))
             for at, meaning in enumerate(frame.meanings)
@@ -112,6 +113,11 @@ class Decoder:
     Args:
         frame_map: compiled once.
         awaited: names of the joints whose cyclic reports are expected in every row.
+
+    Attributes:
+        cycle: number of the present row, from 1.
+        missing: awaited reports that have not come in it.
+        feedback: of all joints; always the same objects.
     """
 
     def __init__(self, frame_map: FrameMap, awaited: Sequence[str] = ()) -> None:
@@ -129,25 +135,18 @@ class Decoder:
                 report.joint = joint
                 if "position" in frame.meanings:
                     joint.position_at = (report, frame.meanings.index("position"))
-                if INPUTS in frame.meanings:
+                if report.inputs_at >= 0:
                     joint.inputs = report
                 if not report.slow:
                     joint.cyclic = (*joint.cyclic, report)
                     report.awaited = frames.name in awaited
         self._awaited = sum(report.awaited for report in self._reports.values())
-        self._cycle = 0
-        self._t_ns = 0
-        self.missing = 0
+        self.cycle = self._t_ns = self.missing = 0
         self.feedback: list[Feedback] = [joint.feedback for joint in self._joints]
-
-    @property
-    def cycle(self) -> int:
-        """Number of the present row, from 1."""
-        return self._cycle
 
     def restart(self) -> None:
         """Forget every report, as at the start of cycling; the feedback objects stay the same."""
-        self._cycle = self._t_ns = self.missing = 0
+        self.cycle = self._t_ns = self.missing = 0
         for report in self._reports.values():
             report.cycle = -1
         blank = Feedback()
@@ -161,7 +160,7 @@ class Decoder:
 
     def begin(self, t_ns: int) -> None:
         """A row begins: SYNC at ``t_ns``."""
-        self._cycle += 1
+        self.cycle += 1
         self._t_ns = t_ns
         self.missing = self._awaited
 
@@ -176,8 +175,8 @@ class Decoder:
             feedback.valid = False
             return True
         values = report.values = report.unpack(data)
-        if report.cycle != self._cycle:
-            report.cycle = self._cycle
+        if report.cycle != self.cycle:
+            report.cycle = self.cycle
             report.t_ns = self._t_ns
             if report.awaited:
                 self.missing -= 1
@@ -203,11 +202,11 @@ class Decoder:
     def has(self, cob_id: int) -> bool:
         """This report has already come in the present row."""
         report = self._reports.get(cob_id)
-        return report is not None and report.cycle == self._cycle
+        return report is not None and report.cycle == self.cycle
 
     def finish(self) -> list[Feedback]:
         """The row ends: take over what is complete, count the age of the rest."""
-        cycle = self._cycle
+        cycle = self.cycle
         for joint in self._joints:
             feedback = joint.feedback
             cyclic = joint.cyclic
@@ -264,10 +263,6 @@ class Decoder:
         return True
 
 
-def _position_of(meaning: str, frame: Frame) -> int:
-    return frame.meanings.index(meaning) if meaning in frame.meanings else -1
-
-
 class Command:
     """One PDO that the host sends: named integers in, the same bytes buffer out, every cycle.
 
@@ -316,34 +311,36 @@ class CommandDecoder:
     def __init__(self, frame_map: FrameMap) -> None:
         self._count = len(frame_map.joints)
         self.restart()
-        self._frames: dict[int, tuple[int, JointFrames, Frame]] = {
-            frame.cob_id: (at, joint, frame) for at, joint in enumerate(frame_map.joints) for frame in joint.commands
+        self._frames = {
+            frame.cob_id: (at, joint, frame.meanings, packing(frame.types).unpack_from)
+            for at, joint in enumerate(frame_map.joints)
+            for frame in joint.commands
         }
-        self._unpack = {cob_id: packing(item[2].types).unpack_from for cob_id, item in self._frames.items()}
 
     def restart(self) -> None:
         """Forget every set-point, as at the start of cycling."""
-        nothing = [float("nan")] * self._count
-        self.position_rad, self.velocity_rad_s = list(nothing), list(nothing)
-        self.torque_nm, self.torque_offset_nm = list(nothing), list(nothing)
+        self.position_rad, self.velocity_rad_s, self.torque_nm, self.torque_offset_nm = (
+            [math.nan] * self._count for _ in range(4)
+        )
 
     def feed(self, cob_id: int, data: bytes | bytearray) -> bool:
         """Take one frame; False when it is no command of ours."""
         known = self._frames.get(cob_id)
         if known is None:
             return False
-        at, joint, frame = known
+        at, joint, meanings, unpack = known
         try:
-            values = self._unpack[cob_id](data)
+            values = unpack(data)
         except struct.error:
             return True
-        for meaning, value in zip(frame.meanings, values, strict=True):
-            if meaning == "target_position":
-                self.position_rad[at] = value * joint.position_rad_per_unit
-            elif meaning == "target_velocity":
-                self.velocity_rad_s[at] = value * joint.velocity_rad_s_per_unit
-            elif meaning == "target_torque":
-                self.torque_nm[at] = value * joint.torque_nm_per_unit
-            elif meaning == "torque_offset":
-                self.torque_offset_nm[at] = value * joint.torque_nm_per_unit
+        for meaning, value in zip(meanings, values, strict=True):
+            match meaning:
+                case "target_position":
+                    self.position_rad[at] = value * joint.position_rad_per_unit
+                case "target_velocity":
+                    self.velocity_rad_s[at] = value * joint.velocity_rad_s_per_unit
+                case "target_torque":
+                    self.torque_nm[at] = value * joint.torque_nm_per_unit
+                case "torque_offset":
+                    self.torque_offset_nm[at] = value * joint.torque_nm_per_unit
         return True

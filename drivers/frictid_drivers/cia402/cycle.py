@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import can
 
@@ -47,27 +46,8 @@ _BRAKE_NS = 400_000_000
 _UNHEARD_NS = 50_000_000
 _NO_POWER = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.READY, DriveState.FAULT)
 _NMT_PRE_OPERATIONAL = 0x80
-
-
-@dataclass(slots=True)
-class CycleTiming:
-    """Durations in run time, nanoseconds."""
-
-    window_ns: int
-    host_heartbeat_ns: int
-    drive_timeout_ns: int
-    first_heartbeat_ns: int
-
-    @staticmethod
-    def of(layout: Layout, settings: BusSettings) -> CycleTiming:
-        """From rate and settings."""
-        drive_timeout_ns = round(settings.drive_timeout_s * 1e9)
-        return CycleTiming(
-            window_ns=round(settings.reply_window * 1e9 / layout.cycle_hz),
-            host_heartbeat_ns=round(settings.host_heartbeat_s * 1e9),
-            drive_timeout_ns=drive_timeout_ns,
-            first_heartbeat_ns=max(drive_timeout_ns, 500_000_000),
-        )
+_FIRST_HEARTBEAT_NS = 500_000_000
+"""A drive's first heartbeat may take this long, whatever its period."""
 
 
 class _Outgoing:
@@ -97,7 +77,6 @@ class Cycle:
         axes: all joints, in order.
         decoder: whose feedback the axes hold.
         settings: of the bus.
-        nodes: node ids, in order.
         other: given frames that are none of ours.
     """
 
@@ -112,7 +91,6 @@ class Cycle:
         decoder: Decoder,
         settings: BusSettings,
         *,
-        lock_step: bool,
         other: Callable[[int, bytearray, float], None],
     ) -> None:
         self._frames = frames_of(bus)
@@ -120,14 +98,16 @@ class Cycle:
         self._sink = sink
         self._axes = list(axes)
         self._decoder = decoder
-        self._lock_step = lock_step
         self._other = other
-        self._timing = CycleTiming.of(layout, settings)
+        self._window_ns = frame_map.window_ns
+        self._host_heartbeat_ns = round(settings.host_heartbeat_s * 1e9)
+        self._drive_timeout_ns = round(settings.drive_timeout_s * 1e9)
         self._active = [axis.joint in layout.active for axis in axes]
         self._fd = layout.fd
         self._resend = [layout.resend_cycles.get(axis.joint, 0) for axis in axes]
         self._primary = [_Outgoing(axis, axis.primary, fd=layout.fd) for axis in axes]
         self._secondary = [_Outgoing(axis, axis.secondary, fd=layout.fd) for axis in axes]
+        self._wheres = [f"joint {joint.name} (node {joint.node})" for joint in frame_map.joints]
         self._sync = bytes(1 if layout.sync_overflow else 0)
         self._overflow = layout.sync_overflow
         self._counter = 0
@@ -168,7 +148,7 @@ class Cycle:
             now_ns = clock.now_ns()
             decoder.begin(now_ns)
             begun = True
-            self._window_end_ns = now_ns + self._timing.window_ns
+            self._window_end_ns = now_ns + self._window_ns
             try:
                 self._frames.send(frames)
             finally:
@@ -181,7 +161,7 @@ class Cycle:
             self._receive()
             if now_ns >= self._heartbeat_due_ns:
                 # After the reports, so that no SYNC ever waits behind it.
-                self._heartbeat_due_ns = now_ns + self._timing.host_heartbeat_ns
+                self._heartbeat_due_ns = now_ns + self._host_heartbeat_ns
                 self._log_sent([self._heartbeat], clock.now_ns())
                 self._frames.send([self._heartbeat])
             self._failures = 0
@@ -339,7 +319,7 @@ class Cycle:
     def _receive(self) -> None:
         receive, now_ns, decoder = self._frames.receive, self._clock.now_ns, self._decoder
         end_ns = self._window_end_ns
-        if self._lock_step:
+        if self._clock.lock_step:
             # The answers were there before ``send`` returned: what is not there will not come.
             while (heard := receive(0.0)) is not None:
                 self._take(heard, now_ns())
@@ -380,53 +360,47 @@ class Cycle:
     # -- watchdogs ----------------------------------------------------------------------------------------------
 
     def _check(self, now_ns: int) -> None:
-        decoder, timing = self._decoder, self._timing
+        decoder = self._decoder
         if self._frames.controller == BUS_OFF and not self._alarmed:
-            self._alarmed = True
-            self.quick_stop()
-            raise self._broken_bus("the bus is off (bus-off)")
+            self._end(self._broken_bus("the bus is off (bus-off)"))
         if self._other_kind is not None:
             at, self._other_kind = self._other_kind, None
-            self._tell_other_kind(at)
+            self._end(self._other_frames(at))
         for at, axis in enumerate(self._axes):
             if decoder.restarted(at):
                 self._alarm(at, "booted up in the middle of the run: the drive was reset")
             seen_ns = decoder.heartbeat_ns(at)
             if seen_ns is None:
-                if now_ns > timing.first_heartbeat_ns:
-                    self._alarm(at, f"no heartbeat within {timing.first_heartbeat_ns * 1e-9:g} s of the start")
+                latest_ns = max(self._drive_timeout_ns, _FIRST_HEARTBEAT_NS)
+                if now_ns > latest_ns:
+                    self._alarm(at, f"no heartbeat within {latest_ns * 1e-9:g} s of the start")
             else:
                 self._healthy[at] = True
-                if now_ns - seen_ns > timing.drive_timeout_ns:
+                if now_ns - seen_ns > self._drive_timeout_ns:
                     self._alarm(at, f"no heartbeat for {(now_ns - seen_ns) * 1e-9:.3f} s")
             if axis.alarm is not None:
                 alarm, axis.alarm = axis.alarm, None
                 raise alarm
 
-    def _tell_other_kind(self, at: int) -> None:
-        if self._alarmed:
-            return
-        self._alarmed = True
-        self.quick_stop()
+    def _other_frames(self, at: int) -> HardwareError:
         found, wanted = ("classical", "`fd: true`") if self._fd else ("CAN FD", "no `fd: true`")
-        raise HardwareError(
+        return HardwareError(
             f"the drive reports in {found} frames, the robot file's options say {wanted}",
-            where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
-            cause="CAN FD is not switched on in this drive" if self._fd else "CAN FD is switched on in this drive",
+            where=self._wheres[at],
+            cause=f"CAN FD is {'not ' if self._fd else ''}switched on in this drive",
             next_step="switch it with the vendor's tool, name the object that does as `fd_object` in the joint's "
             "options, or change `fd`",
         )
 
     def _alarm(self, at: int, what: str) -> None:
-        if self._alarmed:
-            return
-        self._alarmed = True
-        self.quick_stop()
-        raise SafetyAbort(
-            what,
-            where=f"joint {self._axes[at].joint} (node {self._nodes[at]})",
-            cause=CONTROLLER_STATES.get(
-                self._frames.controller, "a drive that lost its supply or its bus, or a broken cable"
-            ),
-            next_step="run `frictid-hil check`, and look at the drive's supply and wiring",
-        )
+        lost = "a drive that lost its supply or its bus, or a broken cable"
+        cause = CONTROLLER_STATES.get(self._frames.controller, lost)
+        next_step = "run `frictid-hil check`, and look at the drive's supply and wiring"
+        self._end(SafetyAbort(what, where=self._wheres[at], cause=cause, next_step=next_step))
+
+    def _end(self, error: FrictidError) -> None:
+        """Quick stop, and tell why; once."""
+        if not self._alarmed:
+            self._alarmed = True
+            self.quick_stop()
+            raise error

@@ -30,7 +30,7 @@ from frictid_drivers.cia402.state import DriveState, drive_state
 from frictid_hil.errors import FrictidError, HardwareError, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Plan
-from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.can_bus import BUS_ERRORS, BusFactory, BusLock, open_bus
 from frictid_hil.protocol.driver import (
     Capabilities,
@@ -74,7 +74,6 @@ class Cia402Driver:
     def __init__(self, setup: RobotSetup, *, bus_factory: BusFactory | None = None, clock: Clock | None = None) -> None:
         self.setup = setup
         self.clock: Clock = clock if clock is not None else WallClock()
-        self._lock_step = self.clock.lock_step
         self._settings, self._joint_settings = read_settings(setup)
         self._bus_factory = bus_factory
         self._torque_limits_nm = {joint.name: joint.max_torque_nm for joint in setup.joints}
@@ -129,18 +128,15 @@ class Cia402Driver:
         facts = fleet.facts.values()
         stretches = [self._layout.active] if self._layout else self._alone()
         may_torque = fleet.watchdog or self._settings.allow_torque_without_watchdog
+        possible = _MODES if may_torque else _MODES[:2]
         return Capabilities(
             max_cycle_hz=min(map(fleet.highest_rate_hz, stretches)),
-            modes=frozenset(
-                mode
-                for mode in _MODES
-                if all(fact.supports(mode) for fact in facts) and (mode is not Mode.TORQUE or may_torque)
-            ),
+            modes=frozenset(mode for mode in possible if all(fact.supports(mode) for fact in facts)),
             torque_offset=all(fact.torque_offset for fact in facts),
             drive_watchdog=fleet.watchdog,
-            lock_step=self._lock_step,
-            external_torque=any(joint.external_torque for joint in self._joint_settings.values()),
-            temperature=any(joint.temperature for joint in self._joint_settings.values()),
+            lock_step=self.clock.lock_step,
+            external_torque=any(joint.external_torque_object for joint in self._joint_settings.values()),
+            temperature=any(joint.temperature_object for joint in self._joint_settings.values()),
             digital_inputs=True,
         )
 
@@ -199,14 +195,11 @@ class Cia402Driver:
         self._layout = layout
         self._decoder = Decoder(self._frame_map, layout.active)
         self._axes = {
-            joint.name: self._axis(joint, frames, feedback, fleet, cycle_hz)
-            for joint, frames, feedback in zip(
-                self.setup.joints, self._frame_map.joints, self._decoder.feedback, strict=True
-            )
+            frames.name: self._axis(frames, feedback, fleet, cycle_hz)
+            for frames, feedback in zip(self._frame_map.joints, self._decoder.feedback, strict=True)
         }
         # The drives watch over us from now on: be heard, also while nobody cycles.
-        if self._heartbeat is None:
-            self._heartbeat = HeartbeatTimer(fleet.send_heartbeat, self._settings.host_heartbeat_s)
+        self._heartbeat = self._heartbeat or HeartbeatTimer(fleet.send_heartbeat, self._settings.host_heartbeat_s)
         self._resume_heartbeat()
 
     def remarks(self) -> list[Finding]:
@@ -223,15 +216,10 @@ class Cia402Driver:
             HardwareError: refused or not confirmed.
         """
         fleet, name = self._reached(), self.setup.joint(joint).name
-        writes, _ = configure.limit_writes(
-            fleet.drives[name],
-            self._joint_settings[name],
-            fleet.scale_of(name),
-            torque_nm,
-            position_min_rad,
-            position_max_rad,
-        )
-        fleet.drives[name].apply(writes)
+        drive, settings = fleet.drives[name], self._joint_settings[name]
+        limits = (torque_nm, position_min_rad, position_max_rad)
+        writes, _ = configure.limit_writes(drive, settings, fleet.scale_of(name), *limits)
+        drive.apply(writes)
         self._torque_limits_nm[name] = torque_nm
         self._axis_of(name).limit_torque(torque_nm)
 
@@ -266,9 +254,7 @@ class Cia402Driver:
         self._decoder.restart()
         fleet.nmt(NMT_START)
         self.may_be_powered = tuple(self._axes)
-        restart = getattr(self.clock, "restart", None)
-        if restart is not None:
-            restart()
+        getattr(self.clock, "restart", lambda: None)()
         self._cycle = Cycle(
             self._bus,
             self.clock,
@@ -278,7 +264,6 @@ class Cia402Driver:
             list(self._axes.values()),
             self._decoder,
             self._settings,
-            lock_step=self._lock_step,
             other=fleet.wire.dispatch,
         )
 
@@ -318,15 +303,13 @@ class Cia402Driver:
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """One cycle; see ``Cycle.exchange``."""
-        cycle = self._cycle
-        if cycle is None:
+        if self._cycle is None:
             raise HardwareError("exchange before start_cycling")
-        return cycle.exchange(set_points)
+        return self._cycle.exchange(set_points)
 
     def quick_stop(self) -> None:
         """Torque to zero and controlword 02 to every drive, past the cyclic loop, from any thread; never raises."""
-        cycle = self._cycle
-        if cycle is not None:
+        if (cycle := self._cycle) is not None:
             cycle.quick_stop()
 
     def stop_cycling(self) -> None:
@@ -370,9 +353,8 @@ class Cia402Driver:
                 self.stop_cycling()
         if self._heartbeat is not None and self._fleet is not None:
             with contextlib.suppress(*_WIRE_ERRORS):
-                self._fleet.restore(
-                    self.may_be_powered
-                )  # the drives' watch over us too: they do not miss us when we leave
+                # The drives' watch over us too: they do not miss us when we leave.
+                self._fleet.restore(self.may_be_powered)
             self._heartbeat.stop()
         if self._bus is not None:
             with contextlib.suppress(*_WIRE_ERRORS):
@@ -385,12 +367,11 @@ class Cia402Driver:
 
     def _seen_powered(self, doubtful: Sequence[str]) -> tuple[str, ...]:
         """Those of the joints whose drives do not say by SDO that they are without power."""
-        fleet = self._fleet
         powered = []
         for name in doubtful:
             status = None
             with contextlib.suppress(*_WIRE_ERRORS):
-                status = None if fleet is None else fleet.drives[name].asked_quickly(od.STATUSWORD, _LAST_LOOK_S)
+                status = self._reached().drives[name].asked_quickly(od.STATUSWORD, _LAST_LOOK_S)
             if status is None or drive_state(status) not in _OFF:
                 powered.append(name)
         return tuple(powered)
@@ -408,24 +389,22 @@ class Cia402Driver:
             raise HardwareError("not configured yet", where=f"joint {name}")
         return self._axes[name]
 
-    def _axis(self, joint: JointSetup, frames: JointFrames, feedback: Feedback, fleet: Fleet, cycle_hz: float) -> Axis:
-        primary, secondary = frames.commands
+    def _axis(self, frames: JointFrames, feedback: Feedback, fleet: Fleet, cycle_hz: float) -> Axis:
+        name = frames.name
         return Axis(
-            joint.name,
-            fleet.scale_of(joint.name),
-            primary,
-            secondary,
+            frames,
+            fleet.scale_of(name),
             feedback,
-            max_torque_nm=self._torque_limits_nm[joint.name],
-            standstill_rad_s=self._joint_settings[joint.name].standstill_rad_s,
+            max_torque_nm=self._torque_limits_nm[name],
+            standstill_rad_s=self._joint_settings[name].standstill_rad_s,
             reset_cycles=max(3, math.ceil(_RESET_S * cycle_hz)),
-            position_mode=fleet.facts[joint.name].position_mode,
-            mode_when_enabled=fleet.drives[joint.name].quirks.mode_when_enabled,
+            position_mode=fleet.facts[name].position_mode,
+            mode_when_enabled=fleet.drives[name].quirks.mode_when_enabled,
         )
 
     def _resume_heartbeat(self) -> None:
         """In lock-step time stands still outside the cycle, and nobody misses us."""
-        if self._heartbeat is not None and not self._lock_step:
+        if self._heartbeat is not None and not self.clock.lock_step:
             self._heartbeat.start()
 
     def _settle(self, cycle: Cycle) -> list[str]:

@@ -18,7 +18,7 @@ from frictid_drivers.cia402.objects import IntegerType, Object
 from frictid_drivers.cia402.quirks import Catalogue, dictionary_of, integer_type
 from frictid_drivers.cia402.scale import raise_on_error, scale_of
 from frictid_drivers.cia402.settings import read_settings
-from frictid_hil.errors import HardwareError, InputFileError
+from frictid_hil.errors import InputFileError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 
 _NOT_VALID = 1 << 31
@@ -42,12 +42,6 @@ class _File:
             return None
         value = variable.value if variable.value is not None else variable.default
         return value if isinstance(value, int) else None
-
-    def read(self, item: Object) -> int:
-        value = self.find(item)
-        if value is None:
-            raise HardwareError(f"has no value for {item}", where=str(self._path))
-        return value
 
     def find_text(self, index: int) -> str:
         variable = self.variable(index, 0)
@@ -75,11 +69,9 @@ def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
         facts = read_facts(file, Catalogue(setup.folder).of)
         scale, findings = scale_of(facts, joint, facts.velocity_unit)
         raise_on_error(findings)
-        meanings = {
-            (entry.index, entry.sub): entry
-            for entry in (options[joint.name].external_torque, options[joint.name].temperature)
-            if entry is not None
-        }
+        mine = options[joint.name]
+        told = (mine.external_torque_object, mine.temperature_object)
+        meanings = {(entry.index, entry.sub): entry for entry in told if entry is not None}
         reports = _frames(file, True, meanings)
         if not any("position" in frame.meanings for frame in reports):
             raise InputFileError(
@@ -95,8 +87,8 @@ def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
                 position_rad_per_unit=scale.position_rad,
                 velocity_rad_s_per_unit=scale.velocity_rad_s,
                 torque_nm_per_unit=scale.torque_nm,
-                external_torque_nm_per_unit=options[joint.name].external_torque_nm_per_unit,
-                temperature_c_per_unit=options[joint.name].temperature_c_per_unit,
+                external_torque_nm_per_unit=mine.external_torque_nm_per_unit,
+                temperature_c_per_unit=mine.temperature_c_per_unit,
                 reports=reports,
                 commands=_frames(file, False, meanings),
             )

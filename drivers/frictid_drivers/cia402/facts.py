@@ -63,17 +63,8 @@ class Facts:
 class Source(Protocol):
     """What can be asked for objects: a drive, or an EDS file."""
 
-    def read(self, item: od.Object) -> int:
-        """A value that must be there."""
-        ...
-
-    def find(self, item: od.Object) -> int | None:
-        """A value, None where there is none."""
-        ...
-
-    def find_text(self, index: int) -> str:
-        """A text, "" where there is none."""
-        ...
+    def find(self, item: od.Object) -> int | None: ...  # noqa: D102 - a value, None where there is none
+    def find_text(self, index: int) -> str: ...  # noqa: D102 - a text, "" where there is none
 
 
 def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | None = None) -> Facts:
@@ -90,6 +81,9 @@ def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | Non
     def pair(first: od.Object, second: od.Object) -> tuple[int, int] | None:
         a, b = drive.find(first), drive.find(second)
         return (a, b) if a and b else None
+
+    def there(item: od.Object) -> bool:
+        return drive.find(item) is not None
 
     device_type = drive.find(od.DEVICE_TYPE) or 0
     vendor, product, revision = (drive.find(item) or 0 for item in (od.VENDOR, od.PRODUCT, od.REVISION))
@@ -112,10 +106,10 @@ def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | Non
         polarity=drive.find(od.POLARITY) or 0,
         home_offset=drive.find(od.HOME_OFFSET) or 0,
         heartbeat_consumers=drive.find(od.HEARTBEAT_CONSUMERS),
-        sync_counter=drive.find(od.SYNC_OVERFLOW) is not None and drive.find(od.pdo_sync_start(1)) is not None,
-        torque_offset=drive.find(od.TORQUE_OFFSET) is not None,
-        target_torque=drive.find(od.TARGET_TORQUE) is not None,
-        error_code=drive.find(od.ERROR_CODE) is not None,
-        stops_alone=drive.find(od.ABORT_CONNECTION) is not None,
+        sync_counter=there(od.SYNC_OVERFLOW) and there(od.pdo_sync_start(1)),
+        torque_offset=there(od.TORQUE_OFFSET),
+        target_torque=there(od.TARGET_TORQUE),
+        error_code=there(od.ERROR_CODE),
+        stops_alone=there(od.ABORT_CONNECTION),
         quirks=quirks_of(vendor, product, revision) if quirks_of else NO_QUIRKS,
     )

@@ -153,8 +153,8 @@ class Fleet:
             offset=offset,
             decimates=quirks.sends_on(10),
             supervised_s=self._rpdo_timeout_s(drive),
-            external_torque=settings.external_torque,
-            temperature=settings.temperature,
+            external_torque=settings.external_torque_object,
+            temperature=settings.temperature_object,
             digital_inputs=settings.digital_inputs,
         )
 

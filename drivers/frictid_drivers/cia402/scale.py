@@ -11,7 +11,6 @@ the motor side. What stays a guess here is proven by the first motion.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from frictid_drivers.cia402.facts import Facts
@@ -68,61 +67,55 @@ def scale_of(facts: Facts, joint: JointSetup, velocity_unit: int | None) -> tupl
     Returns:
         The factors, and findings; an ERROR among them forbids motion.
     """
-    subject = f"joint {joint.name}"
-    findings: list[Finding] = []
-
-    def report(severity: Severity, message: str, next_step: str = "") -> None:
-        findings.append(Finding(severity, subject, message, next_step))
-
-    shaft_is_joint = _gear(facts, joint, report)
-    shafts_per_joint = 1.0 if shaft_is_joint else joint.gear_ratio
-    units = _position_units(facts, joint, shafts_per_joint, report)
-    position = _TURN / units
-    velocity = _velocity_unit(facts, joint, velocity_unit, shafts_per_joint, position, report)
-    rated = _rated_torque(facts, joint, report)
+    doubts = _Doubts(f"joint {joint.name}")
+    shafts_per_joint = 1.0 if _shaft_is_joint(facts, joint, doubts) else joint.gear_ratio
+    position = _TURN / _position_units(facts, joint, shafts_per_joint, doubts)
+    velocity = _velocity_unit(facts, joint, velocity_unit, shafts_per_joint, position, doubts)
+    rated = _rated_torque(facts, joint, doubts)
     unit_mnm = facts.quirks.torque_unit_mnm
     torque = rated / 1000.0 if unit_mnm is None else unit_mnm * 1e-3 * joint.gear_ratio
     sign = float(joint.direction)
-    _resolution(joint, position, report)
-    _polarity(facts, position, report)
-    return Scale(sign * position, sign * velocity, sign * torque, rated, joint.gear_ratio), findings
+    _resolution(joint, position, doubts)
+    _polarity(facts, position, doubts)
+    return Scale(sign * position, sign * velocity, sign * torque, rated, joint.gear_ratio), doubts.findings
 
 
-Report = Callable[..., None]
+class _Doubts:
+    """What does not fit the robot file, as findings."""
+
+    def __init__(self, subject: str) -> None:
+        self._subject = subject
+        self.findings: list[Finding] = []
+
+    def error(self, message: str, next_step: str) -> None:
+        self.findings.append(Finding(Severity.ERROR, self._subject, message, next_step))
+
+    def warning(self, message: str, next_step: str = "") -> None:
+        self.findings.append(Finding(Severity.WARNING, self._subject, message, next_step))
 
 
-def _resolution(joint: JointSetup, position_rad: float, report: Report) -> None:
+def _resolution(joint: JointSetup, position_rad: float, doubts: _Doubts) -> None:
+    cure = "correct 60A8, 6092 or 608F with the vendor's tool, or give `position_units_per_revolution` (of the joint)"
+    would = "one unit of position would be"
     if position_rad > COARSE_POSITION_RAD:
-        report(
-            Severity.ERROR,
-            f"one unit of position would be {format_angle(position_rad)} at the joint: absurdly coarse",
-            "correct 60A8, 6092 or 608F with the vendor's tool, or give `position_units_per_revolution` (of the joint)",
-        )
-    furthest = max(abs(joint.position_min_rad), abs(joint.position_max_rad))
-    if furthest / position_rad >= _COUNTS:
-        report(
-            Severity.ERROR,
-            f"one unit of position would be {position_rad:.3g} rad at the joint: the limits do not fit 32 bits",
-            "correct 60A8, 6092 or 608F with the vendor's tool, or give `position_units_per_revolution` (of the joint)",
-        )
+        doubts.error(f"{would} {format_angle(position_rad)} at the joint: absurdly coarse", cure)
+    if max(abs(joint.position_min_rad), abs(joint.position_max_rad)) / position_rad >= _COUNTS:
+        doubts.error(f"{would} {position_rad:.3g} rad at the joint: the limits do not fit 32 bits", cure)
 
 
-def _polarity(facts: Facts, position_rad: float, report: Report) -> None:
+def _polarity(facts: Facts, position_rad: float, doubts: _Doubts) -> None:
     reversed_ = facts.polarity & (_POSITION_REVERSED | _VELOCITY_REVERSED)
     if reversed_ in (_POSITION_REVERSED, _VELOCITY_REVERSED):
-        report(
-            Severity.ERROR,
+        doubts.error(
             f"position and velocity run against each other (607E = {facts.polarity:#04x})",
             "set both or none of bits 7 and 6 of 607E with the vendor's tool",
         )
     elif reversed_:
-        report(
-            Severity.WARNING,
+        doubts.warning(
             f"position and velocity are turned (607E = {facts.polarity:#04x}); a motion shows whether torque is",
         )
     if facts.home_offset:
-        report(
-            Severity.WARNING,
+        doubts.warning(
             f"positions are shifted by a home offset of {format_angle(facts.home_offset * position_rad)} (607C)",
         )
 
@@ -132,25 +125,20 @@ def unit_rad(code: int) -> float | None:
 
     Source: object 60A8: byte 3 is the SI prefix as a signed power of ten, byte 2 the unit.
     """
-    angle = _ANGLES.get(code >> 16 & 0xFF)
-    return None if angle is None else _prefix(code) * angle
+    angle, power = _ANGLES.get(code >> 16 & 0xFF), code >> 24 & 0xFF
+    return None if angle is None else 10.0 ** (power - 256 if power > 127 else power) * angle
 
 
 def velocity_unit_rad_s(code: int) -> float | None:
     """One unit of 60A9, rad/s of its shaft; None for a unit that is no angle per time.
 
-    Source: object 60A9: byte 3 is the SI prefix as a signed power of ten, byte 2 the angle, byte 1 the time.
+    Source: object 60A9: prefix and angle as in 60A8, byte 1 the time.
     """
-    angle, time_s = _ANGLES.get(code >> 16 & 0xFF), _TIMES.get(code >> 8 & 0xFF)
-    return None if angle is None or time_s is None else _prefix(code) * angle / time_s
+    angle, time_s = unit_rad(code), _TIMES.get(code >> 8 & 0xFF)
+    return None if angle is None or time_s is None else angle / time_s
 
 
-def _prefix(code: int) -> float:
-    power = code >> 24 & 0xFF
-    return float(10.0 ** (power - 256 if power > 127 else power))
-
-
-def _gear(facts: Facts, joint: JointSetup, report: Report) -> bool:
+def _shaft_is_joint(facts: Facts, joint: JointSetup, doubts: _Doubts) -> bool:
     """True where the driving shaft of 6091 is the joint itself."""
     if facts.gear is None:
         return False
@@ -158,13 +146,11 @@ def _gear(facts: Facts, joint: JointSetup, report: Report) -> bool:
     if abs(told / joint.gear_ratio - 1.0) <= RATIO_TOLERANCE:
         return True
     if facts.gear[0] == facts.gear[1]:
-        report(
-            Severity.WARNING,
+        doubts.warning(
             f"the drive does not know the gear (6091 is 1:1); the robot file's {joint.gear_ratio:g} is used",
         )
         return False
-    report(
-        Severity.ERROR,
+    doubts.error(
         f"gear ratio is {joint.gear_ratio:g} in the robot file and {told:g} in the drive "
         f"(6091 = {facts.gear[0]}:{facts.gear[1]})",
         "correct `gear_ratio` in the robot file, or 6091 with the vendor's tool",
@@ -172,13 +158,13 @@ def _gear(facts: Facts, joint: JointSetup, report: Report) -> bool:
     return True
 
 
-def _position_units(facts: Facts, joint: JointSetup, shafts_per_joint: float, report: Report) -> float:
+def _position_units(facts: Facts, joint: JointSetup, shafts_per_joint: float, doubts: _Doubts) -> float:
     """Units per revolution of the joint."""
     given = joint.options.get("position_units_per_revolution")
     if given is not None:
         return float(given)
     if facts.position_unit is not None and (angle := unit_rad(facts.position_unit)) is not None:
-        _same_feed(facts, _TURN / angle, report)
+        _same_feed(facts, _TURN / angle, doubts)
         return _TURN / angle * shafts_per_joint
     if facts.quirks.position_unit_deg is not None:
         return 360.0 / facts.quirks.position_unit_deg
@@ -187,28 +173,25 @@ def _position_units(facts: Facts, joint: JointSetup, shafts_per_joint: float, re
     if facts.encoder is not None:
         # Increments are counted at the motor, whichever shaft 6091 speaks of.
         if facts.feed is not None:
-            report(
-                Severity.WARNING,
+            doubts.warning(
                 f"6092 is {facts.feed[0]}:{facts.feed[1]}, as it leaves the factory: positions are taken for encoder "
                 "increments (608F); the first motion shows whether they are",
             )
         return facts.encoder[0] / facts.encoder[1] * joint.gear_ratio
-    report(
-        Severity.ERROR,
+    doubts.error(
         "the drive tells neither its position unit (60A8), nor its feed constant (6092), nor its encoder (608F)",
         "give `position_units_per_revolution` (of the joint) in the joint's options",
     )
     return 1e6
 
 
-def _same_feed(facts: Facts, units_per_turn: float, report: Report) -> None:
+def _same_feed(facts: Facts, units_per_turn: float, doubts: _Doubts) -> None:
     """6092 says the same as 60A8, or is as it left the factory."""
     if facts.feed is None or facts.feed[0] == facts.feed[1]:
         return
     fed = facts.feed[0] / facts.feed[1]
     if abs(fed / units_per_turn - 1.0) > RATIO_TOLERANCE:
-        report(
-            Severity.ERROR,
+        doubts.error(
             f"its units contradict each other: 60A8 makes {units_per_turn:g} units of one revolution, "
             f"6092 makes {fed:g} ({facts.feed[0]}:{facts.feed[1]})",
             "correct one of them with the vendor's tool, or give `position_units_per_revolution` (of the joint)",
@@ -216,7 +199,7 @@ def _same_feed(facts: Facts, units_per_turn: float, report: Report) -> None:
 
 
 def _velocity_unit(
-    facts: Facts, joint: JointSetup, code: int | None, shafts_per_joint: float, position_rad: float, report: Report
+    facts: Facts, joint: JointSetup, code: int | None, shafts_per_joint: float, position_rad: float, doubts: _Doubts
 ) -> float:
     given = joint.options.get("velocity_unit_rad_s")
     told = None if code is None else velocity_unit_rad_s(code)
@@ -233,25 +216,22 @@ def _velocity_unit(
         unit = position_rad * (0.1 if str(quirk).startswith("tenth") else 1.0)
     else:
         said = "has no 60A9" if code is None else f"has a velocity unit (60A9 = {code:#010x}) that is no angle per time"
-        report(
-            Severity.WARNING if code is None else Severity.ERROR,
+        (doubts.warning if code is None else doubts.error)(
             f"the drive {said}: velocity is taken for position units per second; the first motion shows whether it is",
             "give `velocity_unit_rad_s` (joint side) in the joint's options",
         )
         unit = position_rad
     if unit > COARSE_VELOCITY_RAD_S:
-        report(
-            Severity.WARNING,
+        doubts.warning(
             f"one unit of velocity is {unit:.3g} rad/s at the joint: too coarse for the low end of a friction curve",
             "set 60A9 to 0.001 rpm (FDB44700h) where the drive allows it; velocity from position is used either way",
         )
     return unit
 
 
-def _rated_torque(facts: Facts, joint: JointSetup, report: Report) -> float:
+def _rated_torque(facts: Facts, joint: JointSetup, doubts: _Doubts) -> float:
     if not facts.rated_torque_mnm:
-        report(
-            Severity.WARNING,
+        doubts.warning(
             f"the drive tells no rated torque (6076); the robot file's {joint.rated_torque_nm:g} N m is used",
         )
         return joint.rated_torque_nm
@@ -262,8 +242,7 @@ def _rated_torque(facts: Facts, joint: JointSetup, report: Report) -> float:
         hint = "correct `rated_torque_nm` in the robot file, or 6076 with the vendor's tool"
         if not at_joint and abs(motor_side / joint.rated_torque_nm - 1.0) <= RATED_TOLERANCE:
             hint = "6076 seems to be on the joint side here: set `rated_torque_side: joint` in the joint's options"
-        report(
-            Severity.ERROR,
+        doubts.error(
             f"rated torque is {joint.rated_torque_nm:g} N m in the robot file and {rated:g} N m in the drive "
             f"(6076 = {facts.rated_torque_mnm} mN m, gear {joint.gear_ratio:g})",
             hint,

@@ -47,8 +47,8 @@ fd_object                               -         e.g. ``"2023:00 u8"``: 1 makes
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -59,47 +59,6 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, FORWARDED
 from frictid_hil.protocol.can_load import BitRates
 from frictid_hil.protocol.driver import Timing, unknown_options
-
-BUS_OPTIONS = frozenset(
-    {
-        "bitrate",
-        "fd",
-        "data_bitrate",
-        "pdo_bytes",
-        "sdo_timeout_s",
-        "watchdog_ms",
-        "drive_heartbeat_ms",
-        "host_node",
-        "reply_window",
-        "allow_torque_without_watchdog",
-        "quick_stop_option",
-        "abort_option",
-        "faults",
-        *FORWARDED,
-    }
-)
-JOINT_OPTIONS = frozenset(
-    {
-        "following_window_rad",
-        "locked_window_rad",
-        "following_timeout_ms",
-        "standstill_rad_s",
-        "external_torque_object",
-        "external_torque_nm_per_unit",
-        "temperature_object",
-        "temperature_c_per_unit",
-        "digital_inputs",
-        "position_units_per_revolution",
-        "velocity_unit_rad_s",
-        "rated_torque_side",
-        "torque_source",
-        "timing",
-        "fd_object",
-        "eds",
-        "raise_torque_limit",
-        "widen_position_limits",
-    }
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +101,9 @@ class JointSettings:
     locked_window_rad: float
     following_timeout_ms: int
     standstill_rad_s: float
-    external_torque: Entry | None
+    external_torque_object: Entry | None
     external_torque_nm_per_unit: float
-    temperature: Entry | None
+    temperature_object: Entry | None
     temperature_c_per_unit: float
     digital_inputs: bool
     torque_source: str
@@ -155,179 +114,175 @@ class JointSettings:
     widen_position_limits: bool = False
 
 
+BUS_OPTIONS = frozenset({one.name for one in fields(BusSettings)} | {"fd", "faults", *FORWARDED})
+_OVERRIDES = ("position_units_per_revolution", "velocity_unit_rad_s")
+JOINT_OPTIONS = frozenset({one.name for one in fields(JointSettings)} | {*_OVERRIDES, "rated_torque_side"})
+_DELAYS = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s", "uncertainty_s")
+
+
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:
     """Check and read all options.
 
     Raises:
         InvalidFields: every option or node id that is wrong.
     """
-    reader = _Reader(setup.folder)
-    bus = reader.bus(setup.options)
-    joints = {joint.name: reader.joint(joint) for joint in setup.joints}
-    reader.nodes(setup, bus.host_node)
-    if reader.problems:
-        raise InvalidFields(reader.problems)
+    problems: list[FieldProblem] = []
+    bus = _bus(_Options(setup.options, BUS_OPTIONS, ("options",), problems))
+    joints = {
+        joint.name: _joint(
+            _Options(joint.options, JOINT_OPTIONS, ("joints", joint.name, "options"), problems), setup.folder
+        )
+        for joint in setup.joints
+    }
+    problems += _node_problems(setup.joints, bus.host_node)
+    if problems:
+        raise InvalidFields(problems)
     return bus, joints
 
 
-class _Reader:
-    def __init__(self, folder: Path | None) -> None:
-        self.problems: list[FieldProblem] = []
-        self._folder = folder
+class _Options:
+    """Options of the robot or of one joint; what is wrong with them is gathered."""
 
-    def bus(self, options: Mapping[str, Any]) -> BusSettings:
-        at: tuple[str, ...] = ("options",)
-        self.problems += unknown_options(options, BUS_OPTIONS, at, "cia402")
-        bitrate = self._whole(at, options, "bitrate", DEFAULT_BITRATE, 10_000, 1_000_000)
-        data_bitrate, pdo_bytes = self._fd(at, options, bitrate)
-        return BusSettings(
-            bitrate=bitrate,
-            data_bitrate=data_bitrate,
-            pdo_bytes=pdo_bytes,
-            sdo_timeout_s=self._number(at, options, "sdo_timeout_s", 0.5, 0.01, 60.0),
-            watchdog_ms=self._whole(at, options, "watchdog_ms", 150, 20, 1000),
-            drive_heartbeat_ms=self._whole(at, options, "drive_heartbeat_ms", 100, 10, 1000),
-            host_node=self._whole(at, options, "host_node", 127, 1, 127),
-            reply_window=self._number(at, options, "reply_window", 0.7, 0.1, 0.95),
-            allow_torque_without_watchdog=self._flag(at, options, "allow_torque_without_watchdog"),
-            quick_stop_option=self._whole(at, options, "quick_stop_option", 6, 5, 7),
-            abort_option=self._whole(at, options, "abort_option", 3, 2, 3),
-        )
+    def __init__(
+        self, given: Mapping[str, Any], known: Collection[str], at: tuple[str, ...], problems: list[FieldProblem]
+    ) -> None:
+        self.given, self._at, self._problems = given, at, problems
+        problems += unknown_options(given, known, at, "cia402")
 
-    def _fd(self, at: tuple[str, ...], options: Mapping[str, Any], bitrate: int) -> tuple[int | None, int]:
-        """Data bit rate and length of PDOs: None and 8 on a classical bus."""
-        if self._flag(at, options, "fd"):
-            default = max(DEFAULT_DATA_BITRATE, bitrate)
-            data_bitrate = self._whole(at, options, "data_bitrate", default, 10_000, 8_000_000)
-            if data_bitrate < bitrate:
-                self._problem((*at, "data_bitrate"), f"{data_bitrate} is below the bitrate of arbitration, {bitrate}")
-            return data_bitrate, self._whole(at, options, "pdo_bytes", 64, 8, 64)
-        for key in ("data_bitrate", "pdo_bytes"):
-            if key in options:
-                self._problem(
-                    (*at, key), "means nothing without `fd: true`: classical CAN has one bit rate and 8 bytes"
-                )
-        return None, 8
+    def problem(self, key: str, message: str) -> None:
+        self._problems.append(FieldProblem((*self._at, key), message))
 
-    def joint(self, joint: JointSetup) -> JointSettings:
-        options = joint.options
-        at = ("joints", joint.name, "options")
-        self.problems += unknown_options(options, JOINT_OPTIONS, at, "cia402")
-        self._overrides(at, options)
-        external, external_unit = self._object(at, options, "external_torque", "nm_per_unit")
-        temperature, temperature_unit = self._object(at, options, "temperature", "c_per_unit")
-        return JointSettings(
-            following_window_rad=self._number(at, options, "following_window_rad", 0.12, 1e-4, math.pi),
-            locked_window_rad=self._number(at, options, "locked_window_rad", 0.009, 1e-5, 0.5),
-            following_timeout_ms=self._whole(at, options, "following_timeout_ms", 20, 0, 10_000),
-            standstill_rad_s=self._number(at, options, "standstill_rad_s", 0.02, 1e-4, 1.0),
-            external_torque=external,
-            external_torque_nm_per_unit=external_unit,
-            temperature=temperature,
-            temperature_c_per_unit=temperature_unit,
-            digital_inputs=self._flag(at, options, "digital_inputs"),
-            torque_source=str(options.get("torque_source", "6077 actual torque")),
-            timing=self._timing(at, options),
-            fd_object=self._fd_object(at, options),
-            eds=self._file(at, options, "eds"),
-            raise_torque_limit=self._flag(at, options, "raise_torque_limit"),
-            widen_position_limits=self._flag(at, options, "widen_position_limits"),
-        )
+    def number(self, key: str, default: float | None, low: float, high: float) -> float:
+        value = self.given.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            self.problem(key, f"expected a number {low:g}..{high:g}, found {value!r}")
+            return low
+        return float(value)
 
-    def nodes(self, setup: RobotSetup, host_node: int) -> None:
-        seen = {host_node: "the host itself (options.host_node)"}
-        for joint in setup.joints:
-            if not 1 <= joint.address <= 127:
-                self._problem(("joints", joint.name, "node"), f"expected a node id 1..127, found {joint.address}")
-            elif joint.address in seen:
-                self._problem(
-                    ("joints", joint.name, "node"), f"node {joint.address} is already used by {seen[joint.address]}"
-                )
-            seen.setdefault(joint.address, f"joint {joint.name}")
+    def whole(self, key: str, default: int, low: int, high: int) -> int:
+        value = self.given.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            self.problem(key, f"expected a whole number {low}..{high}, found {value!r}")
+            return default
+        return value
 
-    def _overrides(self, at: tuple[str, ...], options: Mapping[str, Any]) -> None:
-        """What ``facts.scale_of`` takes instead of the drive's own word."""
-        for key in ("position_units_per_revolution", "velocity_unit_rad_s"):
-            if key in options:
-                self._number(at, options, key, None, 1e-12, 1e15)
-        side = options.get("rated_torque_side", "motor")
-        if side not in ("motor", "joint"):
-            self._problem((*at, "rated_torque_side"), f"expected motor or joint, found {side!r}")
+    def flag(self, key: str) -> bool:
+        value = self.given.get(key, False)
+        if not isinstance(value, bool):
+            self.problem(key, f"expected true or false, found {value!r}")
+        return value is True
 
-    def _timing(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Timing | None:
-        given = options.get("timing")
-        if given is None:
+    def file(self, key: str, folder: Path | None) -> Path | None:
+        if (text := self.given.get(key)) is None:
             return None
-        known = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s", "uncertainty_s")
-        if not isinstance(given, Mapping) or not set(given) <= set(known):
-            self._problem((*at, "timing"), f"expected a mapping of {', '.join(known)}")
+        path = (folder or Path()) / str(text)
+        if not path.is_file():
+            self.problem(key, f"no such file: {path}")
             return None
-        here = (*at, "timing")
-        values = {key: self._number(here, given, key, 0.0, -1.0, 1.0) for key in known if key in given}
-        if not 0.0 <= values.get("torque_lag_s", 0.0) <= max(values.get("torque_delay_s", 0.0), 0.0):
-            self._problem((*here, "torque_lag_s"), "is the part of torque_delay_s that is a low-pass, 0 or more")
-        return Timing(**values, source="robot file")
+        return path
 
-    def _fd_object(self, at: tuple[str, ...], options: Mapping[str, Any]) -> Object | None:
-        text = options.get("fd_object")
-        if text is None:
-            return None
-        try:
-            entry = Entry.parse(str(text))
-        except ValueError:
-            self._problem((*at, "fd_object"), f"expected an object such as '2023:00 u8', found {text!r}")
-            return None
-        return Object(entry.index, entry.sub, entry.type, "frames of its PDOs: 0 classical, 1 CAN FD")
-
-    def _object(
-        self, at: tuple[str, ...], options: Mapping[str, Any], meaning: str, unit: str
-    ) -> tuple[Entry | None, float]:
-        text = options.get(f"{meaning}_object")
-        if text is None:
+    def reported(self, meaning: str, unit: str) -> tuple[Entry | None, float]:
+        """An object that drives report, and what its unit is worth."""
+        key = f"{meaning}_object"
+        if (text := self.given.get(key)) is None:
             return None, math.nan
         try:
             entry = Entry.parse(f"{text} {meaning}")
         except ValueError as error:
-            self._problem((*at, f"{meaning}_object"), str(error))
+            self.problem(key, str(error))
             return None, math.nan
         if entry.type.bits not in (8, 16, 32):
-            self._problem((*at, f"{meaning}_object"), f"expected 8, 16 or 32 bits, found {entry.type}")
-        return entry, self._number(at, options, f"{meaning}_{unit}", None, -1e9, 1e9)
+            self.problem(key, f"expected 8, 16 or 32 bits, found {entry.type}")
+        return entry, self.number(f"{meaning}_{unit}", None, -1e9, 1e9)
 
-    def _number(
-        self, at: tuple[str, ...], options: Mapping[str, Any], key: str, default: float | None, low: float, high: float
-    ) -> float:
-        value = options.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            self._problem((*at, key), f"expected a number {low:g}..{high:g}, found {value!r}")
-            return low
-        return float(value)
-
-    def _whole(
-        self, at: tuple[str, ...], options: Mapping[str, Any], key: str, default: int, low: int, high: int
-    ) -> int:
-        value = options.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            self._problem((*at, key), f"expected a whole number {low}..{high}, found {value!r}")
-            return default
-        return value
-
-    def _file(self, at: tuple[str, ...], options: Mapping[str, Any], key: str) -> Path | None:
-        text = options.get(key)
-        if text is None:
+    def fd_object(self) -> Object | None:
+        if (text := self.given.get("fd_object")) is None:
             return None
-        path = (self._folder or Path()) / str(text)
-        if not path.is_file():
-            self._problem((*at, key), f"no such file: {path}")
+        try:
+            entry = Entry.parse(str(text))
+        except ValueError:
+            self.problem("fd_object", f"expected an object such as '2023:00 u8', found {text!r}")
             return None
-        return path
+        return Object(entry.index, entry.sub, entry.type, "frames of its PDOs: 0 classical, 1 CAN FD")
 
-    def _flag(self, at: tuple[str, ...], options: Mapping[str, Any], key: str) -> bool:
-        value = options.get(key, False)
-        if not isinstance(value, bool):
-            self._problem((*at, key), f"expected true or false, found {value!r}")
-            return False
-        return value
+    def timing(self) -> Timing | None:
+        if (given := self.given.get("timing")) is None:
+            return None
+        if not isinstance(given, Mapping) or not set(given) <= set(_DELAYS):
+            self.problem("timing", f"expected a mapping of {', '.join(_DELAYS)}")
+            return None
+        inner = _Options(given, _DELAYS, (*self._at, "timing"), self._problems)
+        values = {key: inner.number(key, 0.0, -1.0, 1.0) for key in _DELAYS if key in given}
+        if not 0.0 <= values.get("torque_lag_s", 0.0) <= max(values.get("torque_delay_s", 0.0), 0.0):
+            inner.problem("torque_lag_s", "is the part of torque_delay_s that is a low-pass, 0 or more")
+        return Timing(**values, source="robot file")
 
-    def _problem(self, path: tuple[str | int, ...], message: str) -> None:
-        self.problems.append(FieldProblem(path, message))
+    def fd(self, bitrate: int) -> tuple[int | None, int]:
+        """Data bit rate and length of PDOs: None and 8 on a classical bus."""
+        if self.flag("fd"):
+            data_bitrate = self.whole("data_bitrate", max(DEFAULT_DATA_BITRATE, bitrate), 10_000, 8_000_000)
+            if data_bitrate < bitrate:
+                self.problem("data_bitrate", f"{data_bitrate} is below the bitrate of arbitration, {bitrate}")
+            return data_bitrate, self.whole("pdo_bytes", 64, 8, 64)
+        for key in ("data_bitrate", "pdo_bytes"):
+            if key in self.given:
+                self.problem(key, "means nothing without `fd: true`: classical CAN has one bit rate and 8 bytes")
+        return None, 8
+
+
+def _bus(options: _Options) -> BusSettings:
+    bitrate = options.whole("bitrate", DEFAULT_BITRATE, 10_000, 1_000_000)
+    data_bitrate, pdo_bytes = options.fd(bitrate)
+    return BusSettings(
+        bitrate=bitrate,
+        data_bitrate=data_bitrate,
+        pdo_bytes=pdo_bytes,
+        sdo_timeout_s=options.number("sdo_timeout_s", 0.5, 0.01, 60.0),
+        watchdog_ms=options.whole("watchdog_ms", 150, 20, 1000),
+        drive_heartbeat_ms=options.whole("drive_heartbeat_ms", 100, 10, 1000),
+        host_node=options.whole("host_node", 127, 1, 127),
+        reply_window=options.number("reply_window", 0.7, 0.1, 0.95),
+        allow_torque_without_watchdog=options.flag("allow_torque_without_watchdog"),
+        quick_stop_option=options.whole("quick_stop_option", 6, 5, 7),
+        abort_option=options.whole("abort_option", 3, 2, 3),
+    )
+
+
+def _joint(options: _Options, folder: Path | None) -> JointSettings:
+    for key in _OVERRIDES:  # what ``scale_of`` takes instead of the drive's own word
+        if key in options.given:
+            options.number(key, None, 1e-12, 1e15)
+    side = options.given.get("rated_torque_side", "motor")
+    if side not in ("motor", "joint"):
+        options.problem("rated_torque_side", f"expected motor or joint, found {side!r}")
+    external, external_unit = options.reported("external_torque", "nm_per_unit")
+    temperature, temperature_unit = options.reported("temperature", "c_per_unit")
+    return JointSettings(
+        following_window_rad=options.number("following_window_rad", 0.12, 1e-4, math.pi),
+        locked_window_rad=options.number("locked_window_rad", 0.009, 1e-5, 0.5),
+        following_timeout_ms=options.whole("following_timeout_ms", 20, 0, 10_000),
+        standstill_rad_s=options.number("standstill_rad_s", 0.02, 1e-4, 1.0),
+        external_torque_object=external,
+        external_torque_nm_per_unit=external_unit,
+        temperature_object=temperature,
+        temperature_c_per_unit=temperature_unit,
+        digital_inputs=options.flag("digital_inputs"),
+        torque_source=str(options.given.get("torque_source", "6077 actual torque")),
+        timing=options.timing(),
+        fd_object=options.fd_object(),
+        eds=options.file("eds", folder),
+        raise_torque_limit=options.flag("raise_torque_limit"),
+        widen_position_limits=options.flag("widen_position_limits"),
+    )
+
+
+def _node_problems(joints: Collection[JointSetup], host_node: int) -> list[FieldProblem]:
+    seen, problems = {host_node: "the host itself (options.host_node)"}, []
+    for joint in joints:
+        at = ("joints", joint.name, "node")
+        if not 1 <= joint.address <= 127:
+            problems.append(FieldProblem(at, f"expected a node id 1..127, found {joint.address}"))
+        elif joint.address in seen:
+            problems.append(FieldProblem(at, f"node {joint.address} is already used by {seen[joint.address]}"))
+        seen.setdefault(joint.address, f"joint {joint.name}")
+    return problems

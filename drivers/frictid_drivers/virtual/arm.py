@@ -17,29 +17,19 @@ from frictid_hil.simulation.servo_loop import ServoLoop
 _NS = 1e-9
 
 
-class ArmAxes:
-    """See the module's first page.
+def couple(model: ArmModel, plants: Sequence[ServoLoop], axes: Sequence[Axis]) -> None:
+    """Put joints that stood alone on one arm; plants and axes are in the order of its joints."""
+    arm = ArmLoop(model, plants)
 
-    Args:
-        arm: behind the axes.
-        axes: in the order of the arm's joints.
-    """
-
-    def __init__(self, arm: ArmLoop, axes: Sequence[Axis]) -> None:
-        self._arm = arm
-        self._axes = tuple(axes)
-        for axis in self._axes:
-            axis.company = self
-
-    def advance(self, now_ns: int) -> None:
-        """To ``now_ns``, or to the first corner of any joint's command on the way."""
-        axes = self._axes
+    def advance(now_ns: int) -> None:
         end_ns = min(axis.unbroken_until_ns(now_ns) for axis in axes)
-        duration_s = (end_ns - axes[0].now_ns) * _NS
-        self._arm.advance(duration_s, [axis.command_until(end_ns) for axis in axes])
+        arm.advance((end_ns - axes[0].now_ns) * _NS, [axis.command_until(end_ns) for axis in axes])
         for axis in axes:
             axis.arrive(end_ns)
             axis.supervise()
+
+    for axis in axes:
+        axis.company = advance
 
 
 def arm_of(setup: RobotSetup) -> ArmModel | None:
@@ -54,8 +44,3 @@ def arm_of(setup: RobotSetup) -> ArmModel | None:
         return ArmModel.from_mapping(setup.simulated_arm, {joint.name: joint.dh for joint in setup.joints})
     except InvalidFields as error:
         raise InvalidFields([FieldProblem(("simulated_arm", *p.path), p.message) for p in error.problems]) from None
-
-
-def couple(model: ArmModel, plants: Sequence[ServoLoop], axes: Sequence[Axis]) -> None:
-    """Put joints that stood alone on one arm."""
-    ArmAxes(ArmLoop(model, plants), axes)

@@ -8,6 +8,7 @@ someone looks or commands something new, so that a joint holding still costs not
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol, cast
 
 from frictid_drivers.virtual import emergency
@@ -55,18 +56,11 @@ class Plant(Protocol):
     @property
     def saturated(self) -> bool: ...  # noqa: D102
 
-    def power(self, on: bool) -> None:
-        """Current may flow."""
-        ...
-
-    def brake(self, engaged: bool) -> None:
-        """Hold the joint by its brake."""
-        ...
-
-    def set_mode(self, mode: int) -> None:
-        """8 position, 9 velocity, 10 torque."""
-        ...
-
+    def power(self, on: bool) -> None: ...  # noqa: D102 - current may flow
+    def brake(self, engaged: bool) -> None: ...  # noqa: D102
+    def set_mode(self, mode: int) -> None: ...  # noqa: D102 - 8 position, 9 velocity, 10 torque
+    def limits(self, torque_nm: float) -> None: ...  # noqa: D102 - of the inner loops
+    def mount_payload(self, on: bool) -> None: ...  # noqa: D102
     def advance(
         self,
         duration_s: float,
@@ -77,22 +71,6 @@ class Plant(Protocol):
         torque_offset_nm: float = 0.0,
     ) -> None:
         """Run on, the position command moving in a straight line to the one given."""
-        ...
-
-    def limits(self, torque_nm: float) -> None:
-        """Largest torque of the inner loops."""
-        ...
-
-    def mount_payload(self, on: bool) -> None:
-        """Change what the joint carries."""
-        ...
-
-
-class Company(Protocol):
-    """Axes whose joints can only move on together: those of an arm."""
-
-    def advance(self, now_ns: int) -> None:
-        """Bring all of them to ``now_ns``, or as far towards it as their commands go on unbroken."""
         ...
 
 
@@ -106,8 +84,6 @@ class Axis:
         increments_per_revolution: encoder increments per joint revolution, as built.
         direction: +1 or -1.
         torque_step: smallest step of the reported torque, per mille.
-        position_units_per_rad: at the joint; None where 608Fh, 6091h and 6092h say it.
-        velocity_unit_rad_s: at the joint; None where 60A9h says it.
 
     Attributes:
         now_ns: run time that the plant has reached.
@@ -119,7 +95,8 @@ class Axis:
         following_error: outside the window right now (statusword bit 13).
         max_torque_per_mille: 6072h as taken over last.
         encoder_stuck: report the last position for ever (a fault to play).
-        company: axes that move on with this one; None where it is alone.
+        company: brings this axis and those that can only move on with it to a run time, or as far towards it as their
+            commands go on unbroken; None where it is alone.
     """
 
     def __init__(
@@ -131,11 +108,8 @@ class Axis:
         increments_per_revolution: float,
         direction: int,
         torque_step: int = 1,
-        position_units_per_rad: float | None = None,
-        velocity_unit_rad_s: float | None = None,
     ) -> None:
-        self._own_units_per_rad = position_units_per_rad
-        self._own_unit_rad_s = velocity_unit_rad_s
+        self._manner = dictionary.manner
         self._values = cast("dict[Key, int]", dictionary.values)
         self._plant = plant
         self._gear_ratio = gear_ratio
@@ -147,7 +121,7 @@ class Axis:
         self.internal_limit = False
         self.following_error = False
         self.encoder_stuck = False
-        self.company: Company | None = None
+        self.company: Callable[[int], None] | None = None
         self.powered = False
         self.mode = 0
         self._stopped = False  # by a ramp: the host's set-points do not count until ``resume``
@@ -167,8 +141,8 @@ class Axis:
         gear = number[key(0x6091, 1)] / number[key(0x6091, 2)]
         feed = number[key(0x6092, 1)] / number[key(0x6092, 2)]
         self._units_per_increment = feed / (encoder * gear)
-        if self._own_units_per_rad is not None:
-            self._units_per_increment = self._own_units_per_rad / self._increments_per_rad
+        if self._manner.position_units_per_rad is not None:
+            self._units_per_increment = self._manner.position_units_per_rad / self._increments_per_rad
         if abs(self._units_per_increment - 1.0) < 1e-12:
             self._units_per_increment = 1.0
         units_per_rad = self._increments_per_rad * self._units_per_increment * self._direction
@@ -176,7 +150,7 @@ class Axis:
         # Velocity is of the shaft behind the gear that the drive knows of; a further gear is the host's business.
         further_gear = self._gear_ratio / gear
         unit_rad_s = VELOCITY_UNITS[number[key(0x60A9)]]
-        self._rad_s_per_unit = (self._own_unit_rad_s or unit_rad_s / further_gear) * self._direction
+        self._rad_s_per_unit = (self._manner.velocity_unit_rad_s or unit_rad_s / further_gear) * self._direction
         self._nm_per_mille = number[key(0x6076)] * 1e-6 * self._gear_ratio * self._direction
         self._speed_limit_rad_s = number[key(0x6080)] * _RPM / self._gear_ratio
         self.max_torque_per_mille = number[key(0x6072)]
@@ -333,7 +307,7 @@ class Axis:
             return
         while self.now_ns < now_ns:
             if self.company is not None:
-                self.company.advance(now_ns)
+                self.company(now_ns)
                 continue
             end_ns = self.unbroken_until_ns(now_ns)
             position_rad, velocity_rad_s, torque_nm, offset_nm = self.command_until(end_ns)

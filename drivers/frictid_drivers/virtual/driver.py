@@ -23,13 +23,7 @@ from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
 from frictid_drivers.virtual.socket_bus import SocketBus
 from frictid_hil.errors import InvalidFields, UsageError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.protocol.driver import (
-    Capabilities,
-    DriverKind,
-    FrameSink,
-    WallClock,
-    unknown_options,
-)
+from frictid_hil.protocol.driver import Capabilities, DriverKind, FrameSink, WallClock, unknown_options
 from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
@@ -60,12 +54,8 @@ class VirtualDriver:
         self._process: RunningRack | None = None
         self.clock: LockStepClock | WallClock = WallClock() if setup.realtime else LockStepClock(self._drives)
         self._host = host = Cia402Driver(_told_to_host(setup), bus_factory=self._open_bus, clock=self.clock)
-        self.identify, self.check, self.faults, self.reset_faults = (
-            host.identify,
-            host.check,
-            host.faults,
-            host.reset_faults,
-        )
+        self.identify, self.check = host.identify, host.check
+        self.faults, self.reset_faults = host.faults, host.reset_faults
         self.configure, self.set_limits, self.remarks = host.configure, host.set_limits, host.remarks
         self.frame_map_values = host.frame_map_values
         self.start_cycling, self.exchange, self.stop_cycling = host.start_cycling, host.exchange, host.stop_cycling
@@ -100,16 +90,11 @@ class VirtualDriver:
             self._rack.power_on()
             leave_in_fault(self._rack, self._faults)
         ours = [fault for fault in self._faults if fault.kind in HOST_KINDS]
-        if not ours:
-            return bus
-        if self._setup.realtime:
-            return FaultyBus(bus, ours)
+        if not ours or self._setup.realtime:
+            return FaultyBus(bus, ours) if ours else bus
         drives = self._drives
         return FaultyBus(
-            bus,
-            ours,
-            now_ns=lambda: drives.now_ns,
-            stand_still=lambda lasts_s: drives.advance(drives.now_ns + round(lasts_s * 1e9)),
+            bus, ours, lambda: drives.now_ns, lambda lasts_s: drives.advance(drives.now_ns + round(lasts_s * 1e9))
         )
 
     def close(self) -> None:
@@ -119,10 +104,9 @@ class VirtualDriver:
         finally:
             if self._process is not None:
                 self._process.stop()
-                self._process = None
             if self._lock is not None:
                 self._lock.release()
-                self._lock = None
+            self._process = self._lock = None
 
     @property
     def may_be_powered(self) -> tuple[str, ...]:
@@ -152,10 +136,9 @@ class VirtualDriver:
             )
         self._write(joint, 0x2040, 1, 0)
         if grip:
-            self._write(joint, 0x2040, 2, round(centre_rad * 1e6))
-            self._write(joint, 0x2040, 3, round(amplitude_rad * 1e6))
-            self._write(joint, 0x2040, 4, round(frequency_hz * 1e3))
-            self._write(joint, 0x2040, 1, 1)
+            figures = (round(centre_rad * 1e6), round(amplitude_rad * 1e6), round(frequency_hz * 1e3), 1)
+            for subindex, value in zip((2, 3, 4, 1), figures, strict=True):
+                self._write(joint, 0x2040, subindex, value)
 
     def mount_payload(self, joint: str, mounted: bool) -> None:
         """Put the payload of the robot file on a joint, or take it off."""
@@ -173,8 +156,7 @@ def _told_to_host(setup: RobotSetup) -> RobotSetup:
     """The robot as the host driver shall see it: no faults, and where our drives keep what other drives have not."""
     from frictid_drivers.cia402.settings import BUS_OPTIONS  # late, as above
 
-    problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "virtual")
-    if problems:
+    if problems := unknown_options(setup.options, BUS_OPTIONS, ("options",), "virtual"):
         raise InvalidFields(problems)
     options = {name: value for name, value in setup.options.items() if name != "faults"}
     fd = bool(options.get("fd"))

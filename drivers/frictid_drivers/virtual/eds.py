@@ -80,7 +80,7 @@ def _index_list(title: str, records: list[Record]) -> list[str]:
 
 
 def _record(record: Record) -> list[str]:
-    if record.is_variable:
+    if len(record.entries) == 1:
         return [f"[{record.index:04X}]", *_entry(record.entries[0])]
     lines = [
         f"[{record.index:04X}]",
@@ -103,10 +103,8 @@ def _entry(entry: Entry) -> list[str]:
         f"DefaultValue={_value(entry, entry.default)}",
         f"PDOMapping={int(entry.receive or entry.transmit)}",
     ]
-    if entry.low is not None:
-        lines.append(f"LowLimit={entry.low}")
-    if entry.high is not None:
-        lines.append(f"HighLimit={entry.high}")
+    limits = {"LowLimit": entry.low, "HighLimit": entry.high}
+    lines += [f"{name}={limit}" for name, limit in limits.items() if limit is not None]
     return [*lines, ""]
 
 

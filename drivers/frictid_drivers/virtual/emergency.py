@@ -40,23 +40,21 @@ class Emergency:
     Args:
         dictionary: 1001h, 1003h and 603Fh live there.
         send: sends the 8 bytes of an EMCY.
+
+    Attributes:
+        present: error codes, oldest first.
     """
 
     def __init__(self, dictionary: ObjectDictionary, send: Callable[[bytes], None]) -> None:
         self._dictionary = dictionary
         self._send = send
-        self._present: tuple[int, ...] = ()
-
-    @property
-    def present(self) -> tuple[int, ...]:
-        """Error codes present, oldest first."""
-        return self._present
+        self.present: tuple[int, ...] = ()
 
     def report(self, code: int, detail: int = 0) -> None:
         """An error appears; said once while it stays."""
-        if code in self._present:
+        if code in self.present:
             return
-        self._present += (code,)
+        self.present += (code,)
         values = self._dictionary.values
         count = min(self._dictionary.number(key(0x1003)) + 1, ERROR_HISTORY)
         for sub in range(count, 1, -1):
@@ -67,18 +65,18 @@ class Emergency:
 
     def clear(self, code: int) -> None:
         """One error is gone."""
-        if code in self._present:
-            self._present = tuple(other for other in self._present if other != code)
+        if code in self.present:
+            self.present = tuple(other for other in self.present if other != code)
             self._publish(0, 0)
 
     def forget(self) -> None:
         """Power was off: nothing is present, nothing is said."""
-        self._present = ()
+        self.present = ()
 
     def _publish(self, code: int, detail: int) -> None:
         register = 0
-        for present in self._present:
+        for present in self.present:
             register |= register_bits(present)
         self._dictionary.values[key(0x1001)] = register
-        self._dictionary.values[key(0x603F)] = self._present[-1] if self._present else 0
+        self._dictionary.values[key(0x603F)] = self.present[-1] if self.present else 0
         self._send(code.to_bytes(2, "little") + bytes([register]) + (detail & 0xFFFF).to_bytes(2, "little") + bytes(3))

@@ -109,22 +109,17 @@ class Fault:
     """One thing that goes wrong; see the module's table.
 
     Attributes:
-        kind: what.
         at_s: when, after the first SYNC; None from the beginning.
-        for_s: how long.
         count: how many frames or calls.
         after: how many frames or calls pass first.
         joints: whose.
         nodes: of these joints.
         frames: which, by name.
         cob_ids: and by identifier, where these are CANopen's.
-        delay_s: how late.
         code: EMCY or SDO abort code.
-        index: object.
         quantity: object of the report.
         level: of the report, in the drive's units; bytes that are left; bit/s of the wire.
         factor: of the report, or of the drives' clocks.
-        error: that the interface raises.
     """
 
     kind: str

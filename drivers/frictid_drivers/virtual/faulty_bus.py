@@ -13,11 +13,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import can
 
-from frictid_drivers.virtual.faults import SERVICES, Fault, read_faults
+from frictid_drivers.virtual.faults import HOST_KINDS, SERVICES, Fault, read_faults
 from frictid_drivers.virtual.wire_faults import SYNC_ID, FaultAtWork, Injections, Late, OccupiedWire, WireFaults
 from frictid_hil.errors import InvalidFields
 
@@ -63,10 +64,7 @@ class FaultyBus(can.BusABC):
         self._start_ns: int | None = None
         self._outgoing, self._incoming = WireFaults(known), WireFaults(known)
         self._injections = Injections(known)
-        self._send_errors = [FaultAtWork(fault) for fault in known if fault.kind == "send_error"]
-        self._receive_errors = [FaultAtWork(fault) for fault in known if fault.kind == "receive_error"]
-        self._off = [FaultAtWork(fault) for fault in known if fault.kind == "bus_off"]
-        self._stalls = [FaultAtWork(fault) for fault in known if fault.kind == "stall"]
+        self._at_work = {kind: [FaultAtWork(fault) for fault in known if fault.kind == kind] for kind in HOST_KINDS}
         self._stand_still = stand_still
         rates = [fault.level for fault in known if fault.kind == "occupied"]
         self._wire = OccupiedWire(min(rates)) if rates else None
@@ -89,10 +87,10 @@ class FaultyBus(can.BusABC):
         """
         if msg.arbitration_id == SYNC_ID and self._start_ns is None:
             self.begin()
-        self._fail(self._send_errors)
+        self._fail("send_error")
         if self._is_off():
             raise can.CanOperationError("injected: the bus is off")
-        for stall in self._stalls:
+        for stall in self._at_work["stall"]:
             if stall.strikes(self._elapsed_ns()):
                 self._stand_still(stall.fault.delay_s)
         self._run_late()
@@ -102,25 +100,17 @@ class FaultyBus(can.BusABC):
         for due_ns, can_id, data in self._outgoing.through(now_ns, elapsed_ns, msg.arbitration_id, bytes(msg.data)):
             frame = _changed(msg, can_id, data)
             if due_ns > now_ns:
-                self._late_out.put(due_ns, _later(self._pass_out, frame))
-            elif self._wire is None:
-                self._bus.send(frame, timeout)
+                self._late_out.put(due_ns, partial(self._pass, self._bus.send, frame))
             else:
-                self._pass_out(frame)
+                self._pass(partial(self._bus.send, timeout=timeout), frame)
         self._run_late()
 
-    def _pass_out(self, frame: can.Message) -> None:
+    def _pass(self, deliver: Callable[[can.Message], None], frame: can.Message) -> None:
+        """Over the wire, which takes time where it is occupied."""
         if self._wire is None:
-            self._bus.send(frame)
+            deliver(frame)
         else:
-            self._wire.put(self._clock(), frame.arbitration_id, bytes(frame.data), lambda: self._bus.send(frame))
-
-    def _pass_in(self, frame: can.Message) -> None:
-        if self._wire is None:
-            self._received.append(frame)
-        else:
-            arrive = _later(self._received.append, frame)
-            self._wire.put(self._clock(), frame.arbitration_id, bytes(frame.data), arrive)
+            self._wire.put(self._clock(), frame.arbitration_id, bytes(frame.data), partial(deliver, frame))
 
     def _run_late(self) -> None:
         now_ns = self._clock()
@@ -130,13 +120,12 @@ class FaultyBus(can.BusABC):
             self._wire.run(now_ns)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        self._fail(self._receive_errors)
+        self._fail("receive_error")
         deadline_s = None if timeout is None else time.monotonic() + timeout
         while True:
             self._run_late()
             self._inject()
-            off = self._is_off()
-            if off and not self._told_off:
+            if (off := self._is_off()) and not self._told_off:
                 self._told_off = True
                 return _BUS_OFF, False
             if self._received:
@@ -157,9 +146,9 @@ class FaultyBus(can.BusABC):
         for due_ns, can_id, data in passed:
             frame = _changed(msg, can_id, data)
             if due_ns <= now_ns:
-                self._pass_in(frame)
+                self._pass(self._received.append, frame)
             else:
-                self._late_in.put(due_ns, _later(self._pass_in, frame))
+                self._late_in.put(due_ns, partial(self._pass, self._received.append, frame))
 
     def shutdown(self) -> None:
         """Both buses."""
@@ -173,17 +162,16 @@ class FaultyBus(can.BusABC):
         for can_id, data in to_drives:
             self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
         for can_id, data in to_host:
-            stamp_s = time.time()
-            frame = can.Message(arbitration_id=can_id, data=data, is_extended_id=False, timestamp=stamp_s)
-            self._received.append(frame)
+            now_s = time.time()
+            self._received.append(can.Message(now_s, can_id, is_extended_id=False, data=data))
 
-    def _fail(self, faults: Sequence[FaultAtWork]) -> None:
-        for work in faults:
+    def _fail(self, kind: str) -> None:
+        for work in self._at_work[kind]:
             if work.strikes(self._elapsed_ns()):
                 raise _ERRORS[work.fault.error]()
 
     def _is_off(self) -> bool:
-        return any(work.strikes(self._elapsed_ns()) for work in self._off)
+        return any(work.strikes(self._elapsed_ns()) for work in self._at_work["bus_off"])
 
     def _elapsed_ns(self) -> int:
         return -1 if self._start_ns is None else self._clock() - self._start_ns
@@ -220,7 +208,3 @@ def _changed(msg: can.Message, can_id: int, data: bytes) -> can.Message:
         is_fd=msg.is_fd,
         bitrate_switch=msg.bitrate_switch,
     )
-
-
-def _later(action: Callable[[can.Message], Any], frame: can.Message) -> Callable[[], None]:
-    return lambda: action(frame)

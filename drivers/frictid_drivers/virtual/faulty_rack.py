@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from frictid_drivers.virtual.faults import FOREVER_S, Fault
 from frictid_drivers.virtual.rack import Rack, Transmit
 from frictid_drivers.virtual.servo import Servo
 from frictid_drivers.virtual.wire_faults import SYNC_ID, Late, WireFaults
+
+_SWITCHED = ("mute", "reset", "emcy", "fault", "stuck_encoder", "blocked", "interlock_open")
 
 
 class FaultyRack:
@@ -20,7 +23,7 @@ class FaultyRack:
     """
 
     def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
-        self.transmit: Transmit = _discard
+        self.transmit: Transmit = lambda can_id, data: None  # no bus yet
         self._rack = rack
         self._faults = tuple(faults)
         self._frames = WireFaults(faults)
@@ -54,7 +57,7 @@ class FaultyRack:
             self._to_drives(can_id, data, remote)
             return
         for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
-            self._at(due_ns, self._delivery(out_id, out, remote))
+            self._at(due_ns, partial(self._to_drives, out_id, out, remote))
 
     def advance(self, to_ns: int) -> None:
         """Let run time go on."""
@@ -84,20 +87,17 @@ class FaultyRack:
                 elif (handler := servo.routes().get(can_id)) is not None:
                     handler(data, self.now_ns)
 
-    def _delivery(self, can_id: int, data: bytes, remote: bool) -> Callable[[], None]:
-        return lambda: self._to_drives(can_id, data, remote)
-
     def _from_drives(self, can_id: int, data: bytes) -> None:
         if can_id & 0x7F in self._muted:
             return
         if can_id not in self._frames.cob_ids:
-            self.transmit(can_id, data)
+            self._to_host(can_id, data)
             return
         for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
-            self._at(due_ns, self._departure(out_id, out))
+            self._at(due_ns, partial(self._to_host, out_id, out))
 
-    def _departure(self, can_id: int, data: bytes) -> Callable[[], None]:
-        return lambda: self.transmit(can_id, data)
+    def _to_host(self, can_id: int, data: bytes) -> None:
+        self.transmit(can_id, data)
 
     def _at(self, due_ns: int, action: Callable[[], None]) -> None:
         """Now where it is due, else later."""
@@ -114,56 +114,35 @@ class FaultyRack:
     def _start(self) -> None:
         self._start_ns = self.now_ns
         for fault in self._faults:
-            for joint in fault.joints:
+            for joint in fault.joints if fault.kind in _SWITCHED else ():
                 servo = self._rack.servos.get(joint)
-                switch = None if servo is None else self._switch(fault, servo)
-                if switch is None:
+                if servo is None:
                     continue
-                self._late.put(self._start_ns + round(fault.begin_s * 1e9), _call(switch, True))
+                begin_ns = self._start_ns + round(fault.begin_s * 1e9)
+                self._late.put(begin_ns, partial(self._switch, fault, servo, True))
                 if fault.for_s < FOREVER_S:
-                    self._late.put(self._start_ns + round((fault.begin_s + fault.for_s) * 1e9), _call(switch, False))
+                    end_ns = self._start_ns + round((fault.begin_s + fault.for_s) * 1e9)
+                    self._late.put(end_ns, partial(self._switch, fault, servo, False))
         self._late.run(self.now_ns)
 
-    def _switch(self, fault: Fault, servo: Servo) -> Callable[[bool], None] | None:
-        """What turns a drive's fault on and off; None for faults of another kind."""
-
-        def mute(on: bool) -> None:
-            (self._muted.add if on else self._muted.discard)(servo.node_id)
-
-        def reset(on: bool) -> None:
-            if on:
-                servo.reset(self.now_ns)
-
-        def warn(on: bool) -> None:
-            for _ in range(fault.times if on else 0):
-                servo.warn(fault.code, self.now_ns)
-
-        def fail(on: bool) -> None:
-            if on:
+    def _switch(self, fault: Fault, servo: Servo, on: bool) -> None:
+        """Turn a drive's fault on and off."""
+        match fault.kind:
+            case "mute":
+                (self._muted.add if on else self._muted.discard)(servo.node_id)
+            case "stuck_encoder":
+                servo.axis.encoder_stuck = on
+            case "blocked":
+                servo.block_brake(on, self.now_ns)
+            case "interlock_open":
+                servo.power.interlock_closed = not on
+            case "reset" if on:
+                servo.boot(self.now_ns)
+            case "fault" if on:
                 servo.fail(fault.code, self.now_ns)
-
-        def stick(on: bool) -> None:
-            servo.axis.encoder_stuck = on
-
-        def block(on: bool) -> None:
-            servo.block_brake(on, self.now_ns)
-
-        def interlock(on: bool) -> None:
-            servo.power.interlock_closed = not on
-
-        switches: dict[str, Callable[[bool], None]] = {
-            "mute": mute, "reset": reset, "emcy": warn, "fault": fail, "stuck_encoder": stick, "blocked": block,
-            "interlock_open": interlock,
-        }  # fmt: skip
-        return switches.get(fault.kind)
-
-
-def _call(switch: Callable[[bool], None], on: bool) -> Callable[[], None]:
-    return lambda: switch(on)
-
-
-def _discard(can_id: int, data: bytes) -> None:
-    """No bus yet."""
+            case "emcy" if on:
+                for _ in range(fault.times):
+                    servo.warn(fault.code, self.now_ns)
 
 
 def leave_in_fault(rack: Rack, faults: Sequence[Fault]) -> None:

@@ -13,7 +13,6 @@ class Consumer:
     """One node listened for.
 
     Attributes:
-        node: its id.
         timeout_ns: longest silence.
         deadline_ns: when it counts as lost; None until it was heard.
         lost: it fell silent and has not been heard again.
@@ -45,10 +44,10 @@ class HeartbeatWatch:
         """Somebody is missing."""
         return any(consumer.lost for consumer in self.consumers)
 
-    def next_deadline_ns(self, otherwise_ns: int) -> int:
-        """When the next one counts as lost, or ``otherwise_ns`` where that is earlier."""
-        deadlines = (consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None)
-        return min((otherwise_ns, *deadlines))
+    @property
+    def deadlines_ns(self) -> list[int]:
+        """When those that were heard count as lost."""
+        return [consumer.deadline_ns for consumer in self.consumers if consumer.deadline_ns is not None]
 
     def newly_lost(self, now_ns: int) -> list[int]:
         """Nodes whose time has run out; each is told once."""

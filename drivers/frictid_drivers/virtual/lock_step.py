@@ -9,32 +9,14 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import can
 from can.interfaces.virtual import VirtualBus
 
+from frictid_drivers.virtual.faulty_rack import FaultyRack
+from frictid_drivers.virtual.rack import Rack
 from frictid_hil.protocol.driver import FD_FRAME
-
-
-class Drives(Protocol):
-    """The drives behind the bus: a ``Rack``, or one with faults."""
-
-    transmit: Callable[[int, bytes], None]
-
-    @property
-    def now_ns(self) -> int:
-        """Run time."""
-        ...
-
-    def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
-        """A frame arrives."""
-        ...
-
-    def advance(self, to_ns: int) -> None:
-        """Run time goes on."""
-        ...
 
 
 class LockStepBus(VirtualBus):
@@ -46,7 +28,7 @@ class LockStepBus(VirtualBus):
         arguments: of ``can.interfaces.virtual.VirtualBus``.
     """
 
-    def __init__(self, drives: Drives, channel: str = "frictid", **arguments: Any) -> None:
+    def __init__(self, drives: Rack | FaultyRack, channel: str = "frictid", **arguments: Any) -> None:
         arguments.setdefault("protocol", can.CanProtocol.CAN_FD)
         super().__init__(channel=channel, preserve_timestamps=True, **arguments)
         self.channel_info = f"lock-step bus {channel}"
@@ -86,7 +68,7 @@ class LockStepBus(VirtualBus):
 
     def shutdown(self) -> None:
         """Leave the channel; drives talk to nobody from now on."""
-        self.drives.transmit = _discard
+        self.drives.transmit = lambda can_id, data: None
         super().shutdown()
 
     def _deliver(self, can_id: int, data: bytes) -> None:
@@ -102,10 +84,9 @@ class LockStepBus(VirtualBus):
             channel=self.channel_id,
         )
         self.queue.put(message)
-        if len(self.channel) > 1:
-            for other in self.channel:
-                if other is not self.queue:
-                    other.put(message)
+        for other in self.channel:
+            if other is not self.queue:
+                other.put(message)
 
 
 class LockStepClock:
@@ -113,7 +94,7 @@ class LockStepClock:
 
     lock_step = True
 
-    def __init__(self, rack: Drives) -> None:
+    def __init__(self, rack: Rack | FaultyRack) -> None:
         self._rack = rack
         self._origin_ns = rack.now_ns
 
@@ -128,7 +109,3 @@ class LockStepClock:
     def wait_until(self, deadline_ns: int) -> None:
         """Let the drives run on to the deadline."""
         self._rack.advance(deadline_ns + self._origin_ns)
-
-
-def _discard(can_id: int, data: bytes) -> None:
-    """The bus is closed."""

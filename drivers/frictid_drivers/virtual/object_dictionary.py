@@ -8,38 +8,21 @@ times a second.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from enum import IntEnum
 
-from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.objects import (
     OBJECTS,
     SIGNED,
     SIZE_BYTES,
+    STANDARD,
     DataType,
     Entry,
     Key,
+    Manner,
     Record,
     Value,
     key,
 )
-
-TOGGLE_NOT_ALTERNATED = 0x05030000
-UNKNOWN_COMMAND = 0x05040001
-UNSUPPORTED_ACCESS = 0x06010000
-WRITE_ONLY = 0x06010001
-READ_ONLY = 0x06010002
-NO_OBJECT = 0x06020000
-NOT_MAPPABLE = 0x06040041
-MAPPING_TOO_LONG = 0x06040042
-INCOMPATIBLE = 0x06040043
-LENGTH_MISMATCH = 0x06070010
-TOO_LONG = 0x06070012
-TOO_SHORT = 0x06070013
-NO_SUBINDEX = 0x06090011
-INVALID_VALUE = 0x06090030
-TOO_HIGH = 0x06090031
-TOO_LOW = 0x06090032
-CANNOT_STORE = 0x08000020
-DEVICE_STATE = 0x08000022
 
 MAX_STRING_BYTES = 64
 
@@ -47,6 +30,29 @@ Guard = Callable[[int], None]
 """Looks at a number about to be written; raises ``SdoAbort`` to refuse it."""
 Effect = Callable[[], None]
 """Acts on a value that was just written."""
+
+
+class Abort(IntEnum):
+    """Abort codes of CiA 301."""
+
+    TOGGLE_NOT_ALTERNATED = 0x05030000
+    UNKNOWN_COMMAND = 0x05040001
+    UNSUPPORTED_ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    MAPPING_TOO_LONG = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    LENGTH_MISMATCH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    INVALID_VALUE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    CANNOT_STORE = 0x08000020
+    DEVICE_STATE = 0x08000022
 
 
 class SdoAbort(Exception):
@@ -65,12 +71,10 @@ class ObjectDictionary:
         overrides: defaults of this very drive (rated torque, gear, serial number).
         missing: indices that this drive does not have (to play a poorer drive).
         records: the table.
-        manner: what sets the drive's family apart.
+        manner: of the drive's family.
 
     Attributes:
-        values: current values by key; numbers, or text for strings.
-        guards: checks made before a download is stored.
-        effects: what follows once it is stored.
+        before_upload: brings values up to date.
     """
 
     def __init__(
@@ -92,7 +96,7 @@ class ObjectDictionary:
         self.indices = frozenset(address >> 8 for address in self.entries)
         self.guards: dict[Key, Guard] = {}
         self.effects: dict[Key, Effect] = {}
-        self.before_upload: Callable[[], None] = _nothing
+        self.before_upload: Effect = lambda: None
         self._defaults: dict[Key, Value] = {entry.key: _with_node(entry, node_id) for entry in every}
         self._defaults |= overrides or {}
         self._stored: dict[Key, Value] | None = None
@@ -126,7 +130,7 @@ class ObjectDictionary:
         """
         found = self.entries.get(address)
         if found is None:
-            raise SdoAbort(NO_SUBINDEX if address >> 8 in self.indices else self.manner.no_object)
+            raise SdoAbort(Abort.NO_SUBINDEX if address >> 8 in self.indices else self.manner.no_object)
         return found
 
     def upload(self, address: Key) -> bytes:
@@ -137,10 +141,10 @@ class ObjectDictionary:
         """
         entry = self.entry(address)
         if entry.access == "wo":
-            raise SdoAbort(WRITE_ONLY)
+            raise SdoAbort(Abort.WRITE_ONLY)
         self.before_upload()
         if address >> 8 == 0x1003 and 0 < address & 0xFF > self.number(key(0x1003)):
-            raise SdoAbort(NO_SUBINDEX)
+            raise SdoAbort(Abort.NO_SUBINDEX)
         return encode(entry, self.values[address])
 
     def download(self, address: Key, data: bytes) -> None:
@@ -151,20 +155,16 @@ class ObjectDictionary:
         """
         entry = self.entry(address)
         if entry.access in ("ro", "const"):
-            raise SdoAbort(READ_ONLY)
+            raise SdoAbort(Abort.READ_ONLY)
         value = decode(entry, data)
         if isinstance(value, int):
             low, high = entry.limits
-            if value > high:
-                raise SdoAbort(TOO_HIGH)
-            if value < low:
-                raise SdoAbort(TOO_LOW)
-            guard = self.guards.get(address)
-            if guard is not None:
+            if not low <= value <= high:
+                raise SdoAbort(Abort.TOO_HIGH if value > high else Abort.TOO_LOW)
+            if (guard := self.guards.get(address)) is not None:
                 guard(value)
         self.values[address] = value
-        effect = self.effects.get(address)
-        if effect is not None:
+        if (effect := self.effects.get(address)) is not None:
             effect()
 
 
@@ -172,7 +172,8 @@ def encode(entry: Entry, value: Value) -> bytes:
     """A value as it travels: little-endian, two's complement, or ASCII."""
     if isinstance(value, str):
         return value.encode("ascii", "replace")
-    return (value & (1 << 8 * SIZE_BYTES[entry.kind]) - 1).to_bytes(SIZE_BYTES[entry.kind], "little")
+    size = SIZE_BYTES[entry.kind]
+    return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
 
 def decode(entry: Entry, data: bytes) -> Value:
@@ -183,21 +184,14 @@ def decode(entry: Entry, data: bytes) -> Value:
     """
     if entry.kind is DataType.STRING:
         if len(data) > MAX_STRING_BYTES:
-            raise SdoAbort(TOO_LONG)
+            raise SdoAbort(Abort.TOO_LONG)
         if any(not 0x20 <= byte < 0x7F for byte in data):
-            raise SdoAbort(INVALID_VALUE)
+            raise SdoAbort(Abort.INVALID_VALUE)
         return data.decode("ascii")
-    size = SIZE_BYTES[entry.kind]
-    if len(data) > size:
-        raise SdoAbort(TOO_LONG)
-    if len(data) < size:
-        raise SdoAbort(TOO_SHORT)
+    if len(data) != (size := SIZE_BYTES[entry.kind]):
+        raise SdoAbort(Abort.TOO_LONG if len(data) > size else Abort.TOO_SHORT)
     return int.from_bytes(data, "little", signed=entry.kind in SIGNED)
 
 
 def _with_node(entry: Entry, node_id: int) -> Value:
     return entry.default + node_id if entry.node_relative and isinstance(entry.default, int) else entry.default
-
-
-def _nothing() -> None:
-    """No refresh needed."""

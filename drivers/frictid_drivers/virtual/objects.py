@@ -16,9 +16,9 @@ feed-forward, 2021h:01), and 60B2h is added as torque in every mode.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 
 class DataType(IntEnum):
@@ -33,8 +33,19 @@ class DataType(IntEnum):
     STRING = 0x09
 
 
-SIZE_BYTES = {DataType.I8: 1, DataType.I16: 2, DataType.I32: 4, DataType.U8: 1, DataType.U16: 2, DataType.U32: 4}
-SIGNED = frozenset({DataType.I8, DataType.I16, DataType.I32})
+I8, I16, I32 = DataType.I8, DataType.I16, DataType.I32
+U8, U16, U32, STRING = DataType.U8, DataType.U16, DataType.U32, DataType.STRING
+
+SIZE_BYTES = {I8: 1, I16: 2, I32: 4, U8: 1, U16: 2, U32: 4}
+SIGNED = frozenset({I8, I16, I32})
+DUMMIES = {kind.value: kind for kind in SIZE_BYTES}
+"""Data types that an RPDO may map to leave a gap (CiA 301, dummy mapping)."""
+
+PDO_COUNT = 4
+PDO_NOT_VALID = 1 << 31
+PDO_NO_RTR = 1 << 30
+MAX_MAPPED = 8
+ERROR_HISTORY = 8
 
 Value = int | str
 Key = int
@@ -56,9 +67,6 @@ class Entry:
     """One value of the object dictionary.
 
     Attributes:
-        key: index << 8 | subindex.
-        name: of the value.
-        kind: data type.
         access: ``ro``, ``rw``, ``wo`` or ``const``.
         default: value after power-on.
         node_relative: the node id is added to the default.
@@ -89,110 +97,85 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """An object with subindices, or a plain variable where ``entries`` is one value at subindex 0.
-
-    Attributes:
-        index: of the object.
-        name: of the object.
-        entries: its values; subindex 0 first.
-        array: all subindices alike (CiA 301 object code 8), else a record (9).
-    """
+    """An object with its values, subindex 0 first; ``array``: all alike (CiA 301 object code 8), else a record (9)."""
 
     index: int
     name: str
     entries: tuple[Entry, ...]
     array: bool = False
 
-    @property
-    def is_variable(self) -> bool:
-        """Only subindex 0 exists."""
-        return len(self.entries) == 1
+
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """What sets a family of drives apart from the standard servo, beyond its table of objects.
+
+    Attributes:
+        absent: objects that it does not have.
+        no_object: the abort code by which it says so.
+        transmission_types: those that its PDOs take; empty for all.
+        position_units_per_rad: at the joint; None where 608Fh, 6091h and 6092h say it.
+        velocity_unit_rad_s: at the joint; None where 60A9h says it.
+        mode_change_s: from 6060h to 6061h.
+        power_on_s: from "switched on" to "enabled".
+    """
+
+    absent: frozenset[Key] = frozenset()
+    no_object: int = 0x06020000
+    transmission_types: tuple[int, ...] = ()
+    position_units_per_rad: float | None = None
+    velocity_unit_rad_s: float | None = None
+    mode_change_s: float = 0.0
+    power_on_s: float = 0.0
 
 
-I8, I16, I32 = DataType.I8, DataType.I16, DataType.I32
-U8, U16, U32, STRING = DataType.U8, DataType.U16, DataType.U32, DataType.STRING
-
-PDO_COUNT = 4
-PDO_NOT_VALID = 1 << 31
-PDO_NO_RTR = 1 << 30
-MAX_MAPPED = 8
-ERROR_HISTORY = 8
+STANDARD = Manner()
 
 
-def _variable(
-    index: int,
+def _entry(
+    address: Key,
     name: str,
     kind: DataType,
     access: str = "rw",
     default: Value = 0,
-    pdo: str = "",
-    *,
+    flags: str = "",
     low: int | None = None,
     high: int | None = None,
-    node_relative: bool = False,
-) -> Record:
-    entry = Entry(key(index), name, kind, access, default, node_relative, "R" in pdo, "T" in pdo, low, high)
-    return Record(index, name, (entry,))
+) -> Entry:
+    """Flags: R and T, may be mapped into an RPDO or TPDO; N, the node id is added."""
+    return Entry(address, name, kind, access, default, "N" in flags, "R" in flags, "T" in flags, low, high)
 
 
-def _group(index: int, name: str, *rows: tuple[object, ...], array: bool = False) -> Record:
-    """Rows are (name, kind, access, default, pdo, low, high); the highest subindex is put first."""
-    count = Entry(key(index), "Highest subindex", U8, "const", len(rows))
-    entries = [count]
-    for subindex, row in enumerate(rows, start=1):
-        padded = (*row, *(None,) * (7 - len(row)))
-        title, kind, access, default, pdo, low, high = padded
-        assert isinstance(title, str) and isinstance(kind, DataType)
-        assert low is None or isinstance(low, int)
-        assert high is None or isinstance(high, int)
-        flags = str(pdo or "")
-        value = default if isinstance(default, int | str) else 0
-        entries.append(
-            Entry(
-                key(index, subindex), title, kind, str(access or "rw"), value, False,
-                "R" in flags, "T" in flags, low, high,
-            )
-        )  # fmt: skip
-    return Record(index, name, tuple(entries), array)
+def _variable(index: int, name: str, *rest: Any, **limits: Any) -> Record:
+    return Record(index, name, (_entry(key(index), name, *rest, **limits),))
 
 
-def _rpdo(number: int) -> Iterator[Record]:
-    index = 0x1400 + number
-    base = 0x200 + 0x100 * number
-    yield Record(
-        index,
-        f"RPDO {number + 1} communication parameter",
-        (
-            Entry(key(index, 0), "Highest subindex", U8, "const", 2),
-            Entry(key(index, 1), "COB-ID", U32, "rw", PDO_NOT_VALID | base, node_relative=True),
-            Entry(key(index, 2), "Transmission type", U8, "rw", 255),
-        ),
+def _group(index: int, name: str, *rows: tuple[Any, ...], array: bool = False) -> Record:
+    """Rows are what ``_entry`` takes after the address; the highest subindex is put first."""
+    count = _entry(key(index), "Highest subindex", U8, "const", len(rows))
+    return Record(index, name, (count, *(_entry(key(index, sub), *row) for sub, row in enumerate(rows, 1))), array)
+
+
+def _pdo(number: int, *, transmit: bool) -> tuple[Record, Record]:
+    """Communication and mapping parameter."""
+    index, cob_id = (0x1800, PDO_NO_RTR | 0x180) if transmit else (0x1400, 0x200)
+    index, cob_id, name = index + number, cob_id + 0x100 * number, f"{'T' if transmit else 'R'}PDO {number + 1}"
+    communication = [
+        _entry(key(index), "Highest subindex", U8, "const", 6 if transmit else 2),
+        _entry(key(index, 1), "COB-ID", U32, "rw", PDO_NOT_VALID | cob_id, "N"),
+        _entry(key(index, 2), "Transmission type", U8, "rw", 255),
+    ]
+    if transmit:
+        communication += [
+            _entry(key(index, 3), "Inhibit time", U16),
+            _entry(key(index, 5), "Event timer", U16),
+            _entry(key(index, 6), "SYNC start value", U8, high=240),
+        ]
+    mapping = [_entry(key(index + 0x200), "Number of mapped objects", U8, high=MAX_MAPPED)]
+    mapping += [_entry(key(index + 0x200, sub), f"Mapped object {sub}", U32) for sub in range(1, MAX_MAPPED + 1)]
+    return (
+        Record(index, f"{name} communication parameter", tuple(communication)),
+        Record(index + 0x200, f"{name} mapping parameter", tuple(mapping)),
     )
-    yield _mapping(0x1600 + number, f"RPDO {number + 1} mapping parameter")
-
-
-def _tpdo(number: int) -> Iterator[Record]:
-    index = 0x1800 + number
-    base = 0x180 + 0x100 * number
-    yield Record(
-        index,
-        f"TPDO {number + 1} communication parameter",
-        (
-            Entry(key(index, 0), "Highest subindex", U8, "const", 6),
-            Entry(key(index, 1), "COB-ID", U32, "rw", PDO_NOT_VALID | PDO_NO_RTR | base, node_relative=True),
-            Entry(key(index, 2), "Transmission type", U8, "rw", 255),
-            Entry(key(index, 3), "Inhibit time", U16, "rw", 0),
-            Entry(key(index, 5), "Event timer", U16, "rw", 0),
-            Entry(key(index, 6), "SYNC start value", U8, "rw", 0, high=240),
-        ),
-    )
-    yield _mapping(0x1A00 + number, f"TPDO {number + 1} mapping parameter")
-
-
-def _mapping(index: int, name: str) -> Record:
-    rows = [Entry(key(index, 0), "Number of mapped objects", U8, "rw", 0, high=MAX_MAPPED)]
-    rows += [Entry(key(index, sub), f"Mapped object {sub}", U32) for sub in range(1, MAX_MAPPED + 1)]
-    return Record(index, name, tuple(rows))
 
 
 COMMUNICATION: tuple[Record, ...] = (
@@ -202,8 +185,8 @@ COMMUNICATION: tuple[Record, ...] = (
         0x1003,
         "Pre-defined error field",
         (
-            Entry(key(0x1003), "Number of errors", U8, "rw", 0),
-            *(Entry(key(0x1003, n), f"Standard error field {n}", U32, "ro") for n in range(1, ERROR_HISTORY + 1)),
+            _entry(key(0x1003), "Number of errors", U8),
+            *(_entry(key(0x1003, n), f"Standard error field {n}", U32, "ro") for n in range(1, ERROR_HISTORY + 1)),
         ),
         array=True,
     ),
@@ -214,7 +197,7 @@ COMMUNICATION: tuple[Record, ...] = (
     _variable(0x100A, "Manufacturer software version", STRING, "const", "1.0"),
     _group(0x1010, "Store parameters", ("Save all parameters", U32, "rw", 1), array=True),
     _group(0x1011, "Restore default parameters", ("Restore all default parameters", U32, "rw", 1), array=True),
-    _variable(0x1014, "COB-ID EMCY", U32, "ro", 0x80, node_relative=True),
+    _variable(0x1014, "COB-ID EMCY", U32, "ro", 0x80, "N"),
     _group(
         0x1016,
         "Consumer heartbeat time",
@@ -232,17 +215,14 @@ COMMUNICATION: tuple[Record, ...] = (
     ),
     _variable(0x1019, "Synchronous counter overflow value", U8, "rw", 0, high=240),
     _group(0x1029, "Error behaviour", ("Communication error", U8, "rw", 0, "", 0, 2), array=True),
-    Record(
+    _group(
         0x1200,
         "SDO server parameter",
-        (
-            Entry(key(0x1200, 0), "Highest subindex", U8, "const", 2),
-            Entry(key(0x1200, 1), "COB-ID client to server", U32, "ro", 0x600, node_relative=True),
-            Entry(key(0x1200, 2), "COB-ID server to client", U32, "ro", 0x580, node_relative=True),
-        ),
+        ("COB-ID client to server", U32, "ro", 0x600, "N"),
+        ("COB-ID server to client", U32, "ro", 0x580, "N"),
     ),
-    *(record for number in range(PDO_COUNT) for record in _rpdo(number)),
-    *(record for number in range(PDO_COUNT) for record in _tpdo(number)),
+    *(record for number in range(PDO_COUNT) for record in _pdo(number, transmit=False)),
+    *(record for number in range(PDO_COUNT) for record in _pdo(number, transmit=True)),
 )
 
 MANUFACTURER: tuple[Record, ...] = (
@@ -363,6 +343,3 @@ DRIVE: tuple[Record, ...] = (
 
 OBJECTS: tuple[Record, ...] = COMMUNICATION + MANUFACTURER + DRIVE
 """Every object of the drive, by rising index."""
-
-DUMMIES: dict[int, DataType] = {0x02: I8, 0x03: I16, 0x04: I32, 0x05: U8, 0x06: U16, 0x07: U32}
-"""Data types that an RPDO may map to leave a gap (CiA 301, dummy mapping)."""

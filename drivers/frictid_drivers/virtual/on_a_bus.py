@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import can
 
@@ -75,21 +74,6 @@ class BusWire:
             return None
 
 
-@dataclass(slots=True)
-class _Told:
-    """The owner of drives that serve until they are told to stop."""
-
-    stop: Callable[[], bool]
-    gone: bool = False
-
-    @property
-    def dismissed(self) -> bool:
-        return self.stop()
-
-    def listen(self) -> None:
-        """It calls."""
-
-
 def serve(setup: RobotSetup, *, announce: Callable[[str], None], stop: Callable[[], bool] = lambda: False) -> None:
     """Run until told to stop.
 
@@ -110,4 +94,4 @@ def serve(setup: RobotSetup, *, announce: Callable[[str], None], stop: Callable[
     with open_bus(setup.bus, options) as bus:
         process = RackProcess(rack, BusWire(bus), faults)
         announce(setup.bus)
-        process.run(_Told(stop))
+        process.run(lambda now_ns, resting: stop())

@@ -12,19 +12,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import cast
 
-from frictid_drivers.virtual.object_dictionary import (
-    DEVICE_STATE,
-    INCOMPATIBLE,
-    INVALID_VALUE,
-    MAPPING_TOO_LONG,
-    NO_OBJECT,
-    NOT_MAPPABLE,
-    ObjectDictionary,
-    SdoAbort,
-)
+from frictid_drivers.virtual.object_dictionary import Abort, ObjectDictionary, SdoAbort
 from frictid_drivers.virtual.objects import (
     DUMMIES,
     MAX_MAPPED,
@@ -32,21 +23,16 @@ from frictid_drivers.virtual.objects import (
     PDO_NO_RTR,
     PDO_NOT_VALID,
     SIZE_BYTES,
-    DataType,
     Key,
     key,
 )
 from frictid_hil.protocol.driver import FD_FRAME
 
-_CODES = {
-    DataType.I8: "b",
-    DataType.I16: "h",
-    DataType.I32: "i",
-    DataType.U8: "B",
-    DataType.U16: "H",
-    DataType.U32: "I",
-}
+_CODES = dict(zip(SIZE_BYTES, "bhiBHI", strict=True))
+"""Of ``struct``, by data type."""
 _EXTENDED = 1 << 29
+_RESTRICTED = ((0x000, 0x080), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x7FF))
+"""First and last COB-ID of what CiA 301 does not leave to PDOs."""
 _WAITING_FOR_START = -1
 _SYNC_MAX = 240
 _MS = 1_000_000
@@ -57,27 +43,14 @@ LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074
 """Actual values: what changes by itself from moment to moment."""
 
 
-def _usable_cob_id(cob_id: int) -> bool:
-    """Identifiers that CiA 301 leaves to PDOs (table of restricted COB-IDs)."""
-    restricted = (
-        range(0x000, 0x080),
-        range(0x101, 0x181),
-        range(0x581, 0x600),
-        range(0x601, 0x680),
-        range(0x6E0, 0x700),
-    )
-    return cob_id <= 0x6FF and cob_id != 0x080 and not any(cob_id in taken for taken in restricted)
-
-
 @dataclass(slots=True)
 class ReceivePdo:
     """A valid RPDO, compiled.
 
     Attributes:
-        cob_id: of the frame, with ``FD_FRAME`` where it is one.
+        cob_id: with ``FD_FRAME`` where it is one.
         on_sync: values count from the next SYNC on; else at once.
         keys: objects in order; dummies have key 0.
-        layout: of the frame.
         pending: the latest frame, not yet applied.
     """
 
@@ -93,10 +66,8 @@ class TransmitPdo:
     """A valid TPDO, compiled.
 
     Attributes:
-        cob_id: of the frame, with ``FD_FRAME`` where it is one.
+        cob_id: with ``FD_FRAME`` where it is one.
         kind: transmission type.
-        keys: objects in order.
-        layout: of the frame.
         start: SYNC counter value that counts as the first, 0 for any.
         inhibit_ns: least time between two event-driven frames.
         event_ns: longest time between two event-driven frames, 0 for none.
@@ -125,13 +96,6 @@ class TransmitPdo:
         return self.layout.pack(*[values[k] for k in self.keys])
 
 
-@dataclass(slots=True)
-class _Compiled:
-    receive: list[ReceivePdo] = field(default_factory=list)
-    cyclic: list[TransmitPdo] = field(default_factory=list)
-    event: list[TransmitPdo] = field(default_factory=list)
-
-
 class ProcessData:
     """All PDOs of one node.
 
@@ -141,6 +105,7 @@ class ProcessData:
         changed: called after a parameter was written.
 
     Attributes:
+        receive: valid RPDOs.
         pending: some RPDO waits for SYNC.
         event_driven: some TPDO is sent on change or by timer.
         live: some of those carries an actual value, which changes all the time.
@@ -156,7 +121,9 @@ class ProcessData:
         self._values = cast("dict[Key, int]", dictionary.values)
         self._send = send
         self._changed = changed
-        self._compiled = _Compiled()
+        self.receive: list[ReceivePdo] = []
+        self._cyclic: list[TransmitPdo] = []
+        self._event: list[TransmitPdo] = []
         self._running = False
         self.pending = False
         self.event_driven = self.live = self.acyclic = False
@@ -165,23 +132,13 @@ class ProcessData:
             self._guard(0x1400 + number, 0x1600 + number, receive=True)
             self._guard(0x1800 + number, 0x1A00 + number, receive=False)
 
-    @property
-    def receive(self) -> list[ReceivePdo]:
-        """Valid RPDOs."""
-        return self._compiled.receive
-
-    @property
-    def transmit(self) -> list[TransmitPdo]:
-        """Valid TPDOs."""
-        return self._compiled.cyclic + self._compiled.event
-
     # -- life cycle ----------------------------------------------------------------------------------------------------
 
     def start(self, now_ns: int) -> None:
         """Entering NMT operational: counters restart, event-driven PDOs announce themselves."""
         self._running = True
         self.recompile(now_ns)
-        for pdo in self._compiled.event:
+        for pdo in self._event:
             if pdo.kind >= 254:
                 self._transmit(pdo, now_ns)
         self.send_events(now_ns)
@@ -191,22 +148,22 @@ class ProcessData:
         self._running = False
         self.pending = False
         self.next_timer_ns = NEVER_NS
-        for pdo in self._compiled.receive:
+        for pdo in self.receive:
             pdo.pending = None
 
     def recompile(self, now_ns: int) -> None:
         """Read the parameters anew; counters and timers of all PDOs restart."""
         number = self._dictionary.number
-        compiled = _Compiled()
+        self.receive, self._cyclic, self._event = [], [], []
         counted = number(key(0x1019)) > 1
-        frame = FD_FRAME if self._fd else 0
         longest = self._longest
+        frame = FD_FRAME if longest > 8 else 0
         for i in range(PDO_COUNT):
             cob_id = number(key(0x1400 + i, 1))
             keys, layout = self._mapping(0x1600 + i)
             if not cob_id & PDO_NOT_VALID and 0x1400 + i in self._dictionary.indices and layout.size <= longest:
                 on_sync = number(key(0x1400 + i, 2)) <= _SYNC_MAX
-                compiled.receive.append(ReceivePdo(cob_id & 0x7FF | frame, on_sync, keys, layout))
+                self.receive.append(ReceivePdo(cob_id & 0x7FF | frame, on_sync, keys, layout))
         for i in range(PDO_COUNT):
             com = 0x1800 + i
             cob_id = number(key(com, 1))
@@ -227,22 +184,17 @@ class ProcessData:
             pdo.countdown = _WAITING_FOR_START if pdo.start else kind
             if pdo.event_ns:
                 pdo.timer_ns = now_ns + pdo.event_ns
-            (compiled.cyclic if 1 <= kind <= _SYNC_MAX else compiled.event).append(pdo)
-        self._compiled = compiled
+            (self._cyclic if 1 <= kind <= _SYNC_MAX else self._event).append(pdo)
         self.pending = False
-        self.event_driven = any(pdo.kind >= 254 for pdo in compiled.event)
-        self.acyclic = any(pdo.kind == 0 for pdo in compiled.event)
-        self.live = any(pdo.kind >= 254 and LIVE.intersection(pdo.keys) for pdo in compiled.event)
+        self.event_driven = any(pdo.kind >= 254 for pdo in self._event)
+        self.acyclic = any(pdo.kind == 0 for pdo in self._event)
+        self.live = any(pdo.kind >= 254 and LIVE.intersection(pdo.keys) for pdo in self._event)
         self.next_timer_ns = NEVER_NS
-
-    @property
-    def _fd(self) -> bool:
-        return self._dictionary.number(key(0x2023)) == 1
 
     @property
     def _longest(self) -> int:
         """Bytes of a PDO."""
-        return 64 if self._fd else 8
+        return 64 if self._dictionary.number(key(0x2023)) == 1 else 8
 
     def _mapping(self, index: int) -> tuple[tuple[Key, ...], struct.Struct]:
         keys: list[Key] = []
@@ -259,27 +211,25 @@ class ProcessData:
     def due_on_sync(self, counter: int | None) -> list[TransmitPdo]:
         """Count one SYNC; the cyclic TPDOs to send now."""
         due = []
-        for pdo in self._compiled.cyclic:
+        for pdo in self._cyclic:
             if pdo.countdown == _WAITING_FOR_START:
-                if counter != pdo.start:
-                    continue
+                now = counter == pdo.start
             else:
                 pdo.countdown -= 1
-                if pdo.countdown > 0:
-                    continue
-            pdo.countdown = pdo.kind
-            due.append(pdo)
+                now = pdo.countdown <= 0
+            if now:
+                pdo.countdown = pdo.kind
+                due.append(pdo)
         return due
 
     def send_due(self, due: list[TransmitPdo]) -> None:
         """Send cyclic TPDOs with the values of this moment."""
-        values, send = self._values, self._send
         for pdo in due:
-            send(pdo.cob_id, pdo.layout.pack(*[values[k] for k in pdo.keys]))
+            self._send(pdo.cob_id, pdo.pack(self._values))
 
     def send_acyclic(self, now_ns: int) -> None:
         """At SYNC: TPDOs of type 0 whose values changed."""
-        for pdo in self._compiled.event:
+        for pdo in self._event:
             if pdo.kind == 0 and pdo.pack(self._values) != pdo.last:
                 self._transmit(pdo, now_ns)
 
@@ -288,12 +238,13 @@ class ProcessData:
         if not self._running:
             return
         due_ns = NEVER_NS
-        for pdo in self._compiled.event:
+        for pdo in self._event:
             if pdo.kind < 254:
                 continue
-            if now_ns >= pdo.timer_ns or (now_ns >= pdo.quiet_until_ns and pdo.pack(self._values) != pdo.last):
+            changed = pdo.pack(self._values) != pdo.last
+            if now_ns >= pdo.timer_ns or (changed and now_ns >= pdo.quiet_until_ns):
                 self._transmit(pdo, now_ns)
-            elif pdo.pack(self._values) != pdo.last:
+            elif changed:
                 due_ns = min(due_ns, pdo.quiet_until_ns)
             due_ns = min(due_ns, pdo.timer_ns)
         self.next_timer_ns = due_ns
@@ -301,7 +252,7 @@ class ProcessData:
     def answer_remote(self, cob_id: int, now_ns: int) -> None:
         """A remote frame asks for a TPDO."""
         if self._running:
-            for pdo in self.transmit:
+            for pdo in self._cyclic + self._event:
                 if pdo.rtr and pdo.cob_id == cob_id:
                     self._transmit(pdo, now_ns)
 
@@ -314,7 +265,7 @@ class ProcessData:
     def apply_pending(self) -> None:
         """At SYNC: take over what came before it."""
         self.pending = False
-        for pdo in self._compiled.receive:
+        for pdo in self.receive:
             if pdo.pending is not None:
                 self.apply(pdo, pdo.pending)
                 pdo.pending = None
@@ -336,18 +287,19 @@ class ProcessData:
             return not number(key(com, 1)) & PDO_NOT_VALID
 
         def cob_id(value: int) -> None:
-            if value & _EXTENDED or value & 0x1FFFF800 or not _usable_cob_id(value & 0x7FF):
-                raise SdoAbort(INVALID_VALUE)
+            taken = any(first <= value & 0x7FF <= last for first, last in _RESTRICTED)
+            if value & _EXTENDED or value & 0x1FFFF800 or taken:
+                raise SdoAbort(Abort.INVALID_VALUE)
             if valid() and not value & PDO_NOT_VALID and (value ^ number(key(com, 1))) & 0x7FF:
-                raise SdoAbort(DEVICE_STATE)
+                raise SdoAbort(Abort.DEVICE_STATE)
 
         def transmission_type(value: int) -> None:
             if _SYNC_MAX < value < 254 or value not in (self._dictionary.manner.transmission_types or (value,)):
-                raise SdoAbort(INVALID_VALUE)
+                raise SdoAbort(Abort.INVALID_VALUE)
 
         def while_invalid(value: int) -> None:
             if valid():
-                raise SdoAbort(DEVICE_STATE)
+                raise SdoAbort(Abort.DEVICE_STATE)
 
         def count(value: int) -> None:
             while_invalid(value)
@@ -356,34 +308,33 @@ class ProcessData:
                 mapped(number(key(mapping, sub)))
                 bits += number(key(mapping, sub)) & 0xFF
             if bits > 8 * self._longest:
-                raise SdoAbort(MAPPING_TOO_LONG)
+                raise SdoAbort(Abort.MAPPING_TOO_LONG)
 
         def entry(value: int) -> None:
             while_invalid(value)
             if number(key(mapping)):
-                raise SdoAbort(DEVICE_STATE)
+                raise SdoAbort(Abort.DEVICE_STATE)
             if value:
                 mapped(value)
 
         def mapped(value: int) -> None:
-            dummy = DUMMIES.get(value >> 16)
-            if dummy is not None and receive and not value >> 8 & 0xFF:
-                kind = dummy
-            else:
-                if value >> 16 in DUMMIES or value == 0:
-                    raise SdoAbort(NO_OBJECT if value == 0 else NOT_MAPPABLE)
+            kind = DUMMIES.get(value >> 16)
+            if value == 0:
+                raise SdoAbort(Abort.NO_OBJECT)
+            if kind is None:
                 found = self._dictionary.entry(value >> 8)
                 kind = found.kind
                 if not (found.receive if receive else found.transmit):
-                    raise SdoAbort(NOT_MAPPABLE)
+                    raise SdoAbort(Abort.NOT_MAPPABLE)
+            elif not receive or value >> 8 & 0xFF:
+                raise SdoAbort(Abort.NOT_MAPPABLE)
             if value & 0xFF != 8 * SIZE_BYTES[kind]:
-                raise SdoAbort(INCOMPATIBLE)
+                raise SdoAbort(Abort.INCOMPATIBLE)
 
         guards[key(com, 1)] = cob_id
         guards[key(com, 2)] = transmission_type
         if not receive:
-            guards[key(com, 3)] = while_invalid
-            guards[key(com, 6)] = while_invalid
+            guards[key(com, 3)] = guards[key(com, 6)] = while_invalid
         guards[key(mapping)] = count
         for sub in range(1, MAX_MAPPED + 1):
             guards[key(mapping, sub)] = entry

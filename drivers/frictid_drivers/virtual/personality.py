@@ -16,8 +16,7 @@ from typing import Any
 
 import yaml
 
-from frictid_drivers.virtual.manner import Manner
-from frictid_drivers.virtual.objects import OBJECTS, DataType, Entry, Key, Record, Value, key
+from frictid_drivers.virtual.objects import OBJECTS, STANDARD, DataType, Entry, Key, Manner, Record, Value, key
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup
 
@@ -35,8 +34,6 @@ class Personality:
     """One family.
 
     Attributes:
-        records: its table of objects.
-        manner: what the table cannot say.
         defaults: values that are the maker's, whatever the joint is.
         position_unit_deg: of 6064h; None for increments, or what 6092h says.
         position_unit_of: ``joint`` or ``motor`` side.
@@ -46,7 +43,7 @@ class Personality:
     """
 
     records: tuple[Record, ...] = OBJECTS
-    manner: Manner = field(default_factory=Manner)
+    manner: Manner = STANDARD
     defaults: Mapping[Key, Value] = field(default_factory=dict)
     position_unit_deg: float | None = None
     position_unit_of: str = "joint"
@@ -66,13 +63,11 @@ class Personality:
 
     def manner_for(self, joint: JointSetup, units_per_joint_turn: float) -> Manner:
         """With the units at this joint."""
-        units = None
+        units = velocity = None
         if self.position_unit_deg is not None:
             units = 360.0 / self.position_unit_deg * (joint.gear_ratio if self.position_unit_of == "motor" else 1.0)
-        unit_rad = _TURN / (units or units_per_joint_turn)
-        velocity = None
         if self.velocity_per_position is not None:
-            velocity = self.velocity_per_position * unit_rad
+            velocity = self.velocity_per_position * (_TURN / (units or units_per_joint_turn))
         elif self.velocity_unit_rad_s is not None:
             velocity = self.velocity_unit_rad_s / joint.gear_ratio
         return replace(
@@ -113,24 +108,18 @@ def from_data(plain: Mapping[str, Any]) -> Personality:
     """One entry of the file."""
     changes = {_key(at): dict(change) for at, change in plain.get("objects", {}).items()}
     changes |= {key(0x1018, 1): {"default": plain["vendor"]}, key(0x1008): {"default": str(plain["name"])}}
-    defaults: dict[Key, Value] = {at: change["default"] for at, change in changes.items() if "default" in change}
-    absent = frozenset(entry.key for at in plain.get("absent", ()) for entry in _entries(at))
     unit = plain.get("velocity_unit")
     return Personality(
         records=_changed(changes),
         manner=Manner(
-            absent=absent,
-            no_object=plain.get("no_object", 0x06020000),
+            absent=frozenset(entry.key for at in plain.get("absent", ()) for entry in _entries(at)),
             transmission_types=tuple(plain.get("transmission_types", ())),
-            mode_change_s=plain.get("mode_change_s", 0.0),
-            power_on_s=plain.get("power_on_s", 0.0),
+            **_given(plain, "no_object", "mode_change_s", "power_on_s"),
         ),
-        defaults=defaults,
-        position_unit_deg=plain.get("position_unit_deg"),
-        position_unit_of=plain.get("position_unit_of", "joint"),
+        defaults={at: change["default"] for at, change in changes.items() if "default" in change},
         velocity_per_position={"position": 1.0, "tenth position": 0.1}.get(unit) if isinstance(unit, str) else None,
         velocity_unit_rad_s=unit if isinstance(unit, float) else None,
-        knows_gear=plain.get("knows_gear", True),
+        **_given(plain, "position_unit_deg", "position_unit_of", "knows_gear"),
     )
 
 
@@ -180,8 +169,12 @@ def _changed(changes: Mapping[Key, Mapping[str, Any]]) -> tuple[Record, ...]:
     )
 
 
+def _given(plain: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: plain[name] for name in names if name in plain}
+
+
 def _entry(entry: Entry, change: Mapping[str, Any]) -> Entry:
-    new = {name: change[name] for name in ("access", "default", "low", "high", "receive", "transmit") if name in change}
+    new = _given(change, "access", "default", "low", "high", "receive", "transmit")
     if "type" in change:
         new["kind"] = _KINDS[change["type"]]
     return replace(entry, **new)

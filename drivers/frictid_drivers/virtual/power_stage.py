@@ -11,7 +11,6 @@ from typing import cast
 from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.axis import CSP, IP, MODES, Axis, Plant
 from frictid_drivers.virtual.emergency import Emergency
-from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary
 from frictid_drivers.virtual.objects import Key, key
 from frictid_drivers.virtual.power_state import FAULT_RESET, HALT, PowerState, next_state
@@ -36,7 +35,6 @@ class PowerStage:
         plant: the joint, for its brake.
         errors: of the node.
         host_missing: asked before power is given: a watched heartbeat is missing.
-        manner: what sets the drive's family apart.
 
     Attributes:
         state: of the state machine.
@@ -51,9 +49,8 @@ class PowerStage:
         plant: Plant,
         errors: Emergency,
         host_missing: Callable[[], bool],
-        manner: Manner = STANDARD,
     ) -> None:
-        self._manner = manner
+        self._manner = dictionary.manner
         self._mode_due_ns: int | None = None
         self._enable_due_ns: int | None = None
         self._values = cast("dict[Key, int]", dictionary.values)
@@ -74,7 +71,7 @@ class PowerStage:
 
     def boot(self) -> None:
         """Transitions 0 and 1: power-on, without motor power; the objects have their defaults again."""
-        self._power_off()
+        self._power(False)
         self._mode_due_ns = self._enable_due_ns = None
         self._controlword = 0
         self._outputs = 0
@@ -111,7 +108,7 @@ class PowerStage:
             self._after_ramp = PowerState.FAULT
             self._ramp(option)
         else:
-            self._power_off()
+            self._power(False)
             self.state = PowerState.FAULT
 
     def follow_commands(self) -> None:
@@ -142,40 +139,35 @@ class PowerStage:
         self.changed = True
         if rising & FAULT_RESET:
             self._reset_fault()
-        while (step := next_state(self.state, controlword)) is not None:
-            transition, target = step
-            if not self._may(transition):
-                break
+        before = None
+        while self.state is not before and (step := next_state(self.state, controlword)) is not None:
             before = self.state
-            self._take(transition, target)
-            if self.state is before:
-                break
+            if self._may(step[0]):
+                self._take(*step)
         if self.state is PowerState.ENABLED and self._after_ramp is None:
             self._follow_halt(bool(controlword & HALT))
 
     def _mode_is_due(self) -> bool:
         """The new mode shows, after as long as this family takes."""
-        if self._mode_due_ns is None:
-            self._mode_due_ns = self._axis.now_ns + round(self._manner.mode_change_s * 1e9)
-        if self._axis.now_ns < self._mode_due_ns:
-            return False
-        self._mode_due_ns = None
-        return True
+        self._mode_due_ns = self._still_due_ns(self._mode_due_ns, self._manner.mode_change_s)
+        return self._mode_due_ns is None
 
     def _power_is_due(self) -> bool:
-        if self._enable_due_ns is None:
-            self._enable_due_ns = self._axis.now_ns + round(self._manner.power_on_s * 1e9)
-        if self._axis.now_ns < self._enable_due_ns:
-            return False
-        self._enable_due_ns = None
-        return True
+        self._enable_due_ns = self._still_due_ns(self._enable_due_ns, self._manner.power_on_s)
+        return self._enable_due_ns is None
+
+    def _still_due_ns(self, due_ns: int | None, takes_s: float) -> int | None:
+        """When it is due that begins now unless it has begun; None where that has come."""
+        if due_ns is None:
+            due_ns = self._axis.now_ns + round(takes_s * 1e9)
+        return None if self._axis.now_ns >= due_ns else due_ns
 
     def _may(self, transition: int) -> bool:
         if transition == 4 and self._manner.power_on_s and not self._power_is_due():
             return False
         if transition in (4, 16) and self._host_missing():
             return False  # no power while the host's heartbeat is missing
-        return not (transition == 16 and self._values[key(0x605A)] not in (5, 6, 7))
+        return transition != 16 or self._values[key(0x605A)] in (5, 6, 7)
 
     def _take(self, transition: int, target: PowerState) -> None:
         if transition in (5, 8):
@@ -190,7 +182,7 @@ class PowerStage:
             self.quick_stop()
         elif transition == 4:
             self.state = target
-            self._power_on()
+            self._power(True)
         elif transition == 16:
             self.state = target
             self._after_ramp = None
@@ -202,7 +194,7 @@ class PowerStage:
         """Enter a state without motor power."""
         self.changed = True
         if self._axis.powered:
-            self._power_off()
+            self._power(False)
         self.state = target
 
     def disable_voltage(self) -> None:
@@ -260,16 +252,10 @@ class PowerStage:
             if not (missing and code == emergency.HEARTBEAT_LOST):
                 self._errors.clear(code)
 
-    def _power_on(self) -> None:
+    def _power(self, on: bool) -> None:
         self._halted = False
         self._after_ramp = None
-        self._axis.switch(True)
-        self.apply_brake()
-
-    def _power_off(self) -> None:
-        self._after_ramp = None
-        self._halted = False
-        self._axis.switch(False)
+        self._axis.switch(on)
         self.apply_brake()
 
     def _brake_wanted(self, powered: bool) -> bool:

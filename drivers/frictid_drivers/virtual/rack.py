@@ -30,16 +30,16 @@ class Rack:
     Attributes:
         transmit: where the drives' frames go; set by whoever owns the bus.
         now_ns: run time.
+        next_event_ns: when something falls due by itself.
         servos: by joint name, in the order of the robot file.
     """
 
     def __init__(self) -> None:
-        self.transmit: Transmit = _discard
+        self.transmit: Transmit = lambda can_id, data: None  # no bus yet
         self.now_ns = 0
         self.servos: dict[str, Servo] = {}
-        self._next_ns = NEVER_NS
-        self._routes: dict[int, tuple[Handler, ...]] = {}
-        self._stale_routes = True
+        self.next_event_ns = NEVER_NS
+        self._routes: dict[int, list[Handler]] | None = None
 
     def install(
         self,
@@ -73,7 +73,7 @@ class Rack:
         servo.wake = self._wake
         servo.routes_changed = self._drop_routes
         self.servos[name] = servo
-        self._stale_routes = True
+        self._routes = None
 
     def send(self, can_id: int, data: bytes) -> None:
         """A drive puts a frame on the bus."""
@@ -86,8 +86,8 @@ class Rack:
 
     def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """A frame with an 11-bit identifier (``FD_FRAME`` set: a CAN FD one) arrives at every drive, now."""
-        if self._stale_routes:
-            self._renew_routes()
+        if self._routes is None:
+            self._routes = self._compiled_routes()
         if remote:
             for servo in self.servos.values():
                 servo.receive_remote(can_id, self.now_ns)
@@ -98,14 +98,14 @@ class Rack:
 
     def advance(self, to_ns: int) -> None:
         """Let run time go on to ``to_ns``, everything that falls due on the way in its order."""
-        while self._next_ns <= to_ns:
-            self.now_ns = max(self.now_ns, self._next_ns)
+        while self.next_event_ns <= to_ns:
+            self.now_ns = max(self.now_ns, self.next_event_ns)
             now_ns = self.now_ns
-            self._next_ns = NEVER_NS
+            self.next_event_ns = NEVER_NS
             for servo in self.servos.values():
                 if servo.next_event_ns <= now_ns:
                     servo.on_time(now_ns)
-            self._next_ns = min((servo.next_event_ns for servo in self.servos.values()), default=NEVER_NS)
+            self.next_event_ns = min((servo.next_event_ns for servo in self.servos.values()), default=NEVER_NS)
         if to_ns > self.now_ns:
             self.now_ns = to_ns
 
@@ -116,31 +116,20 @@ class Rack:
             servo.axis.catch_up(self.now_ns)
 
     @property
-    def next_event_ns(self) -> int:
-        """When something falls due by itself."""
-        return self._next_ns
-
-    @property
     def at_rest(self) -> bool:
         """No motor has power, or every powered one stands still."""
         return all(not servo.axis.powered or servo.axis.at_rest for servo in self.servos.values())
 
     def _wake(self, at_ns: int) -> None:
-        if at_ns < self._next_ns:
-            self._next_ns = at_ns
+        self.next_event_ns = min(self.next_event_ns, at_ns)
 
     def _drop_routes(self) -> None:
-        self._stale_routes = True
+        self._routes = None
 
-    def _renew_routes(self) -> None:
+    def _compiled_routes(self) -> dict[int, list[Handler]]:
         found: dict[int, list[Handler]] = {}
         for servo in self.servos.values():
             for can_id, handler in servo.routes().items():
                 found.setdefault(can_id, []).append(handler)
         found[0x000] = [servo.receive_nmt for servo in self.servos.values()]
-        self._routes = {can_id: tuple(handlers) for can_id, handlers in found.items()}
-        self._stale_routes = False
-
-
-def _discard(can_id: int, data: bytes) -> None:
-    """No bus yet."""
+        return found

@@ -29,11 +29,7 @@ class RunningRack:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+        self.pid = process.pid
 
     def stop(self) -> None:
         """Dismiss it; insist after a while."""

@@ -86,39 +86,10 @@ class Wire(Protocol):
     heard: Callable[[int, bytes, int], None]
 
     @property
-    def members(self) -> int:
-        """How many are connected."""
-        ...
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """To all members."""
-        ...
-
-    def wait(self, longest_s: float) -> None:
-        """For something to serve."""
-        ...
-
-    def serve(self) -> None:
-        """All that has arrived."""
-        ...
-
-
-class WhoAsks(Protocol):
-    """For whom the drives are here: an ``Owner``, or whoever started ``emulate``."""
-
-    @property
-    def dismissed(self) -> bool:
-        """The drives are no longer needed."""
-        ...
-
-    @property
-    def gone(self) -> bool:
-        """It ended without saying so."""
-        ...
-
-    def listen(self) -> None:
-        """Look whether there is word of it."""
-        ...
+    def members(self) -> int: ...  # noqa: D102 - how many are connected
+    def send(self, can_id: int, data: bytes) -> None: ...  # noqa: D102 - to all members
+    def wait(self, longest_s: float) -> None: ...  # noqa: D102 - for something to serve
+    def serve(self) -> None: ...  # noqa: D102 - all that has arrived
 
 
 class RackProcess:
@@ -152,66 +123,51 @@ class RackProcess:
         self._drives.advance(self._time.time_ns(wall_ns))
         return wall_ns
 
-    def run(self, owner: WhoAsks) -> None:
-        """Serve until the owner says so, or is gone and the robot stands still."""
+    def run(self, over: Callable[[int, bool], bool]) -> None:
+        """Serve until told that it is over, many times a second.
+
+        Args:
+            over: asked with the wall clock in ns, and whether the robot stands still with nobody connected.
+        """
         self._drives.power_on()
         leave_in_fault(self._rack, self._faults)
-        farewell = _Farewell()
         while True:
             wait_s = (self._drives.next_event_ns - self._drives.now_ns) * 1e-9
             self._hub.wait(min(_LONGEST_WAIT_S, max(_SHORTEST_WAIT_S, wait_s)))
             # First the time, then the frames: none that was sent before it is left when run time reaches it.
             wall_ns = self.serve_until(time.monotonic_ns())
-            owner.listen()
-            if owner.dismissed or (
-                owner.gone and farewell.over(wall_ns, resting=self._rack.at_rest and not self._hub.members)
-            ):
+            if over(wall_ns, self._rack.at_rest and not self._hub.members):
                 return
 
 
-class _Farewell:
-    """How long drives without an owner live on: a second of standstill unobserved, at most ten altogether."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None
-        self._resting_since_ns: int | None = None
-
-    def over(self, now_ns: int, *, resting: bool) -> bool:
-        """It is time to end."""
-        self._since_ns = now_ns if self._since_ns is None else self._since_ns
-        if not resting:
-            self._resting_since_ns = None
-        elif self._resting_since_ns is None:
-            self._resting_since_ns = now_ns
-        rested = self._resting_since_ns is not None and now_ns - self._resting_since_ns > _STANDSTILL_NS
-        return rested or now_ns - self._since_ns > _FAREWELL_NS
-
-
 class Owner:
-    """The process that started this one, at the other end of our standard input.
-
-    Attributes:
-        dismissed: it said that the drives are no longer needed.
-        gone: it ended without saying so.
-    """
+    """The process that started this one, at the other end of our standard input."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self._pid = os.getppid()
-        self.dismissed = False
-        self.gone = False
+        self._gone_ns: int | None = None
+        self._resting_ns: int | None = None
 
-    def listen(self) -> None:
-        """Look whether there is word of it."""
-        if self.gone:
-            return
-        readable, _, _ = select.select([self._descriptor], [], [], 0)
-        if readable:
-            word = os.read(self._descriptor, 64)
-            self.dismissed = DISMISSAL.encode() in word
-            self.gone = not word
-        # A child of the owner may have inherited the pipe and hold it open.
-        self.gone = self.gone or os.getppid() != self._pid
+    def over(self, now_ns: int, resting: bool) -> bool:
+        """It needs the drives no longer; without it they live on for a second of standstill unobserved, at most ten."""
+        if self._gone_ns is None:
+            if select.select([self._descriptor], [], [], 0)[0]:
+                word = os.read(self._descriptor, 64)
+                if DISMISSAL.encode() in word:
+                    return True
+                self._gone_ns = None if word else now_ns
+            # A child of the owner may have inherited the pipe and hold it open.
+            if os.getppid() != self._pid:
+                self._gone_ns = now_ns
+            if self._gone_ns is None:
+                return False
+        if not resting:
+            self._resting_ns = None
+        elif self._resting_ns is None:
+            self._resting_ns = now_ns
+        rested = self._resting_ns is not None and now_ns - self._resting_ns > _STANDSTILL_NS
+        return rested or now_ns - self._gone_ns > _FAREWELL_NS
 
 
 def be_punctual() -> None:
@@ -241,7 +197,7 @@ def main() -> int:
     process = RackProcess(rack, hub, faults)
     print(READY, flush=True)
     try:
-        process.run(owner)
+        process.run(owner.over)
     finally:
         with contextlib.suppress(OSError):
             hub.close()

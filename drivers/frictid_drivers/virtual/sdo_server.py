@@ -9,14 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from frictid_drivers.virtual.object_dictionary import (
-    LENGTH_MISMATCH,
-    TOGGLE_NOT_ALTERNATED,
-    TOO_LONG,
-    UNKNOWN_COMMAND,
-    ObjectDictionary,
-    SdoAbort,
-)
+from frictid_drivers.virtual.object_dictionary import Abort, ObjectDictionary, SdoAbort
 from frictid_drivers.virtual.objects import Key
 
 _MAX_TRANSFER_BYTES = 1024
@@ -71,7 +64,7 @@ class SdoServer:
                 return self._download_segment(transfer, request)
             if command == 3 and isinstance(transfer, _Upload):
                 return self._upload_segment(transfer, request)
-            raise SdoAbort(UNKNOWN_COMMAND)
+            raise SdoAbort(Abort.UNKNOWN_COMMAND)
         except SdoAbort as abort:
             self._transfer = None
             return _frame(0x80, address, abort.code)
@@ -86,7 +79,7 @@ class SdoServer:
 
     def _upload_segment(self, transfer: _Upload, request: bytes) -> bytes:
         if request[0] >> 4 & 1 != transfer.toggle:
-            raise SdoAbort(TOGGLE_NOT_ALTERNATED)
+            raise SdoAbort(Abort.TOGGLE_NOT_ALTERNATED)
         piece = transfer.data[transfer.sent : transfer.sent + 7]
         transfer.sent += len(piece)
         last = transfer.sent >= len(transfer.data)
@@ -107,7 +100,7 @@ class SdoServer:
             self._dictionary.entry(address)
             size_bytes = int.from_bytes(request[4:8], "little") if size_given else None
             if size_bytes is not None and size_bytes > _MAX_TRANSFER_BYTES:
-                raise SdoAbort(TOO_LONG)
+                raise SdoAbort(Abort.TOO_LONG)
             self._transfer = _Download(address, size_bytes, bytearray())
         return _frame(0x60, address, 0)
 
@@ -116,17 +109,17 @@ class SdoServer:
 
     def _download_segment(self, transfer: _Download, request: bytes) -> bytes:
         if request[0] >> 4 & 1 != transfer.toggle:
-            raise SdoAbort(TOGGLE_NOT_ALTERNATED)
+            raise SdoAbort(Abort.TOGGLE_NOT_ALTERNATED)
         transfer.data += request[1 : 8 - (request[0] >> 1 & 7)]
         limit = _MAX_TRANSFER_BYTES if transfer.size is None else transfer.size
         if len(transfer.data) > limit:
-            raise SdoAbort(LENGTH_MISMATCH if transfer.size is not None else TOO_LONG)
+            raise SdoAbort(Abort.LENGTH_MISMATCH if transfer.size is not None else Abort.TOO_LONG)
         reply = bytes([0x20 | transfer.toggle << 4]) + bytes(7)
         transfer.toggle ^= 1
         if request[0] & 1:
             self._transfer = None
             if transfer.size is not None and len(transfer.data) != transfer.size:
-                raise SdoAbort(LENGTH_MISMATCH)
+                raise SdoAbort(Abort.LENGTH_MISMATCH)
             self._dictionary.download(transfer.address, bytes(transfer.data))
         return reply
 

@@ -16,16 +16,17 @@ from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.axis import Axis, Plant
 from frictid_drivers.virtual.emergency import Emergency
 from frictid_drivers.virtual.heartbeat import Consumer, HeartbeatWatch
-from frictid_drivers.virtual.manner import STANDARD, Manner
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary, encode
-from frictid_drivers.virtual.object_rules import Reactions, install_rules
-from frictid_drivers.virtual.objects import OBJECTS, Key, Record, Value, key
+from frictid_drivers.virtual.object_rules import COMMANDS, HAND, NETWORK, UNITS, install_rules
+from frictid_drivers.virtual.objects import OBJECTS, STANDARD, Key, Manner, Record, Value, key
 from frictid_drivers.virtual.pdo import NEVER_NS, ProcessData, ReceivePdo
 from frictid_drivers.virtual.power_stage import PowerStage
 from frictid_drivers.virtual.power_state import PowerState
 from frictid_drivers.virtual.sdo_server import SdoServer
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+_NMT_STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
+"""By the command that leads there."""
 
 _MS = 1_000_000
 _SUPERVISION_NS = 10 * _MS
@@ -87,37 +88,34 @@ class Servo:
             increments_per_revolution=increments_per_revolution,
             direction=direction,
             torque_step=torque_step,
-            position_units_per_rad=manner.position_units_per_rad,
-            velocity_unit_rad_s=manner.velocity_unit_rad_s,
         )
         self.emergency = Emergency(self.dictionary, self._send_emergency)
         self._watch = HeartbeatWatch()
         self.process_data = ProcessData(self.dictionary, send, self._pdo_changed)
         self._sdo = SdoServer(self.dictionary)
         self.nmt_state = INITIALISING
-        self.power = PowerStage(self.dictionary, self.axis, plant, self.emergency, lambda: self._watch.any_lost, manner)
+        self.power = PowerStage(self.dictionary, self.axis, plant, self.emergency, lambda: self._watch.any_lost)
         self.next_event_ns = NEVER_NS
-        self.wake: Callable[[int], None] = _ignore
-        self.routes_changed: Callable[[], None] = _do_nothing
+        self.wake: Callable[[int], None] = lambda at_ns: None
+        self.routes_changed: Callable[[], None] = lambda: None
         self._last_sync_ns: int | None = None
         self._heartbeat_ns = NEVER_NS
         self._sync_window_ns = 0
         self._sync_length = 0
         self.dictionary.before_upload = self._latch
-        install_rules(
-            self.dictionary,
-            Reactions(
-                powered=lambda: self.axis.powered,
-                units=self.axis.units_changed,
-                commands=self.power.follow_commands,
-                brake=self.power.apply_brake,
-                network=self._network_changed,
-                counter=self._counter_changed,
-                frames=self._pdo_changed,
-                heartbeat=self._heartbeat_changed,
-                hand=self._hand_changed,
-                payload=self._payload_changed,
-            ),
+        install_rules(self.dictionary, lambda: self.axis.powered)
+        self.dictionary.effects.update(
+            {
+                key(0x1017): self._heartbeat_changed,
+                key(0x1019): self._counter_changed,
+                key(0x2023): self._pdo_changed,
+                key(0x2041): self._payload_changed,
+                key(0x60FE, 2): self.power.apply_brake,
+                **dict.fromkeys(NETWORK, self._network_changed),
+                **dict.fromkeys(HAND, self._hand_changed),
+                **dict.fromkeys(UNITS, self.axis.units_changed),
+                **dict.fromkeys(COMMANDS, self.power.follow_commands),
+            }
         )
 
     @property
@@ -144,14 +142,10 @@ class Servo:
             return
         self._arrive(now_ns)
         command = data[0]
-        if command == 0x01:
-            self._enter(OPERATIONAL)
-        elif command == 0x02:
-            self._enter(STOPPED)
-        elif command == 0x80:
-            self._enter(PRE_OPERATIONAL)
+        if command in _NMT_STATES:
+            self._enter(_NMT_STATES[command])
         elif command == 0x81:
-            self.reset(now_ns)
+            self.boot(now_ns)
         elif command == 0x82:
             self._reset_communication()
         self._settle()
@@ -258,24 +252,22 @@ class Servo:
         return _RAMP_TICK_NS if self.axis.ramping else _SUPERVISION_NS
 
     def _sync_deadline_ns(self) -> int:
-        supervised = (
-            self._sync_window_ns
-            and self._last_sync_ns is not None
-            and self.state is PowerState.ENABLED
-            and self.nmt_state == OPERATIONAL
-            and emergency.SYNC_LOST not in self.emergency.present
-        )
+        if (
+            not self._sync_window_ns
+            or self._last_sync_ns is None
+            or self.state is not PowerState.ENABLED
+            or self.nmt_state != OPERATIONAL
+            or emergency.SYNC_LOST in self.emergency.present
+        ):
+            return NEVER_NS
         # One nanosecond past the window: a gap of exactly twice the period is still on time.
-        return (
-            self._last_sync_ns + self._sync_window_ns + 1 if supervised and self._last_sync_ns is not None else NEVER_NS
-        )
+        return self._last_sync_ns + self._sync_window_ns + 1
 
     def _schedule(self) -> None:
-        due = min(self._heartbeat_ns, self._sync_deadline_ns(), self.process_data.next_timer_ns)
-        due = self._watch.next_deadline_ns(due)
+        due = [self._heartbeat_ns, self._sync_deadline_ns(), self.process_data.next_timer_ns, *self._watch.deadlines_ns]
         if self.axis.powered:
-            due = min(due, self.axis.now_ns + self._tick_ns())
-        self.next_event_ns = max(due, self._now_ns + 1)
+            due.append(self.axis.now_ns + self._tick_ns())
+        self.next_event_ns = max(min(due), self._now_ns + 1)
         self.wake(self.next_event_ns)
 
     def _arrive(self, now_ns: int) -> None:
@@ -297,7 +289,7 @@ class Servo:
     # -- NMT -----------------------------------------------------------------------------------------------------------
 
     def boot(self, now_ns: int) -> None:
-        """Power-on: initialise, say boot-up, wait in pre-operational."""
+        """Power-on or reset: initialise, without motor power, say boot-up, wait in pre-operational."""
         self._now_ns = now_ns
         self.power.run_to(now_ns)
         self.dictionary.reset()
@@ -306,10 +298,6 @@ class Servo:
         self.power.boot()
         self._restart_communication()
         self._settle()
-
-    def reset(self, now_ns: int) -> None:
-        """Reset node: as after power-on; a powered motor loses its power."""
-        self.boot(now_ns)
 
     def _reset_communication(self) -> None:
         if self.axis.powered:
@@ -414,8 +402,7 @@ class Servo:
 
     def _network_changed(self) -> None:
         number = self.dictionary.number
-        period_ns = number(key(0x1006)) * 1000
-        self._sync_window_ns = period_ns * number(key(0x2010, 1)) // 10 if number(key(0x2010, 2)) else 0
+        self._sync_window_ns = self.sync_period_ns * number(key(0x2010, 1)) // 10 if number(key(0x2010, 2)) else 0
         self._sync_length = 1 if number(key(0x1019)) > 1 else 0
         self._watch.configure(number(key(0x1016, sub)) for sub in (1, 2))
         self.routes_changed()
@@ -435,11 +422,3 @@ class Servo:
 
     def _payload_changed(self) -> None:
         self._plant.mount_payload(bool(self._values[key(0x2041)]))
-
-
-def _ignore(when_ns: int) -> None:
-    """Nobody waits."""
-
-
-def _do_nothing() -> None:
-    """Nobody listens."""

@@ -48,13 +48,21 @@ def unpacked(packet: bytes) -> tuple[int, bytes, int, bool] | None:
     return can_id, data[:size], stamp_ns, fd
 
 
+def _prepare(end: socket.socket, poll: select.poll) -> None:
+    """Large buffers, never waiting, and what comes is seen by ``poll``."""
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        end.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
+    end.setblocking(False)
+    poll.register(end, select.POLLIN)
+
+
 class SocketBus(can.BusABC):
     """One member of the bus.
 
     Args:
         channel: name of the bus, or path of its socket.
         can_filters: as for any python-can bus.
-        arguments: settings of other interfaces (``bitrate``), of no meaning here.
+        arguments: of other interfaces (``bitrate``), of no meaning here.
 
     Raises:
         can.CanInitializationError: nobody simulates drives on this channel.
@@ -69,11 +77,8 @@ class SocketBus(can.BusABC):
         except OSError as error:
             self._socket.close()
             raise can.CanInitializationError(f"no simulated bus at {path}: {error.strerror or error}") from None
-        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-            self._socket.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
-        self._socket.setblocking(False)
         self._poll = select.poll()
-        self._poll.register(self._socket, select.POLLIN)
+        _prepare(self._socket, self._poll)
         self.channel_info = f"simulated bus {channel}"
         super().__init__(channel=channel, can_filters=can_filters)
         self._can_protocol = can.CanProtocol.CAN_FD
@@ -85,14 +90,8 @@ class SocketBus(can.BusABC):
         Raises:
             can.CanOperationError: the bus is gone, or full for longer than ``timeout``.
         """
-        can_id = msg.arbitration_id
-        if msg.is_extended_id:
-            can_id |= EXTENDED
-        if msg.is_remote_frame:
-            can_id |= REMOTE
-        if msg.is_error_frame:
-            can_id |= ERROR
-        packet = pack(can_id, bytes(msg.data), time.monotonic_ns(), fd=msg.is_fd)
+        flags = EXTENDED * msg.is_extended_id | REMOTE * msg.is_remote_frame | ERROR * msg.is_error_frame
+        packet = pack(msg.arbitration_id | flags, bytes(msg.data), time.monotonic_ns(), fd=msg.is_fd)
         deadline_s = time.monotonic() + (timeout if timeout else 0.0)
         while True:
             try:
@@ -112,11 +111,9 @@ class SocketBus(can.BusABC):
             try:
                 packet = self._socket.recv(FD.size)
             except BlockingIOError:
-                if timeout is not None and timeout <= 0:
+                if timeout == 0 or not self._poll.poll(None if timeout is None else max(0.0, timeout * 1e3)):
                     return None, False
-                if not self._poll.poll(None if timeout is None else timeout * 1e3):
-                    return None, False
-                timeout = 0 if timeout is not None else None
+                timeout = None if timeout is None else 0
                 continue
             except OSError as error:
                 raise can.CanOperationError(f"the simulated bus is gone: {error.strerror}") from None
@@ -179,7 +176,7 @@ class Hub:
         self._poll = select.poll()
         self._poll.register(self._listener, select.POLLIN)
         self._members: dict[int, socket.socket] = {}
-        self.heard: Callable[[int, bytes, int], None] = _ignore
+        self.heard: Callable[[int, bytes, int], None] = lambda can_id, data, stamp_ns: None
 
     @property
     def members(self) -> int:
@@ -216,11 +213,8 @@ class Hub:
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError, ConnectionError):
             member, _ = self._listener.accept()
-            member.setblocking(False)
-            for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-                member.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
+            _prepare(member, self._poll)
             self._members[member.fileno()] = member
-            self._poll.register(member, select.POLLIN)
 
     def _read(self, number: int) -> None:
         member = self._members[number]
@@ -256,7 +250,3 @@ class Hub:
         if member is not None:
             self._poll.unregister(member)
             member.close()
-
-
-def _ignore(can_id: int, data: bytes, stamp_ns: int) -> None:
-    """Nobody listens."""

@@ -28,23 +28,21 @@ class FaultAtWork:
     """One fault of frames or calls: whether it is its turn.
 
     Attributes:
-        fault: which.
-        start_ns: when it begins, after the first SYNC.
         done: how many frames or calls it has spoilt.
         held: the frame that it holds back, or repeats.
     """
 
     def __init__(self, fault: Fault) -> None:
         self.fault = fault
-        self.start_ns = -math.inf if fault.at_s is None else round(fault.at_s * 1e9)
-        self._end_ns = round(min((fault.at_s or 0.0) + fault.for_s, FOREVER_S) * 1e9)
+        self._start_ns = -math.inf if fault.at_s is None else round(fault.at_s * 1e9)
+        self._end_ns = round(min(fault.begin_s + fault.for_s, FOREVER_S) * 1e9)
         self._passed = 0
         self.done = 0
         self.held: tuple[int, bytes] | None = None
 
     def strikes(self, elapsed_ns: float) -> bool:
         """Whether the frame or call that comes now is spoilt; it is counted."""
-        if not self.start_ns <= elapsed_ns < self._end_ns or self.done >= self.fault.count:
+        if not self._start_ns <= elapsed_ns < self._end_ns or self.done >= self.fault.count:
             return False
         if self._passed < self.fault.after:
             self._passed += 1
@@ -62,12 +60,11 @@ class WireFaults:
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._frames = [(FaultAtWork(fault), _ids(fault)) for fault in faults if fault.kind in (*FRAME_KINDS, "abort")]
-        self._reports = [_ReportFault(fault) for fault in faults if fault.kind in REPORT_KINDS]
+        self._reports = [WrongFigure(fault) for fault in faults if fault.kind in REPORT_KINDS]
         self._mapping = ReportMapping()
         plain = {cob_id for _, cob_ids in self._frames for cob_id in cob_ids}
-        for report in self._reports:
-            plain |= {base + node for node in report.fault.nodes for base in (_SDO_ANSWER, _SDO_REQUEST)}
-            plain |= {base + node for node in report.fault.nodes for n in "1234" for base in SERVICES[f"tpdo{n}"]}
+        bases = (_SDO_ANSWER, _SDO_REQUEST, *(base for n in "1234" for base in SERVICES[f"tpdo{n}"]))
+        plain |= {base + node for report in self._reports for node in report.fault.nodes for base in bases}
         self.cob_ids = frozenset(plain | {cob_id | FD_FRAME for cob_id in plain})
 
     def hear(self, can_id: int, data: bytes) -> None:
@@ -88,7 +85,8 @@ class WireFaults:
         if self._reports:
             self._mapping.learn(plain, data)
             for report in self._reports:
-                data = report.applied(self._mapping, now_ns, elapsed_ns, plain, data)
+                for place in self._mapping.places(plain, report.fault):
+                    data = report.in_report(place, plain & 0x7F, now_ns, elapsed_ns, data)
         frames = [(now_ns, can_id, data)]
         for state, cob_ids in self._frames:
             if plain in cob_ids:
@@ -115,25 +113,28 @@ def spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]:
         return [frame, (now_ns, *held)]
     if not state.strikes(elapsed_ns):
         return [frame]
-    if fault.kind == "drop":
-        return []
-    if fault.kind == "delay":
-        return [(now_ns + round(fault.delay_s * 1e9), can_id, data)]
-    if fault.kind == "duplicate":
-        return [frame, frame]
-    if fault.kind == "reorder":
-        state.held = (can_id, data)
-        return []
-    if fault.kind == "foreign":
-        state.held = state.held or (can_id, data)
-        return [frame, (now_ns, *state.held)]
-    if fault.kind == "truncate":
-        return [(now_ns, can_id, data[: round(fault.level)])]
-    if fault.kind == "misaddress":
-        return [(now_ns, can_id + 1, data)]
-    if fault.kind == "abort":
-        return [(now_ns, can_id, b"\x80" + data[1:4] + fault.code.to_bytes(4, "little"))]
-    return [(now_ns, can_id, _flipped(data, state.done))]
+    match fault.kind:
+        case "drop":
+            return []
+        case "duplicate":
+            return [frame, frame]
+        case "reorder":
+            state.held = (can_id, data)
+            return []
+        case "foreign":
+            state.held = state.held or (can_id, data)
+            return [frame, (now_ns, *state.held)]
+        case "delay":
+            now_ns += round(fault.delay_s * 1e9)
+        case "truncate":
+            data = data[: round(fault.level)]
+        case "misaddress":
+            can_id += 1
+        case "abort":
+            data = b"\x80" + data[1:4] + fault.code.to_bytes(4, "little")
+        case _:
+            data = _flipped(data, state.done)
+    return [(now_ns, can_id, data)]
 
 
 def _flipped(data: bytes, number: int) -> bytes:
@@ -168,16 +169,18 @@ class ReportMapping:
             entries = self._entries.setdefault((node, index & 0x1FF), {})
             entries[subindex] = value & 0xFF if subindex == 0 else value
 
-    def places(self, can_id: int, index: int) -> list[slice]:
-        """The bytes of an object in a report; empty where it is not there."""
-        found = []
+    def places(self, can_id: int, fault: Fault) -> list[slice]:
+        """The bytes of a fault's object in a report; empty where it is not there, or the node is not concerned."""
+        found: list[slice] = []
+        if can_id & 0x7F not in fault.nodes or not 0x180 <= can_id < 0x580:
+            return found
         for (node, number), entries in self._entries.items():
             if self._cob_ids.get((node, number)) != can_id or can_id & 0x7F != node:
                 continue
             bit = 0
             for subindex in range(1, entries.get(0, 0) + 1):
                 entry = entries.get(subindex, 0)
-                if entry >> 16 == index:
+                if entry >> 16 == fault.quantity:
                     found.append(slice(bit // 8, (bit + (entry & 0xFF)) // 8))
                 bit += entry & 0xFF
         return found
@@ -214,46 +217,36 @@ class WrongFigure:
         return value
 
     def _wrong(self, before: deque[tuple[int, float]], now_ns: int, value: float) -> float:
-        kind, level = self.fault.kind, self.fault.level
-        if kind == "freeze":
-            return before[0][1]
-        if kind == "invert":
-            return -value
-        if kind == "clip":
-            return max(-level, min(level, value))
-        if kind == "scale":
-            return value * self.fault.factor
-        if kind == "jump":
-            return value + level
-        if kind == "flap":
-            self._turn = not self._turn
-            return int(value) & ~0x6F | _WITHOUT_POWER if self._turn else value
+        level = self.fault.level
+        match self.fault.kind:
+            case "freeze":
+                return before[0][1]
+            case "invert":
+                return -value
+            case "clip":
+                return max(-level, min(level, value))
+            case "scale":
+                return value * self.fault.factor
+            case "jump":
+                return value + level
+            case "flap":
+                self._turn = not self._turn
+                return int(value) & ~0x6F | _WITHOUT_POWER if self._turn else value
         due_ns = now_ns - round(self.fault.delay_s * 1e9)
         while len(before) > 1 and before[1][0] <= due_ns:
             before.popleft()
         return before[0][1]
 
-
-class _ReportFault:
-    """One figure of the reports of some nodes, gone wrong on the wire."""
-
-    def __init__(self, fault: Fault) -> None:
-        self.fault = fault
-        self._figure = WrongFigure(fault)
-
-    def applied(self, mapping: ReportMapping, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> bytes:
-        """The report as it goes on."""
-        if can_id & 0x7F not in self.fault.nodes or not 0x180 <= can_id < 0x580:
-            return data
-        for place in mapping.places(can_id, self.fault.quantity):
-            signed = self.fault.kind != "flap"
-            value = int.from_bytes(data[place], "little", signed=signed)
-            wrong = round(self._figure.applied(can_id & 0x7F, now_ns, elapsed_ns, value))
-            size = place.stop - place.start
-            most = (1 << 8 * size - 1) - 1 if signed else (1 << 8 * size) - 1
-            wrong = max(-most if signed else 0, min(most, wrong))
-            data = data[: place.start] + wrong.to_bytes(size, "little", signed=signed) + data[place.stop :]
-        return data
+    def in_report(self, place: slice, node: int, now_ns: int, elapsed_ns: float, data: bytes) -> bytes:
+        """A report with the figure at a place of it gone wrong."""
+        signed = self.fault.kind != "flap"
+        value = int.from_bytes(data[place], "little", signed=signed)
+        wrong = round(self.applied(node, now_ns, elapsed_ns, value))
+        size: int = place.stop - place.start
+        most = (1 << 8 * size - signed) - 1
+        wrong = max(-most if signed else 0, min(most, wrong))
+        before: bytes = data[: place.start]
+        return before + wrong.to_bytes(size, "little", signed=signed) + data[place.stop :]
 
 
 class Injections:
