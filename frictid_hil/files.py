@@ -27,13 +27,13 @@ def part_of_path(name: str) -> str:
     return name
 
 
-def refuse_overwriting(paths: Iterable[Path], *, force: bool = False) -> None:
+def refuse_overwriting(paths: Iterable[Path | None], *, force: bool = False) -> None:
     """Refuse to write over what is there, before any work is done for it.
 
     Raises:
         UsageError: naming every file that exists, unless ``force``.
     """
-    there = [str(path) for path in paths if path.exists()]
+    there = [str(path) for path in paths if path is not None and path.exists()]
     if there and not force:
         raise UsageError(
             "exists already, and would be overwritten",

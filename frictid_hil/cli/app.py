@@ -8,19 +8,7 @@ from typing import Any
 
 import typer
 
-from frictid_hil.cli import (
-    calibrate,
-    columns,
-    compensate,
-    dashboard,
-    emulate,
-    gap,
-    jobs,
-    new,
-    profiles,
-    replay,
-    reports,
-)
+from frictid_hil.cli import calibrate, columns, compensate, emulate, gap, jobs, new, profiles, reports
 from frictid_hil.cli.output import Output
 from frictid_hil.cli.terminal import outlive_the_terminal
 from frictid_hil.errors import UsageError
@@ -33,13 +21,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibrate.register(app)
-compensate.register(app)
-reports.register(app)
-dashboard.register(app)
-replay.register(app)
-jobs.register(app)
-columns.register(app)
+for group in (calibrate, compensate, reports, jobs, columns):
+    app.add_typer(group.app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
 app.add_typer(emulate.app, name="emulate")

@@ -9,12 +9,10 @@ import typer
 from frictid_hil.cli.options import (
     BusOption,
     DryRunOption,
-    JsonOption,
     LiveAtOption,
     LiveOption,
     OneJointOption,
     OutOption,
-    QuietOption,
     RealtimeOption,
     RobotOption,
     SeedOption,
@@ -24,18 +22,14 @@ from frictid_hil.cli.options import (
     profiles,
     quantity,
 )
-from frictid_hil.cli.output import Output, Result, Told
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.mode import Mode
 from frictid_hil.units import degrees
 
+app = typer.Typer()
+
 _DRIVE_MODES = {"torque": Mode.TORQUE, "position": Mode.POSITION, "velocity": Mode.VELOCITY}
-
-
-def register(app: typer.Typer) -> None:
-    """Add this group's verbs."""
-    app.command("compensate")(compensate)
 
 
 def _drive_mode(name: str) -> Mode:
@@ -120,67 +114,6 @@ DriveModeOption = Annotated[
 ]
 
 
-def compensate(
-    robot: RobotOption,
-    joint: OneJointOption,
-    task: TaskOption,
-    profile: ProfileOption = "active",
-    mode: ModeOption = None,
-    setting: SettingOption = "ours",
-    ratio: Annotated[float | None, typer.Option("--compensation-ratio", metavar="R", help="R, below 1.")] = None,
-    stiffness: StiffnessOption = None,
-    viscosity: ViscosityOption = None,
-    speed: SpeedOption = None,
-    duration: DurationOption = None,
-    centre: CentreOption = None,
-    drive_mode: DriveModeOption = "torque",
-    force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
-    dry_run: DryRunOption = False,
-    bus: BusOption = None,
-    realtime: RealtimeOption = False,
-    seed: SeedOption = 0,
-    live: LiveOption = False,
-    live_at: LiveAtOption = None,
-    out: OutOption = None,
-    store: StoreOption = None,
-    yes: YesOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
-    """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
-    from frictid_hil.cli.progress import answer_dry_run, watching
-    from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
-    from frictid_hil.jobs.compensate import compensate as job
-    from frictid_hil.jobs.compensation.wanted import Wanted
-
-    output = Output(as_json, quiet)
-
-    def options() -> CompensateOptions:
-        wanted = Wanted(
-            task=task,
-            modes=tuple(part.strip() for part in mode.split(",")) if mode else (),
-            setting=setting,
-            ratio=ratio,
-            stiffness_nm_per_rad=stiffness,
-            viscous_nm_s_per_rad=viscosity,
-            speed_rad_s=speed,
-            duration_s=10.0 if duration is None else duration,
-            centre_rad=centre,
-            drive_mode=_drive_mode(drive_mode),
-            force=force,
-        )
-        return CompensateOptions(robot, profile, joint, wanted, bus, realtime, seed, out, store)
-
-    if dry_run:
-        answer_dry_run(output, "compensate", lambda: plan_compensation(options()))
-
-    def run() -> Told:
-        with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
-            return job(options(), watcher, live=watcher.note)
-
-    output.run("compensate", run, lambda result: _show(output, result))
-
-
 _HAND: dict[str, tuple[str, str, float]] = {
     "V_s": ("velocity_rms_rad_s", "deg/s", degrees(1.0)),
     "F_s": ("torque_rms_nm", "N m", 1.0),
@@ -201,18 +134,56 @@ _TRACK: dict[str, tuple[str, str, float]] = {
 def _show(output: Output, result: Result) -> None:
     columns = _HAND if result["task"] == "hand" else _TRACK
     title = f"Joint {result['joint']} of {result['robot']}: {result['task']}, setting {result['setting']}"
-    table = folding("mode", *columns, whole=("mode",), title=title)
-    for name, figures in result["modes"].items():
-        table.add_row(name, *(_number(figures, *column) for column in columns.values()))
-    if table.row_count:
-        output.out.print(table)
+    if modes := result["modes"]:
+        rows = [(name, *(_number(figures, *one) for one in columns.values())) for name, figures in modes.items()]
+        output.table(("mode", *columns), rows, ("mode",), title)
     for told in (*result["warnings"], *result["remarks"]):
-        output.out.print(f"note: {told}", soft_wrap=True)
-    for key in ("run", "report"):
-        if result.get(key):
-            output.out.print(f"{key}: {result[key]}", soft_wrap=True)
+        output.say(f"note: {told}")
+    output.tell(result, "run", "report")
 
 
 def _number(figures: dict[str, Any], key: str, unit: str, scale: float) -> str:
     value = figures.get(key)
     return "" if value is None else f"{value * scale:.4g} {unit}"
+
+
+@verb(app, "compensate", _show)
+def compensate(
+    output: Output,
+    robot: RobotOption,
+    joint: OneJointOption,
+    task: TaskOption,
+    profile: ProfileOption = "active",
+    mode: ModeOption = None,
+    setting: SettingOption = "ours",
+    ratio: Annotated[float | None, typer.Option("--compensation-ratio", metavar="R", help="R, below 1.")] = None,
+    stiffness_nm_per_rad: StiffnessOption = None,
+    viscous_nm_s_per_rad: ViscosityOption = None,
+    speed_rad_s: SpeedOption = None,
+    duration_s: DurationOption = None,
+    centre_rad: CentreOption = None,
+    drive_mode: DriveModeOption = "torque",
+    force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
+    dry_run: DryRunOption = False,
+    bus: BusOption = None,
+    realtime: RealtimeOption = None,
+    seed: SeedOption = 0,
+    live: LiveOption = False,
+    live_at: LiveAtOption = None,
+    out: OutOption = None,
+    store: StoreOption = None,
+    yes: YesOption = False,
+) -> Result | Told:
+    """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
+    from frictid_hil.cli.progress import shown_plan, watching
+    from frictid_hil.jobs.compensate import CompensateOptions, plan_compensation
+    from frictid_hil.jobs.compensate import compensate as job
+    from frictid_hil.jobs.compensation.wanted import Wanted
+
+    modes = tuple(part.strip() for part in mode.split(",")) if mode else ()
+    wanted = output.options(Wanted, modes=modes, drive_mode=_drive_mode(drive_mode))
+    options = output.options(CompensateOptions, wanted=wanted)
+    if dry_run:
+        return shown_plan(output, plan_compensation(options))
+    with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
+        return job(options, watcher, live=watcher.note)

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from frictid_hil.cli.model_words import model_logs, print_arm
 from frictid_hil.cli.options import (
     BusOption,
     ForceOption,
-    JsonOption,
-    QuietOption,
     RealtimeOption,
     ResumeOption,
     RobotOption,
     SeedOption,
     YesOption,
 )
-from frictid_hil.cli.output import Output, Result, Told
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import UsageError
 
 app = typer.Typer(
@@ -33,6 +31,7 @@ LogsArgument = Annotated[
         metavar="SET | LOG...", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
     ),
 ]
+ReportFolderOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")]
 ColumnsOption = Annotated[
     str | None, typer.Option("--columns", metavar="FILE", help="Column map of a foreign logger (emps.yaml).")
 ]
@@ -146,8 +145,46 @@ ApplyOption = Annotated[
 ]
 
 
-@app.command("diagnose")
+def _show_diagnosis(output: Output, result: Result) -> None:
+    if "model_in" in result:
+        print_arm(output, result)
+        return
+    output.out.print(result["summary"], style="bold")
+    if causes := [_cause(cause) for cause in result["causes"]]:
+        output.table(("cause", "confidence", "closes", "parameters", "confusable with"), causes, ("cause", "closes"))
+    shares = [(region, region["share_of_gap"]) for region in result["where"]]
+    where = [(r["region"], f"{100 * s:.0f} %", "█" * round(30 * s), r["description"]) for r, s in shares if s >= 0.005]
+    output.table(("where", "share of gap", "", ""), where, ("where",))
+    gap = []
+    for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
+        row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
+        gap.append((name, *("-" if value is None else f"{value:.4g}" for value in row)))
+    output.table(("on validation logs", "before", "after", "noise floor"), gap)
+    if asked := result.get("next_experiment"):
+        output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}")
+    for subject, why in result["reasons"].items():
+        output.out.print(f"{subject}: {why}")
+    if exported := result.get("mujoco"):
+        output.say(f"mujoco: {exported['model']} and {exported['callback_script']}")
+        for lost in exported["lost"]:
+            output.out.print(f"  lost: {lost}")
+    output.tell(result, "model", "report")
+    if result.get("model_refused"):
+        output.say(f"no model was written: {result['model_refused']}")
+
+
+def _cause(cause: Result) -> tuple[str, ...]:
+    parameters = ", ".join(
+        f"{name} = {value['value']:.4g}" if isinstance(value, dict) else f"{name} = {value:.4g}"
+        for name, value in cause["parameters"].items()
+    )
+    closed = "" if cause["gap_closed_percent"] is None else f"{cause['gap_closed_percent']:.0f} %"
+    return cause["effect"], f"{cause['confidence']:.2f}", closed, parameters, ", ".join(cause["confusable_with"])
+
+
+@verb(app, "diagnose", _show_diagnosis, schema="gap_diagnose")
 def diagnose(
+    output: Output,
     logs: DiagnoseLogsArgument = None,
     model: ModelOption = None,
     more_logs: MoreLogsOption = None,
@@ -167,87 +204,71 @@ def diagnose(
     stage: StageOption = None,
     randomise: RandomiseOption = 0,
     apply: ApplyOption = False,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")] = None,
+    out: ReportFolderOption = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
-    from frictid_hil.cli.model_words import model_logs, print_arm
     from frictid_hil.jobs.gap.export_targets import Wanted
     from frictid_hil.jobs.gap_diagnose import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
     from frictid_hil.jobs.gap_diagnose_arm import diagnose_arm
 
-    output = Output(as_json, quiet)
     every = [*(logs or ()), *(more_logs or ())]
-    of_a_model = hold or tolerance or executor or export or randomise or len(joint or ()) > 1
-    if why := _contradiction(every, model, negligible, bool(of_a_model or stage)):
-        output.refuse("gap_diagnose", UsageError(why))
+    to_write: dict[str, Any] = {"write_model": write_model, "apply": apply, "out": out, "force": force}
     if model is not None:
-        output.run(
-            "gap_diagnose",
-            lambda: diagnose_arm(
-                model_logs(model, every, joint, columns, hold, tolerance, validation, split, nominal, profile, mujoco),
-                write=write_model,
-                apply=apply,
-                wanted=Wanted.of(export or (), randomise, stage),
-                out=out,
-                force=force,
-                executor_name=executor,
-            ),
-            lambda result: print_arm(output, result),
-        )
-    source = Source(every, columns, nominal, profile, joint[0] if joint else None, validation or (), split)
-    share = None if negligible is None else 0.01 * negligible
-    output.run(
-        "gap_diagnose",
-        lambda: job(
-            source, write_model=write_model, mujoco=mujoco, apply=apply, out=out, force=force, negligible=share
-        ),
-        lambda result: _print_diagnosis(output, result),
-    )
-
-
-def _contradiction(every: list[Path], model: Path | None, negligible: float | None, of_a_model: bool) -> str:
-    """Why these options do not go together; "" where they do."""
-    if model is not None:
-        return "" if negligible is None else "--negligible is of one joint; it does not go with --model"
+        if negligible is not None:
+            raise UsageError("--negligible is of one joint; it does not go with --model")
+        wanted = Wanted.of(export or (), randomise, stage)
+        return diagnose_arm(model_logs(output, every), wanted=wanted, executor_name=executor, **to_write)
     if not every:
-        return "needs a set or logs"
-    return "--hold, --tolerance, --executor, --export and several joints need --model" if of_a_model else ""
+        raise UsageError("needs a set or logs")
+    if hold or tolerance or executor or export or randomise or stage or len(joint or ()) > 1:
+        raise UsageError("--hold, --tolerance, --executor, --export and several joints need --model")
+    source = output.options(Source, paths=every, joint=joint[0] if joint else None)
+    return job(source, mujoco=mujoco, negligible=None if negligible is None else 0.01 * negligible, **to_write)
 
 
-@app.command("draft")
+def _show_draft(output: Output, result: Result) -> None:
+    numbers = result["draft"]["numbers"].items()
+    rows = [(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}") for name, found in numbers]
+    output.table(("number", "value", "one-sigma"), rows)
+    for warning in result["draft"]["warnings"]:
+        output.say(f"warning: {warning}")
+    output.tell(result, "nominal")
+
+
+@verb(app, "draft", _show_draft, schema="gap_draft")
 def draft(
+    output: Output,
     logs: LogsArgument,
     columns: ColumnsOption = None,
     joint: JointNameOption = None,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("nominal.yaml"),
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Draft a first nominal.yaml, with tolerances, from recordings where nothing is believed yet."""
     from frictid_hil.jobs.gap_diagnose import Source
     from frictid_hil.jobs.gap_diagnose import draft as job
 
-    output = Output(as_json, quiet)
-
-    def show(result: Result) -> None:
-        table = folding("number", "value", "one-sigma")
-        for name, found in result["draft"]["numbers"].items():
-            table.add_row(name, f"{found['value']:.4g}", f"{found['sigma']:.2g}")
-        output.out.print(table)
-        for warning in result["draft"]["warnings"]:
-            output.out.print(f"warning: {warning}", soft_wrap=True)
-        output.out.print(f"nominal: {result['nominal']}", soft_wrap=True)
-
-    output.run("gap_draft", lambda: job(Source(logs, columns, joint=joint), out, force=force), show)
+    return job(output.options(Source, paths=logs), out, force=force)
 
 
-@app.command("fleet")
+def _show_fleet(output: Output, result: Result) -> None:
+    rows = []
+    for name, effects in result["joints"].items():
+        for effect, numbers in effects.items():
+            for number, told in numbers.items():
+                low, high = told["between_units"]["interval_95"]
+                varies = f"{told['between_units']['value']:.3g} ({low:.2g} .. {high:.2g})"
+                row = (name, f"{effect} {number}", f"{told['mean']:.4g}", f"{told['not_known']:.2g}")
+                rows.append((*row, varies if told["varies"] else f"not seen, below {high:.2g}"))
+    output.table(("joint", "number", "mean", "not known", "varies between robots"), rows)
+    output.tell(result, "samples")
+
+
+@verb(app, "fleet", _show_fleet, schema="gap_fleet")
 def fleet(
+    output: Output,
     results: Annotated[
         list[Path], typer.Argument(metavar="RESULT...", help="What `gap diagnose --json` printed, one file a robot.")
     ],
@@ -257,33 +278,27 @@ def fleet(
     ] = None,
     seed: SeedOption = 1,
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Tell what varies between robots of one kind from what is not known of them."""
     from frictid_hil.jobs.gap_fleet import fleet as job
 
-    output = Output(as_json, quiet)
-
-    def show(result: Result) -> None:
-        table = folding("joint", "number", "mean", "not known", "varies between robots")
-        for name, effects in result["joints"].items():
-            for effect, numbers in effects.items():
-                for number, told in numbers.items():
-                    low, high = told["between_units"]["interval_95"]
-                    varies = f"{told['between_units']['value']:.3g} ({low:.2g} .. {high:.2g})"
-                    mean = f"{told['mean']:.4g}"
-                    row = (name, f"{effect} {number}", mean, f"{told['not_known']:.2g}")
-                    table.add_row(*row, varies if told["varies"] else f"not seen, below {high:.2g}")
-        output.out.print(table)
-        if result.get("samples"):
-            output.out.print(f"samples: {result['samples']}", soft_wrap=True)
-
-    output.run("gap_fleet", lambda: job(results, samples=randomise, out=out, force=force, seed=seed), show)
+    return job(results, samples=randomise, out=out, force=force, seed=seed)
 
 
-@app.command("check")
+def _show_check(output: Output, result: Result) -> None:
+    for name, one in (result.get("worlds") or {result["world"]: result}).items():
+        rows = []
+        for figure, rate in one["rates"].items():
+            if rate.get("of"):
+                interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
+                rows.append((figure.replace("_", " "), f"{100 * rate['rate']:.1f} %", interval, str(rate["of"])))
+        title = f"Blind check, {name} world: {result['cases']} joints, seed {result['seed']}"
+        output.table(("figure", "value", "95 % interval", "of"), rows, title=title)
+
+
+@verb(app, "check", _show_check, schema="gap_check")
 def check(
+    output: Output,
     cases: Annotated[int, typer.Option("--cases", metavar="N", min=1, help="Joints to draw.")] = 40,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the draw.")] = 1,
     world: Annotated[
@@ -297,38 +312,13 @@ def check(
         Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to keep cases, answers and scores in.")
     ] = None,
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Draw joints whose truth is sealed, diagnose them, open the seal, score the answers."""
     from frictid_hil.jobs.gap_check import run_gap_check
 
-    output = Output(as_json, quiet)
-
-    def show(result: Result) -> None:
-        for name, one in (result.get("worlds") or {result["world"]: result}).items():
-            title = f"Blind check, {name} world: {cases} joints, seed {seed}"
-            table = folding("figure", "value", "95 % interval", "of", title=title)
-            for figure, rate in one["rates"].items():
-                if rate.get("of"):
-                    interval = f"{100 * rate['low']:.0f} .. {100 * rate['high']:.0f} %"
-                    table.add_row(figure.replace("_", " "), f"{100 * rate['rate']:.1f} %", interval, str(rate["of"]))
-            output.out.print(table)
-
-    output.run(
-        "gap_check",
-        lambda: run_gap_check(
-            cases,
-            seed,
-            out,
-            worlds=[name.strip() for name in world.split(",") if name.strip()],
-            processes=processes,
-            leave_one_out=leave_one_out,
-            force=force,
-            progress=output.err.print,
-        ),
-        show,
-    )
+    worlds = [name.strip() for name in world.split(",") if name.strip()]
+    more: dict[str, Any] = {"leave_one_out": leave_one_out, "force": force, "progress": output.err.print}
+    return run_gap_check(cases, seed, out, processes, worlds=worlds, **more)
 
 
 PlanOption = Annotated[
@@ -356,8 +346,17 @@ RecordedOption = Annotated[
 ]
 
 
-@app.command("record")
+def _show_recording(output: Output, result: Result) -> None:
+    output.out.print(f"{len(result['experiments'])} experiments: {', '.join(result['experiments'])}")
+    output.say(f"set: {result['set']}")
+    if told := result.get("diagnosis"):
+        output.out.print(told["summary"])
+        output.out.print(f"nothing more is recorded: {result['ended_because']}")
+
+
+@verb(app, "record", _show_recording, schema="gap_record")
 def record(
+    output: Output,
     robot: RobotOption = "",
     joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")] = "",
     bus: BusOption = None,
@@ -366,96 +365,23 @@ def record(
     until_decided: UntilDecidedOption = None,
     profile: ProfileOption = None,
     payload: PayloadOption = None,
-    realtime: RealtimeOption = False,
+    realtime: RealtimeOption = None,
     seed: SeedOption = 0,
     resume: ResumeOption = None,
     recorded: RecordedOption = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
     yes: YesOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Told:
     """Run the diagnostic experiments on the bus and write an experiment set."""
-    from frictid_hil.cli.progress import TerminalWatcher
+    from frictid_hil.cli.progress import watching
     from frictid_hil.jobs.gap_decide import record_until_decided
     from frictid_hil.jobs.gap_record import GapRecordOptions
     from frictid_hil.jobs.gap_record import record as job
 
-    output = Output(as_json, quiet)
-    watcher = TerminalWatcher(output, yes=yes)
-    options = GapRecordOptions(
-        robot=robot,
-        joint=joint,
-        bus=bus,
-        short=short,
-        plan=plan,
-        profile=profile,
-        payload=payload,
-        realtime=realtime,
-        seed=seed,
-        out=out,
-        resume=resume or recorded,
-    )
-
-    def run() -> Told:
-        if resume is not None and recorded is not None:
-            raise UsageError("--resume moves the joint and --from does not; give one")
-        try:
-            if until_decided is not None:
-                return record_until_decided(options, watcher, until_decided)
-            return job(options, watcher, move=recorded is None)
-        finally:
-            watcher.close()
-
-    def show(result: Result) -> None:
-        output.out.print(f"{len(result['experiments'])} experiments: {', '.join(result['experiments'])}")
-        output.out.print(f"set: {result['set']}", soft_wrap=True)
-        if told := result.get("diagnosis"):
-            output.out.print(told["summary"])
-            output.out.print(f"nothing more is recorded: {result['ended_because']}")
-
-    output.run("gap_record", run, show)
-
-
-def _print_diagnosis(output: Output, result: Result) -> None:
-    output.out.print(result["summary"], style="bold")
-    causes = folding("cause", "confidence", "closes", "parameters", "confusable with", whole=("cause", "closes"))
-    for cause in result["causes"]:
-        parameters = ", ".join(
-            f"{name} = {value['value']:.4g}" if isinstance(value, dict) else f"{name} = {value:.4g}"
-            for name, value in cause["parameters"].items()
-        )
-        closed = cause["gap_closed_percent"]
-        causes.add_row(
-            cause["effect"],
-            f"{cause['confidence']:.2f}",
-            "" if closed is None else f"{closed:.0f} %",
-            parameters,
-            ", ".join(cause["confusable_with"]),
-        )
-    if result["causes"]:
-        output.out.print(causes)
-    where = folding("where", "share of gap", "", "", whole=("where",))
-    for region in result["where"]:
-        share = region["share_of_gap"]
-        if share >= 0.005:
-            where.add_row(region["region"], f"{100 * share:.0f} %", "█" * round(30 * share), region["description"])
-    output.out.print(where)
-    gap = folding("on validation logs", "before", "after", "noise floor")
-    for name in ("inverse_nm", "forward_torque_nm", "forward_position_rad"):
-        row = [result["gap"][state][name] for state in ("before", "after", "noise_floor")]
-        gap.add_row(name, *("-" if value is None else f"{value:.4g}" for value in row))
-    output.out.print(gap)
-    if asked := result.get("next_experiment"):
-        output.out.print(f"record next ({asked['duration_s']:.0f} s): {asked['description']}")
-    for subject, why in result["reasons"].items():
-        output.out.print(f"{subject}: {why}")
-    if exported := result.get("mujoco"):
-        output.out.print(f"mujoco: {exported['model']} and {exported['callback_script']}", soft_wrap=True)
-        for lost in exported["lost"]:
-            output.out.print(f"  lost: {lost}")
-    for key in ("model", "report"):
-        if result.get(key):
-            output.out.print(f"{key}: {result[key]}", soft_wrap=True)
-    if result.get("model_refused"):
-        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True)
+    if resume is not None and recorded is not None:
+        raise UsageError("--resume moves the joint and --from does not; give one")
+    options = output.options(GapRecordOptions, resume=resume or recorded)
+    with watching(output, yes=yes) as watcher:
+        if until_decided is not None:
+            return record_until_decided(options, watcher, until_decided)
+        return job(options, watcher, move=recorded is None)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from frictid_hil.cli.output import Output, Result
-from frictid_hil.cli.tables import folding
 from frictid_hil.errors import UsageError
 from frictid_hil.units import parse_quantity
 
@@ -15,19 +14,7 @@ if TYPE_CHECKING:
     from frictid_hil.jobs.gap.from_model import ModelLogs
 
 
-def model_logs(
-    model: Path,
-    logs: Sequence[Path],
-    joints: Sequence[str] | None,
-    columns: str | None,
-    hold: Sequence[str] | None,
-    tolerance: Sequence[str] | None,
-    validation: Sequence[str] | None,
-    split: str,
-    nominal: Path | None,
-    profile: Path | None,
-    mujoco: Path | None,
-) -> ModelLogs:
+def model_logs(output: Output, logs: Sequence[Path]) -> ModelLogs:
     """The options as one value.
 
     Raises:
@@ -35,23 +22,16 @@ def model_logs(
     """
     from frictid_hil.jobs.gap.from_model import ModelLogs
 
-    for name, given in (("--profile", profile), ("--export-mujoco", mujoco)):
-        if given is not None:
+    given = output.given
+    for name, value in (("--profile", given["profile"]), ("--export-mujoco", given["mujoco"])):
+        if value is not None:
             raise UsageError(
                 f"{name} does not go with --model",
                 next_step="the model brings its own friction; --write-model writes the improved model",
             )
-    return ModelLogs(
-        model=model,
-        logs=logs,
-        joints=joints or (),
-        columns=columns,
-        held=dict(_held(word) for word in hold or ()),
-        tolerances=dict(_tolerance(word) for word in tolerance or ()),
-        validation=validation or (),
-        split=split,
-        nominal=nominal,
-    )
+    held = dict(_held(word) for word in given["hold"] or ())
+    tolerances = dict(_tolerance(word) for word in given["tolerance"] or ())
+    return output.options(ModelLogs, logs=logs, joints=given["joint"], held=held, tolerances=tolerances)
 
 
 def _held(word: str) -> tuple[str, float]:
@@ -79,24 +59,23 @@ def _tolerance(word: str) -> tuple[str, float | str]:
 
 def print_arm(output: Output, result: Result) -> None:
     """Joints as rows, then the arm."""
-    table = folding("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor", whole=("joint",))
+    rows = []
     for name, joint in result["joints"].items():
         causes = joint["causes"]
         gap = [joint["gap"][state]["inverse_nm"] for state in ("before", "after", "noise_floor")]
-        table.add_row(
-            name,
-            joint["verdict"],
-            ", ".join(cause["effect"] for cause in causes),
-            ", ".join(f"{cause['confidence']:.2f}" for cause in causes),
-            *("-" if value is None else f"{value:.3g} {_units(joint)[0]}" for value in gap),
-        )
-    output.out.print(table)
-    output.out.print(result["summary"], soft_wrap=True)
+        words = ("effect", "{}"), ("confidence", "{:.2f}")
+        told = (", ".join(form.format(cause[key]) for cause in causes) for key, form in words)
+        unit = _units(joint)[0]
+        rows.append((name, joint["verdict"], *told, *("-" if v is None else f"{v:.3g} {unit}" for v in gap)))
+    headings = ("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor")
+    output.table(headings, rows, ("joint",))
+    output.say(result["summary"])
     _print_arm_cause(output, result)
-    _print_export(output, result)
+    _print_closed_loop(output, result)
+    _print_written(output, result)
     for line, names in _same_lines(result["joints"]).items():
         who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
-        output.out.print(f"{who}: {line}", soft_wrap=True)
+        output.say(f"{who}: {line}")
     for name in result["still"]:
         output.out.print(f"{name}: stands still in every log, so nothing can be said of it")
     for name, place in result["held"].items():
@@ -119,24 +98,31 @@ def _print_arm_cause(output: Output, result: Result) -> None:
     )
 
 
-def _print_export(output: Output, result: Result) -> None:
-    """The user's simulator before and after, and what was written where."""
+def _print_closed_loop(output: Output, result: Result) -> None:
+    """The user's simulator before and after."""
     from frictid_hil.jobs.gap.nearer import left_out_words
 
     loop = result["closed_loop"]
     if "reason" in loop:
-        output.out.print(f"closed loop of your model: {loop['reason']}", soft_wrap=True)
-    else:
-        table = folding("your model in MuJoCo", "torque before", "after", "position before", "after")
-        for name, before in loop["before"].items():
-            states = (before, loop["after"][name])
-            torque, length = _units(result["joints"].get(name, {}))
-            torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
-            table.add_row(name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states))
-        output.out.print(table)
-        for line in left_out_words(loop):
-            output.out.print(line, soft_wrap=True)
-    for name, joint in result.get("export", {}).get("joints", {}).items():
+        output.say(f"closed loop of your model: {loop['reason']}")
+        return
+    rows = []
+    for name, before in loop["before"].items():
+        states = (before, loop["after"][name])
+        torque, length = _units(result["joints"].get(name, {}))
+        torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
+        rows.append((name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states)))
+    output.table(("your model in MuJoCo", "torque before", "after", "position before", "after"), rows)
+    for line in left_out_words(loop):
+        output.say(line)
+
+
+def _print_written(output: Output, result: Result) -> None:
+    """What was written where, and how near every file comes to the machine: one row a file and engine."""
+    from frictid_hil.jobs.gap.export_figures import rows_of
+
+    joints = result.get("export", {}).get("joints", {})
+    for name, joint in joints.items():
         off = joint["torque_difference_percent"]
         how = (
             "chosen by the positions that were fitted"
@@ -145,35 +131,21 @@ def _print_export(output: Output, result: Result) -> None:
         )
         output.out.print(f"{name}: the export is {how}")
         for effect, where in joint["placed"].items():
-            output.out.print(f"  {effect}: {where}", soft_wrap=True)
+            output.say(f"  {effect}: {where}")
         for effect, why in joint["lost"].items():
-            output.out.print(f"  lost of {effect}: {why}", soft_wrap=True)
-    for remark in {r for joint in result.get("export", {}).get("joints", {}).values() for r in joint["remarks"]}:
-        output.out.print(remark, soft_wrap=True)
-    if result.get("model"):
-        output.out.print(f"model: {result['model']}", soft_wrap=True)
+            output.say(f"  lost of {effect}: {why}")
+    for remark in {remark for joint in joints.values() for remark in joint["remarks"]}:
+        output.say(remark)
+    output.tell(result, "model")
     for target, told in result.get("targets", {}).items():
-        output.out.print(f"{target}: {', '.join(told['files'])}", soft_wrap=True)
-    _print_figures(output, result)
-    if result.get("report"):
-        output.out.print(f"report: {result['report']}", soft_wrap=True)
+        output.say(f"{target}: {', '.join(told['files'])}")
+    if rows := rows_of(result):
+        headings = ("export", "where it ran", "torque error before", "after", "what is lost")
+        output.table(headings, rows, ("export",))
+        output.say("torque error: of the measured torque of the changed joints, on motion that was not fitted")
+    output.tell(result, "report")
     if result.get("model_refused"):
-        output.out.print(f"no model was written: {result['model_refused']}", soft_wrap=True)
-
-
-def _print_figures(output: Output, result: Result) -> None:
-    """How near every file comes to the machine: one row a file and engine."""
-    from frictid_hil.jobs.gap.export_figures import rows_of
-
-    if not (rows := rows_of(result)):
-        return
-    table = folding("export", "where it ran", "torque error before", "after", "what is lost", whole=("export",))
-    for row in rows:
-        table.add_row(*row)
-    output.out.print(table)
-    output.out.print(
-        "torque error: of the measured torque of the changed joints, on motion that was not fitted", soft_wrap=True
-    )
+        output.say(f"no model was written: {result['model_refused']}")
 
 
 def _units(joint: Mapping[str, Any]) -> tuple[str, str]:

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 
-from frictid_hil.cli.options import ForceOption, JsonOption, QuietOption, quantity
-from frictid_hil.cli.output import Output
+from frictid_hil.cli.options import ForceOption, quantity
+from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import Interrupted, UsageError
 
 _Value = TypeVar("_Value")
 
 app = typer.Typer(help="Write a file of your own to start from.", no_args_is_help=True)
-
-
-@app.callback()
-def _group() -> None:
-    """Write a file of your own to start from."""
 
 
 def _named(text: str) -> tuple[str, int]:
@@ -103,8 +98,14 @@ RatedTorqueOption = Annotated[
 ]
 
 
-@app.command("robot")
+def _show_robot(output: Output, _result: Result) -> None:
+    path = output.given["path"]
+    output.say(f"{path}: look at every line, then `frictid-hil check --robot {path} --dry`")
+
+
+@verb(app, "robot", _show_robot, schema="new_robot")
 def robot(
+    output: Output,
     path: Annotated[Path, typer.Argument(metavar="FILE", help="Robot file to write; the robot is named after it.")],
     joint: JointOption = None,
     bus: BusOption = None,
@@ -119,60 +120,42 @@ def robot(
         False
     ),
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Told:
     """A robot file for your robot. On a terminal it asks for what you did not give; one answer holds for all joints."""
     from frictid_hil.files import refuse_overwriting
     from frictid_hil.jobs.new_robot import JointAnswers, new_robot
 
-    output = Output(as_json, quiet)
-
     def answer(given: _Value | None, question: str, option: str, parse: Callable[[str], _Value]) -> _Value:
-        return given if given is not None else _asked(question, option, parse, asks=_on_a_terminal() and not as_json)
+        asks = _on_a_terminal() and not output.as_json
+        return given if given is not None else _asked(question, option, parse, asks=asks)
 
-    def written() -> dict[str, Any]:
-        refuse_overwriting([path], force=force)
-        names = answer(joint or None, "joints and their addresses (shoulder=1 elbow=2)", "--joint", _all_named)
-        spot = answer(bus, "bus (socketcan:can0)", "--bus", _bus)
-        range_rad = answer(travel, "travel of the joints (-90deg..90deg)", "--travel", _travel)
-        speed = answer(
-            max_velocity, "highest speed of a joint (115deg/s)", "--max-velocity", quantity("angular velocity")
-        )
-        torque = answer(max_torque, "highest torque at a joint (60Nm)", "--max-torque", quantity("torque"))
-        ratio, rated = gear_ratio, rated_torque
-        if not read:
-            ratio = answer(ratio, "motor revolutions per joint revolution (100)", "--gear-ratio", _ratio)
-            rated = answer(rated, "rated torque at a joint: motor x gear (24Nm)", "--rated-torque", quantity("torque"))
-        joints = [JointAnswers(name, address, range_rad, speed, torque, ratio, rated) for name, address in names]
-        return new_robot(
-            path, driver=driver, bus=spot, joints=joints, cycle_hz=cycle_hz, read=read, force=force
-        ).to_json()
-
-    def show(result: Mapping[str, Any]) -> None:
-        output.out.print(f"{path}: look at every line, then `frictid-hil check --robot {path} --dry`", soft_wrap=True)
-
-    output.run("new_robot", written, show)
+    refuse_overwriting([path], force=force)
+    names = answer(joint or None, "joints and their addresses (shoulder=1 elbow=2)", "--joint", _all_named)
+    spot = answer(bus, "bus (socketcan:can0)", "--bus", _bus)
+    range_rad = answer(travel, "travel of the joints (-90deg..90deg)", "--travel", _travel)
+    speed = answer(max_velocity, "highest speed of a joint (115deg/s)", "--max-velocity", quantity("angular velocity"))
+    torque = answer(max_torque, "highest torque at a joint (60Nm)", "--max-torque", quantity("torque"))
+    ratio, rated = gear_ratio, rated_torque
+    if not read:
+        ratio = answer(ratio, "motor revolutions per joint revolution (100)", "--gear-ratio", _ratio)
+        rated = answer(rated, "rated torque at a joint: motor x gear (24Nm)", "--rated-torque", quantity("torque"))
+    joints = [JointAnswers(name, address, range_rad, speed, torque, ratio, rated) for name, address in names]
+    return new_robot(path, driver=driver, bus=spot, joints=joints, cycle_hz=cycle_hz, read=read, force=force)
 
 
-@app.command("driver")
+def _show_driver(output: Output, result: Result) -> None:
+    for path in result["files"]:
+        output.say(path)
+    output.out.print("now: cd there, `pip install -e .`, `pytest`; then replace the frames by those of your device")
+
+
+@verb(app, "driver", _show_driver, schema="new_driver")
 def driver(
+    output: Output,
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the driver, as robot files will have it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; frictid-NAME here if not given.")] = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """A driver of your own for CAN devices: a package that runs, with a fake device, a robot file and its tests."""
     from frictid_hil.jobs.new_driver import new_driver
 
-    output = Output(as_json, quiet)
-
-    def written() -> dict[str, Any]:
-        return {"files": [str(path.resolve()) for path in new_driver(name, out)]}
-
-    def show(result: Mapping[str, Any]) -> None:
-        for path in result["files"]:
-            output.out.print(path, soft_wrap=True)
-        output.out.print("now: cd there, `pip install -e .`, `pytest`; then replace the frames by those of your device")
-
-    output.run("new_driver", written, show)
+    return {"files": [str(path.resolve()) for path in new_driver(name, out)]}

@@ -70,8 +70,6 @@ def profiles(incomplete: str) -> list[str]:
     return sorted(name for name in known | near | {"active"} if name.startswith(incomplete))
 
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Exactly one JSON object on stdout.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
 OutOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to write to.")]
@@ -107,7 +105,7 @@ BusOption = Annotated[
         help="interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0).",
     ),
 ]
-RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
+RealtimeOption = Annotated[bool | None, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
 SeedOption = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the virtual robot's noise.")]
 
 OneJointOption = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import math
@@ -11,15 +12,17 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol
+from dataclasses import dataclass, field, fields
+from inspect import Parameter
+from typing import Annotated, Any, NoReturn, Protocol, TypeVar
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.text import Text
 
+from frictid_hil.cli.tables import folding
 from frictid_hil.errors import Defect, FrictidError, Interrupted
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
@@ -33,6 +36,7 @@ NOTIFY_TIMEOUT_S = 60.0
 """A command of ``--notify`` may take this long."""
 
 Result = Mapping[str, Any]
+Asked = TypeVar("Asked")
 
 
 @contextmanager
@@ -65,12 +69,18 @@ class Output:
     Attributes:
         as_json: one object on stdout.
         quiet: no progress.
-        notify: command that is given the same JSON on its standard input, whatever the ending.
+        given: every other option and argument of the verb, by name. The command of ``notify`` is given the same JSON
+            on its standard input, whatever the ending.
     """
 
     as_json: bool = False
     quiet: bool = False
-    notify: str | None = None
+    given: Mapping[str, Any] = field(default_factory=dict)
+
+    def options(self, kind: Callable[..., Asked], **more: Any) -> Asked:
+        """The value that a job takes: what was given under the names of its fields, and ``more``; else its defaults."""
+        asked = {name: self.given[name] for name in (one.name for one in fields(kind)) if name in self.given} | more  # type: ignore[arg-type]  # a dataclass
+        return kind(**{n: tuple(v) if isinstance(v, list) else v for n, v in asked.items() if v is not None})
 
     @property
     def err(self) -> Console:
@@ -90,6 +100,38 @@ class Output:
         width = None if sys.stdout.isatty() else 120
         return Console(quiet=self.as_json, markup=False, emoji=False, highlight=False, width=width)
 
+    def say(self, line: str) -> None:
+        """A line of the result; a path in it is not cut in two."""
+        self.out.print(line, soft_wrap=True)
+
+    def tell(self, result: Result, *keys: str) -> None:
+        """A line for each of these paths that the result has."""
+        for key in keys:
+            if result.get(key):
+                self.say(f"{key}: {result[key]}")
+
+    def table(
+        self,
+        headings: Sequence[str],
+        rows: Iterable[Sequence[RenderableType]],
+        whole: Sequence[str] = (),
+        title: str | None = None,
+    ) -> None:
+        """A table of the result, see ``folding``."""
+        table = folding(*headings, whole=whole, title=title)
+        for row in rows:
+            table.add_row(*row)
+        self.out.print(table)
+
+    def announce(self, verb: str, key: str, label: str) -> Callable[[str], None]:
+        """Tells where a verb that runs on can be reached; whoever waits for it reads the first line."""
+
+        def tell(place: str) -> None:
+            told = {"schema": f"frictid.{verb}/1", "outcome": "ok", key: place}
+            print(json.dumps(told) if self.as_json else f"{label}: {place}", flush=True)
+
+        return tell
+
     def counting(self, doing: str) -> Callable[[int, int], None]:
         """Something to tell how many of how many are done: a line on stderr every two seconds, none for quick work."""
         console, told_s = self.err, time.monotonic()
@@ -103,14 +145,14 @@ class Output:
         return count
 
     def run(
-        self, verb: str, job: Callable[[], Result | Told], show: Callable[[Result], None] | None = None
+        self, verb: str, job: Callable[[], Result | Told], show: Callable[[Output, Result], None] | None = None
     ) -> NoReturn:
         """Call a job, print its result, leave with its exit code.
 
         Args:
             verb: names the schema (``frictid.<verb>/1``).
             job: returns a typed result, or a mapping with ``outcome``; may raise ``FrictidError``.
-            show: prints the result for a person.
+            show: prints the result for a person, where more than a plan was asked for.
         """
         try:
             with _noted(self.err):
@@ -132,8 +174,8 @@ class Output:
         self._tell({"schema": f"frictid.{verb}/1", **result})
         if self.as_json:
             _print_json({"schema": f"frictid.{verb}/1", **result})
-        elif show is not None:
-            show(result)
+        elif show is not None and not result.get("dry_run"):
+            show(self, result)
         error_text = result.get("error")
         if code and isinstance(error_text, Mapping) and not self.as_json:
             self._explain(error_text)
@@ -157,12 +199,13 @@ class Output:
 
     def _tell(self, result: Mapping[str, Any]) -> None:
         """Give the result to the command of ``notify``; what becomes of that changes no result."""
-        if self.notify is None:
+        notify = self.given.get("notify")
+        if notify is None:
             return
         text = _json_text(result) + "\n"
         try:
             told = subprocess.run(
-                shlex.split(self.notify),
+                shlex.split(notify),
                 input=text,
                 text=True,
                 stdout=sys.stderr,
@@ -173,7 +216,7 @@ class Output:
         except (OSError, ValueError, subprocess.SubprocessError) as error:
             wrong = str(error)
         if wrong:
-            print(f"warning: --notify {self.notify}: {wrong}", file=sys.stderr)
+            print(f"warning: --notify {notify}: {wrong}", file=sys.stderr)
 
     def _explain(self, error: Mapping[str, Any]) -> None:
         # Errors are never quiet, and never wrapped in the middle of a path.
@@ -184,6 +227,43 @@ class Output:
             console.print(f"  likely cause: {error['cause']}")
         if error.get("next_step"):
             console.print(f"  next step: {error['next_step']}")
+
+
+_COMMON = {
+    "as_json": Annotated[bool, typer.Option("--json", help="Exactly one JSON object on stdout.")],
+    "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")],
+}
+"""Options of every verb."""
+
+Verb = TypeVar("Verb", bound=Callable[..., Result | Told])
+
+
+def verb(
+    app: typer.Typer, name: str, show: Callable[[Output, Result], None] | None = None, *, schema: str = ""
+) -> Callable[[Verb], Verb]:
+    """Make a verb of a function that is given an ``Output`` and the verb's own options, and returns its result.
+
+    Args:
+        app: group that it belongs to.
+        name: as typed.
+        show: prints the result for a person.
+        schema: of the JSON, where it is not the name.
+    """
+
+    def add(function: Verb) -> Verb:
+        _, *own = inspect.signature(function, eval_str=True).parameters.values()
+        common = [Parameter(n, Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in _COMMON.items()]
+
+        def call(*, as_json: bool, quiet: bool, **given: Any) -> None:
+            output = Output(as_json, quiet, given)
+            output.run(schema or name, lambda: function(output, **given), show)
+
+        parameters = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in own] + common
+        vars(call)["__signature__"] = inspect.Signature(parameters)
+        app.command(name, help=inspect.getdoc(function))(call)
+        return function
+
+    return add
 
 
 def _print_json(value: Mapping[str, Any]) -> None:

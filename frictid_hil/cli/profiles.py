@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from frictid_hil.cli.options import ForceOption, JsonOption, ProfileArgument, QuietOption, StoreOption, profiles, robots
-from frictid_hil.cli.output import READING, Output, Result
+from frictid_hil.cli.options import ForceOption, ProfileArgument, StoreOption, profiles, robots
+from frictid_hil.cli.output import READING, Output, Result, verb
 from frictid_hil.cli.tables import folding
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
@@ -22,45 +22,30 @@ RobotName = Annotated[
     ),
 ]
 
+ReasonOption = Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")]
+
 _SHOWN = 50
 """Profiles, promotions and nights in a table that a person reads."""
 
 app = typer.Typer(help="Show, compare and manage friction profiles.", no_args_is_help=True)
 
 
-@app.command("show")
-def show(
-    profile: ProfileArgument,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
-    """Print a profile as a person reads it."""
-    from frictid_hil.jobs.profiles import show as job
-
-    output = Output(as_json, quiet)
-
-    def print_profile(result: Result) -> None:
-        for name, joint in rotary_names(result["joints"]).items():
-            linear = bool(joint.get("prismatic"))
-            force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
-            output.out.print(f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
-            table = folding()
-            table.add_column(f"V_n [{speed}]", justify="right")
-            table.add_column(f"F_n [{force}]", justify="right")
-            table.add_column("95 % interval", justify="right")
-            intervals = joint.get("torque_interval_nm") or [None] * len(joint["torque_nm"])
-            for velocity, torque, interval in zip(joint["velocity_rad_s"], joint["torque_nm"], intervals, strict=True):
-                table.add_row(
-                    f"{velocity if linear else degrees(velocity):.4g}",
-                    f"{torque:.4g}",
-                    f"{interval[0]:.4g} .. {interval[1]:.4g}" if interval else "",
-                )
-            output.out.print(table)
-            output.out.print(_timing(joint), highlight=False)
-        provenance = result["provenance"]
-        output.out.print(f"{result['robot']}, {provenance['created_utc']}, frictid-hil {provenance['tool_version']}")
-
-    output.run("profile_show", lambda: job(profile), print_profile)
+def _show_profile(output: Output, result: Result) -> None:
+    for name, joint in rotary_names(result["joints"]).items():
+        linear = bool(joint.get("prismatic"))
+        force, speed = ("N", "m/s") if linear else ("N m", "deg/s")
+        output.out.print(f"joint {name}: {joint['method']}, F_0 = {joint['coulomb_nm']['value']:.4g} {force}")
+        table = folding()
+        for heading in (f"V_n [{speed}]", f"F_n [{force}]", "95 % interval"):
+            table.add_column(heading, justify="right")
+        intervals = joint.get("torque_interval_nm") or [None] * len(joint["torque_nm"])
+        for velocity, torque, interval in zip(joint["velocity_rad_s"], joint["torque_nm"], intervals, strict=True):
+            known = f"{interval[0]:.4g} .. {interval[1]:.4g}" if interval else ""
+            table.add_row(f"{velocity if linear else degrees(velocity):.4g}", f"{torque:.4g}", known)
+        output.out.print(table)
+        output.out.print(_timing(joint), highlight=False)
+    provenance = result["provenance"]
+    output.out.print(f"{result['robot']}, {provenance['created_utc']}, frictid-hil {provenance['tool_version']}")
 
 
 def _timing(joint: Result) -> str:
@@ -75,32 +60,57 @@ def _timing(joint: Result) -> str:
     return f"{used} (+- {2e3 * skew['used_deviation_s']:.3f}): measured {measured} ms, declared {declared} ms"
 
 
-@app.command("export")
+@verb(app, "show", _show_profile, schema="profile_show")
+def show(output: Output, profile: ProfileArgument) -> Result:
+    """Print a profile as a person reads it."""
+    from frictid_hil.jobs.profiles import show as job
+
+    return job(profile)
+
+
+def _show_export(output: Output, result: Result) -> None:
+    output.tell(result, "written")
+    output.out.print(f"off the curve by {result['worst_percent']:.1f} % at most, within what was measured")
+    output.tell(result, "lost")
+
+
+@verb(app, "export", _show_export, schema="profile_export")
 def export(
+    output: Output,
     profile: ProfileArgument,
     to: Annotated[
         str, typer.Option("--to", metavar="TARGET", help="table (20 points, CSV), ros2 (YAML) or i2rt (YAML).")
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write.")],
     force: ForceOption = False,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Write a profile in the form of the place where it shall act, and say what is lost."""
     from frictid_hil.jobs.profile_export import export as job
 
-    output = Output(as_json, quiet)
-
-    def told(result: Result) -> None:
-        output.out.print(f"written: {result['written']}", soft_wrap=True)
-        output.out.print(f"off the curve by {result['worst_percent']:.1f} % at most, within what was measured")
-        output.out.print(f"lost: {result['lost']}", soft_wrap=True)
-
-    output.run("profile_export", lambda: job(profile, to, out, force=force), told)
+    return job(profile, to, out, force=force)
 
 
-@app.command("diff")
+def _show_diff(output: Output, result: Result) -> None:
+    rows = [
+        (
+            name,
+            f"{figures['distance_percent']:.2f}",
+            _signed(figures["coulomb_change_percent"]),
+            "" if figures["overlap_share"] is None else f"{100 * figures['overlap_share']:.0f}",
+            _signed(figures["temperature_change_c"]),
+            "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
+        )
+        for name, figures in result["joints"].items()
+    ]
+    headings = ("joint", "distance [%]", "F_0 [%]", "intervals that overlap [%]", "temperature [K]", "also changed")
+    output.table(headings, rows, ("joint",))
+    for warning in result["warnings"]:
+        output.out.print(Text.assemble(("note:", "yellow"), f" {warning}"), soft_wrap=True)
+
+
+@verb(app, "diff", _show_diff, schema="profile_diff")
 def diff(
+    output: Output,
     older: Annotated[
         str,
         typer.Argument(
@@ -109,46 +119,25 @@ def diff(
             autocompletion=profiles,
         ),
     ],
-    newer: Annotated[
-        str,
-        typer.Argument(
-            metavar="PROFILE",
-            help="The same.",
-            autocompletion=profiles,
-        ),
-    ],
+    newer: Annotated[str, typer.Argument(metavar="PROFILE", help="The same.", autocompletion=profiles)],
     robot: RobotName = None,
     store: StoreOption = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """How two profiles differ: distance (15), F_0, overlap of intervals, temperature, and what else changed."""
     from frictid_hil.jobs.profiles import diff as job
 
-    output = Output(as_json, quiet)
-
-    def show(result: Result) -> None:
-        headings = ("joint", "distance [%]", "F_0 [%]", "intervals that overlap [%]", "temperature [K]", "also changed")
-        table = folding(*headings, whole=("joint",))
-        for name, figures in result["joints"].items():
-            share = figures["overlap_share"]
-            table.add_row(
-                name,
-                f"{figures['distance_percent']:.2f}",
-                _signed(figures["coulomb_change_percent"]),
-                "" if share is None else f"{100 * share:.0f}",
-                _signed(figures["temperature_change_c"]),
-                "; ".join(f"{what}: {how}" for what, how in figures["other_changes"].items()),
-            )
-        output.out.print(table)
-        for warning in result["warnings"]:
-            output.out.print(Text.assemble(("note:", "yellow"), f" {warning}"), soft_wrap=True)
-
-    output.run("profile_diff", lambda: job(older, newer, robot=robot, store=store), show)
+    return job(older, newer, robot=robot, store=store)
 
 
-@app.command("promote")
+def _show_active(output: Output, result: Result) -> None:
+    output.tell(result, "active")
+    if kept := result.get("joints_kept"):
+        output.out.print(f"joints {', '.join(kept)} are not in this profile, and stay as {result['before']} has them")
+
+
+@verb(app, "promote", _show_active, schema="profile_promote")
 def promote(
+    output: Output,
     profile: Annotated[
         str,
         typer.Argument(
@@ -156,89 +145,39 @@ def promote(
         ),
     ],
     robot: RobotName = None,
-    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
+    reason: ReasonOption = "",
     baseline: Annotated[bool, typer.Option("--baseline", help="Measure drift from it from now on.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Although a quality gate failed.")] = False,
     store: StoreOption = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Make a profile the active one of its robot; joints that it lacks stay, and one command goes back."""
     from frictid_hil.jobs.profiles import promote as job
 
-    output = Output(as_json, quiet)
     told = output.counting(READING)
-
-    def show(result: Result) -> None:
-        output.out.print(f"active: {result['active']}", soft_wrap=True)
-        if kept := result["joints_kept"]:
-            output.out.print(
-                f"joints {', '.join(kept)} are not in this profile, and stay as {result['before']} has them"
-            )
-
-    output.run(
-        "profile_promote",
-        lambda: job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force, told=told),
-        show,
-    )
+    return job(profile, robot=robot, store=store, reason=reason, baseline=baseline, force=force, told=told)
 
 
-@app.command("rollback")
-def rollback(
-    robot: RobotArgument,
-    reason: Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")] = "",
-    store: StoreOption = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+@verb(app, "rollback", _show_active, schema="profile_rollback")
+def rollback(output: Output, robot: RobotArgument, reason: ReasonOption = "", store: StoreOption = None) -> Result:
     """Make the profile active again that was so before the present one."""
     from frictid_hil.jobs.profiles import rollback as job
 
-    output = Output(as_json, quiet)
-    output.run(
-        "profile_rollback",
-        lambda: job(robot, store=store, reason=reason),
-        lambda result: output.out.print(f"active: {result['active']}", soft_wrap=True),
-    )
+    return job(robot, store=store, reason=reason)
 
 
-@app.command("history")
-def history(
-    robot: RobotArgument,
-    last: Annotated[
-        int | None,
-        typer.Option(
-            "--last", metavar="N", min=0, help="Only so many, 0 for all. Default: 50 in a table, all with --json."
-        ),
-    ] = None,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
-    """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
-    from frictid_hil.jobs.history import history as job
-    from frictid_hil.profiles.store import ProfileStore
-
-    output = Output(as_json, quiet)
-
-    def show(result: Result) -> None:
-        headings = ("profile (* active)", "F_0", "from baseline", "temperature")
-        table = folding(*headings, whole=headings[:2], title=result["robot"])
-        for profile in result["profiles"]:
-            table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}")
-            for name, figures in profile["joints"].items():
-                table.add_row(f"  joint {name}", *_figures(figures))
-            table.add_section()
-        output.out.print(table)
-        for line in _events(result):
-            output.out.print(line, soft_wrap=True)
-        if older := result["profiles_kept"] - len(result["profiles"]):
-            output.out.print(f"{older} older profiles are not shown; see them with --last 0")
-
-    shown = last if last is not None else 0 if as_json else _SHOWN
-    output.run(
-        "profile_history", lambda: job(ProfileStore(store, output.counting(READING)), robot, last=shown or None), show
-    )
+def _show_history(output: Output, result: Result) -> None:
+    headings = ("profile (* active)", "F_0", "from baseline", "temperature")
+    table = folding(*headings, whole=headings[:2], title=result["robot"])
+    for profile in result["profiles"]:
+        table.add_row(f"{profile['id']}{' *' if profile['active'] else ''}")
+        for name, figures in profile["joints"].items():
+            table.add_row(f"  joint {name}", *_figures(figures))
+        table.add_section()
+    output.out.print(table)
+    for line in _events(result):
+        output.say(line)
+    if older := result["profiles_kept"] - len(result["profiles"]):
+        output.out.print(f"{older} older profiles are not shown; see them with --last 0")
 
 
 def _figures(joint: Result) -> tuple[str, str, str]:
@@ -268,3 +207,23 @@ def _events(result: Result) -> list[str]:
 
 def _signed(value: float | None) -> str:
     return "" if value is None else f"{value:+.1f}"
+
+
+@verb(app, "history", _show_history, schema="profile_history")
+def history(
+    output: Output,
+    robot: RobotArgument,
+    last: Annotated[
+        int | None,
+        typer.Option(
+            "--last", metavar="N", min=0, help="Only so many, 0 for all. Default: 50 in a table, all with --json."
+        ),
+    ] = None,
+    store: StoreOption = None,
+) -> Result:
+    """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
+    from frictid_hil.jobs.history import history as job
+    from frictid_hil.profiles.store import ProfileStore
+
+    shown = last if last is not None else 0 if output.as_json else _SHOWN
+    return job(ProfileStore(store, output.counting(READING)), robot, last=shown or None)

@@ -9,7 +9,7 @@ import sys
 import termios
 import threading
 from collections.abc import Callable, Iterator
-from typing import NoReturn, Protocol
+from typing import Protocol
 
 import typer
 from rich.console import Console
@@ -43,15 +43,10 @@ class Planned(Protocol):
         ...
 
 
-def answer_dry_run(output: Output, verb: str, planned: Callable[[], Planned]) -> NoReturn:
-    """Print the plan and leave; no bus is opened."""
-
-    def plan_only() -> Result:
-        asked = planned()
-        print_plan(output.out, asked.plan, asked.setup)
-        return {"outcome": "ok", "dry_run": True, "plan": described(asked.plan)}
-
-    output.run(verb, plan_only)
+def shown_plan(output: Output, planned: Planned) -> Result:
+    """What ``--dry-run`` tells; no bus is opened."""
+    print_plan(output.out, planned.plan, planned.setup)
+    return {"outcome": "ok", "dry_run": True, "plan": described(planned.plan)}
 
 
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
@@ -255,7 +250,7 @@ class TerminalWatcher:
 
 
 @contextlib.contextmanager
-def watching(output: Output, *, yes: bool, live: bool, live_at: str | None) -> Iterator[Watcher]:
+def watching(output: Output, *, yes: bool, live: bool = False, live_at: str | None = None) -> Iterator[Watcher]:
     """The terminal's watcher while a job lasts, which streams as well where ``--live`` or ``--live-at`` asks for it."""
     watcher = TerminalWatcher(output, yes=yes)
     try:

@@ -1,22 +1,40 @@
-"""``report``: the HTML page of a run, or of a robot."""
+"""``report``, ``dashboard`` and ``replay``: what was recorded, on a page, in a browser, or played back."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
-from frictid_hil.cli.options import JsonOption, QuietOption, StoreOption, robots
-from frictid_hil.cli.output import READING, Output, Result
+from frictid_hil.cli.options import (
+    AmplitudeOption,
+    CyclesOption,
+    ForceOption,
+    JointOption,
+    MethodOption,
+    OutOption,
+    RatioOption,
+    RobotOption,
+    StoreOption,
+    VelocityOption,
+    robots,
+)
+from frictid_hil.cli.output import READING, Output, Result, verb
+from frictid_hil.units import degrees
+
+app = typer.Typer()
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's verbs."""
-    app.command("report")(report)
+def _show_pages(output: Output, result: Result) -> None:
+    for key in ("report", "recalibration_report"):
+        if key in result:
+            output.say(result[key])
 
 
+@verb(app, "report", _show_pages)
 def report(
+    output: Output,
     run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="Run folder.")] = None,
     robot: Annotated[
         str | None,
@@ -29,17 +47,113 @@ def report(
         ),
     ] = None,
     store: StoreOption = None,
-    as_json: JsonOption = False,
-    quiet: QuietOption = False,
-) -> None:
+) -> Result:
     """Write the self-contained HTML page of a run, or the index page of a robot."""
     from frictid_hil.jobs.report import report as job
 
-    output = Output(as_json, quiet)
+    return job(run, robot=robot, store=store, told=output.counting(READING))
 
-    def show(result: Result) -> None:
-        for key in ("report", "recalibration_report"):
-            if key in result:
-                output.out.print(result[key], soft_wrap=True)
 
-    output.run("report", lambda: job(run, robot=robot, store=store, told=output.counting(READING)), show)
+@verb(app, "dashboard")
+def dashboard(
+    output: Output,
+    runs: Annotated[
+        Path, typer.Option("--runs", metavar="DIR", file_okay=False, help="Folder under which runs are looked for.")
+    ] = Path("runs"),
+    store: StoreOption = None,
+    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of 127.0.0.1 to listen on.")] = 8642,
+) -> NoReturn:
+    """Show robots, runs and a run as it moves, in a browser on this computer; it reads only. Runs until Ctrl-C."""
+    from frictid_hil.jobs.dashboard import serve
+    from frictid_hil.profiles.store import ProfileStore
+
+    serve(runs, ProfileStore(store), port, output.announce("dashboard", "address", "dashboard"))
+    raise typer.Exit(0)
+
+
+FramesOption = Annotated[
+    Path | None,
+    typer.Option("--frames", metavar="FILE", help="Mapping file of a foreign log: which frame is what."),
+]
+EdsOption = Annotated[
+    Path | None, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of the drives of a foreign log.")
+]
+ProfileOption = Annotated[
+    Path | None,
+    typer.Option("--profile", metavar="PROFILE", help="Profile to compare with; default: the run's own."),
+]
+EchoOption = Annotated[
+    str | None,
+    typer.Option("--echo", metavar="BUS", help="interface:channel of a bus on which every frame is sent again."),
+]
+SimulateOption = Annotated[
+    bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
+]
+
+
+def _show_replay(output: Output, result: Result) -> None:
+    rows = []
+    for name, joint in result["joints"].items():
+        position, torque = joint.get("position_rms_rad"), joint.get("torque_rms_nm")
+        rows.append(
+            (
+                name,
+                joint["outcome"],
+                _verdict(joint),
+                str(joint.get("lost_rows") or 0),
+                "" if position is None else f"{degrees(position):.3g} deg",
+                "" if torque is None else f"{torque:.3g} N m",
+                "; ".join(joint["remarks"]),
+            )
+        )
+    headings = ("joint", "outcome", "profile", "rows missing", "position rms", "torque rms", "remarks")
+    output.table(headings, rows, ("joint", "position rms", "torque rms"), f"Replay of {result['source']}")
+    if log := result.get("log"):
+        output.out.print(f"{log['frames']} frames, {log['rows']} cycles")
+        for name, count in log["unknown"].items():
+            output.out.print(f"unknown: {count} x {name}")
+        for key in ("repeated", "backwards", "skipped"):
+            if log[key]:
+                output.out.print(f"{key}: {log[key]} frames")
+        if log["damage"]:
+            output.out.print(f"damaged: {log['damage']}")
+
+
+def _verdict(joint: Result) -> str:
+    if joint["identical"] is None:
+        return "nothing to compare with"
+    if joint["identical"]:
+        return "identical"
+    percent = joint["difference_percent"]
+    return f"curve differs by {percent:.3g} %" if percent else "same curve, other figures or words"
+
+
+@verb(app, "replay", _show_replay)
+def replay(
+    output: Output,
+    source: Annotated[
+        Path, typer.Argument(metavar="RUN_OR_LOG", help="Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")
+    ],
+    robot: RobotOption,
+    joints: JointOption = None,
+    frames: FramesOption = None,
+    eds: EdsOption = None,
+    profile: ProfileOption = None,
+    amplitude: AmplitudeOption = None,
+    velocity: VelocityOption = None,
+    cycles: CyclesOption = None,
+    ratio: RatioOption = None,
+    method: MethodOption = None,
+    paced: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
+    echo: EchoOption = None,
+    simulation: SimulateOption = True,
+    out: OutOption = None,
+    force: ForceOption = False,
+) -> Result:
+    """Play a recording back: the same profile to the last bit, and measured beside simulated motion."""
+    from frictid_hil.jobs.plans import given_procedure
+    from frictid_hil.jobs.replay import ReplayOptions
+    from frictid_hil.jobs.replay import replay as job
+
+    procedure = given_procedure(amplitude, velocity, cycles, ratio)
+    return job(output.options(ReplayOptions, procedure=procedure), output.err.print)

@@ -18,7 +18,8 @@ from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows
 from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
-from frictid_hil.jobs.gap.write_model import Export, exports, likely, natives, write_model
+from frictid_hil.jobs.gap.write_model import Export, exports, likely, natives
+from frictid_hil.jobs.gap.write_model import write_model as write_changed
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.arm import arm_page
 from frictid_hil.report.gap import gap_page
@@ -31,7 +32,7 @@ ARM_PAGE = "arm.html"
 def diagnose_arm(
     asked: ModelLogs,
     *,
-    write: Path | None = None,
+    write_model: Path | None = None,
     apply: bool = False,
     wanted: Wanted | None = None,
     out: Path | None = None,
@@ -42,7 +43,7 @@ def diagnose_arm(
 
     Args:
         asked: model and logs.
-        write: where to write the user's model with the causes added; the user's own file is edited in place.
+        write_model: where to write the user's model with the causes added; the user's own file is edited in place.
         apply: write the likeliest causes of open verdicts too.
         wanted: files for other simulators.
         out: folder for the page of the arm and one page a joint; None writes none.
@@ -63,8 +64,7 @@ def diagnose_arm(
     pages = {name: (out / f"{part_of_path(name)}.html") for name in arm.joints} if out is not None else {}
     if out is not None:
         pages[""] = out / ARM_PAGE
-    outputs = [*pages.values(), *([write] if write is not None else []), *(wanted.files.values() if wanted else ())]
-    refuse_overwriting(outputs, force=force)
+    refuse_overwriting([*pages.values(), write_model, *(wanted.files.values() if wanted else ())], force=force)
     if wanted is not None:
         check_targets(arm, wanted)
     found = diagnosed(arm, executor_name)
@@ -80,8 +80,8 @@ def diagnose_arm(
         "joints": joints,
     }
     made, result["closed_loop"] = nearer_only(arm, exports(arm, found, apply=apply))
-    if write is not None:
-        result |= _written(arm, made, result["closed_loop"], write, force)
+    if write_model is not None:
+        result |= _written(arm, made, result["closed_loop"], write_model, force)
     if wanted is not None and wanted.files:
         result["targets"] = write_targets(arm, found, made, wanted, force=force)
     if out is not None:
@@ -122,7 +122,7 @@ def _written(
         if loop["left_out"]:
             why = "no change brings your model nearer to the recordings that were not fitted"
         return {"model": None, "model_refused": why}
-    told = write_model(arm, made, write, force=force)
+    told = write_changed(arm, made, write, force=force)
     figures = figures_of_model(arm, Withheld(arm, made), natives(made), loop)
     return {"model": told["model"], "export": {**told, "figures": figures}}
 
