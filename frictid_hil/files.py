@@ -61,6 +61,18 @@ def made_folders(path: Path) -> list[Path]:
         raise FrictidError(f"cannot be written to: {error.strerror}", where=str(path)) from error
 
 
+def made_folder(path: Path, kind: type[FrictidError] = FrictidError, next_step: str = "") -> None:
+    """Make a folder where there is none.
+
+    Raises:
+        FrictidError: of this kind: no permission, no space, or a file is in the way.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise kind(f"cannot be created: {error.strerror}", where=str(path), next_step=next_step) from error
+
+
 def write_whole(path: Path, text: str | bytes) -> None:
     """Write a file so that every reader, at any moment and after any crash, sees the old content or the new, whole.
 

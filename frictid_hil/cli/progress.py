@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
 import sys
 import termios
-import threading
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
@@ -26,6 +24,7 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Severity
 from frictid_hil.runner.events import Event, JobProgress, JointRun, PhaseStarted, Preflight, Warned
 from frictid_hil.runner.ring import Rows
+from frictid_hil.runner.stop_signals import handling_signals
 from frictid_hil.units import degrees, format_duration
 
 
@@ -101,20 +100,16 @@ def answer(question: str) -> bool:
         Interrupted: Ctrl-C, Ctrl-D or SIGTERM; while asking, these mean what they say to every other program.
     """
 
-    def stop(_signal: int, _frame: object) -> None:
+    def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    ours = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM) if ours}
     try:
-        with contextlib.suppress(termios.error, OSError, ValueError):  # no terminal
-            termios.tcflush(sys.stdin, termios.TCIFLUSH)
-        return typer.confirm(question, err=True)
+        with handling_signals(stop):
+            with contextlib.suppress(termios.error, OSError, ValueError):  # no terminal
+                termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            return typer.confirm(question, err=True)
     except (typer.Abort, KeyboardInterrupt):
         raise Interrupted("interrupted at the question; nothing moves", next_step="start again") from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class TerminalWatcher:

@@ -78,6 +78,11 @@ def rms(time_s: Array, values: Array) -> float:
     return float(np.sqrt(np.sum(step_s * (square[1:] + square[:-1])) / (2 * np.sum(step_s))))
 
 
+def plain_rms(values: Array) -> float:
+    """Root mean square of evenly sampled values; unit of ``values``."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def rms_by_part(values: Array, parts: int) -> Array:
     """Root mean squares of parts of equal length, one after the other, shape (parts,); unit of ``values``."""
     roots: Array = np.array([np.sqrt(np.mean(np.square(part))) for part in np.array_split(values, parts)])

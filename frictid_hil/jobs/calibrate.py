@@ -17,7 +17,7 @@ from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import FrictidError, GateFailed, IdentificationError, UsageError
 from frictid_hil.friction.estimate import METHODS
 from frictid_hil.friction.trajectory import Procedure, in_whole_ticks
-from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.joint_profile import failed_result, identify_joint, joint_result
 from frictid_hil.jobs.identification.programmes import Programme, programme
 from frictid_hil.jobs.identification.skew_stretch import refuse_where_the_bus_is_too_slow, shaking_note
 from frictid_hil.jobs.plans import (
@@ -53,23 +53,9 @@ _CONTINUED = (VERB, "recalibrate")
 class CalibrateOptions:
     """What a person asked for; what is left at its default is the robot file's own, or that of the run continued.
 
+    The options are those of ``frictid-hil calibrate --help``, and for other verbs:
+
     Attributes:
-        robot: robot file, by path or name; not needed with ``resume``.
-        bus: ``interface:channel``.
-        joints: names; all joints when empty.
-        amplitude_rad: A.
-        velocity_rad_s: V.
-        cycles: N.
-        ratio: c.
-        method: estimator; None for the programme's.
-        program: ``thorough``, ``standard`` or ``quick``; None for ``thorough``.
-        together: all joints move at once, in phase.
-        measure_skew: every joint also shakes to show by how much its torque is late; None for the robot file's choice.
-        rate_hz: rate of set-points.
-        realtime: wall clock for the virtual robot.
-        seed: of simulated noise.
-        resume: run folder to continue.
-        out: run folder to write.
         verb: that the run is part of.
         warm_up: every joint is warmed up before it is measured.
         interlock: must be closed before and during motion.
@@ -103,10 +89,7 @@ class Planned:
     """A calibration that was checked and not yet begun.
 
     Attributes:
-        order: robot, folder and options.
         plan: within every limit; without joints where the run continued has measured all.
-        method: estimator.
-        options: complete.
         kept: joints that the run continued has finished.
     """
 
@@ -117,11 +100,6 @@ class Planned:
     kept: Mapping[str, tuple[JointProfile, dict[str, Any]]]
 
     @property
-    def robot(self) -> Robot:
-        """The robot's file."""
-        return self.order.robot
-
-    @property
     def setup(self) -> RobotSetup:
         """The robot as its driver knows it."""
         return self.order.setup
@@ -129,15 +107,7 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """The result of a calibration.
-
-    Attributes:
-        ended: how the run ended.
-        joints: each joint's figures, in the order of the robot file.
-        profile: of all joints that were identified; None where none was.
-        profile_file: where it is.
-        report: page of the run.
-    """
+    """The result of a calibration: figures of the joints in the order of the robot file; None what was not made."""
 
     ended: Ended
     joints: Mapping[str, Mapping[str, Any]]
@@ -167,10 +137,9 @@ def plan_calibration(options: CalibrateOptions) -> Planned:
     robot = load_robot(options.robot)
     chosen, method = _estimated_by(options)
     setup = _setup(robot, options)
-    kept = {}
     if options.resume is not None:
         manifest_of(options.resume, robot)
-        kept = kept_joints(options.resume)
+    kept = kept_joints(options.resume) if options.resume is not None else {}
     with robot.document.locating():
         quantum_s = planned_quantum_s(robot.driver(options.bus), setup)
     procedures = {
@@ -234,8 +203,8 @@ def calibrate(options: CalibrateOptions, watcher: Watcher) -> Calibrated:
         error = None
         if planned.plan.joints:
             interlock = planned.options.interlock
-            asked = _refuse_without_watchdog if interlock else _nothing
-            error = run.move(planned.plan, each=measured.identify, asked=asked, care=Care(interlock=interlock))
+            asked: dict[str, Any] = {"asked": _refuse_without_watchdog} if interlock else {}
+            error = run.move(planned.plan, each=measured.identify, care=Care(interlock=interlock), **asked)
         else:
             run.reopen()
         return measured.concluded(error)
@@ -259,27 +228,28 @@ class _Measured:
             "late_cycles": moved.late_cycles,
             "missed_cycles": moved.missed_cycles,
         }
+        name = moved.joint
         try:
             profile = identify_joint(
                 self._run.folder.samples(moved),
-                self._planned.setup.joint(moved.joint),
+                self._planned.setup.joint(name),
                 method=self._planned.method,
                 late_cycles=moved.late_cycles + moved.missed_cycles,
                 company=self._company(moved),
             )
         except IdentificationError as error:
-            self._results[moved.joint] = {**result, "outcome": "gate_failed", "remarks": [str(error)], **_NOTHING}
-            self._watcher.joint(moved.joint, str(error), ok=False)
+            self._results[name] = {**result, **failed_result(str(error)), "coulomb_nm": None}
+            self._watcher.joint(name, str(error), ok=False)
             return
-        self._profiles[moved.joint] = profile
-        self._results[moved.joint] = {**joint_result(profile), **result}
-        self._run.folder.keep_joint(moved.joint, profile, self._results[moved.joint])
-        outcome = self._results[moved.joint]["outcome"]
-        self._watcher.joint(moved.joint, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
+        self._profiles[name] = profile
+        self._results[name] = told = {**joint_result(profile), **result}
+        self._run.folder.keep_joint(name, profile, told)
+        outcome = told["outcome"]
+        self._watcher.joint(name, f"F_0 = {profile.coulomb_nm.value:.3f} N m, {outcome}", ok=outcome == "ok")
 
     def concluded(self, error: FrictidError | None) -> Calibrated:
         """Write profile, manifest and page, and return the result."""
-        robot, folder = self._planned.robot, self._run.folder
+        robot, folder = self._planned.order.robot, self._run.folder
         joints = {name: self._results[name] for name in robot.joint_names if name in self._results}
         failed = [name for name, result in joints.items() if result["outcome"] != "ok"]
         if error is None and failed:
@@ -318,13 +288,6 @@ class _Measured:
             run=str(folder.path.resolve()),
             log_sha256=folder.log_digests(),
         )
-
-
-_NOTHING: dict[str, Any] = {"velocity_rad_s": [], "torque_nm": [], "coulomb_nm": None}
-
-
-def _nothing(_: Preflight) -> None:
-    pass
 
 
 def _refuse_without_watchdog(preflight: Preflight) -> None:
@@ -366,18 +329,10 @@ def _setup(robot: Robot, options: CalibrateOptions) -> RobotSetup:
     if options.rate_hz is not None:
         setup = replace(setup, cycle_hz=options.rate_hz)
     if options.interlock is not None:
-        setup = _reporting_inputs(setup, options.interlock.joint)
+        reporting = setup.joint(options.interlock.joint)
+        setup = setup.with_joint(reporting.name, options={**reporting.options, "digital_inputs": True})
     robot.check_joints(options.joints)
     return setup
-
-
-def _reporting_inputs(setup: RobotSetup, joint: str) -> RobotSetup:
-    """The robot with one drive that reports its digital inputs."""
-    joints = tuple(
-        replace(one, options={**one.options, "digital_inputs": True}) if one.name == joint else one
-        for one in setup.joints
-    )
-    return replace(setup, joints=joints)
 
 
 def _active_file(robot: Robot, store: Path | None) -> str | None:
@@ -451,9 +406,7 @@ def _together_notes(setup: RobotSetup) -> list[str]:
 
 
 def _joint_notes(procedures: dict[str, Procedure], expected: dict[str, Any], rehearse: list[str]) -> list[str]:
-    notes = []
-    if rehearse:
-        notes.append(rehearsal_note(rehearse))
+    notes = [rehearsal_note(rehearse)] if rehearse else []
     unknown = [name for name in procedures if name not in expected]
     if unknown:
         notes.append(f"peak torque of joints {', '.join(unknown)} is not predicted (no `expected` in the robot file)")

@@ -7,10 +7,10 @@ it is given its compensation (section 5 of the paper). ``compensation.result`` f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from frictid_hil.config.profile import LOOP_STIFFNESS, JointProfile
+from frictid_hil.config.profile import LOOP_STIFFNESS
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
@@ -19,13 +19,12 @@ from frictid_hil.jobs.compensation.plan import compensation_plan
 from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of_file, refuse
 from frictid_hil.jobs.compensation.result import Asked, CompensationResult, Progress, result_of
 from frictid_hil.jobs.compensation.wanted import MODES, Wanted
-from frictid_hil.jobs.plans import care_notes, expected_of, inherited_notes
+from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.profiles import named_profile
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.limits import refuse_beyond_limits
 from frictid_hil.plan.mode import Mode
-from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import Event, JointRun, PhaseStarted, Preflight
@@ -37,18 +36,11 @@ VERB = "compensate"
 
 @dataclass(frozen=True, slots=True)
 class CompensateOptions:
-    """What a person asked for.
+    """What a person asked for, see ``frictid-hil compensate --help``.
 
     Attributes:
-        robot: robot file, by path or name.
         profile: file, a run folder that holds one, or an id of the store; ``active`` is the one in force there.
-        store: folder of the profile store; None for the user's own.
-        joint: name.
         wanted: task, modes, setting and the rest of what is to be run.
-        bus: ``interface:channel``.
-        realtime: wall clock for the virtual robot.
-        seed: of simulated noise.
-        out: run folder to write.
     """
 
     robot: str
@@ -85,14 +77,11 @@ def plan_compensation(options: CompensateOptions) -> Asked:
             next_step="give it stiffness and damping under `simulated: hand:` in the robot file",
         )
     entry = profile.joint(joint.name)
-    setup = _with_loop_stiffness(setup, joint.name, entry)
-    planned = compensation_plan(
-        robot.name, setup, joint.name, entry, robot.policy, wanted, Rehearsals(robot, options.bus)
-    )
-    forced = tuple(f"forced in spite of: {doubt}" for doubt in doubts)
-    notes = (*planned.plan.notes, *inherited_notes(robot, [joint.name]), *care_notes(robot, setup), *forced)
-    plan = replace(planned.plan, notes=notes)
-    planned = replace(planned, plan=plan, warnings=(*planned.warnings, *forced))
+    if measured := entry.quality.get(LOOP_STIFFNESS):
+        # Measured together with the friction; it takes the place of a stated one.
+        setup = setup.with_joint(joint.name, loop_stiffness_nm_per_rad=measured)
+    forced = [f"forced in spite of: {doubt}" for doubt in doubts]
+    planned = compensation_plan(robot, setup, joint.name, entry, wanted, Rehearsals(robot, options.bus), forced)
     refuse_beyond_limits(planned.plan, setup, expected_of(robot))
     return Asked(robot, setup, joint.name, profile_path, entry, wanted, planned)
 
@@ -148,17 +137,6 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
         elif half is not None and progress.run is None:
             _measure(half, run, asked, progress)
         return result_of(asked, run, progress, error)
-
-
-def _with_loop_stiffness(setup: RobotSetup, name: str, entry: JointProfile) -> RobotSetup:
-    """The robot with the stiffness that was measured together with the friction, in place of a stated one."""
-    measured = entry.quality.get(LOOP_STIFFNESS)
-    if not measured:
-        return setup
-    joints = tuple(
-        replace(one, loop_stiffness_nm_per_rad=measured) if one.name == name else one for one in setup.joints
-    )
-    return replace(setup, joints=joints)
 
 
 def _refuse_mode(mode: Mode, preflight: Preflight) -> None:

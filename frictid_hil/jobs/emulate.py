@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from types import FrameType
+from threading import Event
 
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import UsageError
+from frictid_hil.runner.stop_signals import handling_signals
 
 _GROUP = "frictid_hil.emulators"
 
@@ -41,16 +41,6 @@ def emulate(
     robot = load_robot(robot_name)
     setup = robot.to_setup(bus)
     serve = installed[kind].load()
-    stopping = False
-
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal stopping
-        stopping = True
-
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with robot.document.locating():
-            serve(setup, announce=announce, stop=lambda: stopping, **settings)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    stopping = Event()
+    with handling_signals(lambda *_: stopping.set()), robot.document.locating():
+        serve(setup, announce=announce, stop=stopping.is_set, **settings)

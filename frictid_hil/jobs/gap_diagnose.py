@@ -9,7 +9,7 @@ from typing import Any
 
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
-from frictid_hil.files import refuse_overwriting, write_whole
+from frictid_hil.files import made_folder, refuse_overwriting, write_whole
 from frictid_hil.gap.diagnose import NEGLIGIBLE
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
@@ -125,8 +125,7 @@ def diagnose(
         null and ``model_refused`` says why and what to do.
     """
     callback = None if mujoco is None else mujoco.with_suffix(".py")
-    outputs = (write_model, mujoco, callback, None if out is None else out / "gap.html")
-    refuse_overwriting([path for path in outputs if path is not None], force=force)
+    refuse_overwriting([write_model, mujoco, callback, None if out is None else out / "gap.html"], force=force)
     experiments = (Source((source,)) if isinstance(source, Path) else source).load()
     found = find_causes(experiments, negligible=NEGLIGIBLE if negligible is None else negligible)
     result: dict[str, Any] = {"outcome": "ok", **found.to_json()}
@@ -148,10 +147,7 @@ def diagnose(
         if refused:
             result["model_refused"] = refused
     if out is not None:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"cannot be created: {error.strerror}", where=str(out)) from error
+        made_folder(out, UsageError)
         page = gap_page(found, _side_by_side(experiments, found), missing_torque(experiments))
         result["report"] = str(write_page(page, out / "gap.html").resolve())
     return result

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from frictid_hil.errors import FrictidError, UsageError
-from frictid_hil.files import part_of_path, refuse_overwriting
+from frictid_hil.files import made_folder, part_of_path, refuse_overwriting
 from frictid_hil.gap.arm import ArmFindings
 from frictid_hil.gap.diagnose import diagnose as find_causes
 from frictid_hil.gap.diagnosis import Diagnosis
-from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
@@ -85,7 +84,7 @@ def diagnose_arm(
     if wanted is not None and wanted.files:
         result["targets"] = write_targets(arm, found, made, wanted, force=force)
     if out is not None:
-        _make_folder(out)
+        made_folder(out, UsageError)
         for name, told in joints.items():
             page = gap_page(found[name], (), missing_torque(arm.joints[name].experiments))
             told["report"] = str(write_page(page, pages[name]).resolve())
@@ -136,15 +135,11 @@ def diagnosed(arm: ArmSet, executor_name: str | None = None) -> dict[str, Diagno
     found: dict[str, Diagnosis] = {}
     sets = [joint.experiments for joint in arm.joints.values()]
     with executor(executor_name, len(sets)) as pool:
-        for name, answer in zip(arm.joints, answers(pool, _diagnosed, sets), strict=True):
+        for name, answer in zip(arm.joints, answers(pool, find_causes, sets), strict=True):
             if isinstance(answer, FrictidError):
                 raise answer
             found[name] = answer
     return found
-
-
-def _diagnosed(experiments: ExperimentSet) -> Diagnosis:
-    return find_causes(experiments)
 
 
 def summary(found: Mapping[str, Diagnosis], arm: ArmFindings | None = None) -> str:
@@ -168,13 +163,12 @@ def summary(found: Mapping[str, Diagnosis], arm: ArmFindings | None = None) -> s
 def _of_the_arm(found: ArmFindings | None) -> dict[str, Any] | None:
     if found is None:
         return None
-    cause = found.cause
     told = None
-    if cause is not None:
-        parameters = {
-            name: {"value": value, "interval_95": [low, high]} for name, (value, low, high) in cause.parameters.items()
-        }
-        told = {"effect": cause.effect, "body": cause.body, "confidence": cause.confidence, "parameters": parameters}
+    if found.cause is not None:
+        numbers = found.cause.parameters.items()
+        parameters = {name: {"value": value, "interval_95": [low, high]} for name, (value, low, high) in numbers}
+        told = {name: getattr(found.cause, name) for name in ("effect", "body", "confidence")}
+        told["parameters"] = parameters
     return {
         "cause": told,
         "chances": dict(found.chances),
@@ -196,10 +190,3 @@ def _told(joint: JointSet, found: Diagnosis) -> dict[str, Any]:
         "drafted": dict(joint.drafted),
         "asked": list(joint.asked),
     }
-
-
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot be created: {error.strerror}", where=str(out)) from error

@@ -93,7 +93,7 @@ def fleet(
         )
     if bool(samples) != (out is not None):
         raise UsageError("--randomise N and --out FILE belong together", next_step="give both, or neither")
-    refuse_overwriting([out] if out is not None else [], force=force)
+    refuse_overwriting([out], force=force)
     units = {str(path): _joints(path) for path in results}
     random = np.random.default_rng(seed)
     every = list(_varied(units, random))

@@ -14,11 +14,11 @@ from frictid_hil.config.columns import load_columns
 from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance, file_sha256
 from frictid_hil.config.robot import load_robot
-from frictid_hil.errors import FrictidError, InputFileError, UsageError
+from frictid_hil.errors import FrictidError, GateFailed, InputFileError, UsageError
 from frictid_hil.files import made_folders, refuse_overwriting
 from frictid_hil.friction.trajectory import Procedure
 from frictid_hil.jobs.identification.executors import answers, executor
-from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.joint_profile import failed_result, identify_joint, joint_result
 from frictid_hil.jobs.plans import given_procedure
 from frictid_hil.jobs.replaying.bus_logs import is_log, logs_of
 from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
@@ -37,22 +37,7 @@ _MOST_PAGES = 50
 
 @dataclass(frozen=True, slots=True)
 class IdentifyOptions:
-    """What a person asked for.
-
-    Attributes:
-        logs: run folders, files, folders of files, globs.
-        robot: robot file for limits and gear; None where the recording says enough.
-        joints: only these; all when empty.
-        amplitude_rad: A, where the recording does not carry it.
-        velocity_rad_s: V.
-        cycles: N.
-        ratio: c.
-        method: estimator.
-        columns: column map of foreign files.
-        executor: ``processes:N`` or ``dask://host:port``; None chooses.
-        out: folder for profiles and their pages.
-        force: write over files that are there.
-    """
+    """What a person asked for, see ``frictid-hil identify --help``; the procedure is of recordings that carry none."""
 
     logs: tuple[Path, ...]
     robot: str | None = None
@@ -91,7 +76,7 @@ class _Identified:
     page: Page | None = None
 
     def told(self) -> str:
-        """Form one line of progress."""
+        """One line of progress."""
         if self.error is not None:
             return f"{self.error} ({self.error.cause})" if self.error.cause else str(self.error)
         good = f"joint {', '.join(self.joints)}"
@@ -195,7 +180,12 @@ def _task(log: Path, options: IdentifyOptions, *, with_page: bool = False) -> _T
 def _identified(task: _Task) -> _Identified:
     """Read and identify one recording; what goes wrong is part of the answer, so that others go on."""
     try:
-        every = _decoded(task) if task.log.is_file() and is_log(task.log) else read(task.log, task.columns)
+        if task.log.is_file() and is_log(task.log):
+            # Where nothing tells which frame is what, `replay` can be told.
+            robot = task.setup.name if task.setup else ""
+            every = list(samples_in(logs_of(task.log, None), robot, Account()).values())
+        else:
+            every = read(task.log, task.columns)
     except FrictidError as error:
         return _Identified({}, {}, error)
     wanted = [samples for samples in every if not task.joints or samples.joint in task.joints]
@@ -205,11 +195,19 @@ def _identified(task: _Task) -> _Identified:
     joints: dict[str, JointProfile] = {}
     failed: dict[str, str] = {}
     last: FrictidError | None = None
+    marked = any(samples.marks for samples in wanted)
     for samples in wanted:
-        if len(wanted) > 1 and not task.joints and samples.marks == () and _has_marks(wanted):
+        if len(wanted) > 1 and not task.joints and samples.marks == () and marked:
             continue  # the joints that stood still in a run of another one
         try:
-            joints[samples.joint] = _joint(samples, task, every)
+            joints[samples.joint] = identify_joint(
+                samples,
+                None if task.setup is None else task.setup.joint(samples.joint),
+                method=task.method,
+                procedure=task.procedure,
+                late_cycles=_late_cycles(task.log, samples.joint),
+                company=every,
+            )
         except FrictidError as error:
             last = _with_damage(error, samples)
             failed[samples.joint] = str(error).removeprefix(f"joint {samples.joint}: ")
@@ -230,26 +228,6 @@ def _with_damage(error: FrictidError, samples: Samples) -> FrictidError:
     return type(error)(error.what, where=error.where, cause=cause, next_step=next_step)
 
 
-def _decoded(task: _Task) -> list[Samples]:
-    """The samples in a bus log; where nothing tells which frame is what, `replay` can be told."""
-    account = Account()
-    return list(samples_in(logs_of(task.log, None), task.setup.name if task.setup else "", account).values())
-
-
-def _joint(samples: Samples, task: _Task, every: Sequence[Samples]) -> JointProfile:
-    joint = None
-    if task.setup is not None:
-        joint = task.setup.joint(samples.joint)
-    return identify_joint(
-        samples,
-        joint,
-        method=task.method,
-        procedure=task.procedure,
-        late_cycles=_late_cycles(task.log, samples.joint),
-        company=every,
-    )
-
-
 def _late_cycles(log: Path, joint: str) -> int:
     """Late and missed cycles of a joint, where the recording is a run folder."""
     if not (log / "manifest.json").exists():
@@ -258,21 +236,12 @@ def _late_cycles(log: Path, joint: str) -> int:
     return sum(int(run["late_cycles"] + run["missed_cycles"]) for run in sessions if run["joint"] == joint)
 
 
-def _has_marks(every: Sequence[Samples]) -> bool:
-    return any(samples.marks for samples in every)
-
-
 def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOptions) -> dict[str, Any]:
     entries: list[dict[str, Any]] = []
     names = profile_names([task.log for task in tasks])
     for task, result, name in zip(tasks, results, names, strict=True):
         joints = {joint: joint_result(profile) for joint, profile in result.joints.items()}
-        joints.update(
-            {
-                joint: {"outcome": "gate_failed", "remarks": [why], "velocity_rad_s": [], "torque_nm": []}
-                for joint, why in result.failed.items()
-            }
-        )
+        joints |= {joint: failed_result(why) for joint, why in result.failed.items()}
         profile_path = None if options.out is None else _write(task, result, options.out / name)
         entries.append(
             {
@@ -296,12 +265,10 @@ def _result(tasks: list[_Task], results: list[_Identified], options: IdentifyOpt
         said = [f"{Path(entry['log']).name}: {entry['error'] or '; '.join(_failed(entry))}" for entry in failures]
     if not sound:
         more = f"; and {len(said) - 5} more" if len(said) > 5 else ""
-        whole["error"] = {
-            "what": f"{count} of {of} failed: {'; '.join(said[:5])}{more}",
-            "where": "",
-            "cause": "",
-            "next_step": "results of the others stand; the page that `--out` writes shows curve, loops and gates",
-        }
+        whole["error"] = GateFailed(
+            f"{count} of {of} failed: {'; '.join(said[:5])}{more}",
+            next_step="results of the others stand; the page that `--out` writes shows curve, loops and gates",
+        ).to_json()
     return whole
 
 
@@ -343,15 +310,12 @@ def _page_beside(profile: Path) -> Path:
 
 
 def _profile(task: _Task, joints: dict[str, JointProfile]) -> FrictionProfile:
+    files = sorted(task.log.glob("samples*.mcap")) if task.log.is_dir() else [task.log]
     return FrictionProfile(
         robot=task.setup.name if task.setup else task.log.stem,
         joints=joints,
         provenance=Provenance.now(
             run=str(task.log.resolve()),
-            log_sha256={path.name: file_sha256(path) for path in _files(task.log)},
+            log_sha256={path.name: file_sha256(path) for path in files},
         ),
     )
-
-
-def _files(log: Path) -> list[Path]:
-    return sorted(log.glob("samples*.mcap")) if log.is_dir() else [log]

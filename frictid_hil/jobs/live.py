@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from frictid_hil.errors import UsageError
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.ring import Rows
 
 if TYPE_CHECKING:
@@ -72,17 +71,9 @@ class LiveWatcher:
         self._due_ns = [0] * len(setup.joints)
         self._watcher.plan(plan, setup)
 
-    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
-        """Return the other watcher's answer."""
-        return self._watcher.confirm(plan, preflight)
-
-    def ask(self, question: str) -> bool:
-        """Return the other watcher's answer."""
-        return self._watcher.ask(question)
-
-    def event(self, event: Event) -> None:
-        """Pass it on to the other watcher."""
-        self._watcher.event(event)
+    def __getattr__(self, name: str) -> Any:
+        """Everything else is the other watcher's."""
+        return getattr(self._watcher, name)
 
     def rows(self, rows: Rows) -> None:
         """Send each joint's rows, thinned to ``LIVE_HZ``."""
@@ -97,14 +88,6 @@ class LiveWatcher:
         self._server.send(messages)
         self._tell_refused()
         self._watcher.rows(rows)
-
-    def joint(self, joint: str, summary: str, ok: bool) -> None:
-        """Pass it on to the other watcher."""
-        self._watcher.joint(joint, summary, ok)
-
-    def note(self, message: str) -> None:
-        """Pass it on to the other watcher."""
-        self._watcher.note(message)
 
     def _tell_refused(self) -> None:
         while self._refused:
@@ -147,7 +130,7 @@ def live(watcher: Watcher, address: str | None) -> Iterator[Watcher]:
                 f"warning: --live-at {address} is open to the network: everybody who reaches it can watch, unencrypted"
             )
         watcher.note(f"live: open ws://{host}:{server.port} in Foxglove (Open connection, Foxglove WebSocket)")
-        yield LiveWatcher(watcher, server, refused)
+        yield cast(Watcher, LiveWatcher(watcher, server, refused))
     finally:
         server.close()
 

@@ -13,21 +13,19 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-import signal
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn
 
 import filelock
 
-from frictid_hil.config.policy import Policy, WarmUpPolicy
+from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
+from frictid_hil.files import made_folder
 from frictid_hil.jobs.calibrate import Calibrated, CalibrateOptions, calibrate
 from frictid_hil.jobs.history import write_index_page
 from frictid_hil.jobs.watch import Watcher
@@ -38,8 +36,11 @@ from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.recalibration import recalibration_page
 from frictid_hil.runner.interlock import Interlock
+from frictid_hil.runner.stop_signals import handling_signals
 
 VERB = "recalibrate"
+_JOURNAL = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
+"""What is told of each joint in the morning."""
 DRIFTED = 6
 """Exit code of a good night on which a joint drifted, where the policy wants an alarm for that."""
 
@@ -49,17 +50,7 @@ _UNTOLD = "see the run folder and `frictid-hil check`, then start it again with 
 
 @dataclass(frozen=True, slots=True)
 class RecalibrateOptions:
-    """What the schedule asks for.
-
-    Attributes:
-        robot: robot file, by path or name; its ``policy`` decides.
-        bus: ``interface:channel``.
-        store: folder of the profile store; None for the user's own.
-        realtime: wall clock for the virtual robot.
-        seed: of simulated noise.
-        out: run folder to write.
-        by: who started it, for the history.
-    """
+    """What the schedule asks for, see ``frictid-hil recalibrate --help``; the ``policy`` of the robot file decides."""
 
     robot: str
     bus: str | None = None
@@ -67,7 +58,6 @@ class RecalibrateOptions:
     realtime: bool = False
     seed: int = 0
     out: Path | None = None
-    by: str = "recalibrate"
 
 
 def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]:
@@ -112,7 +102,7 @@ def _night(options: RecalibrateOptions, robot: Robot, store: ProfileStore, watch
             seed=options.seed,
             out=options.out,
             verb=VERB,
-            warm_up=_warm_up(policy),
+            warm_up=None if policy.warm_up.fixed_s == 0.0 else policy.warm_up,
             interlock=interlock,
             store=options.store,
         ),
@@ -141,13 +131,10 @@ def _permission(robot: Robot, bus: str | None) -> Interlock | None:
     return Interlock(named.joint, named.bit, named.closed_when)
 
 
-def _warm_up(policy: Policy) -> WarmUpPolicy | None:
-    return None if policy.warm_up.fixed_s == 0.0 else policy.warm_up
-
-
 def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, measured: Calibrated) -> dict[str, Any]:
     """Compare the profile and promote or refuse it. The active profile changes nowhere else."""
-    active, baseline = _active_and_baseline(store, robot.name)
+    active, pinned = store.active_profile(robot.name), store.baseline(robot.name)
+    baseline = None if pinned is None else store.load(robot.name, pinned)
     told = measured.to_json()
     result: dict[str, Any] = {
         **{key: told[key] for key in ("outcome", "exit_code", "robot", "run", "profile")},
@@ -158,7 +145,10 @@ def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, m
         "active": None,
         "reason": "",
         "next_step": "",
-        "joints": {name: _short(joint) for name, joint in told["joints"].items()},
+        "joints": {
+            name: {key: value for key, value in joint.items() if rotary_name(key) in _JOURNAL}
+            for name, joint in told["joints"].items()
+        },
         "report": told.get("report"),
     }
     if "error" in told:
@@ -171,13 +161,14 @@ def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, m
             for name, joint in measured.joints.items()
             if joint["outcome"] != "ok"
         }
-        by_hand = _promote_by_hand(result["run"], options.store)
+        kept_at = ["--store", str(options.store.resolve())] if options.store else []
+        by_hand = shlex.join(["frictid-hil", "profile", "promote", result["run"], *kept_at])
         verdict = judge(robot.policy, newer, active, baseline, failed=failed, promote_by_hand=by_hand)
         result |= {"drift": dict(verdict.joints), "drifted": list(verdict.drifted)}
         # What an aborted night got done stays in its run folder: half a robot is no point of a trend.
         if measured.ended.outcome in ("ok", "gate_failed"):
             result["stored"] = identity = store.add(newer)
-            _apply(verdict, result, store, robot.name, identity, options.by)
+            _apply(verdict, result, store, robot.name, identity)
             if verdict.drifted and not result["exit_code"] and robot.policy.on_drift == "alarm":
                 result["exit_code"] = DRIFTED
         _write_page(result, robot, store, newer, active, baseline)
@@ -186,31 +177,14 @@ def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, m
     return result
 
 
-def _active_and_baseline(store: ProfileStore, robot: str) -> tuple[FrictionProfile | None, FrictionProfile | None]:
-    baseline = store.baseline(robot)
-    return store.active_profile(robot), None if baseline is None else store.load(robot, baseline)
-
-
-def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot: str, identity: str, by: str) -> None:
+def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot: str, identity: str) -> None:
     result |= {"reason": verdict.reason, "next_step": verdict.next_step}
     if verdict.promote:
-        store.promote(robot, identity, by=by, reason=verdict.reason)
+        store.promote(robot, identity, by=VERB, reason=verdict.reason)
         result["promoted"] = True
     elif verdict.refused:
-        result |= {"outcome": GateFailed.outcome, "exit_code": GateFailed.exit_code}
-        where = f"{robot}, profile {identity}"
-        result["error"] = {"what": verdict.reason, "where": where, "cause": "", "next_step": verdict.next_step}
-
-
-def _promote_by_hand(run: str, store: Path | None) -> str:
-    """Return the command by which a person can promote the profile later."""
-    return shlex.join(["frictid-hil", "profile", "promote", run, *(["--store", str(store.resolve())] if store else [])])
-
-
-def _short(joint: dict[str, Any]) -> dict[str, Any]:
-    """Shorten a text to one line of a journal."""
-    kept = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
-    return {key: value for key, value in joint.items() if rotary_name(key) in kept}
+        refused = GateFailed(verdict.reason, where=f"{robot}, profile {identity}", next_step=verdict.next_step)
+        result |= {"outcome": refused.outcome, "exit_code": refused.exit_code, "error": refused.to_json()}
 
 
 def _write_page(
@@ -238,10 +212,7 @@ def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
         HardwareBusy: another one is at work.
     """
     folder = store.root / robot.name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot be created: {error.strerror}", where=str(folder)) from None
+    made_folder(folder, UsageError)
     lock = filelock.FileLock(folder / ".recalibrate.lock")
     try:
         lock.acquire(timeout=0)
@@ -260,19 +231,12 @@ def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
     """SIGTERM outside motion ends the job like Ctrl-C, with its line and exit code; inside, the runner handles it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
-    def stop(_signal: int, _frame: FrameType | None) -> NoReturn:
+    def stop(*_: object) -> NoReturn:
         raise Interrupted("stopped by a signal; nothing was moving", next_step="start it again when it suits")
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
+    with handling_signals(stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # -- history --------------------------------------------------------------------------------------------------------

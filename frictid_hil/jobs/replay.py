@@ -7,8 +7,9 @@ an EDS file says it.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,18 +17,14 @@ from typing import Any
 import can
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, JointProfile, JudgedGate, load_profile, profile_file
+from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile, profile_file
 from frictid_hil.config.provenance import Provenance, file_sha256
 from frictid_hil.config.robot import Robot, load_robot
-from frictid_hil.errors import (
-    HardwareError,
-    IdentificationError,
-    InputFileError,
-)
+from frictid_hil.errors import GateFailed, HardwareError, IdentificationError, InputFileError
 from frictid_hil.files import refuse_overwriting
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.trajectory import Procedure
-from frictid_hil.jobs.identification.joint_profile import identify_joint, joint_result
+from frictid_hil.jobs.identification.joint_profile import failed_result, identify_joint, joint_result
 from frictid_hil.jobs.replaying.bus_logs import given_map, is_log, logs_of
 from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
 from frictid_hil.jobs.replaying.simulated_replay import simulate
@@ -38,22 +35,12 @@ from frictid_hil.recording.samples import Samples
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """What a person asked for.
+    """What a person asked for, see ``frictid-hil replay --help``.
 
     Attributes:
-        source: run folder, bus log, or a recording of samples.
-        robot: robot file.
-        joints: only these; all when empty.
-        frames: mapping file that tells which frame is what (``schema: frictid.frames/1``).
-        eds: EDS or DCF file that does.
-        profile: to compare with; None for the run's own.
         procedure: of a log that carries no marks.
         method: estimator; None for the one of the profile compared with, else ``aligned``.
         paced: at recorded speed.
-        echo: bus on which the frames are sent again.
-        simulation: stream the set-points to the simulated joints as well.
-        out: folder for profile and CSV files.
-        force: write over those that are there.
     """
 
     source: Path
@@ -95,8 +82,9 @@ def replay(options: ReplayOptions, note: Callable[[str], None] = lambda _: None)
             where=str(options.source),
         )
     reference = _reference(options)
-    profiles, failed = _identify(recordings, robot.to_setup(), options, reference, account, late)
-    result = _result(options, robot, recordings, profiles, failed, reference, account)
+    setup = robot.to_setup()
+    told = {one.joint: _identified(one, recordings, setup, options, reference, account, late) for one in recordings}
+    result = _result(options, robot, told, reference, account)
     if options.simulation:
         result |= _simulated(options, robot, recordings, result["joints"], note)
     return result
@@ -121,36 +109,24 @@ def _decoded(
     with _echo(options.echo) as echo:
         samples = samples_in(logs, robot.name, account, joints=options.joints, paced=options.paced, echo=echo, at=at)
     late = {motion.joint: motion.late_cycles for log in logs for motion in log.motions}
-    return [samples[name] for name in sorted(samples, key=_order_in(robot))], late
+    return [samples[name] for name in dict.fromkeys([*robot.joint_names, *samples]) if name in samples], late
 
 
-def _order_in(robot: Robot) -> Callable[[str], int]:
-    names = list(robot.joint_names)
-    return lambda name: names.index(name) if name in names else len(names)
-
-
-class _echo:  # noqa: N801 - a context manager that reads as a function
+@contextlib.contextmanager
+def _echo(named: str | None) -> Iterator[can.BusABC | None]:
     """The bus to send the frames to again, or None."""
-
-    def __init__(self, named: str | None) -> None:
-        self._named = named
-        self._bus: can.BusABC | None = None
-
-    def __enter__(self) -> can.BusABC | None:
-        if self._named is None:
-            return None
-        interface, _, channel = self._named.partition(":")
-        try:
-            self._bus = can.Bus(interface=interface, channel=channel)
-        except (can.CanError, OSError, ValueError) as error:
-            raise HardwareError(
-                f"cannot be opened: {error}", where=self._named, next_step="name it as interface:channel"
-            ) from None
-        return self._bus
-
-    def __exit__(self, *_: object) -> None:
-        if self._bus is not None:
-            self._bus.shutdown()
+    if named is None:
+        yield None
+        return
+    interface, _, channel = named.partition(":")
+    try:
+        bus = can.Bus(interface=interface, channel=channel)
+    except (can.CanError, OSError, ValueError) as error:
+        raise HardwareError(
+            f"cannot be opened: {error}", where=named, next_step="name it as interface:channel"
+        ) from None
+    with bus:
+        yield bus
 
 
 # -- identifying and comparing --------------------------------------------------------------------------------------
@@ -164,66 +140,57 @@ def _reference(options: ReplayOptions) -> FrictionProfile | None:
     return load_profile(own) if (folder / "manifest.json").exists() and own.exists() else None
 
 
-def _identify(
+_Identified = tuple[JointProfile | None, dict[str, Any]]
+"""The profile of a joint, None where there is no curve, and its entry in the result."""
+
+
+def _identified(
+    samples: Samples,
     recordings: list[Samples],
     setup: RobotSetup,
     options: ReplayOptions,
     reference: FrictionProfile | None,
     account: Account,
     late: Mapping[str, int],
-) -> tuple[dict[str, JointProfile], dict[str, str]]:
-    profiles: dict[str, JointProfile] = {}
-    failed: dict[str, str] = {}
-    for samples in recordings:
-        known = reference.joints.get(samples.joint) if reference else None
-        method = options.method or (known.method if known else "aligned")
-        procedure = None if samples.marks else options.procedure
-        try:
-            profile = identify_joint(
-                samples,
-                setup.joint(samples.joint),
-                method=method,
-                procedure=procedure,
-                late_cycles=late.get(samples.joint, 0),
-                company=recordings,
-            )
-        except IdentificationError as error:
-            failed[samples.joint] = str(error)
-            continue
-        gate = account.gate(samples.joint)
-        gates: tuple[JudgedGate, ...] = profile.gates if gate is None else (*profile.gates, gate)
-        drive = profile.drive if known is None else known.drive
-        profiles[samples.joint] = profile.model_copy(update={"gates": gates, "drive": drive})
-    return profiles, failed
+) -> _Identified:
+    name = samples.joint
+    known = reference.joints.get(name) if reference else None
+    told = {"identical": None, "difference_percent": None, "lost_rows": account.lost_rows.get(name)}
+    try:
+        profile = identify_joint(
+            samples,
+            setup.joint(name),
+            method=options.method or (known.method if known else "aligned"),
+            procedure=None if samples.marks else options.procedure,
+            late_cycles=late.get(name, 0),
+            company=recordings,
+        )
+    except IdentificationError as error:
+        return None, {**failed_result(str(error)), **told}
+    gate = account.gate(name)
+    gates = profile.gates if gate is None else (*profile.gates, gate)
+    profile = profile.model_copy(update={"gates": gates, "drive": profile.drive if known is None else known.drive})
+    result = {**joint_result(profile), **told}
+    if known is not None:
+        result["identical"] = profile.values() == known.values()
+        result["difference_percent"] = curve_distance(
+            profile.curve(), known.curve(), known.velocity_rad_s[-1]
+        ).e_percent
+    return profile, result
 
 
 def _result(
     options: ReplayOptions,
     robot: Robot,
-    recordings: list[Samples],
-    profiles: Mapping[str, JointProfile],
-    failed: Mapping[str, str],
+    told: Mapping[str, _Identified],
     reference: FrictionProfile | None,
     account: Account,
 ) -> dict[str, Any]:
-    joints: dict[str, dict[str, Any]] = {}
-    for samples in recordings:
-        name = samples.joint
-        if name in failed:
-            joints[name] = {"outcome": "gate_failed", "remarks": [failed[name]], "velocity_rad_s": [], "torque_nm": []}
-        else:
-            joints[name] = joint_result(profiles[name])
-        joints[name] |= {"identical": None, "difference_percent": None}
-        joints[name]["lost_rows"] = account.lost_rows.get(name)
-        if reference is not None and name in reference.joints and name in profiles:
-            mine, other = profiles[name], reference.joints[name]
-            joints[name]["identical"] = mine.values() == other.values()
-            distance = curve_distance(mine.curve(), other.curve(), other.velocity_rad_s[-1])
-            joints[name]["difference_percent"] = distance.e_percent
-    wanted = set(options.joints or (reference.joints if reference else ()))
+    joints = {name: joint for name, (_, joint) in told.items()}
     compared = None
     if reference is not None:
-        compared = all(joints.get(name, {}).get("identical") is True for name in wanted & set(reference.joints))
+        wanted = set(options.joints or reference.joints) & set(reference.joints)
+        compared = all(joints.get(name, {}).get("identical") is True for name in wanted)
     bad = {name: joint["remarks"] for name, joint in joints.items() if joint["outcome"] != "ok"}
     result: dict[str, Any] = {
         "outcome": "gate_failed" if bad else "ok",
@@ -233,16 +200,15 @@ def _result(
         "position_rms_rad": None,
         "torque_rms_nm": None,
         "log": asdict(account) if account.frames else None,
-        "profile": _write(options, robot, profiles),
+        "profile": _write(options, robot, {name: one for name, (one, _) in told.items() if one is not None}),
         "joints": joints,
     }
     if bad:
-        result["error"] = {
-            "what": "; ".join(f"joint {name}: {'; '.join(remarks)}" for name, remarks in bad.items()),
-            "where": str(options.source),
-            "cause": "",
-            "next_step": "results of the other joints stand",
-        }
+        result["error"] = GateFailed(
+            "; ".join(f"joint {name}: {'; '.join(remarks)}" for name, remarks in bad.items()),
+            where=str(options.source),
+            next_step="results of the other joints stand",
+        ).to_json()
     return result
 
 

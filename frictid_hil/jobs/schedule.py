@@ -22,7 +22,7 @@ import platformdirs
 
 from frictid_hil.config.robot import Robot, interface_of, load_robot
 from frictid_hil.errors import FrictidError, UsageError
-from frictid_hil.files import write_whole
+from frictid_hil.files import made_folder, write_whole
 from frictid_hil.jobs.cron import cron_fields
 from frictid_hil.runner.realtime import WAKE_TIME
 
@@ -33,15 +33,10 @@ _VERIFY_TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ScheduleOptions:
-    """What a person asked for.
+    """What a person asked for, see ``frictid-hil schedule --help``.
 
     Attributes:
-        robot: robot file, by path or name.
-        on_calendar: when, as systemd writes it (``Mon..Fri 02:30``).
-        bus: ``interface:channel`` for ``recalibrate``.
-        system: for the whole machine, run as ``user``; else for this person alone.
         user: account of a system service.
-        notify: command given the result on its standard input.
         out: folder for the units; None for systemd's own.
         time_limit_s: a night that takes longer is stopped as by Ctrl-C.
     """
@@ -79,17 +74,12 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
         )
     elapses = next_elapse(options.on_calendar)
     name = f"frictid-hil-{robot.name}"
-    service, timer = _service(options, robot), _timer(options, robot)
-    verified = verify({f"{name}.service": service, f"{name}.timer": timer}, system=options.system)
+    units = {f"{name}.service": _service(options, robot), f"{name}.timer": _timer(options, robot)}
+    verified = verify(units, system=options.system)
     folder = options.out or _unit_folder(options.system)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FrictidError(
-            f"cannot be created: {error.strerror}", where=str(folder), next_step="run it as root, or give --out"
-        ) from None
-    paths = [folder / f"{name}.service", folder / f"{name}.timer"]
-    for path, text in zip(paths, (service, timer), strict=True):
+    made_folder(folder, next_step="run it as root, or give --out")
+    paths = [folder / unit for unit in units]
+    for path, text in zip(paths, units.values(), strict=True):
         write_whole(path, text)
     cron, cron_refused = _cron_line(options, robot)
     return {
@@ -137,8 +127,9 @@ def next_elapse(on_calendar: str) -> str | None:
         return None
     answer = _run([tool, "calendar", on_calendar])
     if answer.returncode:
+        why = answer.stderr.strip().rpartition("\n")[2]
         raise UsageError(
-            f"systemd refuses the calendar expression {on_calendar!r}: {_last_line(answer.stderr)}",
+            f"systemd refuses the calendar expression {on_calendar!r}: {why}",
             next_step=f"see `man systemd.time`; {_EXAMPLE}",
         )
     for line in answer.stdout.splitlines():
@@ -148,11 +139,6 @@ def next_elapse(on_calendar: str) -> str | None:
                 raise UsageError(f"the calendar expression {on_calendar!r} never comes true")
             return elapse
     return None
-
-
-def _last_line(text: str) -> str:
-    lines = text.strip().splitlines()
-    return lines[-1] if lines else ""
 
 
 def verify(units: dict[str, str], *, system: bool) -> bool:
@@ -165,11 +151,9 @@ def verify(units: dict[str, str], *, system: bool) -> bool:
     if tool is None:
         return False
     with tempfile.TemporaryDirectory(prefix="frictid-units-") as temporary:
-        paths = []
-        for name, text in units.items():
-            path = Path(temporary) / name
-            path.write_text(text)
-            paths.append(str(path))
+        paths = [str(Path(temporary) / name) for name in units]
+        for path, text in zip(paths, units.values(), strict=True):
+            Path(path).write_text(text)
         # Without a session (a container, ssh) there is no user manager to ask; the syntax is the same.
         for manager in ["--system"] if system else ["--user", "--system"]:
             answer = _run([tool, "verify", manager, "--man=no", "--recursive-errors=no", *paths])
@@ -197,11 +181,8 @@ def _cron_line(options: ScheduleOptions, robot: Robot) -> tuple[str | None, str]
 def _command(options: ScheduleOptions, robot: Robot) -> list[str]:
     program = shutil.which("frictid-hil", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
     command = [program or "frictid-hil", "recalibrate", "--robot", str(robot.path.resolve()), "--json"]
-    if options.bus is not None:
-        command += ["--bus", options.bus]
-    if options.notify is not None:
-        command += ["--notify", options.notify]
-    return command
+    given = {"--bus": options.bus, "--notify": options.notify}
+    return [*command, *(word for name, value in given.items() if value is not None for word in (name, value))]
 
 
 def _service(options: ScheduleOptions, robot: Robot) -> str:

@@ -8,29 +8,14 @@ from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.runner.events import Event, Preflight
 from frictid_hil.runner.ring import Rows
+from frictid_hil.runs.life import Follower
 
 
-class Watcher(Protocol):
+class Watcher(Follower, Protocol):
     """Everything a job says while it works; nothing here decides a result except ``confirm`` and ``ask``."""
-
-    def plan(self, plan: Plan, setup: RobotSetup) -> None:
-        """The plan, before anything is opened."""
-        ...
-
-    def confirm(self, plan: Plan, preflight: Preflight) -> bool:
-        """Ask the person, with the hardware read and the plan shown."""
-        ...
 
     def ask(self, question: str) -> bool:
         """Ask whether a person has done what the question says; False where nobody can be asked."""
-        ...
-
-    def event(self, event: Event) -> None:
-        """Something happened on the hardware."""
-        ...
-
-    def rows(self, rows: Rows) -> None:
-        """What was measured since the last call, rows of ``ring.SAMPLE_ROW``; as it is written to disk."""
         ...
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:

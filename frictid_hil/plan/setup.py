@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,3 +103,7 @@ class RobotSetup:
                 return joint
         known = ", ".join(j.name for j in self.joints)
         raise InvalidFields([FieldProblem(("joints", name), f"no such joint; this robot has {known}")])
+
+    def with_joint(self, name: str, **changes: Any) -> RobotSetup:
+        """The same robot, but for some values of one joint."""
+        return replace(self, joints=tuple(replace(j, **changes) if j.name == name else j for j in self.joints))

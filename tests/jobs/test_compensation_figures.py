@@ -106,10 +106,10 @@ def test_the_error_before_and_after_has_an_interval_from_cycle_to_cycle() -> Non
         return ModeRun("", time_s, position, np.gradient(path, STEP), path, still, None, cycles=8)
 
     found = figures({"nc": followed(0.02), "mop": followed(0.004)}, "track", None)
-    low, high = found["mop"].reduction_interval_percent or (0.0, 0.0)
+    low, high = found["mop"].reduction_interval_95_percent or (0.0, 0.0)
     assert low < 80.0 < high < low + 5.0
-    low, high = found["nc"].interval or (0.0, 0.0)
-    assert low < 0.02 * math.sqrt(0.5) < high and found["nc"].reduction_interval_percent is None
+    low, high = found["nc"].interval_95 or (0.0, 0.0)
+    assert low < 0.02 * math.sqrt(0.5) < high and found["nc"].reduction_interval_95_percent is None
     assert found["mop"].velocity_error_rms_rad_s == pytest.approx(0.0, abs=1e-2)
     alone = figures({"nc": replace(followed(0.02), cycles=1)}, "track", None)
-    assert alone["nc"].interval is None, "one cycle tells nothing of the next"
+    assert alone["nc"].interval_95 is None, "one cycle tells nothing of the next"

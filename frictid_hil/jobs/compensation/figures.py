@@ -7,13 +7,14 @@ compensation can spare: it sets the ceiling of the raw reduction, and is removed
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
 from frictid_hil.friction.filtering import Gaussian
-from frictid_hil.friction.metrics import ratio_interval, rms_by_part
+from frictid_hil.friction.metrics import plain_rms, ratio_interval, rms_by_part
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.jobs.identification.declared import declared_skew
 from frictid_hil.plan.control import Compensated
 from frictid_hil.recording.samples import Mark, Samples
 
@@ -26,15 +27,11 @@ _WIDTH_S = 0.004
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeRun:
-    """The samples of one mode: its whole cycles without the first one.
+    """The samples of one mode: its whole cycles without the first one; columns of shape (n,).
 
     Attributes:
-        mode: name.
-        time_s: since the beginning of the task, shape (n,).
-        position_rad: measured.
-        velocity_rad_s: measured.
+        time_s: since the beginning of the task.
         reference_rad: the path.
-        torque_nm: of the drive.
         external_torque_nm: a person's; None without a force sensor.
         velocity_delay_s: by which the reported velocity is older than its row.
         cycles: of the task, each a repetition of the others.
@@ -66,9 +63,8 @@ class ModeFigures:
             any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor``).
         inertial_rms_nm: of inertia times acceleration.
         velocity_error_rms_rad_s: of the path's speed less the measured one; None by hand.
-        drive_torque_rms_nm: of the drive.
-        interval: 95 % of the task's own measure, from cycle to cycle; None where there is one cycle.
-        reduction_interval_percent: 95 % of its reduction.
+        interval_95: of the task's own measure, from cycle to cycle; None where there is one cycle.
+        reduction_interval_95_percent: of its reduction.
         reasons: by figure.
     """
 
@@ -82,26 +78,13 @@ class ModeFigures:
     inertial_rms_nm: float | None = None
     velocity_error_rms_rad_s: float | None = None
     drive_torque_rms_nm: float | None = None
-    interval: tuple[float, float] | None = None
-    reduction_interval_percent: tuple[float, float] | None = None
-    reasons: Mapping[str, str] | None = None
+    interval_95: tuple[float, float] | None = None
+    reduction_interval_95_percent: tuple[float, float] | None = None
+    reasons: Mapping[str, str] = field(default_factory=dict)
 
     def values(self) -> dict[str, object]:
         """The figures as plain values for JSON."""
-        return {
-            "velocity_rms_rad_s": self.velocity_rms_rad_s,
-            "torque_rms_nm": self.torque_rms_nm,
-            "torque_rms_inertia_removed_nm": self.torque_rms_inertia_removed_nm,
-            "reduction_percent": self.reduction_percent,
-            "reduction_inertia_removed_percent": self.reduction_inertia_removed_percent,
-            "tracking_rms_rad": self.tracking_rms_rad,
-            "reduction_interval_95_percent": self.reduction_interval_percent,
-            "interval_95": self.interval,
-            "ceiling_percent": self.ceiling_percent,
-            "velocity_error_rms_rad_s": self.velocity_error_rms_rad_s,
-            "drive_torque_rms_nm": self.drive_torque_rms_nm,
-            "reasons": dict(self.reasons or {}),
-        }
+        return {name: value for name, value in asdict(self).items() if name != "inertial_rms_nm"}
 
 
 def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, period_s: float) -> ModeRun:
@@ -121,7 +104,7 @@ def mode_run(samples: Samples, mark: Mark, motion: Compensated, mode: str, perio
         reference_rad=motion.position_rad(time_s),
         torque_nm=part.torque_nm,
         external_torque_nm=part.external_torque_nm,
-        velocity_delay_s=_velocity_delay_s(samples.meta),
+        velocity_delay_s=declared_skew(samples).velocity_delay_s,
         cycles=max(1, round((whole_s - begin_s) / period_s)),
     )
 
@@ -165,7 +148,8 @@ def _with_intervals(figure: ModeFigures, own: Array | None, base: Array | None) 
         return figure
     ratio = None if base is None else ratio_interval(base, own)
     reduction = None if ratio is None else (100.0 * (1.0 - ratio[1]), 100.0 * (1.0 - ratio[0]))
-    return replace(figure, interval=ratio_interval(np.ones_like(own), own), reduction_interval_percent=reduction)
+    interval = ratio_interval(np.ones_like(own), own)
+    return replace(figure, interval_95=interval, reduction_interval_95_percent=reduction)
 
 
 def friction_dominates(found: Mapping[str, ModeFigures]) -> bool | None:
@@ -204,27 +188,20 @@ def smoothed_acceleration(run: ModeRun) -> tuple[Array, Array]:
     return kernel.rate(velocity, run.velocity_delay_s)[inside], kernel.smooth(torque_nm)[inside]
 
 
-def _velocity_delay_s(meta: Mapping[str, object]) -> float:
-    """Return the delay of the velocity, as the drive or its robot file declares it."""
-    timing = meta.get("timing")
-    delay_s = timing.get("velocity_delay_s") if isinstance(timing, Mapping) else None
-    return float(delay_s) if isinstance(delay_s, int | float) else 0.0
-
-
 def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
-    figure = ModeFigures(velocity_rms_rad_s=_rms(run.velocity_rad_s), drive_torque_rms_nm=_rms(run.torque_nm))
+    figure = ModeFigures(velocity_rms_rad_s=plain_rms(run.velocity_rad_s), drive_torque_rms_nm=plain_rms(run.torque_nm))
     if task == "track":
         return replace(
             figure,
-            tracking_rms_rad=_rms(run.reference_rad - run.position_rad),
-            velocity_error_rms_rad_s=_rms(np.gradient(run.reference_rad, run.time_s) - run.velocity_rad_s),
+            tracking_rms_rad=plain_rms(run.reference_rad - run.position_rad),
+            velocity_error_rms_rad_s=plain_rms(np.gradient(run.reference_rad, run.time_s) - run.velocity_rad_s),
             reasons={"torque_rms_nm": "nobody touches the joint while it tracks"},
         )
     reasons = {"tracking_rms_rad": "a person's hand has no reference"}
     if run.external_torque_nm is None or not np.all(np.isfinite(run.external_torque_nm)):
         reasons["torque_rms_nm"] = "no force sensor"
         return replace(figure, reasons=reasons)
-    figure = replace(figure, torque_rms_nm=_rms(run.external_torque_nm), reasons=reasons)
+    figure = replace(figure, torque_rms_nm=plain_rms(run.external_torque_nm), reasons=reasons)
     if inertia_kg_m2 is None:
         reasons["torque_rms_inertia_removed_nm"] = "the inertia is not known"
         return figure
@@ -232,16 +209,14 @@ def _alone(run: ModeRun, task: str, inertia_kg_m2: float | None) -> ModeFigures:
     inertial_nm = inertia_kg_m2 * acceleration
     return replace(
         figure,
-        torque_rms_inertia_removed_nm=_rms(torque_nm - inertial_nm),
-        inertial_rms_nm=_rms(inertial_nm),
+        torque_rms_inertia_removed_nm=plain_rms(torque_nm - inertial_nm),
+        inertial_rms_nm=plain_rms(inertial_nm),
     )
 
 
 def _against(figure: ModeFigures, base: ModeFigures | None, task: str, floor_rad: float | None) -> ModeFigures:
-    reasons = dict(figure.reasons or {})
     if base is None:
-        reasons["reduction_percent"] = "nc did not run"
-        return replace(figure, reasons=reasons)
+        return replace(figure, reasons={**figure.reasons, "reduction_percent": "nc did not run"})
     if task == "track":
         return replace(
             figure,
@@ -262,7 +237,3 @@ def _reduction(value: float | None, base: float | None) -> float | None:
     if value is None or not base:
         return None
     return 100.0 * (1.0 - value / base)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -7,16 +7,17 @@ a PD so weak that friction alone costs 2 deg, the same in all modes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import JointProfile
+from frictid_hil.config.robot import Robot
 from frictid_hil.jobs.compensation.laws import TRACK_SLACK_RAD, calibrated_centre_rad, law_of, speed_bound_rad_s
 from frictid_hil.jobs.compensation.wanted import Wanted, refuse_contradictions
-from frictid_hil.jobs.plans import APPROACH_RAD_S, rehearsal_note
+from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, inherited_notes, rehearsal_note
 from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Probe, Swing
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import REHEARSAL, Corners, Hold, JointPlan, Motion, Move, Plan, Sine, joint_plan
@@ -37,12 +38,10 @@ _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
 
 @dataclass(frozen=True, slots=True)
 class CompensationPlan:
-    """A plan of a compensation, with the laws and figures that it was made from.
+    """A plan of a compensation, with the laws by mode and the figures that it was made from.
 
     Attributes:
-        plan: frozen.
         centre_rad: middle of the travel.
-        laws: by mode.
         lowest_ratio: R where gravity is known least, within the task's travel; None without compensation.
         warnings: what speaks against it and is done all the same.
     """
@@ -55,15 +54,24 @@ class CompensationPlan:
 
 
 def compensation_plan(
-    robot: str,
+    robot: Robot,
     setup: RobotSetup,
     name: str,
     entry: JointProfile,
-    policy: Policy,
     wanted: Wanted,
     rehearsals: Rehearsals,
+    forced: Sequence[str],
 ) -> CompensationPlan:
     """The plan of one joint; a travel that was never seen on this robot is rehearsed first.
+
+    Args:
+        robot: its file.
+        setup: the robot as its driver knows it.
+        name: of the joint.
+        entry: its profile.
+        wanted: what a person asks for.
+        rehearsals: travels that were seen.
+        forced: warnings of what is done in spite of doubts.
 
     Raises:
         UsageError: options that contradict each other, or an unstable R or K.
@@ -71,14 +79,12 @@ def compensation_plan(
     """
     joint = setup.joint(name)
     refuse_contradictions(wanted)
-    centre_rad = wanted.centre_rad
-    if centre_rad is None:
-        centre_rad = calibrated_centre_rad(entry, joint)
+    centre_rad = calibrated_centre_rad(entry, joint) if wanted.centre_rad is None else wanted.centre_rad
     warnings: list[str] = []
     laws = {mode: law_of(entry, joint, mode, wanted, warnings) for mode in wanted.modes}
     reach_rad = wanted.amplitude_rad
     rehearse = not rehearsals.covers(name, centre_rad - reach_rad, centre_rad + reach_rad)
-    motions = _motions(joint, entry, policy, wanted, centre_rad, laws, hunts=bool(warnings), rehearse=rehearse)
+    motions = _motions(joint, entry, robot.policy, wanted, centre_rad, laws, hunts=bool(warnings), rehearse=rehearse)
     others = {other.name: other.locked_position_rad for other in setup.joints if other.name != name}
     moved: JointPlan = joint_plan(joint, motions, others, None)
     gravity = next(iter(laws.values())).gravity
@@ -95,8 +101,9 @@ def compensation_plan(
             f"beyond the calibrated travel gravity is less certain: there R falls from {_ratio(laws):.3g} "
             f"to {lowest_ratio:.3g}"
         )
-    plan = Plan(robot, setup.cycle_hz, (moved,), (*notes, *warnings))
-    return CompensationPlan(plan, centre_rad, laws, lowest_ratio, tuple(warnings))
+    notes += [*warnings, *inherited_notes(robot, [name]), *care_notes(robot, setup), *forced]
+    plan = Plan(robot.name, setup.cycle_hz, (moved,), tuple(notes))
+    return CompensationPlan(plan, centre_rad, laws, lowest_ratio, (*warnings, *forced))
 
 
 def _ratio(laws: Mapping[str, ControlLaw]) -> float:
@@ -164,7 +171,7 @@ def _task(
     withstands_nm: float,
     hunts: bool,
 ) -> list[Motion]:
-    bounds = replace(_bounds(joint, wanted, centre_rad, law), withstands_nm=withstands_nm)
+    bounds = _bounds(joint, wanted, centre_rad, law, withstands_nm)
     drive_mode = wanted.drive_mode
     if wanted.task == "track":
         path = triangle(centre_rad, wanted.amplitude_rad, wanted.peak_rad_s, wanted.cycles)
@@ -194,7 +201,7 @@ def triangle(centre_rad: float, amplitude_rad: float, speed_rad_s: float, cycles
     return Corners("triangle", (*times, cycles * period_s), (*positions, centre_rad))
 
 
-def _bounds(joint: JointSetup, wanted: Wanted, centre_rad: float, law: ControlLaw) -> Bounds:
+def _bounds(joint: JointSetup, wanted: Wanted, centre_rad: float, law: ControlLaw, withstands_nm: float) -> Bounds:
     slack = _HAND_SLACK_RAD if wanted.task == "hand" else TRACK_SLACK_RAD
     reach = wanted.amplitude_rad + slack
     low, high = centre_rad - reach, centre_rad + reach
@@ -209,4 +216,5 @@ def _bounds(joint: JointSetup, wanted: Wanted, centre_rad: float, law: ControlLa
         velocity_rad_s=speed,
         power_w=_POWER_SHARE * speed * torque_nm,
         growth_s=math.inf if wanted.task == "track" else max(0.75, 0.375 * wanted.period_s),
+        withstands_nm=withstands_nm,
     )

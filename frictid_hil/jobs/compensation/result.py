@@ -39,17 +39,7 @@ _LATE_PERCENT = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A compensation, decided before a bus is opened.
-
-    Attributes:
-        robot: its file.
-        setup: as the driver knows it.
-        joint: name.
-        profile: file.
-        entry: of the joint.
-        wanted: what a person asked for.
-        planned: what will move, and under which laws.
-    """
+    """A compensation of a joint, decided before a bus is opened; ``entry`` is the joint's in the profile."""
 
     robot: Robot
     setup: RobotSetup
@@ -67,10 +57,9 @@ class Asked:
 
 @dataclass(slots=True)
 class Progress:
-    """What a run has measured so far; an error halfway loses nothing of it.
+    """What a run has measured so far, by mode; an error halfway loses nothing of it.
 
     Attributes:
-        runs: by mode.
         run: the joint's, once it is done.
         service: the sums of a service.
     """
@@ -82,13 +71,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class CompensationResult:
-    """The result of a compensation.
-
-    Attributes:
-        ended: how the run ended.
-        figures: everything told of it, as in the JSON of the verb.
-        report: its page; None where no mode was finished.
-    """
+    """The result of a compensation: its figures as in the JSON, its page where a mode was finished."""
 
     ended: Ended
     figures: Mapping[str, Any]

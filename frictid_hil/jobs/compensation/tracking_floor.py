@@ -14,6 +14,7 @@ import numpy as np
 
 from frictid_hil.friction.compensation import Compensation, CompensationSettings
 from frictid_hil.friction.curve import FrictionCurve
+from frictid_hil.friction.metrics import plain_rms
 from frictid_hil.plan.control import PositionGains
 from frictid_hil.plan.plan import Motion
 
@@ -31,15 +32,9 @@ def tracking_floor_rad(
     first_s: float,
     follows_reference: bool,
 ) -> float:
-    """E_s of (28) of the ideal joint.
+    """E_s of (28) of the ideal joint along a path from rest; what comes before ``first_s`` is not counted.
 
-    Args:
-        path: the reference, from rest.
-        gains: of the PD.
-        inertia_kg_m2: of the joint.
-        curve: phi.
-        first_s: what comes before is not counted.
-        follows_reference: friction is given back at the reference velocity; otherwise the joint has none.
+    With ``follows_reference`` friction is given back at the reference velocity; otherwise the joint has none.
     """
     times_s = np.arange(0.0, path.duration_s, _STEP_S)
     references = path.position_rad(times_s)
@@ -58,4 +53,4 @@ def tracking_floor_rad(
         velocity += torque / inertia_kg_m2 * _STEP_S
         position += velocity * _STEP_S
     counted = np.array(errors)[times_s >= first_s]
-    return float(np.sqrt(np.mean(np.square(counted))))
+    return plain_rms(counted)

@@ -20,18 +20,12 @@ TRACK_AMPLITUDE_RAD = math.radians(10.0)
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a person asks for.
+    """What a person asks for, see ``frictid-hil compensate --help``.
 
     Attributes:
-        task: ``hand`` or ``track``.
-        modes: in order; () for all that the task has.
-        setting: ``ours`` or ``paper``.
-        ratio: R instead of the setting's.
-        stiffness_nm_per_rad: K instead of the setting's.
-        viscous_nm_s_per_rad: B_c instead of the least-squares one.
+        ratio: R instead of the setting's; so K and B_c after it.
         speed_rad_s: of the triangle; of the hand at the middle of its travel.
         duration_s: of one mode; 0 until interrupted.
-        centre_rad: middle of the travel; None for that of the calibrated travel.
         drive_mode: TORQUE, or POSITION or VELOCITY with the torque as offset.
         force: doubts only warn.
         simulated: the robot is, and the paper's K may then hunt; ``completed`` fills it in.

@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from frictid_hil.config.write import dump
-from frictid_hil.errors import ConfigError, FrictidError, UsageError
-from frictid_hil.files import write_whole
+from frictid_hil.errors import ConfigError, UsageError
+from frictid_hil.files import made_folder, write_whole
 from frictid_hil.gap.experiments import Experiment
 from frictid_hil.jobs.gap.belief import Belief
 from frictid_hil.recording.csv import write_csv
@@ -61,10 +61,7 @@ def write_set(
     Raises:
         FrictidError: disk full, or no permission.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FrictidError(f"cannot be created: {error.strerror}", where=str(folder)) from error
+    made_folder(folder)
     listed = list(earlier["experiments"]) if earlier else []
     for experiment, samples in logs:
         # Also a log that no list names: whoever put it there did not ask for another in its place.

@@ -28,8 +28,7 @@ from frictid_hil.friction import quality
 from frictid_hil.friction.estimate import Estimate as Estimated
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
-from frictid_hil.friction.gate import GateLimits, beside_usual
-from frictid_hil.friction.identify import IdentifiedPairs
+from frictid_hil.friction.gate import Gate, GateLimits, beside_usual
 from frictid_hil.friction.loop_stiffness import loop_stiffness
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
@@ -46,6 +45,7 @@ from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import POSITION_GAIN
 from frictid_hil.recording.samples import Mark, Samples
 
+_BODY = ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm", "bias_nm")
 _PROCEDURE_KEYS = ("amplitude_rad", "velocity_rad_s", "cycles", "ratio")
 
 
@@ -134,6 +134,11 @@ def joint_result(profile: JointProfile) -> dict[str, Any]:
     return linear_names(result) if profile.prismatic else result
 
 
+def failed_result(why: str) -> dict[str, Any]:
+    """The entry of a joint without a curve."""
+    return {"outcome": "gate_failed", "remarks": [why], "velocity_rad_s": [], "torque_nm": []}
+
+
 def _from_cycles(
     samples: Samples,
     procedure: Procedure,
@@ -152,7 +157,7 @@ def _from_cycles(
     gates = quality.gates(recording, result, GateLimits(**limits))
     if recording.shaken is None and not recording.coupled and result.terms is not None:
         notes += filter(None, [wanted_note(result.terms, float(np.mean(result.curve.torque_nm)))])
-    body, curve, skew = result.rigid_body, result.curve, recording.skew
+    body, curve, skew, published = result.rigid_body, result.curve, recording.skew, result.published
     stiffness, level, yields = _presliding(samples, recording, body, curve.coulomb_nm)
     if yields == "unseen":
         notes.append(f"the encoder hides presliding; its stiffness is {stiffness.value:.3g} N m/rad at least")
@@ -160,6 +165,7 @@ def _from_cycles(
     if loop is not None:
         notes.append(f"its own position loop is a spring of {loop:.3g} N m/rad at this gain")
     apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
+    rigid: dict[str, Any] = {name: _figure(getattr(body, name) if body else None, apart) for name in _BODY}
     return JointProfile(
         method=result.method,
         prismatic=samples.prismatic,
@@ -170,30 +176,28 @@ def _from_cycles(
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
         presliding_yields=yields,
-        inertia_kg_m2=_figure(body.inertia_kg_m2 if body else None, apart),
-        gravity_cos_nm=_figure(body.gravity_cos_nm if body else None, apart),
-        gravity_sin_nm=_figure(body.gravity_sin_nm if body else None, apart),
-        bias_nm=_figure(body.bias_nm if body else None, apart),
+        **rigid,
         forward=_pair_list(result.pairs.velocity_plus_rad_s, result.pairs.torque_plus_nm),
         backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
-        published=_published(result.published),
+        published=_pair_list(published.velocity_rad_s, published.torque_nm) if published else None,
         ripple=Ripple.of_table(result.ripple.period_rad, result.ripple.torque_nm) if result.ripple else None,
         torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=result.time_skew.used_s if result.time_skew else skew.torque_delay_s - skew.position_delay_s,
         time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
         temperature_c=_mean_temperature_c(samples),
         procedure=ProcedureUsed(
-            amplitude_rad=procedure.amplitude_rad,
-            velocity_rad_s=procedure.velocity_rad_s,
-            cycles=procedure.cycles,
-            ratio=procedure.ratio,
+            **{key: getattr(procedure, key) for key in _PROCEDURE_KEYS},
             shares=procedure.shares or None,
             together=together or None,
         ),
         drive=_drive(samples.meta),
         quality={**_quality(recording, result, notes), LOOP_STIFFNESS: loop},
-        gates=tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates),
+        gates=_judged(gates),
     )
+
+
+def _judged(gates: Sequence[Gate]) -> tuple[JudgedGate, ...]:
+    return tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates)
 
 
 def _prepared(
@@ -287,8 +291,9 @@ def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
         prismatic=samples.prismatic,
         where=f"joint {samples.joint}",
     )
-    names = ("inertia_kg_m2", "gravity_cos_nm", "gravity_sin_nm", "bias_nm")
-    body = {name: _figure(getattr(found, name), found.untold.get(name, "a linear axis")) for name in names}
+    body: dict[str, Any] = {
+        name: _figure(getattr(found, name), found.untold.get(name, "a linear axis")) for name in _BODY
+    }
     return JointProfile(
         method="least-squares",
         prismatic=samples.prismatic,
@@ -303,11 +308,8 @@ def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
             "torque_rms_nm": found.torque_rms_nm,
             "notes": [*_damage(samples), *notes],
         },
-        gates=tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in found.gates),
-        inertia_kg_m2=body["inertia_kg_m2"],
-        gravity_cos_nm=body["gravity_cos_nm"],
-        gravity_sin_nm=body["gravity_sin_nm"],
-        bias_nm=body["bias_nm"],
+        gates=_judged(found.gates),
+        **body,
     )
 
 
@@ -389,9 +391,7 @@ def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np
 
 def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
     return DriveIdentity(
-        serial=str(meta.get("serial") or ""),
-        firmware=str(meta.get("firmware") or ""),
-        product=str(meta.get("product") or ""),
+        **{key: str(meta.get(key) or "") for key in ("serial", "firmware", "product")},
         rated_torque_nm=meta.get("rated_torque_nm"),
         gear_ratio=meta.get("gear_ratio"),
         settings=dict(meta.get("settings") or {}),
@@ -435,10 +435,6 @@ def _figure(measured: Measured | None, reason: str = "") -> Figure:
     if not math.isfinite(measured.half_width):
         return Figure(value=measured.value, reason="no interval could be formed")
     return Figure(value=measured.value, low=measured.low, high=measured.high)
-
-
-def _published(pairs: IdentifiedPairs | None) -> PairList | None:
-    return None if pairs is None else _pair_list(pairs.velocity_rad_s, pairs.torque_nm)
 
 
 def _pair_list(velocity: Any, torque: Any) -> PairList:
