@@ -125,13 +125,13 @@ def diagnose(*paths: str | Path, nominal: str | Path | None = None, **options: A
     Args:
         *paths: the folder of an experiment set, or logs.
         nominal: what the simulator believes; a set's own ``nominal.yaml`` when None.
-        **options: further fields of ``jobs.gap_diagnose.Source`` (``columns``, ``profile``, ``joint``, ``validation``).
+        **options: further fields of ``jobs.gap.logs.Source`` (``columns``, ``profile``, ``joint``, ``validation``).
 
     Raises:
         InputFileError, ConfigError: the recordings are unusable.
     """
     from frictid_hil.gap.diagnose import diagnose as find_causes
-    from frictid_hil.jobs.gap_diagnose import Source
+    from frictid_hil.jobs.gap.logs import Source
 
     source = Source([Path(path) for path in paths], nominal=None if nominal is None else Path(nominal), **options)
     return find_causes(source.load())

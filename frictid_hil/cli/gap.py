@@ -209,7 +209,7 @@ def diagnose(
 ) -> Result:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
     from frictid_hil.jobs.gap.export_targets import Wanted
-    from frictid_hil.jobs.gap_diagnose import Source
+    from frictid_hil.jobs.gap.logs import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
     from frictid_hil.jobs.gap_diagnose_arm import diagnose_arm
 
@@ -247,7 +247,7 @@ def draft(
     force: ForceOption = False,
 ) -> Result:
     """Draft a first nominal.yaml, with tolerances, from recordings where nothing is believed yet."""
-    from frictid_hil.jobs.gap_diagnose import Source
+    from frictid_hil.jobs.gap.logs import Source
     from frictid_hil.jobs.gap_diagnose import draft as job
 
     return job(output.options(Source, paths=logs), out, force=force)

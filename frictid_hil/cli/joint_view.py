@@ -58,11 +58,7 @@ def torque_bar(torque_nm: float, max_torque_nm: float | None) -> str:
 
 
 class Lateness:
-    """Counts late cycles from the rows alone, while the loop's own count is still in its process.
-
-    Args:
-        period_s: of a cycle.
-    """
+    """Counts late cycles from the rows alone, while the loop's own count is still in its process."""
 
     def __init__(self, period_s: float) -> None:
         self._most_ns = 1.5e9 * period_s
@@ -72,8 +68,7 @@ class Lateness:
     def take(self, t_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> int:
         """Late cycles so far: rows more than a period and a half after the one before.
 
-        Args:
-            t_ns: times of one joint's rows since the last call, shape ``(n,)``.
+        The times are those of one joint's rows since the last call, shape ``(n,)``.
         """
         if self._newest_ns is not None:
             t_ns = np.concatenate([[self._newest_ns], t_ns])

@@ -113,12 +113,7 @@ def answer(question: str) -> bool:
 
 
 class TerminalWatcher:
-    """The watcher of the command line.
-
-    Args:
-        output: how to speak.
-        yes: the person has said yes beforehand.
-    """
+    """The watcher of the command line."""
 
     def __init__(self, output: Output, *, yes: bool) -> None:
         self._console = output.err

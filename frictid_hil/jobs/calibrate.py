@@ -88,9 +88,7 @@ class CalibrateOptions:
 class Planned:
     """A calibration that was checked and not yet begun.
 
-    Attributes:
-        plan: within every limit; without joints where the run continued has measured all.
-        kept: joints that the run continued has finished.
+    The plan is without joints where the run continued has measured all; ``kept`` are those that it has finished.
     """
 
     order: Order

@@ -20,11 +20,8 @@ from frictid_hil.runner.realtime import Latency, measure_latency
 def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0, dry: bool = False) -> dict[str, Any]:
     """Read the hardware, and compare it with the robot file and with the standard plan.
 
-    Args:
-        robot_name: robot file.
-        bus: ``interface:channel`` instead of the file's own.
-        latency_s: for so long this computer's punctuality is measured; 0 not at all.
-        dry: the robot file, all it refers to and the plan alone; the bus is not opened.
+    This computer's punctuality is measured for ``latency_s``. With ``dry`` the robot file, all it refers to and the
+    plan are checked alone; the bus is not opened.
 
     Raises:
         HardwareError: the bus or a drive cannot be reached at all.
@@ -102,13 +99,9 @@ def _measured(latency_s: float) -> Latency:
 
 
 def _told(found: Latency, cycle_hz: float) -> list[Finding]:
-    shares = (
-        ("half of them", found.p50_s),
-        ("99 %", found.p99_s),
-        ("99.9 %", found.p999_s),
-        ("the latest", found.worst_s),
-    )
-    figures = ", ".join(f"{name} {1e3 * value:.2f} ms" for name, value in shares)
+    names = ("half of them", "99 %", "99.9 %", "the latest")
+    values = (found.p50_s, found.p99_s, found.p999_s, found.worst_s)
+    figures = ", ".join(f"{name} {1e3 * value:.2f} ms" for name, value in zip(names, values, strict=True))
     said = (
         f"cycles of an empty loop begin late by at most: {figures}, in {found.duration_s:g} s; it holds "
         f"{found.highest_hz} Hz"
@@ -117,7 +110,5 @@ def _told(found: Latency, cycle_hz: float) -> list[Finding]:
         said += f", alone on processor {found.isolated_cpu}"
     enough = found.highest_hz >= cycle_hz
     remedy = "close other programs, isolate a processor, use a real-time kernel, or lower cycle_hz in the robot file"
-    findings = [
-        Finding(Severity.OK if enough else Severity.WARNING, "this computer", said, "" if enough else remedy),
-    ]
-    return findings + [Finding(Severity.WARNING, "this computer", told) for told in found.told]
+    own = Finding(Severity.OK if enough else Severity.WARNING, "this computer", said, "" if enough else remedy)
+    return [own, *(Finding(Severity.WARNING, "this computer", told) for told in found.told)]

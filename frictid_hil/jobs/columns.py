@@ -18,11 +18,7 @@ from frictid_hil.recording.samples import Samples
 def columns(log: Path, *, columns: str | None = None, out: Path | None = None, force: bool = False) -> dict[str, Any]:
     """Show what a log holds, column by column.
 
-    Args:
-        log: file or folder.
-        columns: a map to try on it instead of drafting one.
-        out: file to write the draft to.
-        force: overwrite it.
+    The map ``columns`` is tried on it, or one is drafted, into ``out``.
 
     Raises:
         InputFileError: the log cannot be read, or no column is like a position.

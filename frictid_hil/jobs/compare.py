@@ -24,10 +24,7 @@ _TRUTH_POINTS = 4000
 def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> dict[str, Any]:
     """Compute how far apart the curves are, for every joint that both sides have.
 
-    Args:
-        profile_path: a profile, or a run folder that holds one.
-        other_path: the reference profile, or run folder.
-        truth: a robot file instead, whose ``simulated`` joints are the reference.
+    The reference is another profile, or ``truth``, a robot file with ``simulated`` joints; profiles may be run folders.
 
     Raises:
         UsageError: not exactly one reference.

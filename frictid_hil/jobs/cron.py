@@ -31,8 +31,7 @@ _PART = re.compile(r"(\d+)(?:\.\.(\d+))?(?:/(\d+))?", re.ASCII)
 def cron_fields(on_calendar: str) -> str:
     """Minute, hour, day, month and weekday of a crontab line that comes true exactly when the expression does.
 
-    Args:
-        on_calendar: valid for ``systemd-analyze calendar``.
+    The expression is valid for ``systemd-analyze calendar``.
 
     Raises:
         UsageError: cron cannot say it; why.

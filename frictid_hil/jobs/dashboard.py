@@ -34,11 +34,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 def serve(runs: Path, store: ProfileStore, port: int, announce: Callable[[str], None]) -> None:
     """Answer on loopback until Ctrl-C.
 
-    Args:
-        runs: folder under which runs are looked for.
-        store: of profiles.
-        port: to listen on.
-        announce: given the address once it is known.
+    ``announce`` is given the address once it is known; runs are looked for under ``runs``.
 
     Raises:
         UsageError: starlette and uvicorn are not installed.

@@ -23,12 +23,7 @@ def emulate(
 ) -> None:
     """Serve until Ctrl-C or SIGTERM.
 
-    Args:
-        kind: name of an installed emulator (``motoman``, ``cia402``).
-        announce: told the port or bus once it can be opened.
-        robot_name: robot file.
-        bus: ``interface:channel`` instead of the file's own.
-        settings: what else this emulator takes.
+    ``announce`` is told the port or bus once it can be opened; ``settings`` are what else this emulator takes.
 
     Raises:
         UsageError: no such emulator, or settings that it cannot take.

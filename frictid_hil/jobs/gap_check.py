@@ -29,10 +29,10 @@ def run_gap_check(
     """Draw joints whose effect is sealed, diagnose them in processes of their own, open the seal, score.
 
     Args:
-        cases: how many joints; twenty bring every kind, 200 every effect five times.
+        cases: how many joints of each world; twenty bring every kind, 200 every effect five times.
         seed: of everything drawn.
         out: folder that keeps commitment, cases, answers, truth, ``result.json`` and ``gap-check.md``.
-        worlds: names of the worlds to draw from, ``cases`` joints each.
+        worlds: to draw from.
         processes: at once; one per processor core unless given.
         leave_one_out: also take each joint's own effect out of the library and diagnose again.
         force: write over the result and the page of an earlier check, and drop the answers of an unfinished one.

@@ -29,8 +29,7 @@ class Decided:
 
     Attributes:
         recorded: the last recording; its set holds all experiments.
-        experiments: of all recordings, in the order in which they ran.
-        duration_s: of all experiments.
+        experiments: of all recordings, in the order in which they ran; ``duration_s`` is theirs.
         diagnosis: of the whole set; None where nothing was recorded.
         why: why nothing more was recorded.
     """
@@ -43,10 +42,8 @@ class Decided:
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the verb: that of a recording, and the diagnosis."""
-        told = None
-        if self.diagnosis is not None:
-            whole = self.diagnosis.to_json()
-            told = {key: whole[key] for key in ("verdict", "causes", "summary", "next_experiment")}
+        whole = None if self.diagnosis is None else self.diagnosis.to_json()
+        told = whole and {key: whole[key] for key in ("verdict", "causes", "summary", "next_experiment")}
         return {
             **self.recorded.to_json(),
             "experiments": list(self.experiments),
@@ -57,12 +54,7 @@ class Decided:
 
 
 def record_until_decided(options: GapRecordOptions, watcher: Watcher, budget_s: float) -> Decided:
-    """Record and diagnose in turn until the cause is decided or the time is used up.
-
-    Args:
-        options: as of a recording; neither a plan nor the short set.
-        watcher: follows it, and is asked before each recording.
-        budget_s: time of all experiments at most.
+    """Record and diagnose in turn until the cause is decided or all experiments have taken ``budget_s``.
 
     Raises:
         UsageError: refused before anything moved.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,63 +17,11 @@ from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.draft import drafted
 from frictid_hil.jobs.gap.export_mujoco import export_mujoco
 from frictid_hil.jobs.gap.improved_robot import improved_belief, improved_robot
-from frictid_hil.jobs.gap.logs import set_from_logs
+from frictid_hil.jobs.gap.logs import Source
 from frictid_hil.jobs.gap.write_model import applied
 from frictid_hil.report.gap import SideBySide, gap_page
 from frictid_hil.report.pages import write_page
 from frictid_hil.simulation.joint import JointModel
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """What is diagnosed: a set's folder, or recordings with a belief; see ``set_from_logs``.
-
-    Attributes:
-        paths: one folder, or logs.
-        columns: column map of foreign logs.
-        nominal: what the simulator believes; a set's own ``nominal.yaml`` unless told.
-        profile: friction profile, whose numbers overrule it.
-        joint: its name in recordings and profile that hold several.
-        validation: logs to judge on.
-        split: how logs are parted into those that are fitted and those that are judged on; see ``parted``.
-    """
-
-    paths: Sequence[Path]
-    columns: str | None = None
-    nominal: Path | None = None
-    profile: Path | None = None
-    joint: str | None = None
-    validation: Sequence[str] = ()
-    split: str = ""
-
-    def load(self) -> ExperimentSet:
-        """Read the set.
-
-        Raises:
-            UsageError: a folder beside other paths or with options of single logs.
-            InputFileError, ConfigError: it is unusable.
-        """
-        folders = [path for path in self.paths if (path / "nominal.yaml").exists()]
-        options = (self.columns, self.nominal, self.profile, self.joint, self.split, *self.validation)
-        if not folders and len(self.paths) == 1 and self.paths[0].is_dir() and not any(options):
-            folders = list(self.paths)
-        if not folders:
-            return set_from_logs(
-                self.paths,
-                columns=self.columns,
-                nominal=self.nominal,
-                profile=self.profile,
-                joint=self.joint,
-                validation=self.validation,
-                split=self.split,
-            )
-        if len(self.paths) > 1 or any(options):
-            raise UsageError(
-                "an experiment set says by itself what is believed and which logs are judged on",
-                where=str(folders[0]),
-                next_step="give the set alone, or its logs with --nominal",
-            )
-        return ExperimentSet.load(folders[0])
 
 
 def draft(source: Source, out: Path, *, force: bool = False) -> dict[str, Any]:
@@ -106,15 +52,8 @@ def diagnose(
 ) -> dict[str, Any]:
     """Diagnose a set.
 
-    Args:
-        source: what is diagnosed; a path stands for the folder of an experiment set.
-        write_model: file to write the improved joint to: a robot file, or a belief with effects where its loop cannot
-            be simulated.
-        mujoco: MJCF file to export the improved joint to; its callback script is written beside it.
-        apply: write it even where the verdict does not recommend it.
-        out: folder for the report page; None writes none.
-        force: write over files that are there.
-        negligible: gap that means nothing to the user, over the friction level; the diagnosis' own share unless told.
+    The options are those of the verb; a path stands for the folder of an experiment set. ``write_model`` becomes a
+    robot file, or a belief with effects where its loop cannot be simulated; ``negligible`` is over the friction level.
 
     Raises:
         InputFileError, ConfigError: the set is unusable.

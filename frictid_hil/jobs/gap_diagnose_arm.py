@@ -40,14 +40,7 @@ def diagnose_arm(
 ) -> dict[str, Any]:
     """Diagnose the joints of a model.
 
-    Args:
-        asked: model and logs.
-        write_model: where to write the user's model with the causes added; the user's own file is edited in place.
-        apply: write the likeliest causes of open verdicts too.
-        wanted: files for other simulators.
-        out: folder for the page of the arm and one page a joint; None writes none.
-        force: write over files that are there.
-        executor_name: ``processes:N`` or ``dask://host:port``; None chooses.
+    The options are those of the verb; ``wanted`` are files for other simulators.
 
     Raises:
         InputFileError, ConfigError: model, logs or map are unusable.

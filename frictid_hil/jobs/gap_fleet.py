@@ -35,9 +35,6 @@ class Varied:
     """One number over the robots.
 
     Attributes:
-        joint: that it belongs to.
-        effect: see there.
-        parameter: see there.
         units: robots that it was looked for on; none where it only shapes an effect.
         deviations: of their values from the mean, over the spread of the values, (units,).
         means: draws of the mean, (n,).
@@ -69,14 +66,9 @@ class Varied:
 def fleet(
     results: Sequence[Path], *, samples: int = 0, out: Path | None = None, force: bool = False, seed: int = 1
 ) -> dict[str, Any]:
-    """Tell the spread of a fleet.
+    """Tell the spread of a fleet from what ``gap diagnose --model ... --json`` printed, one file a robot.
 
-    Args:
-        results: what ``gap diagnose --model ... --json`` printed, one file a robot.
-        samples: robots to draw; each is one whole set of numbers.
-        out: file for them.
-        force: write over it.
-        seed: of the draw.
+    ``samples`` robots are drawn into ``out``, each as one whole set of numbers.
 
     Raises:
         UsageError: too few robots, samples without a file, or a file that is there.

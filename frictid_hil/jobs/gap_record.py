@@ -51,24 +51,17 @@ VERB = "gap-record"
 
 @dataclass(frozen=True, slots=True)
 class GapRecordOptions:
-    """What a person asked for.
+    """What a person asked for, see ``frictid-hil gap record --help``.
 
     Attributes:
-        robot: robot file, by path or name; not needed with ``resume``.
-        joint: name; not needed with ``resume``.
-        bus: ``interface:channel``.
-        short: the short set.
         plan: plan file of a diagnosis that could not decide; overrules ``short``.
         experiments: names of experiments; overrule ``plan``.
-        profile: friction profile that the simulator believes.
         payload: a person is there to mount the payload when asked; None: on a simulated robot only, which mounts its
             own.
         centre_rad: middle of all travels; None: middle of the joint's procedure.
         travel_rad: of the small sines; None: the joint's procedure's.
-        realtime: wall clock for the virtual robot.
         seed: of simulated noise and of the validation moves.
         out: folder of the set; what a plan file asks for is added to the set of the same joint that is there.
-        resume: run folder to continue.
     """
 
     robot: str = ""
@@ -92,12 +85,9 @@ class Recorded:
     """The result of a recording.
 
     Attributes:
-        ended: how the run ended.
-        joint: name.
         place: folder of the set; None where no experiment was finished.
-        experiments: in the set, in the order in which they ran.
+        experiments: in the set, in the order in which they ran; ``duration_s`` is theirs.
         skipped: experiments left out, each with its reason.
-        duration_s: of the experiments.
         belief: where the belief of the simulator comes from.
     """
 
@@ -127,8 +117,6 @@ class _Planned:
     """A recording, decided before a bus is opened.
 
     Attributes:
-        order: robot, folder and options.
-        joint: as the driver knows it.
         belief: of the simulator.
         experiments: all that belong to the set.
         plans: of those that are still to be recorded, without the payload and with it.
@@ -152,10 +140,7 @@ class _Planned:
 def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) -> Recorded:
     """Record diagnostic experiments: plan, check, ask, run, and write the set.
 
-    Args:
-        options: what a person asked for.
-        watcher: follows it.
-        move: record what is missing; else a set is made of what the run ``options.resume`` has, and no bus is opened.
+    Without ``move``, a set is made of what the run ``options.resume`` has, and no bus is opened.
 
     Raises:
         UsageError: refused before anything moved.
@@ -178,32 +163,29 @@ def recordable(options: GapRecordOptions) -> dict[str, float]:
     Raises:
         UsageError, ConfigError: as ``record``.
     """
+    robot, _, joint, _, without = _situation(options)
+    every = list(catalogue(envelope_of(robot, joint, options), seed=options.seed).values())
+    return {e.name: e.duration_s for e in (every if without is None else _unloaded(every))}
+
+
+def _situation(options: GapRecordOptions) -> tuple[Robot, RobotSetup, JointSetup, Belief, str | None]:
+    """(robot, its setup, the joint, what is believed of it, why nothing is recorded with the payload)."""
     robot = load_robot(options.robot)
     setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
     robot.check_joints([options.joint])
     joint = setup.joint(options.joint)
-    profile = load_profile(options.profile).joint(options.joint) if options.profile else None
     simulated = robot.kind(options.bus).simulated
-    belief = belief_of(joint, profile, simulated_drive=simulated)
-    without = _why_no_payload(options, belief, simulated=simulated)
-    every = catalogue(envelope_of(robot, joint, options), seed=options.seed)
-    return {e.name: e.duration_s for e in (every.values() if without is None else _unloaded(list(every.values())))}
+    profile = load_profile(options.profile).joint(options.joint) if options.profile else None
+    name = options.profile.name if options.profile else ""
+    belief = belief_of(joint, profile, profile_name=name, simulated_drive=simulated)
+    return robot, setup, joint, belief, _why_no_payload(options, belief, simulated=simulated)
 
 
 def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
     if options.resume is not None and not move and not options.robot:
         options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
     options = restored(options, (VERB,))
-    robot = load_robot(options.robot)
-    setup = robot.to_setup(options.bus, realtime=options.realtime, seed=options.seed)
-    robot.check_joints([options.joint])
-    joint = setup.joint(options.joint)
-    simulated = robot.kind(options.bus).simulated
-    profile = load_profile(options.profile).joint(options.joint) if options.profile else None
-    belief = belief_of(
-        joint, profile, profile_name=options.profile.name if options.profile else "", simulated_drive=simulated
-    )
-    without = _why_no_payload(options, belief, simulated=simulated)
+    robot, setup, joint, belief, without = _situation(options)
     envelope = envelope_of(robot, joint, options)
     names = manifest_of(options.resume, robot)["options"]["names"] if options.resume else _names(options, envelope)
     asked = chosen(names, envelope, seed=options.seed)
@@ -251,11 +233,6 @@ def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
 def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> dict[str, Samples]:
     """The experiments that a run folder holds whole, from all of its parts.
 
-    Args:
-        run: folder.
-        joint: name.
-        experiments: wanted.
-
     Raises:
         InputFileError: a recording is unreadable.
     """
@@ -269,14 +246,12 @@ def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> d
 def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> Envelope:
     """The place of the experiments: around the travel of the joint's procedure, within the limits."""
     procedure = robot.procedure(joint.name)
-    centre = options.centre_rad
-    if centre is None:
-        centre = joint.start_position_rad + procedure.amplitude_rad / 2
+    middle = joint.start_position_rad + procedure.amplitude_rad / 2
     return Envelope.within(
         joint.position_min_rad,
         joint.position_max_rad,
         joint.max_velocity_rad_s,
-        centre_rad=centre,
+        centre_rad=middle if options.centre_rad is None else options.centre_rad,
         travel_rad=options.travel_rad or procedure.amplitude_rad,
         velocity_rad_s=procedure.velocity_rad_s,
     )

@@ -16,13 +16,16 @@ NIGHT_PAGE = "recalibration.html"
 """In the run folder of a recalibration."""
 
 
+_JOINT = ("temperature_c", "distance_percent", "gates_failed")
+_PROMOTION = ("action", "id", "utc", "by", "reason")
+_NIGHT = ("utc", "outcome", "promoted", "drifted", "reason", "next_step", "run")
+"""What is told of each, by its own names."""
+
+
 def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict[str, Any]:
     """Profiles, promotions and recalibrations of a robot, oldest first.
 
-    Args:
-        store: where they are.
-        robot: name.
-        last: only so many of each; None for all.
+    With ``last``, only so many of each.
 
     Raises:
         UsageError: nothing is known of such a robot.
@@ -44,25 +47,15 @@ def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict
                 "created_utc": stored.created_utc,
                 "active": active is not None and stored.id == active.id,
                 "joints": {
-                    name: {
-                        "coulomb_n" if joint.prismatic else "coulomb_nm": joint.coulomb_nm,
-                        "temperature_c": joint.temperature_c,
-                        "distance_percent": joint.distance_percent,
-                        "gates_failed": list(joint.gates_failed),
-                    }
+                    name: {"coulomb_n" if joint.prismatic else "coulomb_nm": joint.coulomb_nm}
+                    | {key: getattr(joint, key) for key in _JOINT}
                     for name, joint in stored.joints.items()
                 },
             }
             for stored in profiles
         ],
-        "promotions": [
-            {"action": p.action, "id": p.id, "utc": p.utc, "by": p.by, "reason": p.reason} for p in promotions
-        ],
-        "recalibrations": [
-            {"utc": one.utc, "outcome": one.outcome, "promoted": one.promoted, "drifted": list(one.drifted)}
-            | {"reason": one.reason, "next_step": one.next_step, "run": one.run}
-            for one in nights
-        ],
+        "promotions": [{key: getattr(one, key) for key in _PROMOTION} for one in promotions],
+        "recalibrations": [{key: getattr(one, key) for key in _NIGHT} for one in nights],
     }
 
 
@@ -81,10 +74,7 @@ def write_index_page(store: ProfileStore, robot: str) -> Path:
 def page_of(store: ProfileStore, robot: str, address: Callable[[Path], str]) -> Page:
     """The index page of a robot.
 
-    Args:
-        store: where its profiles are.
-        robot: name.
-        address: of the page of a night, by its run folder; "" where it cannot be reached.
+    ``address`` is of the page of a night, by its run folder; "" where it cannot be reached.
 
     Raises:
         UsageError: nothing is known of such a robot.

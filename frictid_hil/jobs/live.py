@@ -51,10 +51,7 @@ _SCHEMA = {
 class LiveWatcher:
     """Passes everything on to another watcher, and every joint's samples to whoever is connected.
 
-    Args:
-        watcher: follows the job as well.
-        server: that viewers connect to.
-        refused: origins of pages that it turned away; each is told once.
+    ``refused`` holds the origins of pages that the server turned away; each is told once.
     """
 
     def __init__(self, watcher: Watcher, server: FoxgloveServer, refused: deque[str]) -> None:

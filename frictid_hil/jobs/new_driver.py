@@ -20,9 +20,7 @@ _FILES = {
 def new_driver(name: str, out: Path | None = None) -> list[Path]:
     """Write the package; the files, in the order in which they are worth reading.
 
-    Args:
-        name: of the driver: small letters, digits and underscores.
-        out: folder, not there yet or empty; ``frictid-NAME`` here where None.
+    The folder is not there yet, or empty; ``frictid-NAME`` here where None.
 
     Raises:
         UsageError: a name that is none, or a folder with something in it.

@@ -17,16 +17,12 @@ from frictid_hil.protocol.driver import kind_of, new_driver
 
 @dataclass(frozen=True, slots=True)
 class JointAnswers:
-    """What a person says of one joint.
+    """What a person says of one joint, joint side; gear and rated torque are None where the drive shall say.
 
     Attributes:
-        name: in the file and on every page.
         address: node, axis or id, as the driver calls it.
         travel_rad: lowest and highest position.
-        max_velocity_rad_s: limit of the joint.
-        max_torque_nm: limit of the joint, joint side.
-        gear_ratio: motor revolutions per joint revolution; None where the drive shall say.
-        rated_torque_nm: joint side; None where the drive shall say.
+        gear_ratio: motor revolutions per joint revolution.
     """
 
     name: str
@@ -40,12 +36,7 @@ class JointAnswers:
 
 @dataclass(frozen=True, slots=True)
 class NewRobot:
-    """The file that was written, and what of it the drives said.
-
-    Attributes:
-        path: of the file.
-        read: per joint the figures that its drive gave, by key of the robot file.
-    """
+    """The file that was written, and by joint the figures in it that its drive gave."""
 
     path: Path
     read: Mapping[str, Mapping[str, float]]
@@ -71,14 +62,7 @@ def new_robot(
 ) -> NewRobot:
     """Write a robot file that loads; nothing moves, and drives are only read.
 
-    Args:
-        path: of the file; the robot is named after it.
-        driver: entry-point name.
-        bus: ``interface:channel``.
-        joints: in the order of the file.
-        cycle_hz: set-points per second.
-        read: ask the drives for gear ratio and rated torque.
-        force: replace a file that is there.
+    The robot is named after the file. With ``read``, the drives are asked for gear ratio and rated torque.
 
     Raises:
         UsageError: the file exists, or a figure is missing that no drive gave.
@@ -121,6 +105,7 @@ def _read(
 
 def _provisional(joint: JointAnswers) -> JointSetup:
     low, high = joint.travel_rad
+    middle = (low + high) / 2
     return JointSetup(
         name=joint.name,
         address=joint.address,
@@ -131,8 +116,8 @@ def _provisional(joint: JointAnswers) -> JointSetup:
         rated_torque_nm=joint.rated_torque_nm or joint.max_torque_nm,
         position_min_rad=low,
         position_max_rad=high,
-        start_position_rad=(low + high) / 2,
-        locked_position_rad=(low + high) / 2,
+        start_position_rad=middle,
+        locked_position_rad=middle,
     )
 
 
@@ -146,6 +131,7 @@ def _text(
 ) -> str:
     """The file: what was answered, what was read, and what is still to be looked at."""
     travel = min(high - low for low, high in (joint.travel_rad for joint in joints))
+    amplitude = min(travel / 4, math.radians(20))
     speed = min(joint.max_velocity_rad_s for joint in joints)
     lines = [
         "# Written by `frictid-hil new robot`. Look at every line before the robot moves.",
@@ -155,15 +141,15 @@ def _text(
         f"bus: {bus}",
         f"cycle_hz: {cycle_hz:g}",
         "procedure:",
-        f"  amplitude_rad: {_degrees(min(travel / 4, math.radians(20)))}   # travel of a cycle, peak-to-peak",
+        f"  amplitude_rad: {_degrees(amplitude)}   # travel of a cycle, peak-to-peak",
         f"  velocity_rad_s: {_degrees(0.5 * speed, '/s')}   # peak speed of the last cycle; half of the lowest limit",
         "  cycles: 10",
         "joints:",
     ]
     for joint in joints:
-        lines += _joint(joint, driver, found[joint.name], min(travel / 4, math.radians(20)))
+        lines += _joint(joint, driver, found[joint.name], amplitude)
         if kind_of(driver).addressed_by == "node":  # as the simulated drives are
-            lines += _simulated(joint, min(travel / 4, math.radians(20)), 0.5 * speed)
+            lines += _simulated(joint, amplitude, 0.5 * speed)
     return "\n".join(lines) + "\n"
 
 

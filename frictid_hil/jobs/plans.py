@@ -52,13 +52,7 @@ def calibration_motions(
 ) -> list[Motion]:
     """What one joint does in a calibration, from its locked position and back to it.
 
-    Args:
-        joint: which.
-        procedure: its cycles.
-        rehearse: its travel was never seen slowly.
-        warm_up: before it is measured.
-        place: among the joints that move together; None where it moves alone.
-        measure_skew: it shakes to show by how much its torque is late.
+    ``rehearse`` where its travel was never seen slowly; ``place`` is that among the joints that move together.
     """
     start, home = joint.start_position_rad, joint.locked_position_rad
     amplitude = procedure.amplitude_rad
@@ -206,11 +200,11 @@ def _in_step(motions: Mapping[str, Sequence[Motion]]) -> dict[str, list[Motion]]
     Only moves and slow sines differ: cycles have identical timing already.
     """
     moved_first = any(own[0].name == "move" for own in motions.values())
-    lists: dict[str, list[Motion]] = {}
-    for name, own in motions.items():
-        here_rad = float(own[0].position_rad(np.zeros(1))[0])
-        stays = moved_first and own[0].name != "move"  # it is locked where it starts
-        lists[name] = [Move(here_rad, here_rad, 0.0), *own] if stays else list(own)
+    lists = {name: list(own) for name, own in motions.items()}
+    for own in lists.values():
+        if moved_first and own[0].name != "move":  # it is locked where it starts
+            here_rad = float(own[0].position_rad(np.zeros(1))[0])
+            own.insert(0, Move(here_rad, here_rad, 0.0))
     longest_s = [max(motion.duration_s for motion in stretch) for stretch in zip(*lists.values(), strict=True)]
     return {
         name: [_lasting(motion, duration_s) for motion, duration_s in zip(own, longest_s, strict=True)]
@@ -229,17 +223,8 @@ def _lasting(motion: Motion, duration_s: float) -> Motion:
 
 def expected_of(robot: Robot) -> dict[str, Expected]:
     """What the robot file expects of its joints. Joints without an entry are left out."""
-    expected: dict[str, Expected] = {}
-    for name, joint in robot.file.joints.items():
-        if joint.expected is not None:
-            values = joint.expected
-            expected[name] = Expected(
-                values.inertia_kg_m2,
-                values.gravity_nm,
-                values.friction_nm,
-                link_inertia_kg_m2=values.link_inertia_kg_m2,
-            )
-    return expected
+    told = {name: joint.expected for name, joint in robot.file.joints.items()}
+    return {name: Expected(**values.model_dump()) for name, values in told.items() if values is not None}
 
 
 def given_procedure(

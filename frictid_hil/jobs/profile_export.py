@@ -22,11 +22,7 @@ POINTS = 20
 def export(profile: Path, target: str, out: Path, *, force: bool = False) -> dict[str, Any]:
     """Write a profile for another place.
 
-    Args:
-        profile: file or run folder.
-        target: ``table``, ``ros2`` or ``i2rt``.
-        out: file to write.
-        force: write over it.
+    The target is ``table``, ``ros2`` or ``i2rt``.
 
     Raises:
         UsageError: no such target, or ``out`` exists.

@@ -36,11 +36,7 @@ def _by_axis(joint: JointProfile, values: dict[str, Any]) -> dict[str, Any]:
 def diff(older: str, newer: str, *, robot: str | None = None, store: Path | None = None) -> dict[str, Any]:
     """How two profiles differ, joint by joint.
 
-    Args:
-        older: a file, a run folder, or (with ``robot``) an id of the store, ``active`` or ``baseline``.
-        newer: the same.
-        robot: whose store is meant by ids.
-        store: folder of the store.
+    Each is named as for ``named_profile``.
 
     Raises:
         ProfileMismatch: no joint in common.
@@ -78,14 +74,8 @@ def promote(
 ) -> dict[str, Any]:
     """Make a profile the active one; joints that it lacks stay as the active profile has them.
 
-    Args:
-        named: a file or run folder, which is added to the store; or (with ``robot``) an id of the store.
-        robot: whose store is meant by an id.
-        store: folder of the store.
-        reason: for the history.
-        baseline: drift is measured from it from now on, too.
-        force: also with failed quality gates.
-        told: as ``ProfileStore``'s.
+    It is named as for ``named_profile``, and added to the store. With ``baseline`` drift is measured from it from now
+    on, too; ``force`` is for failed quality gates; ``told`` is as ``ProfileStore``'s.
 
     Raises:
         GateFailed: a quality gate failed.

@@ -29,11 +29,8 @@ def report(
 ) -> dict[str, Any]:
     """Write ``report.html`` into a run folder, or the index page of a robot.
 
-    Args:
-        run: folder. A run of compensation has its page since it ended, and is told where it is.
-        robot: instead of a run: robot file, or name of a robot that the store knows.
-        store: folder of the profile store; None for the user's own.
-        told: as ``ProfileStore``'s.
+    A run of compensation has its page since it ended, and is told where it is. A robot is named by its file, or by the
+    name that the store knows. ``told`` is as ``ProfileStore``'s.
 
     Raises:
         UsageError: neither or both; not a run folder; nothing was identified in it; nothing known of the robot.

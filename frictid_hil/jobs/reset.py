@@ -13,10 +13,7 @@ from frictid_hil.protocol.driver import Finding, Resettable, new_driver
 def reset(robot_name: str, *, bus: str | None = None, ask: Callable[[list[Finding]], bool]) -> dict[str, Any]:
     """Show what the faults are, ask, and reset them.
 
-    Args:
-        robot_name: robot file.
-        bus: ``interface:channel`` instead of the file's own.
-        ask: shown the faults; False leaves everything as it is.
+    ``ask`` is shown the faults; False leaves everything as it is.
 
     Raises:
         UsageError: this robot's driver has no such thing.

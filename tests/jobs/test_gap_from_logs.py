@@ -13,8 +13,8 @@ from frictid_hil.config.nominal import load_nominal
 from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import ConfigError, InputFileError, UsageError
 from frictid_hil.gap.experiment_set import ExperimentSet
-from frictid_hil.jobs.gap.logs import set_from_logs
-from frictid_hil.jobs.gap_diagnose import Source, draft
+from frictid_hil.jobs.gap.logs import Source
+from frictid_hil.jobs.gap_diagnose import draft
 
 STEP_S = 0.004
 INERTIA, COS, SIN, COULOMB, VISCOUS = 0.6, 5.0, -1.0, 2.0, 0.8
@@ -34,7 +34,7 @@ def _log(path: Path, seconds: float = 12.0, phase: float = 0.0, header: str = ""
 
 
 def test_the_end_of_a_single_recording_is_judged_on(tmp_path: Path) -> None:
-    read = set_from_logs([_log(tmp_path / "walk.csv")])
+    read = Source([_log(tmp_path / "walk.csv")]).load()
     assert [(e.name, e.validation) for e in read.experiments] == [("walk", False), ("walk, last third", True)]
     first, last = read.experiments
     assert last.time_s[0] > first.time_s[-1] and last.time_s.size == pytest.approx(0.5 * first.time_s.size, rel=0.01)
@@ -42,16 +42,16 @@ def test_the_end_of_a_single_recording_is_judged_on(tmp_path: Path) -> None:
 
 def test_of_several_recordings_the_last_are_judged_on_or_those_named(tmp_path: Path) -> None:
     logs = [_log(tmp_path / f"{name}.csv", seconds) for name, seconds in (("a", 9.0), ("b", 9.0), ("c", 9.0))]
-    assert [e.name for e in set_from_logs(logs).experiments if e.validation] == ["c"]
-    assert [e.name for e in set_from_logs(logs, validation=["a"]).experiments if e.validation] == ["a"]
+    assert [e.name for e in Source(logs).load().experiments if e.validation] == ["c"]
+    assert [e.name for e in Source(logs, validation=["a"]).load().experiments if e.validation] == ["a"]
     with pytest.raises(UsageError, match="no log is called d"):
-        set_from_logs(logs, validation=["d"])
+        Source(logs, validation=["d"]).load()
 
 
 @pytest.mark.parametrize(("split", "end_s"), [("25%", 3.0), ("4s", 4.0)])
 def test_a_split_by_time_judges_on_the_end_of_every_log(tmp_path: Path, split: str, end_s: float) -> None:
     logs = [_log(tmp_path / f"{name}.csv") for name in ("a", "b")]
-    read = set_from_logs(logs, split=split)
+    read = Source(logs, split=split).load()
     assert [(e.name, e.validation) for e in read.experiments] == [
         ("a", False), (f"a, last {split}", True), ("b", False), (f"b, last {split}", True),
     ]  # fmt: skip
@@ -60,14 +60,14 @@ def test_a_split_by_time_judges_on_the_end_of_every_log(tmp_path: Path, split: s
 
 def test_a_split_by_log_is_that_of_several_logs(tmp_path: Path) -> None:
     logs = [_log(tmp_path / f"{name}.csv") for name in ("a", "b")]
-    assert [e.validation for e in set_from_logs(logs, split="log").experiments] == [False, True]
+    assert [e.validation for e in Source(logs, split="log").load().experiments] == [False, True]
     with pytest.raises(UsageError, match="needs several logs"):
-        set_from_logs(logs[:1], split="log")
+        Source(logs[:1], split="log").load()
     for split, why in (("half", "cannot be read"), ("100%", "leaves nothing"), ("20s", "leaves nothing")):
         with pytest.raises(UsageError, match=why):
-            set_from_logs(logs, split=split)
+            Source(logs, split=split).load()
     with pytest.raises(UsageError, match="both say"):
-        set_from_logs(logs, split="30%", validation=["a"])
+        Source(logs, split="30%", validation=["a"]).load()
 
 
 def test_a_nominal_file_tells_belief_and_roles(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_nominal_file_tells_belief_and_roles(tmp_path: Path) -> None:
     }
     (tmp_path / "n.yaml").write_text(yaml.safe_dump(told))
     logs = [_log(tmp_path / "a.csv"), _log(tmp_path / "b.csv")]
-    read = set_from_logs(logs, nominal=tmp_path / "n.yaml")
+    read = Source(logs, nominal=tmp_path / "n.yaml").load()
     assert [(e.validation, e.payload) for e in read.experiments] == [(True, True), (False, False)]
     assert read.nominal.inertia_kg_m2 == 0.5 and read.nominal.tolerances.inertia_kg_m2.relative == 0.2
 
@@ -87,7 +87,7 @@ def test_a_profile_alone_is_a_belief(tmp_path: Path) -> None:
     golden = Path(__file__).parents[1] / "config" / "golden" / "profile-1.yaml"
     known = load_profile(golden)
     name, joint = next(iter(known.joints.items()))
-    read = set_from_logs([_log(tmp_path / "a.csv")], profile=golden, joint=name)
+    read = Source([_log(tmp_path / "a.csv")], profile=golden, joint=name).load()
     assert read.nominal.curve is not None and read.nominal.curve.torque_nm == joint.torque_nm
     assert read.nominal.inertia_kg_m2 == joint.inertia_kg_m2.value
     assert read.nominal.tolerances.friction_torque.source in ("stated", "profile")
@@ -102,7 +102,7 @@ def test_foreign_columns_are_read_by_their_map(tmp_path: Path) -> None:
         "joints": {"elbow": {"position": {"column": "deg", "unit": "deg"}, "torque": {"column": "tau", "unit": "N m"}}},
     }
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(columns))
-    read = set_from_logs([log], columns=str(tmp_path / "arm.yaml"))
+    read = Source([log], columns=str(tmp_path / "arm.yaml")).load()
     assert max(e.travel_rad for e in read.experiments) == pytest.approx(2.1, abs=0.3)
 
 
@@ -127,7 +127,7 @@ def test_a_draft_finds_the_joint_and_says_how_sure_it_is(tmp_path: Path) -> None
         assert abs(found[name]["value"] - value) < 3.0 * found[name]["sigma"] + 0.02 * abs(value), name
     read = load_nominal(out, logs=False)
     assert read.file.tolerance is not None and read.file.joint.inertia_kg_m2 == pytest.approx(INERTIA, rel=0.05)
-    assert set_from_logs(logs, nominal=out).nominal.tolerances.inertia_kg_m2.source == "stated"
+    assert Source(logs, nominal=out).load().nominal.tolerances.inertia_kg_m2.source == "stated"
 
 
 def test_a_draft_says_which_number_no_joint_has(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_draft_says_which_number_no_joint_has(tmp_path: Path) -> None:
     np.savetxt(log, table, delimiter=",", header="time_s,position_rad,torque_nm", comments="")
     told = draft(Source([log]), tmp_path / "n.yaml")
     assert [line.split()[0] for line in told["draft"]["warnings"]] == ["coulomb_nm"]
-    assert set_from_logs([log], nominal=tmp_path / "n.yaml").nominal.curve is not None
+    assert Source([log], nominal=tmp_path / "n.yaml").load().nominal.curve is not None
     assert draft(Source([_log(tmp_path / "fine.csv")]), tmp_path / "m.yaml")["draft"]["warnings"] == []
 
 

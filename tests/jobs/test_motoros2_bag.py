@@ -15,7 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from frictid_hil.config.write import dump
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.jobs.gap_diagnose import Source, diagnose
+from frictid_hil.jobs.gap.logs import Source
+from frictid_hil.jobs.gap_diagnose import diagnose
 from frictid_hil.jobs.identify import IdentifyOptions, identify
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)

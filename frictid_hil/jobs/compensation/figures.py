@@ -114,11 +114,8 @@ def figures(
 ) -> dict[str, ModeFigures]:
     """The figures of all modes, each one compared with ``nc`` where that ran.
 
-    Args:
-        runs: by mode.
-        task: ``hand`` or ``track``.
-        inertia_kg_m2: that is removed from the hand torque.
-        floors_rad: by mode, the tracking error that an ideal joint would have.
+    The inertia is removed from the hand torque; ``floors_rad`` is, by mode, what an ideal joint's tracking error would
+    be.
     """
     floors_rad = floors_rad or {}
     alone = {mode: _alone(run, task, inertia_kg_m2) for mode, run in runs.items()}

@@ -40,10 +40,7 @@ _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
 class CompensationPlan:
     """A plan of a compensation, with the laws by mode and the figures that it was made from.
 
-    Attributes:
-        centre_rad: middle of the travel.
-        lowest_ratio: R where gravity is known least, within the task's travel; None without compensation.
-        warnings: what speaks against it and is done all the same.
+    R is lowest where gravity is known least within the task's travel; None without compensation.
     """
 
     plan: Plan
@@ -64,14 +61,7 @@ def compensation_plan(
 ) -> CompensationPlan:
     """The plan of one joint; a travel that was never seen on this robot is rehearsed first.
 
-    Args:
-        robot: its file.
-        setup: the robot as its driver knows it.
-        name: of the joint.
-        entry: its profile.
-        wanted: what a person asks for.
-        rehearsals: travels that were seen.
-        forced: warnings of what is done in spite of doubts.
+    ``forced`` are warnings of what is done in spite of doubts.
 
     Raises:
         UsageError: options that contradict each other, or an unstable R or K.

@@ -57,12 +57,7 @@ class Asked:
 
 @dataclass(slots=True)
 class Progress:
-    """What a run has measured so far, by mode; an error halfway loses nothing of it.
-
-    Attributes:
-        run: the joint's, once it is done.
-        service: the sums of a service.
-    """
+    """What a run has measured so far, by mode; an error halfway loses nothing of it."""
 
     runs: dict[str, ModeRun] = field(default_factory=dict)
     run: JointRun | None = None

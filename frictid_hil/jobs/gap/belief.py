@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from frictid_hil.config.profile import JointProfile
@@ -18,16 +18,13 @@ from frictid_hil.simulation.joint import CoulombViscous, JointModel
 
 SIMULATED_CONTROL_HZ = 1000
 """Rate of the position loop inside a simulated drive."""
+_PLAIN = ("inertia_kg_m2", "motor_inertia_share", "gravity_cos_nm", "gravity_sin_nm", "gear_ratio")
+"""Keys of ``joint`` that the simulated joint has under the same names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Sections of ``nominal.yaml`` and where they come from.
-
-    Attributes:
-        sections: ``joint``, and ``payload``, ``controller``, ``drive``, ``encoder`` where known.
-        sources: what was used, for the file and for a person.
-    """
+    """Sections of ``nominal.yaml`` as far as they are known, and where they come from."""
 
     sections: Mapping[str, Any]
     sources: tuple[str, ...]
@@ -43,11 +40,7 @@ def belief_of(
 ) -> Belief:
     """Form what is believed about one joint before its logs are looked at.
 
-    Args:
-        joint: with its ``simulated`` mapping, which may be empty.
-        profile: measured on this joint, or None.
-        profile_name: of its file, for the sources.
-        simulated_drive: the drive is simulated too, so that its controller is known.
+    The controller is known where the drive is simulated too.
 
     Raises:
         InvalidFields: the ``simulated`` mapping is wrong.
@@ -80,23 +73,13 @@ def read_back(sections: Mapping[str, Any], identity: Mapping[str, Any]) -> dict[
 
 def _of_model(model: JointModel, *, simulated_drive: bool) -> dict[str, Any]:
     if isinstance(model.friction, CoulombViscous):
-        friction: dict[str, Any] = {
-            "coulomb_nm": model.friction.coulomb_nm,
-            "viscous_nm_s_per_rad": model.friction.viscous_nm_s_per_rad,
-        }
+        friction: dict[str, Any] = asdict(model.friction)
     else:
-        friction = {
-            "velocity_rad_s": list(model.friction.velocity_rad_s),
-            "torque_nm": list(model.friction.torque_nm),
-        }
+        friction = {name: list(getattr(model.friction, name)) for name in ("velocity_rad_s", "torque_nm")}
     friction["presliding_stiffness_nm_per_rad"] = model.presliding_stiffness_nm_per_rad
     sections: dict[str, Any] = {
         "joint": {
-            "inertia_kg_m2": model.inertia_kg_m2,
-            "motor_inertia_share": model.motor_inertia_share,
-            "gravity_cos_nm": model.gravity_cos_nm,
-            "gravity_sin_nm": model.gravity_sin_nm,
-            "gear_ratio": model.gear_ratio,
+            **{name: getattr(model, name) for name in _PLAIN},
             "friction": friction,
         },
         "drive": {

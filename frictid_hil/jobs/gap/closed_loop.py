@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -88,14 +87,12 @@ def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, 
 
     Nothing where ``closed_loop_gap`` has a reason. Torques behind the low-pass; positions where no torque is known.
     """
-    motion = next((m for m in reversed(arm.motions) if m.validation), arm.motions[-1])
-    if why_no_closed_loop(arm, [motion]):
+    short = withheld(arm)[-1].beginning(SHOWN_S)
+    if why_no_closed_loop(arm, [short]):
         return ()
-    keep = int(np.searchsorted(motion.time_s, motion.time_s[0] + SHOWN_S))
-    short = replace(motion, samples={n: s.select(np.arange(len(s)) < keep) for n, s in motion.samples.items()})
     torque, position = _off(arm, arm.robot.compiled, short, {})
     better = _off(arm, compiled_with(arm.robot, natives), short, natives) if natives else None
-    begin = keep - len(position)
+    begin = len(short.time_s) - len(position)
     smooth = low_pass(short.time_s)
     runs = []
     for k, (name, samples) in enumerate(short.samples.items()):
@@ -108,7 +105,7 @@ def side_by_side(arm: ArmSet, natives: Mapping[str, Native]) -> tuple[JointRun, 
         quantity = "torque [N m]" if known else "position [rad]"
         if arm.robot.joint(name).prismatic:
             quantity = "force [N]" if known else "position [m]"
-        runs.append(JointRun(name, motion.name, quantity, short.time_s[begin:], measured, measured - off, improved))
+        runs.append(JointRun(name, short.name, quantity, short.time_s[begin:], measured, measured - off, improved))
     return tuple(runs)
 
 
@@ -122,13 +119,9 @@ def low_pass(time_s: Array) -> Callable[[Array], Array]:
 def gap_of(
     arm: ArmSet, natives: Mapping[str, Native], motions: Sequence[Motion], model: Any = None
 ) -> tuple[Array, Array]:
-    """RMS of (torque, position) of recordings less the model's, (k,) each; torque is NaN where none was recorded.
+    """RMS of (torque, position) of recordings less the changed model's, (k,) each; torque is NaN where none is known.
 
-    Args:
-        arm: model and recordings.
-        natives: changes of the user's model.
-        motions: to run along.
-        model: another one, compiled, instead of the user's with the changes.
+    ``model`` is another one, compiled, instead of the user's with the changes.
     """
     torque, position = _each(arm, natives, motions, model)
     return _rms(torque), _rms(position)
@@ -150,20 +143,24 @@ def _each(
 
 
 def _off(arm: ArmSet, model: Any, motion: Motion, natives: Mapping[str, Native]) -> tuple[Array, Array]:
-    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten.
-
-    A drive with another torque constant reports another torque than it gives.
-    """
-    names = tuple(motion.samples)
-    samples = list(motion.samples.values())
-    time = samples[0].time_s
-    command = np.stack([s.position_command_rad for s in samples if s.position_command_rad is not None], axis=1)
-    ran = replayed(model, names, arm.held, time, motion.position_rad, command)
+    """(torque, position) of the recording less the model's, (n, k), from where the start is forgotten."""
+    time = motion.time_s
+    ran = replayed(model, *driven(arm, motion))
     begin = int(np.searchsorted(time, time[0] + 1.0))
     position = (motion.position_rad - ran.position_rad)[begin:]
-    measured = [s.torque_nm for s in samples]
-    if any(torque is None for torque in measured):
+    measured = [s.torque_nm for s in motion.samples.values() if s.torque_nm is not None]
+    if len(measured) < len(motion.samples):
         return np.full_like(position, np.nan), position
-    reported = np.array([natives[name].reported if name in natives else 1.0 for name in names])
-    torque = np.stack([t for t in measured if t is not None], axis=1) - reported * ran.torque_nm
+    torque = np.stack(measured, axis=1) - reported(arm, natives) * ran.torque_nm
     return low_pass(time)(torque)[begin:], position
+
+
+def driven(arm: ArmSet, motion: Motion) -> tuple[Sequence[str], Mapping[str, float], Array, Array, Array]:
+    """(joints, held, time, position, command) of a motion."""
+    commands = [s.position_command_rad for s in motion.samples.values() if s.position_command_rad is not None]
+    return arm.recorded, arm.held, motion.time_s, motion.position_rad, np.stack(commands, axis=1)
+
+
+def reported(arm: ArmSet, natives: Mapping[str, Native]) -> Array:
+    """Torque that each drive reports over the torque that it gives, (k,)."""
+    return np.array([natives[joint].reported if joint in natives else 1.0 for joint in arm.recorded])

@@ -8,16 +8,16 @@ builds up as in the user's model.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from frictid_hil.friction.metrics import plain_rms
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.jobs.gap.closed_loop import low_pass, why_no_closed_loop, withheld
-from frictid_hil.jobs.gap.from_model import ArmSet, Motion, kinematics
+from frictid_hil.jobs.gap.closed_loop import driven, low_pass, reported, why_no_closed_loop, withheld
+from frictid_hil.jobs.gap.from_model import ArmSet, Motion
 from frictid_hil.jobs.gap.write_model import PRESLIDING_RAD
 from frictid_hil.simulation.model_edit import compiled_with
 from frictid_hil.simulation.model_replay import replayed
@@ -40,35 +40,28 @@ _PERCENT = ("before_percent", "after_percent")
 _ITSELF = "our own evaluation of the file, not run there"
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One exported file.
+def _row(
+    target: str,
+    where: str,
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    size: Mapping[str, float],
+    lost: str,
+) -> dict[str, Any]:
+    """One exported file, as JSON.
 
-    Attributes:
+    Args:
         target: what it is for.
         where: where it ran.
         before: RMS of the torque error by joint, N m, of the user's model.
         after: with the export.
-        size: RMS of the measured torque by joint, N m.
+        size: RMS of the measured torque by joint, N m; percent is of it, the RMS over joints.
         lost: what the target cannot hold.
     """
-
-    target: str
-    where: str
-    before: Mapping[str, float]
-    after: Mapping[str, float]
-    size: Mapping[str, float]
-    lost: str
-
-    def told(self) -> dict[str, Any]:
-        """As JSON; percent is of the measured torque, the RMS over joints."""
-        joints = {name: {"before_nm": self.before[name], "after_nm": self.after[name]} for name in self.after}
-        percent = [
-            100.0 * float(np.sqrt(np.mean([(off[name] / self.size[name]) ** 2 for name in self.after])))
-            for off in (self.before, self.after)
-        ]
-        told = {"target": self.target, "where": self.where, "lost": self.lost, "joints": joints}
-        return {**told, "before_percent": percent[0], "after_percent": percent[1]}
+    joints = {name: {"before_nm": before[name], "after_nm": after[name]} for name in after}
+    told = {"target": target, "where": where, "lost": lost, "joints": joints}
+    shares = (np.array([off[name] / size[name] for name in after]) for off in (before, after))
+    return {**told, **dict(zip(_PERCENT, (100.0 * plain_rms(share) for share in shares), strict=True))}
 
 
 class Withheld:
@@ -82,15 +75,15 @@ class Withheld:
 
     def __init__(self, arm: ArmSet, changed: Iterable[str]) -> None:
         self._arm = arm
-        self.motion = _beginning(withheld(arm)[-1], LAW_S)
+        self.motion = withheld(arm)[-1].beginning(LAW_S)
         self.joints = tuple(changed) or arm.recorded
         self._smooth = low_pass(self.motion.time_s)
         measured = {n: s.torque_nm for n, s in self.motion.samples.items() if s.torque_nm is not None}
         self.known = set(self.joints) <= set(measured)
         if not self.known:
             return
-        self.size = {name: _rms(measured[name]) for name in self.joints}
-        moved = kinematics(self.motion.time_s, self.motion.position_rad)
+        self.size = {name: plain_rms(measured[name]) for name in self.joints}
+        moved = self.motion.moved
         bodies = arm.robot.rigid_body_torque(arm.recorded, *moved, arm.held)
         if arm.found is not None and arm.found.torque is not None:
             bodies = bodies + arm.found.torque(*moved)
@@ -109,7 +102,7 @@ class Withheld:
             torque = (friction_nm or {}).get(name, law.torque_nm(self.velocity[name], self._slip[name]))
             if law.armature_kg_m2 is not None:
                 torque = torque + (law.armature_kg_m2 - believed.armature_kg_m2) * self._acceleration[name]
-            found[name] = _rms((self._left[name] - self._smooth(torque))[edge])
+            found[name] = plain_rms((self._left[name] - self._smooth(torque))[edge])
         return found
 
     def before(self) -> dict[str, float]:
@@ -131,7 +124,7 @@ def rows_of(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def figure_of_target(
     arm: ArmSet, motion: Withheld, target: str, texts: Mapping[str, str], lost: str
 ) -> list[dict[str, Any]]:
-    """Rows of a target's files, see ``Row``; none where the logs have no torque."""
+    """Rows of a target's files, see ``_row``; none where the logs have no torque."""
     if not motion.known:
         return []
     before, laws = motion.before(), laws_of(target, texts, arm.joints)
@@ -144,7 +137,7 @@ def figure_of_target(
         where = "compiled and run here"
     every = [motion.off(one, friction) for one in laws]
     after = {name: float(np.median([off[name] for off in every])) for name in motion.joints}
-    return [Row(target, where, before, after, motion.size, lost).told()]
+    return [_row(target, where, before, after, motion.size, lost)]
 
 
 def figures_of_model(
@@ -153,12 +146,6 @@ def figures_of_model(
     """Rows of the user's improved model: in MuJoCo, and for a short while in the other engines that are installed.
 
     Where it cannot run in closed loop, its friction is read back from the edited file.
-
-    Args:
-        arm: model and recordings.
-        motion: that was not fitted.
-        natives: what was changed.
-        told: its ``closed_loop_gap``.
     """
     if not motion.known:
         return []
@@ -166,19 +153,19 @@ def figures_of_model(
         return [_row_as_read(arm, motion, natives)]
     before, after = ({n: told[when][n]["torque_nm"] for n in motion.joints} for when in ("before", "after"))
     here = f"MuJoCo {mujoco_library().__version__}, closed loop"
-    rows = [Row("mjcf", here, before, after, motion.size, "told with each joint").told()]
+    rows = [_row("mjcf", here, before, after, motion.size, "told with each joint")]
     improved = compiled_with(arm.robot, natives)
-    short = _beginning(motion.motion, SLOW_FROM_S + SLOW_S)
+    short = motion.motion.beginning(SLOW_FROM_S + SLOW_S)
     begin = int(np.searchsorted(short.time_s, short.time_s[0] + SLOW_FROM_S))
     for name, engine in installed().items():
         try:
-            ran = replayed(improved, *_driven(arm, short), engine=engine, begin=begin).torque_nm
+            ran = replayed(improved, *driven(arm, short), engine=engine, begin=begin).torque_nm
         except Exception as error:  # whatever another engine raises: the model is written all the same
             rows.append({"target": "mjcf", "where": name, "refused": f"{type(error).__name__}: {error}"[:300]})
             continue
-        where, torque = f"{name}, closed loop, {SLOW_S:g} s", _reported(arm, natives) * ran
+        where, torque = f"{name}, closed loop, {SLOW_S:g} s", reported(arm, natives) * ran
         off = _short_off(arm, motion, short, begin, torque)
-        rows.append(Row("mjcf", where, *off, motion.size, "as above").told())
+        rows.append(_row("mjcf", where, *off, motion.size, "as above"))
     return rows
 
 
@@ -188,7 +175,7 @@ def _row_as_read(arm: ArmSet, motion: Withheld, natives: Mapping[str, Native]) -
     joints = {name: improved.joint(name) for name in motion.joints}
     laws = {name: Law(b.dry_nm, *b.stribeck, b.damping, b.armature_kg_m2) for name, b in joints.items()}
     target, where = "urdf" if robot.urdf else "mjcf", "our own evaluation of the friction that MuJoCo reads from it"
-    return Row(target, where, motion.before(), motion.off(laws), motion.size, "told with each joint").told()
+    return _row(target, where, motion.before(), motion.off(laws), motion.size, "told with each joint")
 
 
 def figure_in_newton(
@@ -198,8 +185,8 @@ def figure_in_newton(
     name = newton()
     if name is None or not motion.known or why_no_closed_loop(arm, [motion.motion]):
         return []
-    short, step_s = _beginning(motion.motion, ENGINE_S), float(arm.robot.compiled.opt.timestep)
-    joints, _, time, position, command = _driven(arm, short)
+    short, step_s = motion.motion.beginning(ENGINE_S), float(arm.robot.compiled.opt.timestep)
+    joints, _, time, position, command = driven(arm, short)
     where = f"{name}, closed loop, {ENGINE_S:g} s"
     try:
         prims = [prim_name(joint) for joint in joints]
@@ -207,13 +194,8 @@ def figure_in_newton(
     except Exception as error:  # as above
         return [{"target": "newton", "where": name, "refused": f"{type(error).__name__}: {error}"[:300]}]
     begin = int(np.searchsorted(time, time[0] + EDGE_S))
-    off = _short_off(arm, motion, short, begin, _reported(arm, natives) * ran)
-    return [Row("newton", where, *off, motion.size, lost).told()]
-
-
-def _reported(arm: ArmSet, natives: Mapping[str, Native]) -> Array:
-    """Torque that each drive reports over the torque that it gives, (k,)."""
-    return np.array([natives[joint].reported if joint in natives else 1.0 for joint in arm.recorded])
+    off = _short_off(arm, motion, short, begin, reported(arm, natives) * ran)
+    return [_row("newton", where, *off, motion.size, lost)]
 
 
 def _short_off(
@@ -221,19 +203,13 @@ def _short_off(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """RMS of the torque error by joint from row ``begin`` on: user's model in MuJoCo, and ``torque`` (n, k)."""
     smooth = low_pass(short.time_s)
-    nominal = replayed(arm.robot.compiled, *_driven(arm, short)).torque_nm
+    nominal = replayed(arm.robot.compiled, *driven(arm, short)).torque_nm
     before, after = {}, {}
     for name in motion.joints:
         k, measured = arm.recorded.index(name), np.asarray(short.samples[name].torque_nm)
-        before[name] = _rms(smooth(measured - nominal[:, k])[begin:])
-        after[name] = _rms(smooth(measured - torque[:, k])[begin:])
+        before[name] = plain_rms(smooth(measured - nominal[:, k])[begin:])
+        after[name] = plain_rms(smooth(measured - torque[:, k])[begin:])
     return before, after
-
-
-def _driven(arm: ArmSet, motion: Motion) -> tuple[Sequence[str], Mapping[str, float], Array, Array, Array]:
-    """(joints, held, time, position, command) of a motion."""
-    commands = [s.position_command_rad for s in motion.samples.values() if s.position_command_rad is not None]
-    return arm.recorded, arm.held, motion.time_s, motion.position_rad, np.stack(commands, axis=1)
 
 
 def _travel(arm: ArmSet, name: str) -> float:
@@ -249,12 +225,3 @@ def _slip(position_rad: Array, travel_rad: float) -> Array:
     for k, moved in enumerate(np.diff(position_rad) / travel_rad, 1):
         slip[k] = min(1.0, max(-1.0, slip[k - 1] + moved))
     return slip
-
-
-def _beginning(motion: Motion, seconds: float) -> Motion:
-    keep = motion.time_s - motion.time_s[0] <= seconds
-    return Motion(motion.name, motion.validation, {name: s.select(keep) for name, s in motion.samples.items()})
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

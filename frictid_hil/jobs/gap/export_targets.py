@@ -15,7 +15,7 @@ from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.gap.diagnosis import Diagnosis
 from frictid_hil.jobs.gap.export_figures import Withheld, figure_in_newton, figure_of_target
 from frictid_hil.jobs.gap.from_model import ArmSet
-from frictid_hil.jobs.gap.write_model import Export, joint_model, natives, use_of
+from frictid_hil.jobs.gap.write_model import Export, joint_model, natives, use_of, within
 from frictid_hil.simulation import usd
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, place_of, written_as
@@ -101,12 +101,9 @@ def write_targets(
         effects = made[name].model.effects if name in made else {}
         stiffness = found[name].presliding_nm_per_rad
         joints[name] = numbers_of(joint.believed, joint_model(joint, effects, stiffness), use)
-        drawn: list[Numbers] = []
-        for _ in range(wanted.samples):
-            other = _drawn(effects, found[name], random)
-            drawn.append(numbers_of(joint.believed, joint_model(joint, other, stiffness), use))
-        if drawn:
-            samples[name] = drawn
+        if wanted.samples:
+            others = (_drawn(effects, found[name], random) for _ in range(wanted.samples))
+            samples[name] = [numbers_of(joint.believed, joint_model(joint, o, stiffness), use) for o in others]
     texts = {
         target: {path.parent / name: text for name, text in _texts(arm, target, path, joints, samples, wanted).items()}
         for target, path in wanted.files.items()
@@ -159,17 +156,8 @@ def _drawn(
     if not found.samples:
         return {effect: _within_interval(effect, values, found, random) for effect, values in effects.items()}
     draw = found.samples[int(random.integers(len(found.samples)))]
-    drawn = {}
-    for effect in effects:
-        limits = {p.name: p for p in all_effects()[effect].parameters}
-        told = {
-            n: float(np.clip(v, limits[n].lower, limits[n].upper))
-            for n, v in draw.get(effect, {}).items()
-            if n in limits
-        }
-        if told:
-            drawn[effect] = all_effects()[effect].complete(told)
-    return drawn
+    told = {effect: within(effect, draw.get(effect, {})) for effect in effects}
+    return {effect: all_effects()[effect].complete(values) for effect, values in told.items() if values}
 
 
 def _within_interval(
@@ -177,11 +165,9 @@ def _within_interval(
 ) -> dict[str, float]:
     """Parameters of an effect that was read without a posterior, each within its interval."""
     parameters = next((cause.parameters for cause in found.causes if cause.effect == effect), {})
-    limits = {p.name: p for p in all_effects()[effect].parameters}
-    drawn = dict(values)
-    for name, told in parameters.items():
-        if told.low is not None and told.high is not None and name in drawn:
-            sigma = (told.high - told.low) / _SIGMAS
-            value = drawn[name] + sigma * float(random.standard_normal())
-            drawn[name] = float(np.clip(value, limits[name].lower, limits[name].upper))
-    return drawn
+    drawn = {
+        name: values[name] + (told.high - told.low) / _SIGMAS * float(random.standard_normal())
+        for name, told in parameters.items()
+        if told.low is not None and told.high is not None and name in values
+    }
+    return {**values, **within(effect, drawn)}

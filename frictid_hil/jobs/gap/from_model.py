@@ -23,7 +23,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.arm import ArmFindings, Recorded, find_in_arm
 from frictid_hil.gap.experiment_set import ExperimentSet, experiment_set
 from frictid_hil.jobs.gap.draft import drafted
-from frictid_hil.jobs.gap.logs import names_of, parted, samples_of_all
+from frictid_hil.jobs.gap.logs import listed_as, names_of, parted, samples_of_all
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.robot_model import ModelJoint, RobotModel
 
@@ -44,9 +44,7 @@ class ModelLogs:
 
     Attributes:
         model: MJCF or URDF, by path or the name of one that is shipped.
-        logs: recordings, each of any number of joints.
         joints: to diagnose; ``NAME`` or ``NAME=NAME_IN_LOG``; all that model and logs share unless told.
-        columns: column map of foreign logs.
         held: place in rad (m) of joints that the logs do not have.
         tolerances: one-sigma by ``NUMBER`` or ``JOINT:NUMBER``.
         validation: names of logs to judge on.
@@ -87,13 +85,7 @@ class JointSet:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One recording of several joints on one clock.
-
-    Attributes:
-        name: of the recording.
-        validation: judged on, never fitted.
-        samples: by the model's name of the joint; all on the same times.
-    """
+    """One recording of several joints on one clock, by the model's names; ``validation`` is judged on, never fitted."""
 
     name: str
     validation: bool
@@ -109,14 +101,29 @@ class Motion:
         """Shape (n, k)."""
         return np.stack([s.position_rad for s in self.samples.values()], axis=1)
 
+    @property
+    def moved(self) -> tuple[Array, Array, Array]:
+        """Its ``kinematics``."""
+        return kinematics(self.time_s, self.position_rad)
+
+    def beginning(self, seconds: float) -> Motion:
+        """The first seconds of it."""
+        keep = self.time_s - self.time_s[0] <= seconds
+        return replace(self, samples={name: s.select(keep) for name, s in self.samples.items()})
+
+
+def postures(motions: Sequence[Motion], most: int) -> Array:
+    """Positions that the joints had along some recordings, about so many, shape (n, k)."""
+    every = np.concatenate([motion.position_rad for motion in motions])
+    some: Array = every[:: max(1, every.shape[0] // most)]
+    return some
+
 
 @dataclass(frozen=True, slots=True)
 class ArmSet:
     """The whole arm: its model, its motions, one set a joint.
 
     Attributes:
-        robot: the model.
-        motions: the recordings.
         held: where the joints stand that no recording has.
         joints: by name; only those that move.
         found: of the arm as a whole; None where no log has torques of all joints, or there is only one joint.
@@ -147,14 +154,14 @@ def sets_from_model(asked: ModelLogs) -> ArmSet:
     motions = _motions(asked, robot)
     names = tuple(motions[0].samples)
     held = {name: value for name, value in (asked.held or {}).items() if name not in names}
-    rigid = [_rigid(robot, motion, held) for motion in motions]
+    rigid = [robot.rigid_body_torque(names, *motion.moved, held) for motion in motions]
     _ask_for_places(robot, motions, held)
     _known_tolerances(asked.tolerances or {}, names)
-    inertia = _inertia(robot, motions, held)
+    inertia = robot.inertia_kg_m2(names, postures(motions, INERTIA_POSTURES), held).mean(axis=0)
     found = _of_the_arm(robot, motions, held)
     if found is not None and found.torque is not None:
         # What belongs to the arm is no cause of a joint.
-        rigid = [torque + found.torque(*_motion_of(motion)) for torque, motion in zip(rigid, motions, strict=True)]
+        rigid = [torque + found.torque(*motion.moved) for torque, motion in zip(rigid, motions, strict=True)]
     sets = {}
     for k, name in enumerate(names):
         moved = [n for n, motion in enumerate(motions) if _moves(motion.samples[name])]
@@ -181,8 +188,7 @@ def _of_the_arm(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str,
         torques = [s.torque_nm for s in motion.samples.values() if s.torque_nm is not None]
         if len(torques) < len(names):
             return None
-        time = next(iter(motion.samples.values())).time_s
-        recorded.append(Recorded(motion.validation, time, motion.position_rad, np.stack(torques, axis=1)))
+        recorded.append(Recorded(motion.validation, motion.time_s, motion.position_rad, np.stack(torques, axis=1)))
     if len(names) < 2:
         return None
     curves = [_curve_of(robot.joint(name), motions) for name in names]
@@ -196,15 +202,12 @@ def _curve_of(believed: ModelJoint, motions: Sequence[Motion]) -> FrictionCurve 
     return FrictionCurve.through(np.array(told["velocity_rad_s"]), np.array(told["torque_nm"]))
 
 
-def _motion_of(motion: Motion) -> tuple[Array, Array, Array]:
-    return kinematics(next(iter(motion.samples.values())).time_s, motion.position_rad)
-
-
 def _motions(asked: ModelLogs, robot: RobotModel) -> tuple[Motion, ...]:
     if not asked.logs:
         raise UsageError("no log is given", next_step="name recordings of the machine with --log")
     columns = load_columns(asked.columns) if asked.columns is not None else None
-    wanted = dict(_pair(word) for word in asked.joints)
+    pairs = (word.partition("=") for word in asked.joints)
+    wanted = {name: in_log or name for name, _, in_log in pairs}
     for name in wanted:
         robot.number(name)
     named_logs = zip(names_of(asked.logs), asked.logs, strict=True)
@@ -222,17 +225,12 @@ def _motions(asked: ModelLogs, robot: RobotModel) -> tuple[Motion, ...]:
                 next_step="give logs of the same joints together, or name the joints that all have with --joint",
             )
         on_one_clock.append((log, _one_clock({name: named[name] for name in first})))
-    motions = []
     leads = [(log, next(iter(together.values()))) for log, together in on_one_clock]
     whole = dict(on_one_clock)
-    for log, source, keep, validation in parted(leads, asked.validation, asked.split):
-        motions.append(Motion(log, validation, {name: s.select(keep) for name, s in whole[source].items()}))
-    return tuple(motions)
-
-
-def _pair(word: str) -> tuple[str, str]:
-    name, _, in_log = word.partition("=")
-    return name, in_log or name
+    return tuple(
+        Motion(log, validation, {name: s.select(keep) for name, s in whole[source].items()})
+        for log, source, keep, validation in parted(leads, asked.validation, asked.split)
+    )
 
 
 def _as_in_model(
@@ -272,11 +270,6 @@ def _one_clock(named: Mapping[str, Samples]) -> dict[str, Samples]:
     return made
 
 
-def _rigid(robot: RobotModel, motion: Motion, held: Mapping[str, float]) -> Array:
-    """The bodies' torque along a recording, shape (n, k)."""
-    return robot.rigid_body_torque(tuple(motion.samples), *_motion_of(motion), held)
-
-
 def kinematics(time_s: Array, position_rad: Array) -> tuple[Array, Array, Array]:
     """Position, velocity and acceleration by differences, shape (n, k) each; nothing is filtered."""
     step_s = float(np.median(np.diff(time_s)))
@@ -291,14 +284,6 @@ def kinematics(time_s: Array, position_rad: Array) -> tuple[Array, Array, Array]
     return position_rad, velocity, acceleration
 
 
-def _inertia(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str, float]) -> Array:
-    """Mean inertia of each joint along the recordings, shape (k,)."""
-    every = np.concatenate([motion.position_rad for motion in motions])
-    some = every[:: max(1, every.shape[0] // INERTIA_POSTURES)]
-    mean: Array = robot.inertia_kg_m2(tuple(motions[0].samples), some, held).mean(axis=0)
-    return mean
-
-
 def _reference(robot: RobotModel, logged: Sequence[str]) -> dict[str, float]:
     reference = robot.compiled.qpos0
     places = {name: int(robot.compiled.jnt_qposadr[robot.number(name)]) for name in robot.joints}
@@ -308,8 +293,7 @@ def _reference(robot: RobotModel, logged: Sequence[str]) -> dict[str, float]:
 def _ask_for_places(robot: RobotModel, motions: Sequence[Motion], held: Mapping[str, float]) -> None:
     """Ask where a joint stood that no log has, if that makes a difference to those that have."""
     names = tuple(motions[0].samples)
-    every = np.concatenate([motion.position_rad for motion in motions])
-    some = every[:: max(1, every.shape[0] // INERTIA_POSTURES)]
+    some = postures(motions, INERTIA_POSTURES)
     still = np.zeros_like(some)
 
     def gravity(places: Mapping[str, float]) -> Array:
@@ -362,14 +346,7 @@ def _joint_set(
     listed = []
     for order, (motion, column) in enumerate(zip(motions, rigid_nm, strict=True)):
         samples = motion.samples[name] if alone else replace(motion.samples[name], rigid_body_torque_nm=column)
-        listed.append(
-            (
-                ExperimentFile(
-                    name=motion.name, role="validation" if motion.validation else "identification", run_order=order
-                ),
-                samples,
-            )
-        )
+        listed.append((listed_as(motion.name, motion.validation, order), samples))
     numbers: dict[str, Any] = {}
     friction = told["joint"].get("friction") or _friction(believed, [samples for _, samples in listed])
     if friction is None:
@@ -401,8 +378,7 @@ def _alone(motions: Sequence[Motion], name: str, rigid_nm: Sequence[Array]) -> t
 
 def _gravity(robot: RobotModel, motions: Sequence[Motion], name: str) -> tuple[float, float]:
     """Cosine and sine that come nearest to the joint's gravity along the recordings."""
-    every = np.concatenate([motion.position_rad for motion in motions])
-    some = every[:: max(1, every.shape[0] // (10 * INERTIA_POSTURES))]
+    some = postures(motions, 10 * INERTIA_POSTURES)
     names = tuple(motions[0].samples)
     torque = robot.rigid_body_torque(names, some, np.zeros_like(some), np.zeros_like(some))
     q = some[:, names.index(name)]
@@ -449,14 +425,9 @@ def _drive(believed: ModelJoint, robot: RobotModel) -> dict[str, Any]:
     motor = believed.motor
     if motor is None:
         return {}
-    told: dict[str, Any] = {}
-    drive = {}
-    if motor.delay_s > 0.0:
-        drive["torque_delay_s"] = motor.delay_s
-    if motor.lag_s > 0.0:
-        drive["current_lag_s"] = motor.lag_s
-    if drive:
-        told["drive"] = drive
+    late = {"torque_delay_s": motor.delay_s, "current_lag_s": motor.lag_s}
+    drive = {name: value for name, value in late.items() if value > 0.0}
+    told: dict[str, Any] = {"drive": drive} if drive else {}
     if motor.law == "position":
         limit = {"torque_limit_nm": motor.torque_limit_nm} if np.isfinite(motor.torque_limit_nm) else {}
         rate = {"rate_hz": 1.0 / float(robot.compiled.opt.timestep)}

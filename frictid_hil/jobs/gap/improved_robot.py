@@ -23,10 +23,6 @@ def improved_robot(experiments: ExperimentSet, model: JointModel) -> dict[str, A
     """A robot of one simulated joint.
 
     Limits come from the recordings: the joint may go where it was seen to go, a little further, and as fast.
-
-    Args:
-        experiments: the set that was diagnosed.
-        model: its joint with the causes added.
     """
     document: Mapping[str, Any] = experiments.nominal.document or {}
     low = min(float(log.position_rad.min()) for log in experiments.experiments)
@@ -72,10 +68,6 @@ def improved_belief(experiments: ExperimentSet, effects: Mapping[str, Mapping[st
 
     Inertia, gravity and friction are drafted where nothing was believed of friction. ``effects`` are those of a robot
     file's ``simulated``.
-
-    Args:
-        experiments: the set that was diagnosed.
-        effects: parameters by effect.
     """
     document = {k: v for k, v in (experiments.nominal.document or {}).items() if k != "experiments"}
     fitted = tuple(log for log in experiments.experiments if not log.validation) or experiments.experiments

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,53 +25,71 @@ VALIDATION_SHARE = 1.0 / 3.0
 """Part of the recorded time, its end, that is judged on where nobody says what to judge on."""
 
 
-def set_from_logs(
-    logs: Sequence[Path],
-    *,
-    columns: str | None = None,
-    nominal: Path | None = None,
-    profile: Path | None = None,
-    joint: str | None = None,
-    validation: Sequence[str] = (),
-    split: str = "",
-) -> ExperimentSet:
-    """A set of recordings that lie anywhere.
+@dataclass(frozen=True, slots=True)
+class Source:
+    """What is diagnosed: a set's folder, or recordings that lie anywhere, with a belief.
 
-    Roles come from ``validation``, else from what ``nominal`` says of logs of the same name, else from time: the last
-    log, or the last third of a single one, is judged on.
+    Roles of such recordings come from ``validation``, else from what ``nominal`` says of logs of the same name, else
+    from time: the last log, or the last third of a single one, is judged on.
 
-    Args:
-        logs: recordings of one joint.
+    Attributes:
+        paths: one folder, or logs.
         columns: column map of a foreign logger, by path or name.
-        nominal: a ``nominal.yaml``; it need not list the logs.
-        profile: friction profile or run folder, whose numbers overrule the file's.
+        nominal: what the simulator believes; a set's own ``nominal.yaml`` unless told. It need not list the logs.
+        profile: friction profile or run folder, whose numbers overrule it.
         joint: its name in recordings and profile that hold several.
         validation: names of logs (file names without ending) to judge on.
         split: see ``parted``.
-
-    Raises:
-        UsageError: several joints and none named, or a validation log that is not there.
-        InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
     """
-    read_logs = [(n, _samples(path, columns, joint)) for n, path in zip(names_of(logs), logs, strict=True)]
-    data, told, where = _belief(nominal, profile, joint)
-    entries = {entry.name: entry for entry in told.experiments}
-    if not validation and not split:
-        names = [name for name, _ in read_logs]
-        validation = [name for name in names if name in entries and entries[name].role == "validation"]
-    whole = dict(read_logs)
-    parts = [
-        (name, whole[source].select(keep), judged)
-        for name, source, keep, judged in parted(read_logs, validation, split)
-    ]
-    listed = []
-    for order, (name, samples, judged) in enumerate(parts):
-        payload = entries[name].payload if name in entries else False
-        entry = ExperimentFile(
-            name=name, role="validation" if judged else "identification", payload=payload, run_order=order
-        )
-        listed.append((entry, samples))
-    return experiment_set(told, data, where, logs[0].resolve().parent.name, listed)
+
+    paths: Sequence[Path]
+    columns: str | None = None
+    nominal: Path | None = None
+    profile: Path | None = None
+    joint: str | None = None
+    validation: Sequence[str] = ()
+    split: str = ""
+
+    def load(self) -> ExperimentSet:
+        """Read the set.
+
+        Raises:
+            UsageError: a folder beside other paths or with options of single logs; several joints and none named.
+            InputFileError, ConfigError: an unusable recording, map, nominal joint or profile.
+        """
+        folders = [path for path in self.paths if (path / "nominal.yaml").exists()]
+        options = (self.columns, self.nominal, self.profile, self.joint, self.split, *self.validation)
+        if not folders and len(self.paths) == 1 and self.paths[0].is_dir() and not any(options):
+            folders = list(self.paths)
+        if not folders:
+            return self._of_logs()
+        if len(self.paths) > 1 or any(options):
+            raise UsageError(
+                "an experiment set says by itself what is believed and which logs are judged on",
+                where=str(folders[0]),
+                next_step="give the set alone, or its logs with --nominal",
+            )
+        return ExperimentSet.load(folders[0])
+
+    def _of_logs(self) -> ExperimentSet:
+        named = zip(names_of(self.paths), self.paths, strict=True)
+        logs = [(name, _samples(path, self.columns, self.joint)) for name, path in named]
+        data, told, where = _belief(self.nominal, self.profile, self.joint)
+        entries = {entry.name: entry for entry in told.experiments}
+        validation = self.validation
+        if not validation and not self.split:
+            validation = [name for name, _ in logs if name in entries and entries[name].role == "validation"]
+        whole, listed = dict(logs), []
+        for order, (name, source, keep, judged) in enumerate(parted(logs, validation, self.split)):
+            payload = entries[name].payload if name in entries else False
+            listed.append((listed_as(name, judged, order, payload=payload), whole[source].select(keep)))
+        return experiment_set(told, data, where, self.paths[0].resolve().parent.name, listed)
+
+
+def listed_as(name: str, judged: bool, order: int, *, payload: bool = False) -> ExperimentFile:
+    """The entry of a log in a ``nominal.yaml``."""
+    role: Any = "validation" if judged else "identification"
+    return ExperimentFile(name=name, role=role, payload=payload, run_order=order)
 
 
 def parted(
@@ -144,9 +162,8 @@ def _belief(nominal: Path | None, profile: Path | None, joint: str | None) -> tu
     if profile is not None:
         measured = _joint_of(profile, joint)
         numbers = measured_by(measured)
-        kept = {name: value for name, value in data["joint"].items() if name != "gravity_torque_nm"}
-        if "gravity_cos_nm" not in numbers:
-            kept = data["joint"]
+        known = "gravity_torque_nm" if "gravity_cos_nm" in numbers else ""
+        kept = {name: value for name, value in data["joint"].items() if name != known}
         data = {
             **data,
             "joint": {**kept, **numbers},
@@ -170,25 +187,23 @@ def _joint_of(profile: Path, joint: str | None) -> JointProfile:
 def _samples(path: Path, columns: str | None, joint: str | None) -> Samples:
     if columns is None and path.name.lower().endswith((".csv", ".csv.gz")):
         return read_log(path)
-    found = read(path, load_columns(columns) if columns is not None else None, joint)
+    found = samples_of_all(path, load_columns(columns) if columns is not None else None, joint)
     if len(found) > 1:
         raise UsageError(
             f"holds joints {', '.join(samples.joint for samples in found)}",
             where=str(path),
             next_step="name one with --joint",
         )
-    if not found:
-        raise InputFileError("no joint in this recording", where=str(path))
     return replace(found[0], prismatic=False)  # a linear axis is diagnosed like a rotary one, m for rad, N for N m
 
 
-def samples_of_all(path: Path, columns: ColumnMap | None) -> list[Samples]:
-    """Every joint of a recording.
+def samples_of_all(path: Path, columns: ColumnMap | None, joint: str | None = None) -> list[Samples]:
+    """Every joint of a recording, or the one.
 
     Raises:
         InputFileError: unusable, or without a joint.
     """
-    found = read(path, columns)
+    found = read(path, columns, joint)
     if not found:
         raise InputFileError("no joint in this recording", where=str(path))
     return found

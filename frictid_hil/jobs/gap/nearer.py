@@ -18,10 +18,6 @@ def nearer_only(arm: ArmSet, made: Mapping[str, Export]) -> tuple[dict[str, Expo
     A joint whose interval reaches the gap that it had gets a part of its causes instead, the one that comes nearest
     along the motions that were fitted; if that is no nearer either, the joint stays as the user had it.
 
-    Args:
-        arm: model and recordings.
-        made: every joint's change.
-
     Returns:
         The changes that stand, and ``closed_loop_gap`` with them. Its ``left_out`` says by joint which ``effects`` were
         not written, ``left_percent`` of the gap with them, and ``instead``, what was written.

@@ -17,7 +17,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnose import UNDECIDED
 from frictid_hil.gap.diagnosis import Cause, Diagnosis
 from frictid_hil.jobs.gap.closed_loop import fitted, gap_of, why_no_closed_loop
-from frictid_hil.jobs.gap.from_model import ArmSet, JointSet
+from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, postures
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
 from frictid_hil.simulation.model_edit import changed_elsewhere, compiled_with, edited_files
@@ -35,11 +35,7 @@ _FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9
 class Export:
     """One joint's part of an improved model.
 
-    Attributes:
-        model: the joint with its causes, as we simulate it.
-        native: what is changed in the file.
-        form: of its friction.
-        off: by form that was tried, torque on withheld motion against our own simulation, over its RMS.
+    ``off`` is, by form of friction that was tried, torque on withheld motion against our own simulation, over its RMS.
     """
 
     model: JointModel
@@ -56,10 +52,7 @@ def natives(made: Mapping[str, Export]) -> dict[str, Native]:
 def exports(arm: ArmSet, found: Mapping[str, Diagnosis], *, apply: bool = False) -> dict[str, Export]:
     """What to change in the user's model, by joint; only joints with named causes, or drafted friction.
 
-    Args:
-        arm: model and recordings.
-        found: diagnosis of every joint.
-        apply: take the likeliest causes where the verdict is open, too.
+    With ``apply``, the likeliest causes where the verdict is open, too.
     """
     wanted = {name: applied(found[name], apply=apply) for name in arm.joints}
     if not any(s.torque_nm is not None for motion in arm.motions for s in motion.samples.values()):
@@ -122,9 +115,9 @@ def applied(found: Diagnosis, *, apply: bool) -> dict[str, dict[str, float]]:
         told = {name: value.value for name, value in cause.parameters.items()}
         if "lag_s" in told:
             # A chain from command to position: what lags is an effect of its own, and what no delay holds lags too.
-            late = told["delay_s"] - _within("torque_delay", told)["delay_s"]
-            effects["electrical_lag"] = _within("electrical_lag", {"time_constant_s": told["lag_s"] + late})
-        if values := _within(cause.effect, told):
+            late = told["delay_s"] - within("torque_delay", told)["delay_s"]
+            effects["electrical_lag"] = within("electrical_lag", {"time_constant_s": told["lag_s"] + late})
+        if values := within(cause.effect, told):
             effects[cause.effect] = all_effects()[cause.effect].complete(values)
     return effects
 
@@ -134,7 +127,7 @@ def likely(found: Diagnosis) -> Sequence[Cause]:
     return [cause for cause in found.causes if cause.confidence >= UNDECIDED] or found.causes[:1]
 
 
-def _within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
+def within(effect: str, told: Mapping[str, float]) -> dict[str, float]:
     """An effect's own parameters, within their bounds."""
     limits = {p.name: p for p in all_effects()[effect].parameters}
     return {n: float(np.clip(v, limits[n].lower, limits[n].upper)) for n, v in told.items() if n in limits}
@@ -171,11 +164,7 @@ def export_of(
 ) -> Export:
     """The change of a joint with these effects, in the form of friction that comes nearest to our own simulation.
 
-    Args:
-        arm: model and recordings.
-        joint: to be changed.
-        effects: its causes.
-        presliding_nm_per_rad: its presliding stiffness; None as believed.
+    The presliding stiffness is as believed where None.
     """
     robot, name = arm.robot, joint.believed.name
     model = joint_model(joint, effects, presliding_nm_per_rad)
@@ -218,8 +207,7 @@ def _gravity(arm: ArmSet, name: str) -> tuple[Array, float]:
     """Gravity torque that a joint carries along the recordings, (n,), and its own body's share of it."""
     robot = arm.robot
     names = arm.recorded
-    every = np.concatenate([motion.position_rad for motion in arm.motions])
-    some = every[:: max(1, every.shape[0] // 200)]
+    some = postures(arm.motions, 200)
     still, column = np.zeros_like(some), names.index(name)
     whole = robot.rigid_body_torque(names, some, still, still, arm.held)[:, column]
     body = int(robot.compiled.jnt_bodyid[robot.number(name)])

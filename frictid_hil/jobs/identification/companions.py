@@ -20,11 +20,7 @@ def with_companions(
 ) -> CycleRecording:
     """The recording of one joint, knowing those that moved along.
 
-    Args:
-        recording: of the joint.
-        samples: of the joint, whole run.
-        company: of the others, whole run.
-        start_s: run time of cycle 1.
+    Samples are of whole runs; cycle 1 starts at run time ``start_s``.
 
     Raises:
         IdentificationError: the run has no coupling stretch, lacks a joint, or does not tell them apart.

@@ -24,10 +24,6 @@ Answer = TypeVar("Answer")
 def executor(named: str | None, tasks: int) -> Iterator[Executor | None]:
     """Open the executor; None stands for this process.
 
-    Args:
-        named: ``processes:N``, ``dask://host:port``, or None to choose.
-        tasks: how many there are.
-
     Raises:
         UsageError: no such executor, or its package is missing.
         HardwareError: no cluster answers there.

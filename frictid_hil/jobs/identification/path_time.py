@@ -77,10 +77,7 @@ class PathTime:
 def path_time(samples: Samples, procedure: Procedure, start_ns: int) -> PathTime | None:
     """The time of the path; None where it is run time, or nothing tells.
 
-    Args:
-        samples: whole run, with commanded positions.
-        procedure: whose cycles start at ``start_ns``.
-        start_ns: run time.
+    The samples are of the whole run; cycle 1 starts at run time ``start_ns``.
     """
     if any(STOPS in mark.details for mark in samples.marks):
         noted = sorted(tuple(stop) for mark in samples.marks for stop in mark.details.get(STOPS, ()))

@@ -40,10 +40,7 @@ class Programme:
     def note(self, procedure: Procedure, rate_hz: float, quantum_s: float = 0.0) -> str:
         """What a person should expect of it, in a sentence; an accuracy is promised only where it was measured.
 
-        Args:
-            procedure: of one joint.
-            rate_hz: of set-points.
-            quantum_s: of the positions' time where a controller cycles by itself; 0 on a bus that we cycle.
+        ``quantum_s`` is of the positions' time where a controller cycles by itself; 0 on a bus that we cycle.
         """
         cycles = len(self.shares) or _CYCLES
         compared = (

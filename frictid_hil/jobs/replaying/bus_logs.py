@@ -24,7 +24,6 @@ class LoggedMotion:
     """One joint's motion in a log.
 
     Attributes:
-        joint: name.
         marks: where it is, on the log's own run time; empty where nothing tells.
         late_cycles: late and missed cycles that the live run counted.
     """
@@ -39,7 +38,6 @@ class Log:
     """One bus log with what is known of it.
 
     Attributes:
-        path: of the file.
         frame_map: which frame carries what.
         identities: what the drives said of themselves, by joint; empty for logs of other origin.
         motions: what the joints did; empty where nothing tells.
@@ -84,9 +82,7 @@ def given_map(frames: Path | None, eds: Path | None, robot: Robot) -> Mapping[st
 def logs_of(source: Path, given: Mapping[str, Any] | None) -> list[Log]:
     """The bus logs of a run folder, or the one file, each with its frame map.
 
-    Args:
-        source: run folder or bus log.
-        given: frame map that a person gave; it goes before the manifest's.
+    A frame map that a person gave goes before the manifest's.
 
     Raises:
         UsageError: nothing says which frame carries what.

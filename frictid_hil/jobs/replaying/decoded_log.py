@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import can
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from frictid_hil.config.profile import JudgedGate
 from frictid_hil.errors import InputFileError
 from frictid_hil.jobs.replaying.bus_logs import Log, LoggedMotion
-from frictid_hil.protocol.frames import LogDecoder, LoggedFrame, frame_decoders, joint_names
+from frictid_hil.protocol.frames import LoggedFrame, frame_decoders, joint_names
 from frictid_hil.recording.bus_log import Frames, read_frames
 from frictid_hil.recording.playback import LogBus
 from frictid_hil.recording.samples import Mark, Samples
@@ -23,6 +24,11 @@ from frictid_hil.runs.folder import samples_from_rows
 
 MOST_LOST_PERCENT = 5.0
 """A joint that lacks more of its rows than this is not trusted."""
+
+
+_MOTION = attrgetter("t_ns", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad")
+_STATE = attrgetter("external_torque_nm", "temperature_c", "status_raw")
+"""Columns of ``ring.SAMPLE_ROW`` that a report has, in order; between and after them are those that it has not."""
 
 
 @dataclass(slots=True)
@@ -65,11 +71,9 @@ class Account:
         if not lost:
             return None
         message = f"{lost} rows ({percent:.2g} %) are missing from the log"
-        if percent > MOST_LOST_PERCENT:
-            return JudgedGate(
-                name="log", passed=False, message=f"{message}; up to {MOST_LOST_PERCENT:g} % are tolerated"
-            )
-        return JudgedGate(name="log", passed=True, message=f"{message}; the others were used")
+        passed = percent <= MOST_LOST_PERCENT
+        then = "the others were used" if passed else f"up to {MOST_LOST_PERCENT:g} % are tolerated"
+        return JudgedGate(name="log", passed=passed, message=f"{message}; {then}")
 
 
 def lost_rows(time_ns: NDArray[np.int64]) -> tuple[int, float]:
@@ -88,26 +92,8 @@ def ordered(frames: Frames) -> tuple[Frames, int]:
     if not backwards:
         return frames, 0
     order = np.argsort(frames.t_ns, kind="stable")
-    return (
-        replace(
-            frames,
-            t_ns=frames.t_ns[order],
-            can_id=frames.can_id[order],
-            length=frames.length[order],
-            data=frames.data[order],
-            sent=frames.sent[order],
-        ),
-        backwards,
-    )
-
-
-def decoder_for(frame_map: Mapping[str, Any]) -> LogDecoder:
-    """Create a decoder for the frames of a log.
-
-    Raises:
-        InvalidFields: nobody understands this map, or a field of it is wrong.
-    """
-    return frame_decoders(str(frame_map.get("schema"))).decoder(frame_map)
+    columns = ("t_ns", "can_id", "length", "data", "sent")
+    return replace(frames, **{name: getattr(frames, name)[order] for name in columns}), backwards
 
 
 def rows_by_joint(
@@ -118,40 +104,24 @@ def rows_by_joint(
 ) -> dict[str, Rows]:
     """Every report of every joint as rows of ``ring.SAMPLE_ROW``, as the cyclic loop would have kept them.
 
-    Args:
-        frames: in order of time.
-        frame_map: which frame carries what.
-        account: counts are added to it.
-        at: told the run time of rows as they come, in ns.
+    ``at`` is told the run time of rows as they come, in ns; counts are added to ``account``.
+
+    Raises:
+        InvalidFields: nobody understands this map, or a field of it is wrong.
     """
     names = joint_names(frame_map)
     kept: list[list[tuple[Any, ...]]] = [[] for _ in names]
-    decoder = decoder_for(frame_map)
+    decoder = frame_decoders(str(frame_map.get("schema"))).decoder(frame_map)
     for row in decoder.rows(frames):
         account.rows += 1
         if account.rows % 1024 == 0:
             at(row.t_ns)
         for report, mine in zip(row.feedback, kept, strict=True):
             if report.age_cycles == 0 and report.valid:
-                mine.append(
-                    (
-                        report.t_ns,
-                        report.position_rad,
-                        report.velocity_rad_s,
-                        report.torque_nm,
-                        report.position_command_rad,
-                        0.0,
-                        report.external_torque_nm,
-                        report.temperature_c,
-                        report.status_raw,
-                        0,
-                        report.error_code,
-                    )
-                )
-    for name, count in decoder.unknown.items():
-        account.unknown[name] = account.unknown.get(name, 0) + count
-    for name, count in decoder.services.items():
-        account.services[name] = account.services.get(name, 0) + count
+                mine.append((*_MOTION(report), 0.0, *_STATE(report), 0, report.error_code))
+    for counted, more in ((account.unknown, decoder.unknown), (account.services, decoder.services)):
+        for name, count in more.items():
+            counted[name] = counted.get(name, 0) + count
     account.repeated += decoder.repeated
     account.backwards += decoder.backwards
     return {name: _increasing(np.array(mine, dtype=SAMPLE_ROW)) for name, mine in zip(names, kept, strict=True)}
@@ -165,12 +135,9 @@ def samples_of(
         rows = rows[(rows["t_ns"] >= marks[0].start_ns) & (rows["t_ns"] < marks[-1].end_ns)]
     samples = samples_from_rows(joint, rows, marks, identity, robot)
     # Before its first command a joint has none, and a log of other origin may carry none at all.
-    samples = replace(
-        samples,
-        velocity_rad_s=_filled(samples.velocity_rad_s),
-        torque_nm=_filled(samples.torque_nm),
-        position_command_rad=_filled(samples.position_command_rad),
-    )
+    columns = ("velocity_rad_s", "torque_nm", "position_command_rad")
+    filled: dict[str, Any] = {name: _filled(getattr(samples, name)) for name in columns}
+    samples = replace(samples, **filled)
     account.take(samples)
     return samples
 

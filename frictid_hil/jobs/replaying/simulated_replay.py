@@ -9,6 +9,7 @@ import numpy as np
 
 from frictid_hil.config.robot import Robot
 from frictid_hil.files import write_whole
+from frictid_hil.friction.metrics import plain_rms
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.samples import Samples
 
@@ -17,14 +18,9 @@ _CONTROL_PERIOD_S = 0.001
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedReplay:
-    """One joint, measured and simulated on the same rows.
+    """One joint, measured (``samples``) and simulated without noise on the same rows, shape (n,).
 
-    Attributes:
-        samples: as recorded.
-        position_rad: simulated, shape (n,).
-        velocity_rad_s: simulated.
-        torque_nm: simulated, without noise.
-        note: what a reader should know of the set-points.
+    ``note`` is what a reader should know of the set-points.
     """
 
     samples: Samples
@@ -36,13 +32,13 @@ class SimulatedReplay:
     @property
     def position_rms_rad(self) -> float:
         """Root of the mean square of measured minus simulated."""
-        return _rms(self.samples.position_rad - self.position_rad)
+        return plain_rms(self.samples.position_rad - self.position_rad)
 
     @property
     def torque_rms_nm(self) -> float | None:
         """The same of the torque; None for a recording without."""
         measured = self.samples.torque_nm
-        return None if measured is None else _rms(measured - self.torque_nm)
+        return None if measured is None else plain_rms(measured - self.torque_nm)
 
     def write_csv(self, path: Path) -> Path:
         """Measured and simulated columns, for any tool."""
@@ -89,7 +85,3 @@ def simulate(robot: Robot, samples: Samples) -> SimulatedReplay:
     if len(torque) > 1:
         torque[0] = torque[1]
     return SimulatedReplay(samples, np.array(position), np.array(velocity), np.array(torque), note)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
