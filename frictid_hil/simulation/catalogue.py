@@ -128,7 +128,7 @@ def write(folder: Path) -> None:
     (folder / PICTURES).mkdir(parents=True, exist_ok=True)
     (folder / PAGE).write_text(page(), encoding="utf-8")
     for effect in all_effects().values():
-        text = picture(effect.illustrate({}))
+        text = picture(effect.illustrate(effect.typical))
         (folder / PICTURES / f"{effect.name}.svg").write_text(text, encoding="utf-8")
 
 

@@ -129,8 +129,12 @@ class KinematicForm:
     position_step: bool = False
 
 
-def guesses_by_sample(step_s: float, upper_s: float) -> Array:
-    """Times to try for what comes late: parts of a sample, then up to eight of them, none above ``upper_s``."""
-    times = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * step_s
-    guesses: Array = times[times <= upper_s]
+LATEST_S = 0.05
+"""Longest time by which a torque comes late."""
+
+
+def guesses_by_sample(views: Sequence[DriveView], seen: float | None) -> Array:
+    """Times to try for what comes late: parts of a sample, then up to eight of them, none above ``LATEST_S``."""
+    times = np.concatenate([[0.125, 0.25], np.arange(0.5, 8.1, 0.5)]) * views[0].step_s
+    guesses: Array = times[times <= LATEST_S]
     return guesses

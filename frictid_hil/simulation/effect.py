@@ -103,14 +103,19 @@ class Illustration:
     y_label: str
     curves: tuple[tuple[str, Array, Array], ...]
 
+    @staticmethod
+    def over(x_label: str, x: Array, y_label: str, curves: Mapping[str, Array]) -> Illustration:
+        """Curves by label over one x."""
+        return Illustration(x_label, y_label, tuple((label, x, y) for label, y in curves.items()))
 
-def lagging_step(time_constant_s: float, y_label: str, true: str, lagging: str) -> Illustration:
-    """A step and its first-order lag, under the names given."""
-    constant = max(time_constant_s, 1e-5)
-    time = np.linspace(-1.0, 5.0, 601) * constant
-    step = np.where(time >= 0.0, 1.0, 0.0)
-    late = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
-    return Illustration("time (s)", y_label, ((true, time, step), (lagging, time, late)))
+    @staticmethod
+    def lagging_step(time_constant_s: float, y_label: str, true: str, lagging: str) -> Illustration:
+        """A step and its first-order lag, under the names given."""
+        constant = max(time_constant_s, 1e-5)
+        time = np.linspace(-1.0, 5.0, 601) * constant
+        step = np.where(time >= 0.0, 1.0, 0.0)
+        late = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
+        return Illustration.over("time (s)", time, y_label, {true: step, lagging: late})
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +161,7 @@ class Effect:
         parameters: in the order of its files.
         signature: where it shows.
         hooks: the forward form.
-        illustrate: a plot of the effect at given parameters (``typical`` ones when empty).
+        illustrate: a plot of the effect at given parameters, all of them.
         inverse: how it shows in the plant; None for effects of drive and encoder.
         actuation: how it shows between demand and reported torque, where it does.
         kinematic: how it shows in reported position and velocity, where it does.

@@ -100,6 +100,49 @@ class InverseForm:
         return self.shapes if self.shapes_for is None else self.shapes_for(views)
 
 
+def linear(
+    columns: Mapping[str, Callable[[View], Array]], first_coefficient: tuple[float, float] = (-math.inf, math.inf)
+) -> InverseForm:
+    """The form of an effect whose parameters enter linearly: by name, N m per unit of each along a view, (n,)."""
+    return InverseForm(
+        shapes=({},),
+        regressors=lambda views, shape: [np.stack([column(v) for column in columns.values()], axis=1) for v in views],
+        parameters=lambda shape, coefficients: dict(zip(columns, map(float, coefficients), strict=True)),
+        first_coefficient=first_coefficient,
+    )
+
+
+def behind_transmission(v: View, gap_rad: float, stiffness_nm_per_rad: float, relaxation_s: float) -> Array:
+    """Torque to a link behind play and spring less that to a rigid one, (n, 1)."""
+    from frictid_hil.simulation.inverse_loops import transmitted
+
+    link, damping = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2, relaxation_s * stiffness_nm_per_rad
+    torque = transmitted(
+        v.position_rad, v.step_s, link, v.gravity_cos_nm, v.gravity_sin_nm, gap_rad, stiffness_nm_per_rad, damping
+    )
+    rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
+    return np.asarray(torque - rigid)[:, None]
+
+
+PERIODIC = ("first", "second", "third", "fourth")
+"""Names of the lines of a shape that repeats with the motor's angle."""
+
+
+def periodic_lines(unit: str) -> Callable[[Shape, Array], dict[str, float]]:
+    """Amplitudes and phases of such lines, from the coefficients of cosine and sine of each."""
+
+    def lines(shape: Shape, coefficients: Array) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for which, cycles, (cos, sin) in zip(PERIODIC, shape.values(), coefficients.reshape(-1, 2), strict=False):
+            prefix = "" if which == "first" else f"{which}_"
+            found[f"{prefix}amplitude_{unit}"] = math.hypot(cos, sin)
+            found[f"{prefix}cycles_per_motor_revolution"] = cycles
+            found[f"{prefix}phase_rad"] = math.atan2(-sin, cos)
+        return found
+
+    return lines
+
+
 def most_telling(
     views: Sequence[View], shapes: Sequence[Shape], regressors: Callable[[Sequence[View], Shape], list[Array]]
 ) -> int:

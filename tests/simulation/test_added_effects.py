@@ -117,7 +117,7 @@ def test_the_lines_found_give_amplitude_and_phase_back() -> None:
     view = _spinning(torque, angle, 0.001)
     shape = next(s for s in torque_ripple.shapes_for([view]) if list(s.values()) == [72.0, 18.0])
     (columns,) = torque_ripple.regressors([view], shape)
-    found = torque_ripple.ripples(shape, np.linalg.lstsq(columns, torque, rcond=None)[0])
+    found = torque_ripple.EFFECT.inverse.parameters(shape, np.linalg.lstsq(columns, torque, rcond=None)[0])
     assert found["amplitude_nm"] == pytest.approx(0.3) and found["phase_rad"] == pytest.approx(0.4)
     assert found["second_amplitude_nm"] == pytest.approx(0.1) and found["second_phase_rad"] == pytest.approx(-1.0)
 
@@ -133,7 +133,7 @@ def test_a_transmission_error_has_one_formula_both_ways() -> None:
         for v, x, load, a in zip(view.velocity_rad_s, q, view.load_nm, view.acceleration_rad_s2, strict=True)
     ]
     weights = np.linalg.lstsq(columns, np.array(forward), rcond=None)[0]
-    found = transmission_error.lines({"first": 2.0}, weights)
+    found = transmission_error.EFFECT.inverse.parameters({"first": 2.0}, weights)
     assert found["amplitude_rad"] == pytest.approx(amplitude) and found["phase_rad"] == pytest.approx(phase)
 
 
@@ -141,7 +141,7 @@ def test_driving_and_back_driving_are_told_apart() -> None:
     time_s = 0.001 * np.arange(4000)
     q = 0.5 * np.sin(2.0 * time_s)
     view = replace(_spinning(np.zeros_like(q), q, 0.001), load_nm=3.0 * np.cos(q) + 1.0)
-    (columns,) = directional_efficiency.regressors([view], {})
+    (columns,) = directional_efficiency.EFFECT.inverse.regressors([view], {})
     loads = zip(view.load_nm, view.slip, strict=True)
     forward = np.array([directional_efficiency.level(0.0, load, s, 0.2, 0.05) * s for load, s in loads])
     assert np.linalg.lstsq(columns, forward, rcond=None)[0] == pytest.approx([0.2, 0.05])

@@ -64,7 +64,7 @@ def test_every_effect_is_completely_described(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_effect_draws_a_picture(name: str) -> None:
     effect = all_effects()[name]
-    for parameters in ({}, effect.typical, effect.off):
+    for parameters in (effect.typical, effect.off):
         picture = effect.illustrate(parameters)
         assert picture.x_label and picture.y_label and picture.curves
         for label, x, y in picture.curves:
@@ -213,7 +213,7 @@ def test_the_page_of_effects_is_up_to_date() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_are_well_formed(name: str) -> None:
-    picture = catalogue.picture(all_effects()[name].illustrate({}))
+    picture = catalogue.picture(all_effects()[name].illustrate(all_effects()[name].typical))
     lines = ElementTree.fromstring(picture).findall("{http://www.w3.org/2000/svg}polyline")
     assert lines
     for line in lines:

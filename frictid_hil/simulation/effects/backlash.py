@@ -8,10 +8,8 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid, most_telling
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, behind_transmission, grid, most_telling
 from frictid_hil.simulation.tracking_form import Link, TrackingForm
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
 def play(play_rad: float, gap_rad: float) -> float:
@@ -38,30 +36,11 @@ def coupling_damping(
 STIFFNESS_BOUNDS = (100.0, 1e7)
 """From a wrist of 0.01 kg m2 to a base joint of tens of kg m2 that rings at 100 Hz."""
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """Torque through the play less that of a rigid joint, once."""
-    from frictid_hil.simulation.inverse_loops import transmitted
-
-    columns: list[Array] = []
-    for v in views:
-        link = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2
-        stiffness = shape["contact_stiffness_nm_per_rad"]
-        torque = transmitted(
-            v.position_rad,
-            v.step_s,
-            link,
-            v.gravity_cos_nm,
-            v.gravity_sin_nm,
-            shape["gap_rad"],
-            stiffness,
-            shape["contact_relaxation_s"] * stiffness,
-        )
-        rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
-        columns.append((torque - rigid)[:, None])
-    return columns
+    contact = shape["contact_stiffness_nm_per_rad"], shape["contact_relaxation_s"]
+    return [behind_transmission(v, shape["gap_rad"], *contact) for v in views]
 
 
 GAPS_RAD = (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 5e-3, 1e-2)
@@ -107,12 +86,8 @@ def behind_play(position_rad: Array, gap_rad: float, step_s: float) -> Array:
     return played(position_rad, gap_rad)
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Transmitted torque over the angle between motor and link."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     half = p["gap_rad"] / 2
     twist = np.linspace(-4.0 * half, 4.0 * half, 201)
     torque = p["contact_stiffness_nm_per_rad"] * (twist - np.clip(twist, -half, half))

@@ -10,8 +10,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import DemandForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def proportional(kp_nm_per_rad: float, kp_error_share: float) -> float:
     """The true proportional gain."""
@@ -28,26 +26,16 @@ def derivative(kd_nm_s_per_rad: float, kd_error_share: float) -> float:
     return kd_nm_s_per_rad * (1.0 + kd_error_share)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[DriveView]) -> list[Array]:
     """The believed parts of the demand, each per share of its gain."""
     return [v.parts_nm for v in views]
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Demand over tracking error of the proportional part."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     error = np.linspace(-1.0, 1.0, 3)
-    return Illustration(
-        "tracking error / its largest",
-        "demand / its largest",
-        (("believed", error, error), ("true", error, (1.0 + p["kp_error_share"]) * error)),
-    )
+    curves = {"believed": error, "true": (1.0 + p["kp_error_share"]) * error}
+    return Illustration.over("tracking error / its largest", error, "demand / its largest", curves)
 
 
 EFFECT = Effect(

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def friction(
@@ -20,28 +17,13 @@ def friction(
     return other_nm + coulomb_share * level_nm * abs(slip) + viscous_share * abs(rate_nm)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """Even parts of level and rate, per share."""
-    return [np.stack([v.coulomb_nm * np.abs(v.slip), np.abs(v.rate_nm)], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     velocity = np.linspace(-1.0, 1.0, 201)
     symmetric = np.sign(velocity) + velocity
     even = p["coulomb_share"] * np.sign(np.abs(velocity)) + p["viscous_share"] * np.abs(velocity)
-    return Illustration(
-        "velocity (rad/s)",
-        "friction / Coulomb level",
-        (("symmetric", velocity, symmetric), ("with", velocity, symmetric + even)),
-    )
+    curves = {"symmetric": symmetric, "with": symmetric + even}
+    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
@@ -62,12 +44,10 @@ EFFECT = Effect(
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("friction", friction),),
     illustrate=illustrate,
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {
-            "coulomb_share": float(coefficients[0]),
-            "viscous_share": float(coefficients[1]),
-        },
+    inverse=linear(
+        {
+            "coulomb_share": lambda v: v.coulomb_nm * np.abs(v.slip),
+            "viscous_share": lambda v: np.abs(v.rate_nm),
+        }
     ),
 )

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def level(level_nm: float, load_nm: float, slip: float, driving_share: float, backdriving_share: float) -> float:
@@ -23,32 +20,12 @@ def level(level_nm: float, load_nm: float, slip: float, driving_share: float, ba
     return level_nm + (driving_share if driving else backdriving_share) * abs(load_nm)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """Level raised by transmitted torque: where the motor drives the load, and where the load drives the motor."""
-    columns = []
-    for v in views:
-        loaded = v.slip * np.abs(v.load_nm)
-        driving = v.load_nm * v.slip >= 0.0
-        columns.append(np.stack([loaded * driving, loaded * ~driving], axis=1))
-    return columns
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Added friction over the load along the motion."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     load = np.linspace(-50.0, 50.0, 201)
     added = np.where(load >= 0.0, p["driving_share"] * load, -p["backdriving_share"] * load)
-    return Illustration(
-        "load against the motion (N m)",
-        "added friction (N m)",
-        (("without", load, np.zeros_like(load)), ("with", load, added)),
-    )
+    curves = {"without": np.zeros_like(load), "with": added}
+    return Illustration.over("load against the motion (N m)", load, "added friction (N m)", curves)
 
 
 EFFECT = Effect(
@@ -71,13 +48,11 @@ EFFECT = Effect(
     hooks=(Hook("level", level, order=61),),
     illustrate=illustrate,
     parted=(Parting("load_dependent_friction", "moves_payload", "lifting and lowering one load at equal speed", 15.0),),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {
-            "driving_share": float(coefficients[0]),
-            "backdriving_share": float(coefficients[1]),
+    inverse=linear(
+        {
+            "driving_share": lambda v: v.slip * np.abs(v.load_nm) * (v.load_nm * v.slip >= 0.0),
+            "backdriving_share": lambda v: v.slip * np.abs(v.load_nm) * ~(v.load_nm * v.slip >= 0.0),
         },
-        first_coefficient=(0.0, math.inf),
+        (0.0, math.inf),
     ),
 )

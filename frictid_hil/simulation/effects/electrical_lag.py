@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, DriveView, guesses_by_sample
-from frictid_hil.simulation.effect import (
-    Channel,
-    Effect,
-    Hook,
-    Illustration,
-    Parameter,
-    Region,
-    Signature,
-    lagging_step,
-)
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.drive_form import LATEST_S, ActuationForm, guesses_by_sample
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 
 def current(current_nm: float, state: Any, at: int, step_s: float, time_constant_s: float) -> float:
@@ -39,9 +28,6 @@ def settle(state: Any, at: int, torque_nm: float) -> None:
     state[at] = torque_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: float) -> Array:
     """Mean over each step of the lagging torque; exact for held input."""
     from frictid_hil.simulation.inverse_loops import lagged
@@ -53,18 +39,9 @@ def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: 
     return mean
 
 
-def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
-    """Up to eight samples."""
-    return guesses_by_sample(views[0].step_s, EFFECT.parameters[0].upper)
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """A step of demand and the current that follows."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
-    return lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current")
+    return Illustration.lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current")
 
 
 EFFECT = Effect(
@@ -76,14 +53,13 @@ EFFECT = Effect(
         "reported torque, more at high frequency than a delay of the same size at low frequency. Source: W. "
         "Leonhard, 'Control of Electrical Drives', 3rd ed., 2001, chapter 7."
     ),
-    parameters=(Parameter("time_constant_s", 0.0, 0.05, 0.002, "of the closed current loop", off=0.0),),
+    parameters=(Parameter("time_constant_s", 0.0, LATEST_S, 0.002, "of the closed current loop", off=0.0),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
-    hooks=(
-        Hook("current", current, order=40),
-        Hook("settle", settle),
-    ),
+    hooks=(Hook("current", current, order=40), Hook("settle", settle)),
     illustrate=illustrate,
     belief="current_lag_s",
-    actuation=ActuationForm("time_constant_s", guesses, reported, order=40, late=True, believed_as="current_lag_s"),
+    actuation=ActuationForm(
+        "time_constant_s", guesses_by_sample, reported, order=40, late=True, believed_as="current_lag_s"
+    ),
     state_size=1,
 )

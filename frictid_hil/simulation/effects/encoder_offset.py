@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def encoder(measured_rad: float, offset_rad: float) -> float:
@@ -18,29 +15,15 @@ def encoder(measured_rad: float, offset_rad: float) -> float:
     return measured_rad + offset_rad
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 LARGEST_RAD = 0.2
 """Offset up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than the model has it."""
 
 
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """Slope of gravity, per radian."""
-    return [np.stack([-v.gravity_slope_nm_per_rad], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Gravity over reported position, in units of its amplitude."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     position = np.linspace(-np.pi, np.pi, 301)
-    believed, true = np.cos(position), np.cos(position - p["offset_rad"])
-    return Illustration(
-        "reported position (rad)", "gravity / amplitude", (("believed", position, believed), ("true", position, true))
-    )
+    curves = {"believed": np.cos(position), "true": np.cos(position - p["offset_rad"])}
+    return Illustration.over("reported position (rad)", position, "gravity / amplitude", curves)
 
 
 EFFECT = Effect(
@@ -65,10 +48,5 @@ EFFECT = Effect(
             26.0,
         ),
     ),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        first_coefficient=(-LARGEST_RAD, LARGEST_RAD),
-        parameters=lambda shape, coefficients: {"offset_rad": float(coefficients[0])},
-    ),
+    inverse=linear({"offset_rad": lambda v: -v.gravity_slope_nm_per_rad}, (-LARGEST_RAD, LARGEST_RAD)),
 )

@@ -10,15 +10,11 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import Believed, Finding, KinematicForm, MotionView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def resolution(resolution_rad: float, step_rad: float) -> float:
     """The coarser of both steps."""
     return max(resolution_rad, step_rad)
 
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 COARSER = 1.5
 """Step over the stated resolution from which it is called coarser."""
@@ -54,12 +50,8 @@ def position_step(positions: Sequence[Array], resolution_rad: float) -> tuple[fl
     return (slope, factor) if factor > COARSER else (nominal, 1.0)
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Reported over true position."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     step = max(p["step_rad"], 1e-9)
     true = np.linspace(0.0, 6.0 * step, 601)
     return Illustration("position (rad)", "reported (rad)", (("reported", true, np.round(true / step) * step),))

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def level(level_nm: float, coulomb_nm: float, error_share: float) -> float:
@@ -24,27 +21,11 @@ def rate(rate_nm: float, error_share: float) -> float:
     return rate_nm * (1.0 + error_share)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The whole believed friction, per share."""
-    return [np.stack([v.coulomb_nm * v.slip + v.rate_nm], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     velocity = np.linspace(0.01, 1.0, 100)
-    believed = 1.0 + velocity
-    return Illustration(
-        "velocity (rad/s)",
-        "friction / Coulomb level",
-        (("believed", velocity, believed), ("true", velocity, (1.0 + p["error_share"]) * believed)),
-    )
+    curves = {"believed": 1.0 + velocity, "true": (1.0 + p["error_share"]) * (1.0 + velocity)}
+    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
@@ -68,10 +49,5 @@ EFFECT = Effect(
         ),
         Parting("viscous_error", "triangle_slow", "creeping leaves the level alone", 20.0),
     ),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
-        first_coefficient=(-1.0, math.inf),
-    ),
+    inverse=linear({"error_share": lambda v: v.coulomb_nm * v.slip + v.rate_nm}, (-1.0, math.inf)),
 )

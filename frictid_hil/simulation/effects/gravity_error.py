@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def gravity(gravity_nm: float, error_share: float) -> float:
@@ -19,24 +16,11 @@ def gravity(gravity_nm: float, error_share: float) -> float:
     return gravity_nm * (1.0 + error_share)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The joint's own gravity, per share."""
-    return [np.stack([v.gravity_nm], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Gravity over position, in units of the stated amplitude."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     position = np.linspace(-np.pi, np.pi, 301)
-    stated = np.cos(position)
-    true = (1.0 + p["error_share"]) * stated
-    return Illustration("position (rad)", "gravity / stated", (("stated", position, stated), ("true", position, true)))
+    curves = {"stated": np.cos(position), "true": (1.0 + p["error_share"]) * np.cos(position)}
+    return Illustration.over("position (rad)", position, "gravity / stated", curves)
 
 
 EFFECT = Effect(
@@ -61,10 +45,5 @@ EFFECT = Effect(
             13.0,
         ),
     ),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
-        first_coefficient=(-1.0, math.inf),
-    ),
+    inverse=linear({"error_share": lambda v: v.gravity_nm}, (-1.0, math.inf)),
 )

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def inertia(link_kg_m2: float, error_share: float) -> float:
@@ -19,27 +16,11 @@ def inertia(link_kg_m2: float, error_share: float) -> float:
     return link_kg_m2 * (1.0 + error_share)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The link's own inertia torque, per share."""
-    return [np.stack([v.link_inertia_kg_m2 * v.acceleration_rad_s2], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Torque over acceleration, per stated inertia."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     acceleration = np.linspace(-10.0, 10.0, 3)
-    true = (1.0 + p["error_share"]) * acceleration
-    return Illustration(
-        "acceleration (rad/s2)",
-        "torque / stated inertia (rad/s2)",
-        (("stated", acceleration, acceleration), ("true", acceleration, true)),
-    )
+    curves = {"stated": acceleration, "true": (1.0 + p["error_share"]) * acceleration}
+    return Illustration.over("acceleration (rad/s2)", acceleration, "torque / stated inertia (rad/s2)", curves)
 
 
 EFFECT = Effect(
@@ -55,10 +36,5 @@ EFFECT = Effect(
     hooks=(Hook("inertia", inertia),),
     illustrate=illustrate,
     belief="inertia_kg_m2",
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
-        first_coefficient=(-1.0, math.inf),
-    ),
+    inverse=linear({"error_share": lambda v: v.link_inertia_kg_m2 * v.acceleration_rad_s2}, (-1.0, math.inf)),
 )

@@ -8,9 +8,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid, most_telling
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, behind_transmission, grid, most_telling
 
 
 def coupling(coupling_nm_per_rad: float, compliance_rad_per_nm: float) -> float:
@@ -28,30 +26,10 @@ def coupling_damping(
 COMPLIANCE_BOUNDS = (1e-7, 0.2)
 """From a large joint's stiff gear to a wrist of 0.01 kg m2 that swings at 4 Hz."""
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """Torque through the spring less that of a rigid joint, once."""
-    from frictid_hil.simulation.inverse_loops import transmitted
-
-    columns: list[Array] = []
-    for v in views:
-        link = v.link_inertia_kg_m2 + v.payload_inertia_kg_m2
-        stiffness = 1.0 / shape["compliance_rad_per_nm"]
-        torque = transmitted(
-            v.position_rad,
-            v.step_s,
-            link,
-            v.gravity_cos_nm,
-            v.gravity_sin_nm,
-            0.0,
-            stiffness,
-            shape["relaxation_s"] * stiffness,
-        )
-        rigid = link * v.acceleration_rad_s2 + v.gravity_nm + v.payload_gravity_nm
-        columns.append((torque - rigid)[:, None])
-    return columns
+    return [behind_transmission(v, 0.0, 1.0 / shape["compliance_rad_per_nm"], shape["relaxation_s"]) for v in views]
 
 
 SHAPES = grid(
@@ -83,12 +61,8 @@ CLOSER = (0.9, 0.95, 1.05, 1.1)
 """Resonances that are tried beside the one that describes most."""
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Link motion over motor motion, against frequency, for a link of 1 kg m2."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     stiffness = 1.0 / max(p["compliance_rad_per_nm"], 1e-9)
     resonance_hz = np.sqrt(stiffness) / (2.0 * np.pi)
     frequency = np.linspace(0.05, 2.0, 300) * resonance_hz
@@ -113,10 +87,7 @@ EFFECT = Effect(
         Parameter("relaxation_s", 0.0, 0.02, 3e-4, "damping over stiffness"),
     ),
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
-    hooks=(
-        Hook("coupling", coupling),
-        Hook("coupling_damping", coupling_damping),
-    ),
+    hooks=(Hook("coupling", coupling), Hook("coupling_damping", coupling_damping)),
     illustrate=illustrate,
     inverse=InverseForm(
         shapes=SHAPES,

@@ -11,15 +11,10 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def level(level_nm: float, load_nm: float, linear_share: float, quadratic_per_nm: float) -> float:
     """The level that multiplies the slip spring, raised by load."""
     return level_nm + linear_share * abs(load_nm) + quadratic_per_nm * load_nm * load_nm
-
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
@@ -33,18 +28,12 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Added friction over transmitted torque."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     load = np.linspace(-50.0, 50.0, 201)
     added = p["linear_share"] * np.abs(load) + p["quadratic_per_nm"] * load**2
-    flat = np.zeros_like(load)
-    return Illustration(
-        "transmitted torque (N m)", "added friction (N m)", (("without", load, flat), ("with", load, added))
-    )
+    curves = {"without": np.zeros_like(load), "with": added}
+    return Illustration.over("transmitted torque (N m)", load, "added friction (N m)", curves)
 
 
 EFFECT = Effect(

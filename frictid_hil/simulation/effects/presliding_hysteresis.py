@@ -12,8 +12,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def level(level_nm: float, coulomb_nm: float, share: float) -> float:
     """The stiff slip spring keeps what the soft element does not carry."""
@@ -50,9 +48,6 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
     state[at] = 0.0 if velocity_rad_s == 0.0 else math.copysign(1.0, velocity_rad_s)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """What the soft element carries instead of the stiff spring, per share."""
     from frictid_hil.simulation.inverse_loops import soft_spring
@@ -61,12 +56,8 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return [(v.coulomb_nm * (soft_spring(v.position_rad, *numbers) - v.slip))[:, None] for v in views]
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Loop of the soft element over a small sinusoidal motion."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     position = 2.0 * p["distance_rad"] * np.sin(np.linspace(0.0, 4.0 * np.pi, 2000))
     state, loop = np.zeros(1), np.empty(2000)
     shape = p["distance_rad"], p["loop_exponent"], p["loop_beta"]

@@ -12,8 +12,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def level(level_nm: float, coulomb_nm: float, state: Any, at: int, share: float) -> float:
     """The level that multiplies the slip spring, raised by the time at rest."""
@@ -36,9 +34,6 @@ def settle(state: Any, at: int, velocity_rad_s: float, dwell_time_s: float, trav
     state[at] = 1.0 / (1.0 + dwell_time_s * abs(velocity_rad_s) / travel_rad)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """The level raised by rest, per share."""
     from frictid_hil.simulation.inverse_loops import rest_memory
@@ -47,12 +42,8 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return [(v.coulomb_nm * v.slip * rest_memory(v.velocity_rad_s, v.step_s, *numbers))[:, None] for v in views]
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Rise of the break-away level with the dwell."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     dwell = np.linspace(0.0, 5.0 * p["dwell_time_s"], 200)
     rise = p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))
     return Illustration("dwell (s)", "rise of break-away / Coulomb level", (("break-away", dwell, rise),))
@@ -76,11 +67,7 @@ EFFECT = Effect(
         Parameter("travel_rad", 1e-5, 0.1, 2e-3, "travel that wipes it out"),
     ),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.REVERSAL)),
-    hooks=(
-        Hook("level", level),
-        Hook("remember", remember),
-        Hook("settle", settle),
-    ),
+    hooks=(Hook("level", level), Hook("remember", remember), Hook("settle", settle)),
     illustrate=illustrate,
     inverse=InverseForm(
         shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),

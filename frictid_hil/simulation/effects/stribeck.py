@@ -11,8 +11,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def level(
     level_nm: float,
@@ -28,9 +26,6 @@ def level(
     return level_nm + share * coulomb_nm * math.exp(-((abs(velocity_rad_s) / stribeck_velocity_rad_s) ** exponent))
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """The raised level along the motion, per share; a bristle follows it over some travel."""
     from frictid_hil.simulation.inverse_loops import followed
@@ -43,18 +38,12 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Friction over speed, in units of the Coulomb level."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     speed = np.linspace(0.0, 6.0 * p["stribeck_velocity_rad_s"], 200)
     raised = 1.0 + p["share"] * np.exp(-((speed / p["stribeck_velocity_rad_s"]) ** p["exponent"]))
-    flat = np.ones_like(speed)
-    return Illustration(
-        "speed (rad/s)", "friction / Coulomb level", (("without", speed, flat), ("with", speed, raised))
-    )
+    curves = {"without": np.ones_like(speed), "with": raised}
+    return Illustration.over("speed (rad/s)", speed, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(

@@ -11,8 +11,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def level(level_nm: float, state: Any, at: int, coulomb_share: float) -> float:
     """The sliding level, warm."""
@@ -41,9 +39,6 @@ def remember(
 def temperature(temperature_c: float, state: Any, at: int, rise_c: float) -> float:
     """What a sensor at the gear reads."""
     return float(temperature_c + rise_c * state[at])
-
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
 POWER_W = 5.0
@@ -75,22 +70,12 @@ def fall(shape: Shape, coefficients: Array) -> dict[str, float]:
     }
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Both parts of friction over a long run at the reference power."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     time = np.linspace(0.0, 5.0 * p["time_constant_s"], 200)
     warm = 1.0 - np.exp(-time / p["time_constant_s"])
-    return Illustration(
-        "time (s)",
-        "friction / cold friction",
-        (
-            ("sliding level", time, 1.0 - p["coulomb_share"] * warm),
-            ("rate part", time, 1.0 - p["viscous_share"] * warm),
-        ),
-    )
+    curves = {"sliding level": 1.0 - p["coulomb_share"] * warm, "rate part": 1.0 - p["viscous_share"] * warm}
+    return Illustration.over("time (s)", time, "friction / cold friction", curves)
 
 
 EFFECT = Effect(

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def shaft(torque_nm: float, bias_nm: float) -> float:
@@ -18,25 +15,11 @@ def shaft(torque_nm: float, bias_nm: float) -> float:
     return torque_nm - bias_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """One, per N m."""
-    return [np.stack([np.ones_like(v.position_rad)], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Measured torque of slow motion both ways, around a Coulomb level of 1 N m."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     velocity = np.linspace(-1.0, 1.0, 201)
-    level = np.sign(velocity)
-    return Illustration(
-        "velocity (rad/s)", "torque (N m)", (("without", velocity, level), ("with", velocity, level + p["bias_nm"]))
-    )
+    curves = {"without": np.sign(velocity), "with": np.sign(velocity) + p["bias_nm"]}
+    return Illustration.over("velocity (rad/s)", velocity, "torque (N m)", curves)
 
 
 EFFECT = Effect(
@@ -66,9 +49,5 @@ EFFECT = Effect(
             26.0,
         ),
     ),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"bias_nm": float(coefficients[0])},
-    ),
+    inverse=linear({"bias_nm": lambda v: np.ones_like(v.position_rad)}),
 )

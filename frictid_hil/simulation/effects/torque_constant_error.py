@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.inverse import linear
 from frictid_hil.simulation.tracking_form import Link, TrackingForm
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
 def shaft(torque_nm: float, error_share: float) -> float:
@@ -20,30 +18,16 @@ def shaft(torque_nm: float, error_share: float) -> float:
     return torque_nm * (1.0 + error_share)
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The measured torque, per share."""
-    return [np.stack([-v.torque_nm], axis=1) for v in views]
-
-
 def scaled(position_rad: Array, gain: float, step_s: float) -> Array:
     """A position that falls short of its command by a factor, as a loop without integral does."""
     return gain * position_rad
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """True over reported torque."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     reported = np.linspace(-1.0, 1.0, 3)
-    true = (1.0 + p["error_share"]) * reported
-    return Illustration(
-        "reported torque (N m)", "true torque (N m)", (("stated", reported, reported), ("with", reported, true))
-    )
+    curves = {"stated": reported, "with": (1.0 + p["error_share"]) * reported}
+    return Illustration.over("reported torque (N m)", reported, "true torque (N m)", curves)
 
 
 EFFECT = Effect(
@@ -62,10 +46,5 @@ EFFECT = Effect(
     illustrate=illustrate,
     belief="torque_constant",
     tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
-        first_coefficient=(-1.0, math.inf),
-    ),
+    inverse=linear({"error_share": lambda v: -v.torque_nm}, (-1.0, math.inf)),
 )

@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, DriveView, guesses_by_sample
+from frictid_hil.simulation.drive_form import LATEST_S, ActuationForm, guesses_by_sample
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
 from frictid_hil.simulation.tracking_form import Link, TrackingForm
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
 def current(current_nm: float, state: Any, at: int, step_s: float, delay_s: float) -> float:
@@ -39,9 +37,6 @@ def settle(state: Any, at: int, torque_nm: float) -> None:
         state[at + 1 + k] = torque_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def reported(torque_nm: Array, delay_s: float, step_s: float, limit_nm: float) -> Array:
     """The torque of ``delay_s`` before; between samples, the mean of both."""
     whole, part = divmod(delay_s / step_s, 1.0)
@@ -55,11 +50,6 @@ def _shifted(torque_nm: Array, rows: int) -> Array:
     return np.concatenate([np.full(min(rows, torque_nm.size), torque_nm[0]), torque_nm[:-rows]])
 
 
-def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
-    """Up to eight samples."""
-    return guesses_by_sample(views[0].step_s, EFFECT.parameters[0].upper)
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """What a torque that acts up to one sample later than it is reported leaves in the plant, per sample."""
     return [v.step_s * np.gradient(v.torque_nm, v.step_s)[:, None] for v in views]
@@ -67,7 +57,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
 
 def sample(views: Sequence[View]) -> tuple[Shape, ...]:
     """The sampling step: a longer delay shows in the reported torque itself."""
-    return ({"sample_s": views[0].step_s},) if views else ({"sample_s": 0.0},)
+    return ({"sample_s": views[0].step_s if views else 0.0},)
 
 
 def delayed(position_rad: Array, delay_s: float, step_s: float) -> Array:
@@ -84,12 +74,8 @@ def followed(position_rad: Array, lag_s: float, step_s: float) -> Array:
     return lagged(position_rad, step_s, lag_s)
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """A step and its delayed copy."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     time = np.linspace(-1.0, 4.0, 501) * max(p["delay_s"], 1e-4)
     demand = np.where(time >= 0.0, 1.0, 0.0)
     late = np.where(time >= p["delay_s"], 1.0, 0.0)
@@ -106,15 +92,12 @@ EFFECT = Effect(
         "reported; then it shows in the plant alone, where torque and motion do not belong to the same time. "
         "Source: K. J. Astrom, B. Wittenmark, 'Computer-Controlled Systems', 3rd ed., 1997, section 2."
     ),
-    parameters=(Parameter("delay_s", 0.0, 0.05, 0.002, "from demand to current", off=0.0, replayed=False),),
+    parameters=(Parameter("delay_s", 0.0, LATEST_S, 0.002, "from demand to current", off=0.0, replayed=False),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
-    hooks=(
-        Hook("current", current, order=20),
-        Hook("settle", settle),
-    ),
+    hooks=(Hook("current", current, order=20), Hook("settle", settle)),
     illustrate=illustrate,
     belief="torque_delay_s",
-    actuation=ActuationForm("delay_s", guesses, reported, order=20, late=True, believed_as="torque_delay_s"),
+    actuation=ActuationForm("delay_s", guesses_by_sample, reported, order=20, late=True, believed_as="torque_delay_s"),
     inverse=InverseForm(
         shapes=({"sample_s": 0.0},),
         regressors=regressors,

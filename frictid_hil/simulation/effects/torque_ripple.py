@@ -9,9 +9,8 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.inverse import PERIODIC, InverseForm, Shape, View, periodic_lines
 
-LINES = 4
 PREFIXES = ("", "second_", "third_", "fourth_")
 MOST_CYCLES = 600
 """Highest line looked for; 300 slots times two is more than motors have."""
@@ -26,8 +25,6 @@ USUAL: tuple[Shape, ...] = tuple({"first": k} for k in (1.0, 2.0, 4.0)) + tuple(
 STANDS_OUT = 25.0
 """Power over floor of a line worth trying: noise alone passes it at one line in 1e7 (an exponential law's median is
 0.69 of its mean); what passes is judged like every other shape."""
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
 
 
 def shaft(
@@ -58,9 +55,6 @@ def shaft(
     return torque_nm - ripple_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """Cosine and sine of the motor angle's multiples that the shape names."""
     columns = []
@@ -70,28 +64,16 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def ripples(shape: Shape, coefficients: Array) -> dict[str, float]:
-    """Amplitudes and phases of the lines."""
-    found: dict[str, float] = {}
-    for index, cycles in enumerate(shape.values()):
-        cos, sin = float(coefficients[2 * index]), float(coefficients[2 * index + 1])
-        prefix = PREFIXES[index]
-        found[f"{prefix}amplitude_nm"] = math.hypot(cos, sin)
-        found[f"{prefix}cycles_per_motor_revolution"] = cycles
-        found[f"{prefix}phase_rad"] = math.atan2(-sin, cos)
-    return found
-
-
 def shapes_for(views: Sequence[View]) -> tuple[Shape, ...]:
     """The usual lines of a gear, and the lines that stand out of these recordings: one, two, three, four of them."""
     strongest = lines_seen(views)
-    seen = tuple(_shape(strongest[: k + 1]) for k in range(len(strongest)))
-    single = tuple(_shape((line,)) for line in strongest[1:])
-    return tuple({tuple(shape.values()): shape for shape in (*USUAL, *seen, *single)}.values())
+    seen = [strongest[: k + 1] for k in range(len(strongest))] + [(line,) for line in strongest[1:]]
+    tried = dict.fromkeys([*(tuple(shape.values()) for shape in USUAL), *seen])
+    return tuple(dict(zip(PERIODIC, lines, strict=False)) for lines in tried)
 
 
 def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
-    """Whole cycles per motor revolution whose power stands out, the strongest first; at most ``LINES``.
+    """Whole cycles per motor revolution whose power stands out, the strongest first; at most four.
 
     A line is in reach where the motor turns by less than half its period from sample to sample, and where the recording
     covers two of its periods. The floor of a line is the median power of its neighbours, which the friction of a joint
@@ -115,7 +97,7 @@ def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
         power[k] = abs(np.mean(rest[known] * np.exp(-1j * order * angle[known]))) ** 2 * np.sqrt(known.mean())
     near = [power[max(0, k - NEIGHBOURS) : k + NEIGHBOURS + 1] for k in range(orders.size)]
     ratio = power / np.maximum([np.median(part) for part in near], 1e-300)
-    best = [k for k in np.argsort(-power) if ratio[k] > STANDS_OUT][:LINES]
+    best = [k for k in np.argsort(-power) if ratio[k] > STANDS_OUT][: len(PREFIXES)]
     return tuple(float(orders[k]) for k in best)
 
 
@@ -137,16 +119,8 @@ def _step_rad(v: View) -> Array:
     return travel
 
 
-def _shape(lines: Sequence[float]) -> dict[str, float]:
-    return dict(zip(("first", "second", "third", "fourth"), lines, strict=False))
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Ripple over two motor revolutions."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     turns = np.linspace(0.0, 2.0, 400)
     torque = np.zeros_like(turns)
     for prefix in PREFIXES:
@@ -197,7 +171,7 @@ EFFECT = Effect(
     inverse=InverseForm(
         shapes=USUAL,
         regressors=regressors,
-        parameters=ripples,
+        parameters=periodic_lines("nm"),
         continuous=False,
         shapes_for=shapes_for,
     ),

@@ -12,8 +12,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 HARD = 60.0
 """Exponent from which a knee is a corner."""
 LASTS_S = 0.01
@@ -28,9 +26,6 @@ def current(current_nm: float, limit_nm: float, limit_share: float, exponent: fl
     if exponent >= 60.0:  # HARD; the kernel takes this function's text alone
         return min(limit, max(-limit, current_nm))
     return float(current_nm / (1.0 + abs(current_nm / limit) ** exponent) ** (1.0 / exponent))
-
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
 def reported(torque_nm: Array, limit_share: float, step_s: float, limit_nm: float, exponent: float) -> Array:
@@ -58,12 +53,8 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.linspace(0.7, 1.05, 15) * given / limit
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Torque over demand, in units of the stated limit."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     demand = np.linspace(-1.0, 1.0, 201)
     clipped = reported(demand, p["limit_share"], 0.0, 1.0, p["exponent"])
     return Illustration("demand / limit", "torque / limit", (("stated", demand, demand), ("with", demand, clipped)))

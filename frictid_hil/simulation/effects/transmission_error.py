@@ -9,9 +9,7 @@ import numpy as np
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import InverseForm, Shape, View, periodic_lines
 
 
 def friction(
@@ -43,9 +41,6 @@ def friction(
     return other_nm + slope * load_nm + pushed_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     """The reaction per radian of the error's cosine and sine, for the multiples that the shape names."""
     columns = []
@@ -63,24 +58,8 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def lines(shape: Shape, coefficients: Array) -> dict[str, float]:
-    """Amplitudes and phases of the one or two lines."""
-    found: dict[str, float] = {}
-    for index, cycles in enumerate(shape.values()):
-        cos, sin = float(coefficients[2 * index]), float(coefficients[2 * index + 1])
-        prefix = "second_" if index else ""
-        found[f"{prefix}amplitude_rad"] = math.hypot(cos, sin)
-        found[f"{prefix}cycles_per_motor_revolution"] = cycles
-        found[f"{prefix}phase_rad"] = math.atan2(-sin, cos)
-    return found
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """The error over two motor revolutions."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     turns = np.linspace(0.0, 2.0, 400)
     motor_rad = 2.0 * np.pi * turns
     error = p["amplitude_rad"] * np.cos(motor_rad * p["cycles_per_motor_revolution"] + p["phase_rad"])
@@ -119,7 +98,7 @@ EFFECT = Effect(
             {"first": 2.0, "second": 4.0},
         ),
         regressors=regressors,
-        parameters=lines,
+        parameters=periodic_lines("rad"),
         continuous=False,
     ),
 )

@@ -11,18 +11,7 @@ from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, Believed, DriveView, Finding, KinematicForm, MotionView
-from frictid_hil.simulation.effect import (
-    Channel,
-    Effect,
-    Hook,
-    Illustration,
-    Parameter,
-    Region,
-    Signature,
-    lagging_step,
-)
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 
 def report_velocity(reported_rad_s: float, state: Any, at: int, period_s: float, time_constant_s: float) -> float:
@@ -37,8 +26,6 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
     """Caught up."""
     state[at] = velocity_rad_s
 
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 LEAST_SHARE = 0.5
 """Part of the channel's squares that a lag must explain."""
@@ -84,13 +71,9 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.array([seen]) if seen is not None else np.empty(0)
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """A step of velocity and its report."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
-    return lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported")
+    return Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported")
 
 
 EFFECT = Effect(
@@ -105,10 +88,7 @@ EFFECT = Effect(
     ),
     parameters=(Parameter("time_constant_s", 0.0, 0.1, 0.004, "of the first-order lag", off=0.0),),
     signature=Signature((Channel.KINEMATIC,), (Region.KINEMATICS,)),
-    hooks=(
-        Hook("report_velocity", report_velocity),
-        Hook("settle", settle),
-    ),
+    hooks=(Hook("report_velocity", report_velocity), Hook("settle", settle)),
     illustrate=illustrate,
     belief="velocity_filter_s",
     actuation=ActuationForm("time_constant_s", guesses, None),

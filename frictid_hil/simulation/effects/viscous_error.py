@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
-
-# -- forward: what the joint does ---------------------------------------------------------------------------------
+from frictid_hil.simulation.inverse import linear
 
 
 def rate(rate_nm: float, curve_nm: float, error_share: float) -> float:
@@ -19,29 +16,11 @@ def rate(rate_nm: float, curve_nm: float, error_share: float) -> float:
     return rate_nm + error_share * curve_nm
 
 
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """The believed part that depends on speed, per share."""
-    return [np.stack([v.rate_nm], axis=1) for v in views]
-
-
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     velocity = np.linspace(0.01, 1.0, 100)
-    return Illustration(
-        "velocity (rad/s)",
-        "friction / Coulomb level",
-        (
-            ("believed", velocity, 1.0 + velocity),
-            ("true", velocity, 1.0 + (1.0 + p["error_share"]) * velocity),
-        ),
-    )
+    curves = {"believed": 1.0 + velocity, "true": 1.0 + (1.0 + p["error_share"]) * velocity}
+    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
@@ -60,10 +39,5 @@ EFFECT = Effect(
     illustrate=illustrate,
     belief="viscous",
     parted=(Parting("viscous_nonlinearity", "sines_large", "high speeds tell a slope from a bend", 15.0),),
-    inverse=InverseForm(
-        shapes=({},),
-        regressors=regressors,
-        parameters=lambda shape, coefficients: {"error_share": float(coefficients[0])},
-        first_coefficient=(-1.0, math.inf),
-    ),
+    inverse=linear({"error_share": lambda v: v.rate_nm}, (-1.0, math.inf)),
 )

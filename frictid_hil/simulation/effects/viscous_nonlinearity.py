@@ -11,8 +11,6 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, grid
 
-# -- forward: what the joint does ---------------------------------------------------------------------------------
-
 
 def rate(
     rate_nm: float, coulomb_nm: float, velocity_rad_s: float, share: float, knee_rad_s: float, bend: float
@@ -24,9 +22,6 @@ def rate(
     shape = math.log(relative) if abs(bend) < 1e-6 else (relative**bend - 1.0) / bend
     bent_nm = share * coulomb_nm * shape
     return rate_nm + (bent_nm if velocity_rad_s >= 0.0 else -bent_nm)
-
-
-# -- inverse: what a recording shows (used by the diagnosis) ------------------------------------------------------
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
@@ -51,18 +46,12 @@ BENDS = grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 2.0, 3.0)) 
 )
 
 
-# -- the effect ---------------------------------------------------------------------------------------------------
-
-
-def illustrate(parameters: Mapping[str, float]) -> Illustration:
+def illustrate(p: Mapping[str, float]) -> Illustration:
     """Added friction over speed, in units of the Coulomb level."""
-    p = EFFECT.complete(parameters or EFFECT.typical)
     speed = np.linspace(0.0, 8.0 * p["knee_rad_s"], 200)
     added = np.array([rate(0.0, 1.0, v, p["share"], p["knee_rad_s"], p["bend"]) for v in speed])
-    line = added[-1] * speed / speed[-1]
-    return Illustration(
-        "speed (rad/s)", "added friction / Coulomb level", (("line", speed, line), ("bent", speed, added))
-    )
+    curves = {"line": added[-1] * speed / speed[-1], "bent": added}
+    return Illustration.over("speed (rad/s)", speed, "added friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
