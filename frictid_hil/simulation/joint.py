@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -181,6 +181,7 @@ class JointModel:
         inertia = top.number("inertia_kg_m2", low=1e-6, high=1e6)
         friction = _read_friction(top.part("friction"), required="friction" in top, top=top)
         level = friction.coulomb_nm
+        drive, gains = Drive(rated_torque_nm, math.inf), ServoGains.for_inertia(inertia)
         model = JointModel(
             inertia_kg_m2=inertia,
             motor_inertia_share=top.number("motor_inertia_share", 0.3, low=0.01, high=0.99),
@@ -192,17 +193,19 @@ class JointModel:
                 "presliding_stiffness_nm_per_rad", max(level, 1e-3) / PRESLIDING_TRAVEL_RAD, low=1e-3, high=1e9
             ),
             encoder=_read_encoder(top.part("encoder")),
-            drive=_read_drive(top.part("drive"), rated_torque_nm),
-            servo=ServoGains.for_inertia(inertia),
-            payload=_read_payload(top.part("payload")) if "payload" in top else None,
-            hand=_read_hand(top.part("hand")) if "hand" in top else None,
+            drive=replace(drive, **_numbers(top.part("drive"), _DRIVE, asdict(drive))),
+            servo=gains,
+            payload=Payload(**_numbers(top.part("payload"), _PAYLOAD)) if "payload" in top else None,
+            hand=HandImpedance(**_numbers(top.part("hand"), _HAND)) if "hand" in top else None,
             effects=_read_effects(top.part("effects")),
         )
-        gains, limit = _read_servo(top.part("servo"), model.servo, max_torque_nm)
+        limits = {**_SERVO, "torque_limit_nm": (0.0, max_torque_nm * (1 + 1e-9))}
+        servo = _numbers(top.part("servo"), limits, {**asdict(gains), "torque_limit_nm": max_torque_nm})
         top.part("payload"), top.part("hand")
         top.no_others()
         top.finish()
-        return replace(model, servo=gains, drive=replace(model.drive, torque_limit_nm=limit))
+        drive = replace(model.drive, torque_limit_nm=servo.pop("torque_limit_nm"))
+        return replace(model, servo=ServoGains(**servo), drive=drive)
 
     @staticmethod
     def of(joint: Simulated, name: str) -> JointModel:
@@ -237,31 +240,12 @@ class JointModel:
             "presliding_stiffness_nm_per_rad": self.presliding_stiffness_nm_per_rad,
         }
         if self.payload is not None:
-            mapping["payload"] = {
-                "inertia_kg_m2": self.payload.inertia_kg_m2,
-                "gravity_cos_nm": self.payload.gravity_cos_nm,
-            }
-        mapping["encoder"] = {
-            "side": self.encoder.side,
-            "counts_per_revolution": self.encoder.counts_per_revolution,
-        }
-        mapping["drive"] = {
-            "torque_quantum_per_mille": self.drive.torque_quantum_per_mille,
-            "torque_noise_per_mille": self.drive.torque_noise_per_mille,
-            "velocity_filter_s": self.drive.velocity_filter_s,
-            "torque_filter_s": self.drive.torque_filter_s,
-        }
-        mapping["servo"] = {
-            "kp_nm_per_rad": self.servo.kp_nm_per_rad,
-            "ki_nm_per_rad_s": self.servo.ki_nm_per_rad_s,
-            "kd_nm_s_per_rad": self.servo.kd_nm_s_per_rad,
-            "torque_limit_nm": self.drive.torque_limit_nm,
-        }
+            mapping["payload"] = asdict(self.payload)
+        mapping["encoder"] = asdict(self.encoder)
+        mapping["drive"] = {name: getattr(self.drive, name) for name in _DRIVE}
+        mapping["servo"] = {**asdict(self.servo), "torque_limit_nm": self.drive.torque_limit_nm}
         if self.hand is not None:
-            mapping["hand"] = {
-                "stiffness_nm_per_rad": self.hand.stiffness_nm_per_rad,
-                "damping_nm_s_per_rad": self.hand.damping_nm_s_per_rad,
-            }
+            mapping["hand"] = asdict(self.hand)
         mapping["effects"] = {name: dict(parameters) for name, parameters in self.effects.items()}
         return mapping
 
@@ -281,71 +265,42 @@ def _read_friction(fields: Fields, *, required: bool, top: Fields) -> FrictionCu
     if not required:
         top.problem("friction", "is required: coulomb_nm and viscous_nm_s_per_rad, or velocity_rad_s and torque_nm")
         return CoulombViscous(0.0)
-    if "velocity_rad_s" in fields or "torque_nm" in fields:
-        velocity, torque = fields.numbers("velocity_rad_s"), fields.numbers("torque_nm")
-        fields.no_others()
-        if not velocity or not torque:
-            return CoulombViscous(0.0)
+    if "velocity_rad_s" not in fields and "torque_nm" not in fields:
+        return CoulombViscous(**_numbers(fields, _FRICTION, {"viscous_nm_s_per_rad": 0.0}))
+    velocity, torque = fields.numbers("velocity_rad_s"), fields.numbers("torque_nm")
+    fields.no_others()
+    if velocity and torque:
         try:
             return FrictionCurve.through(np.array(velocity), np.array(torque))
         except IdentificationError as error:
             fields.problem("velocity_rad_s", error.what)
-            return CoulombViscous(0.0)
-    coulomb = fields.number("coulomb_nm", low=0.0, high=1e6)
-    viscous = fields.number("viscous_nm_s_per_rad", 0.0, low=0.0, high=1e6)
+    return CoulombViscous(0.0)
+
+
+_Bounds = Mapping[str, tuple[float, float]]
+_FRICTION: _Bounds = {"coulomb_nm": (0.0, 1e6), "viscous_nm_s_per_rad": (0.0, 1e6)}
+_ENCODER: _Bounds = {"counts_per_revolution": (0.0, 1e12)}
+_DRIVE: _Bounds = {
+    "torque_quantum_per_mille": (0.0, 1000.0),
+    "torque_noise_per_mille": (0.0, 1000.0),
+    "velocity_filter_s": (0.0, 1.0),
+    "torque_filter_s": (0.0, 1.0),
+}
+_SERVO: _Bounds = {"kp_nm_per_rad": (0.0, 1e9), "ki_nm_per_rad_s": (0.0, 1e12), "kd_nm_s_per_rad": (0.0, 1e9)}
+_PAYLOAD: _Bounds = {"inertia_kg_m2": (0.0, 1e6), "gravity_cos_nm": (-1e6, 1e6)}
+_HAND: _Bounds = {"stiffness_nm_per_rad": (0.0, 1e6), "damping_nm_s_per_rad": (0.0, 1e6)}
+
+
+def _numbers(fields: Fields, bounds: _Bounds, defaults: Mapping[str, Any] | None = None) -> dict[str, float]:
+    """A part of the joint that holds numbers; those without a default are required."""
+    told = {n: fields.number(n, (defaults or {}).get(n), low=low, high=high) for n, (low, high) in bounds.items()}
     fields.no_others()
-    return CoulombViscous(coulomb, viscous)
+    return told
 
 
 def _read_encoder(fields: Fields) -> Encoder:
-    encoder = Encoder(
-        side=fields.choice("side", "motor", ("motor", "link")),
-        counts_per_revolution=fields.number("counts_per_revolution", 131072.0, low=0.0, high=1e12),
-    )
-    fields.no_others()
-    return encoder
-
-
-def _read_drive(fields: Fields, rated_torque_nm: float) -> Drive:
-    drive = Drive(
-        rated_torque_nm=rated_torque_nm,
-        torque_limit_nm=math.inf,
-        torque_quantum_per_mille=fields.number("torque_quantum_per_mille", 1.0, low=0.0, high=1000.0),
-        torque_noise_per_mille=fields.number("torque_noise_per_mille", 5.0, low=0.0, high=1000.0),
-        velocity_filter_s=fields.number("velocity_filter_s", 0.001, low=0.0, high=1.0),
-        torque_filter_s=fields.number("torque_filter_s", 0.0, low=0.0, high=1.0),
-    )
-    fields.no_others()
-    return drive
-
-
-def _read_servo(fields: Fields, default: ServoGains, max_torque_nm: float) -> tuple[ServoGains, float]:
-    gains = ServoGains(
-        kp_nm_per_rad=fields.number("kp_nm_per_rad", default.kp_nm_per_rad, low=0.0, high=1e9),
-        ki_nm_per_rad_s=fields.number("ki_nm_per_rad_s", default.ki_nm_per_rad_s, low=0.0, high=1e12),
-        kd_nm_s_per_rad=fields.number("kd_nm_s_per_rad", default.kd_nm_s_per_rad, low=0.0, high=1e9),
-    )
-    limit = fields.number("torque_limit_nm", max_torque_nm, low=0.0, high=max_torque_nm * (1 + 1e-9))
-    fields.no_others()
-    return gains, limit
-
-
-def _read_payload(fields: Fields) -> Payload:
-    payload = Payload(
-        inertia_kg_m2=fields.number("inertia_kg_m2", low=0.0, high=1e6),
-        gravity_cos_nm=fields.number("gravity_cos_nm", low=-1e6, high=1e6),
-    )
-    fields.no_others()
-    return payload
-
-
-def _read_hand(fields: Fields) -> HandImpedance:
-    hand = HandImpedance(
-        stiffness_nm_per_rad=fields.number("stiffness_nm_per_rad", low=0.0, high=1e6),
-        damping_nm_s_per_rad=fields.number("damping_nm_s_per_rad", low=0.0, high=1e6),
-    )
-    fields.no_others()
-    return hand
+    side = fields.choice("side", "motor", ("motor", "link"))
+    return Encoder(side, **_numbers(fields, _ENCODER, asdict(Encoder())))
 
 
 def _read_effects(fields: Fields) -> dict[str, dict[str, float]]:
@@ -365,5 +320,5 @@ def _read_effects(fields: Fields) -> dict[str, dict[str, float]]:
 
 def _friction_mapping(friction: FrictionCurve | CoulombViscous) -> dict[str, Any]:
     if isinstance(friction, CoulombViscous):
-        return {"coulomb_nm": friction.coulomb_nm, "viscous_nm_s_per_rad": friction.viscous_nm_s_per_rad}
+        return asdict(friction)
     return {"velocity_rad_s": list(friction.velocity_rad_s), "torque_nm": list(friction.torque_nm)}
