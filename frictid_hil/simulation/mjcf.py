@@ -19,7 +19,7 @@ from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
-from frictid_hil.simulation.native import FRICTION, Native, Use, largest_torque, native_elements
+from frictid_hil.simulation.native import FRICTION, Native, Use, largest_torque, limits_of_gap, native_elements
 from frictid_hil.simulation.robot_model import ModelJoint
 
 STEP_S = 1e-4
@@ -70,12 +70,14 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     even = packing.parameters(replace(model, effects={k: v for k, v in model.effects.items() if k != "torque_ripple"}))
     nothing = functions.shaft_torque(even, 0.0, 0.0, model.gear_ratio)
     gain = functions.shaft_torque(even, 1.0, 0.0, model.gear_ratio) - nothing
-    limit = largest_torque(model) if math.isfinite(model.drive.torque_limit_nm) else math.inf
+    limit = largest_torque(model)
     soft = stiffness > 0.0
     own = _own_friction(model)
     on_joint = f'armature="{motor:.9g}" ' + " ".join(f'{key}="{value}"' for key, value in own.joint.items())
     body = _body(link, cos_nm, sin_nm)
-    twist = _twist(stiffness, damping, float(state[plant.PLAY]), motor, link)
+    play = float(state[plant.PLAY])
+    twist = f'stiffness="{stiffness:.9g}" damping="{damping:.9g}"'
+    twist = limits_of_gap(play, stiffness, damping, motor, link) if play > 0.0 else twist
     inner = (
         f'<body name="link"><joint name="twist" type="hinge" axis="0 -1 0" {twist}/>{body}</body>'
         f'<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
@@ -108,21 +110,6 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
 </mujoco>
 """
     return Exported(xml, *_accounts(model, soft, own))
-
-
-def _twist(stiffness: float, damping: float, play: float, motor: float, link: float) -> str:
-    """The spring between motor and link; with a play, limits on either side of the gap that yield like one.
-
-    With an impedance near 0 a constraint's force depends on its depth and speed alone, as stiffness and damping over
-    the inertia that it sees.
-    """
-    if play <= 0.0:
-        return f'stiffness="{stiffness:.9g}" damping="{damping:.9g}"'
-    reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
-    return (
-        f'limited="true" range="{-0.5 * play:.9g} {0.5 * play:.9g}" solimplimit="0.001 0.001 0.001" '
-        f'solreflimit="{-stiffness / reduced:.9g} {-max(damping, 1e-9) / reduced:.9g}"'
-    )
 
 
 def _limits(limit_nm: float) -> str:

@@ -58,6 +58,9 @@ _LOADS = (np.arange(12) + 0.5) / 12
 """Quantiles of the load at which friction that depends on it is read."""
 _LEAST_SHARE = 0.03
 """Share of a loop below which a spring is not worth its line."""
+_POWERS = ((1, 2, 3), (1, 2), (1,))
+"""Of damping's polynomial, to be tried in turn."""
+_Damping = tuple[float, float, float]
 FAR_RAD = 3e5
 """Where a spring is anchored whose torque shall not depend on the joint."""
 
@@ -140,15 +143,15 @@ _NOWHERE = {
 # -- friction -----------------------------------------------------------------------------------------------------
 
 
-def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, tuple[float, float, float]]:
+def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, _Damping]:
     """(level, rise at standstill, Stribeck speed, damping polynomial) that stand nearest to the joint's sliding."""
     fastest = float(np.max(use.speed_rad_s))
     speed = _speeds(use, falling="stribeck" in model.effects)
     odd, _ = _sliding(model, speed, use)
     if "stribeck" in model.effects:
         return _with_stribeck(speed, odd, fastest)
-    level, a, b, c = _level_and_damping(speed, odd, fastest)
-    return level, 0.0, 0.0, (a, b, c)
+    level, poly = _level_and_damping(speed, odd, fastest)
+    return level, 0.0, 0.0, poly
 
 
 def _speeds(use: Use, *, falling: bool = False) -> Array:
@@ -169,8 +172,8 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     if form == "ramps":
         dry, ramps, poly = _with_ramps(speed, odd, fastest)
     elif rise <= _SMALLEST_RISE * dry:
-        dry, a, b, c = _level_and_damping(speed, odd, fastest)
-        rise, at, poly = 0.0, 0.0, (a, b, c)
+        dry, poly = _level_and_damping(speed, odd, fastest)
+        rise = at = 0.0
     # Friction builds up over a travel that does not depend on the level.
     stiffness = model.presliding_stiffness_nm_per_rad * dry / model.friction.coulomb_nm
     dry = max(1e-9, dry - soft_nm)
@@ -186,19 +189,19 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         dry -= base
     if ramps:
         _write_ramps(native, name, ramps, dry, dry / stiffness)
-    if form in ("spring", "lugre", "ramps") and believed.spring_nm_per_rad == 0.0:
-        native.joint |= {"stiffness": _word(stiffness), "springyield": _word(dry / stiffness), "springref": "0"}
-        where = "joint: springyield and damping of three numbers"
-        native.remarks.append(_PLASTIC)
-    elif form in ("spring", "lugre", "ramps"):
-        native.more_tendons.append(_slipping(f"{name}_friction", name, stiffness, dry / stiffness))
-        where = "tendon with springyield, and damping of three numbers"
-        native.remarks.append(_PLASTIC)
-    else:
+    if form == "loss":
         native.joint |= {"frictionloss": _word(dry), "solimpfriction": "0.9999 0.9999", "solreffriction": "0.004 1"}
         where = "joint: frictionloss (stiff solver settings) and damping of three numbers"
         if believed.presliding_nm_per_rad is not None and believed.spring_nm_per_rad == 0.0:
             native.joint["stiffness"] = "0"
+    else:
+        native.remarks.append(_PLASTIC)
+        where = "joint: springyield and damping of three numbers"
+        if believed.spring_nm_per_rad == 0.0:
+            native.joint |= {"stiffness": _word(stiffness), "springyield": _word(dry / stiffness), "springref": "0"}
+        else:
+            native.more_tendons.append(_slipping(f"{name}_friction", name, stiffness, dry / stiffness))
+            where = "tendon with springyield, and damping of three numbers"
     if soft_nm > 0.0:
         for number, (share, yields_rad) in enumerate(_slip_elements(model.effects["presliding_hysteresis"]), 1):
             stiffness = share * soft_nm / yields_rad
@@ -260,74 +263,69 @@ def _soft_nm(model: JointModel) -> float:
     return values["share"] * model.friction.coulomb_nm if values else 0.0
 
 
-def _level_and_damping(speed: Array, torque: Array, fastest: float) -> tuple[float, float, float, float]:
+def _polynomial(weights: Sequence[float] | Array, fastest: float) -> _Damping | None:
+    """(a, b, c) of a v + b v**2 + c v**3, zero where left out; None where it falls before or beyond the fastest."""
+    a, b, c = (*map(float, weights), 0.0, 0.0)[:3]
+    beyond = np.linspace(0.0, _STEEP * fastest, 50)
+    return None if np.any(a + 2.0 * b * beyond + 3.0 * c * beyond**2 < -1e-12) else (a, b, c)
+
+
+def _level_and_damping(speed: Array, torque: Array, fastest: float) -> tuple[float, _Damping]:
     """Level and damping polynomial that fit best without falling, all the way beyond the fastest speed."""
-    for powers in ((0, 1, 2, 3), (0, 1, 2), (0, 1), (0,)):
+    for count in (4, 3, 2, 1):
         weights = np.zeros(4)
-        weights[list(powers)] = np.linalg.lstsq(np.stack([speed**p for p in powers], axis=1), torque, rcond=None)[0]
-        beyond = np.linspace(0.0, _STEEP * fastest, 50)
-        slope = weights[1] + 2.0 * weights[2] * beyond + 3.0 * weights[3] * beyond**2
-        if weights[0] >= 0.0 and np.all(slope >= -1e-12):
+        weights[:count] = np.linalg.lstsq(np.stack([speed**p for p in range(count)], axis=1), torque, rcond=None)[0]
+        if weights[0] >= 0.0 and _polynomial(weights[1:], fastest) is not None:
             break
     # What makes a billionth of the torque is rounding.
     weights[np.abs(weights) * fastest ** np.arange(4) < 1e-9 * np.max(np.abs(torque))] = 0.0
-    return float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3])
+    level, a, b, c = map(float, weights)
+    return level, (a, b, c)
 
 
-def _with_stribeck(
-    speed: Array, torque: Array, fastest: float
-) -> tuple[float, float, float, tuple[float, float, float]]:
+def _with_stribeck(speed: Array, torque: Array, fastest: float) -> tuple[float, float, float, _Damping]:
     """(Coulomb, rise, Stribeck speed, damping) of the nearest curve of LuGre's form."""
-    best: tuple[float, float, float, float, tuple[float, float, float]] | None = None
+    best: tuple[float, float, float, float, _Damping] | None = None
     for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.6 * fastest, 60):
         bump = np.exp(-((speed / at) ** 2))
-        for powers in ((1, 2, 3), (1, 2), (1,)):
+        for powers in _POWERS:
             table = np.column_stack([np.ones_like(speed), bump, *(speed**p for p in powers)])
             weights = np.linalg.lstsq(table, torque, rcond=None)[0]
-            poly = [0.0, 0.0, 0.0]
-            for p, w in zip(powers, weights[2:], strict=True):
-                poly[p - 1] = float(w)
-            beyond = np.linspace(0.0, _STEEP * fastest, 50)
-            slope = poly[0] + 2.0 * poly[1] * beyond + 3.0 * poly[2] * beyond**2
-            if weights[0] < 0.0 or weights[1] < 0.0 or np.any(slope < -1e-12):
+            poly = _polynomial(weights[2:], fastest)
+            if weights[0] < 0.0 or weights[1] < 0.0 or poly is None:
                 continue
             rest = float(np.mean((torque - table @ weights) ** 2))
             if best is None or rest < best[0]:
-                best = (rest, float(weights[0]), float(weights[1]), float(at), (poly[0], poly[1], poly[2]))
+                best = (rest, float(weights[0]), float(weights[1]), float(at), poly)
             break
     if best is None:
-        level, a, b, c = _level_and_damping(speed, torque, fastest)
-        return level, 0.0, 0.1, (a, b, c)
+        level, poly = _level_and_damping(speed, torque, fastest)
+        return level, 0.0, 0.1, poly
     return best[1:]
 
 
-def _with_ramps(
-    speed: Array, torque: Array, fastest: float
-) -> tuple[float, list[tuple[float, float]], tuple[float, float, float]]:
+def _with_ramps(speed: Array, torque: Array, fastest: float) -> tuple[float, list[tuple[float, float]], _Damping]:
     """(level at standstill, (knee in rad/s, fall in N m) of each ramp, damping) of the nearest falling curve."""
-    best: tuple[float, float, list[tuple[float, float]], tuple[float, float, float]] | None = None
-    beyond = np.linspace(0.0, _STEEP * fastest, 50)
+    best: tuple[float, float, list[tuple[float, float]], _Damping] | None = None
     for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.3 * fastest, 40):
         knees = at * np.array(_KNEES)
         ramps = -np.minimum(speed[:, None] / knees, 1.0)
-        for powers in ((1, 2, 3), (1, 2), (1,)):
+        for powers in _POWERS:
             table = np.column_stack([np.ones_like(speed), ramps, *(speed**p for p in powers)])
             bounds = ([0.0] * (1 + knees.size) + [-np.inf] * len(powers), np.inf)
             found = lsq_linear(table, torque, bounds, method="bvls")
-            poly = [0.0, 0.0, 0.0]
-            for p, w in zip(powers, found.x[1 + knees.size :], strict=True):
-                poly[p - 1] = float(w)
-            if np.any(poly[0] + 2.0 * poly[1] * beyond + 3.0 * poly[2] * beyond**2 < -1e-12):
+            poly = _polynomial(found.x[1 + knees.size :], fastest)
+            if poly is None:
                 continue
             falls = [(float(v), float(f)) for v, f in zip(knees, found.x[1 : 1 + knees.size], strict=True)]
             if best is None or found.cost < best[0]:
-                best = (found.cost, float(found.x[0]), falls, (poly[0], poly[1], poly[2]))
+                best = (found.cost, float(found.x[0]), falls, poly)
             break
     if best is None:
-        level, a, b, c = _level_and_damping(speed, torque, fastest)
-        return level, [], (a, b, c)
-    level = best[1]
-    return level, [(v, f) for v, f in best[2] if f > _SMALLEST_RISE * level], best[3]
+        level, poly = _level_and_damping(speed, torque, fastest)
+        return level, [], poly
+    _, level, falls, poly = best
+    return level, [(v, f) for v, f in falls if f > _SMALLEST_RISE * level], poly
 
 
 def _write_ramps(
@@ -405,7 +403,7 @@ def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: U
     errors = effects.get("controller_gain_error", {})
     kp *= gain * (1.0 + errors.get("kp_error_share", 0.0))
     kv *= gain * (1.0 + errors.get("kd_error_share", 0.0))
-    limit = largest_torque(model) if math.isfinite(model.drive.torque_limit_nm) else math.inf
+    limit = largest_torque(model)
     if "torque_constant_error" in effects or "controller_gain_error" in effects:
         if motor.law == "position":
             native.actuators |= {"kp": _word(kp), "kv": _word(kv)}
@@ -445,7 +443,9 @@ def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: U
 
 
 def largest_torque(model: JointModel) -> float:
-    """What the drive gives in the end when everything is asked of it, whatever effect clips it."""
+    """What the drive gives in the end when everything is asked of it, whatever effect clips it; infinite if without."""
+    if math.isinf(model.drive.torque_limit_nm):
+        return math.inf
     parameters, state = packing.parameters(model), packing.state()
     state[plant.DEMAND] = model.drive.torque_limit_nm
     current = [kernel().motor_torque(parameters, state, 1e-3) for _ in range(2000)]
@@ -461,14 +461,9 @@ def _write_transmission(native: Native, believed: ModelJoint, model: JointModel,
     link = model.inertia_kg_m2 - motor
     if "backlash" in effects:
         values = effects["backlash"]
-        half, stiffness = 0.5 * values["gap_rad"], values["contact_stiffness_nm_per_rad"]
+        stiffness = values["contact_stiffness_nm_per_rad"]
         damping = values["contact_relaxation_s"] * stiffness
-        # With an impedance near 0 a limit is a spring and a damper over the inertia that it sees.
-        reduced = 1.0 / (1.0 / max(motor, 1e-9) + 1.0 / max(link, 1e-9))
-        limits = f'limited="true" range="{_words((-half, half))}" solimplimit="0.001 0.001 0.001"'
-        damping = max(damping, 1e-9) / reduced
-        solver = f'solreflimit="{_words((-_at_step(stiffness / reduced, damping, use.timestep_s), -damping))}"'
-        native.more_joints.append(f"{limits} {solver}")
+        native.more_joints.append(limits_of_gap(values["gap_rad"], stiffness, damping, motor, link, use.timestep_s))
         native.placed["backlash"] = f"a joint {name}_play behind it, with limits"
     elif "joint_elasticity" in effects:
         values = effects["joint_elasticity"]
@@ -484,6 +479,23 @@ def _write_transmission(native: Native, believed: ModelJoint, model: JointModel,
     if believed.armature_kg_m2 <= 0.0:
         native.joint.setdefault("armature", _word(motor))
         native.lost[effect] += f"; armature {_word(motor)} kg m2 was assumed for the motor's side"
+
+
+def limits_of_gap(
+    gap_rad: float, stiffness: float, damping: float, motor_kg_m2: float, link_kg_m2: float, step_s: float | None = None
+) -> str:
+    """Limits on either side of a gap that yield like spring and damper, corrected for a step where one is given.
+
+    With an impedance near 0 a limit's force depends on its depth and speed alone, as stiffness and damping over the
+    inertia that it sees.
+    """
+    reduced = 1.0 / (1.0 / max(motor_kg_m2, 1e-9) + 1.0 / max(link_kg_m2, 1e-9))
+    stiff, damped = stiffness / reduced, max(damping, 1e-9) / reduced
+    stiff = stiff if step_s is None else _at_step(stiff, damped, step_s)
+    return (
+        f'limited="true" range="{_words((-0.5 * gap_rad, 0.5 * gap_rad))}" solimplimit="0.001 0.001 0.001" '
+        f'solreflimit="{_words((-stiff, -damped))}"'
+    )
 
 
 def _at_step(stiffness: float, damping: float, step_s: float) -> float:

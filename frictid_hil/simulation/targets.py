@@ -69,7 +69,6 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
     effects, motor = model.effects, believed.motor
     gains = effects.get("controller_gain_error", {})
     constant = 1.0 + effects.get("torque_constant_error", {}).get("error_share", 0.0)
-    limit = largest_torque(model) if math.isfinite(model.drive.torque_limit_nm) else math.inf
     link = model.inertia_kg_m2 * (1.0 - model.motor_inertia_share)
     return Numbers(
         dry_nm=dry,
@@ -84,7 +83,7 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
         ),
         kp_nm_per_rad=(motor.kp_nm_per_rad if motor else 0.0) * constant * (1.0 + gains.get("kp_error_share", 0.0)),
         kv_nm_s_per_rad=(motor.kv_nm_s_per_rad if motor else 0.0) * constant * (1.0 + gains.get("kd_error_share", 0.0)),
-        torque_limit_nm=limit * constant,
+        torque_limit_nm=largest_torque(model) * constant,
         delay_s=(motor.delay_s if motor else 0.0) + effects.get("torque_delay", {}).get("delay_s", 0.0),
     )
 
