@@ -36,19 +36,12 @@ DIAGNOSER: DiagnoserCommand = (sys.executable, "-m", "frictid_hil.blind.diagnose
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """Drawn cases: sets on disk, truth in memory, its hash for the world.
+    """Drawn cases: sets on disk, truth in memory, its hash for the world."""
 
-    Attributes:
-        folder: of the cases.
-        truths: by case name.
-        texts: the truth files to be, by case name.
-        digest: SHA-256 over all of them, hexadecimal.
-    """
-
-    folder: Path
-    truths: dict[str, dict[str, Any]]
-    texts: dict[str, str]
-    digest: str
+    folder: Path  # of the cases
+    truths: dict[str, dict[str, Any]]  # by case name
+    texts: dict[str, str]  # the truth files to be, by case name
+    digest: str  # SHA-256 over all of them, hexadecimal
 
 
 def run_check(

@@ -31,21 +31,13 @@ FIGURES = ("inverse_nm", "actuation_nm", "velocity_rad_s", "forward_torque_nm", 
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """One experiment as a drive would have recorded it; columns of shape (n,).
+    """One experiment as a drive would have recorded it; columns of shape (n,)."""
 
-    Attributes:
-        experiment: what was run.
-        position_rad: reported.
-        velocity_rad_s: reported.
-        torque_nm: reported, with noise.
-        command_rad: set-points.
-    """
-
-    experiment: Experiment
-    position_rad: Array
-    velocity_rad_s: Array
-    torque_nm: Array
-    command_rad: Array
+    experiment: Experiment  # what was run
+    position_rad: Array  # reported
+    velocity_rad_s: Array  # reported
+    torque_nm: Array  # reported, with noise
+    command_rad: Array  # set-points
 
 
 def record(joint: Joint, physics: Physics, seed: list[int]) -> tuple[Log, ...]:

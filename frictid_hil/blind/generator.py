@@ -43,19 +43,12 @@ _KINDS = ("none",) * 3 + ("single",) * 10 + ("double",) * 3 + ("outside",) * 4
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One drawn case.
+    """One drawn case."""
 
-    Attributes:
-        name: ``case_000``.
-        nominal: ``nominal.yaml``.
-        logs: recordings with the effects on.
-        truth: what is sealed.
-    """
-
-    name: str
-    nominal: dict[str, Any]
-    logs: tuple[Log, ...]
-    truth: dict[str, Any]
+    name: str  # ``case_000``
+    nominal: dict[str, Any]  # ``nominal.yaml``
+    logs: tuple[Log, ...]  # recordings with the effects on
+    truth: dict[str, Any]  # what is sealed
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,31 +39,18 @@ class Payload:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """A healthy joint, its controller and drive, and the belief about it.
+    """A healthy joint, its controller and drive, and the belief about it."""
 
-    Attributes:
-        physics: the real plant, with traces.
-        payload: the real payload.
-        belief: the plant that the nominal model describes.
-        believed_payload: the payload that it describes.
-        control: the position controller (known exactly).
-        envelope: where the experiments run.
-        rated_torque_nm: of the drive.
-        torque_noise_nm: standard deviation of the reported torque's white noise.
-        torque_quantum_nm: step of the reported torque.
-        experiments: what is recorded, in order.
-    """
-
-    physics: Physics
-    payload: Payload
-    belief: Physics
-    believed_payload: Payload
-    control: Controller
-    envelope: Envelope
-    rated_torque_nm: float
-    torque_noise_nm: float
-    torque_quantum_nm: float
-    experiments: tuple[Experiment, ...]
+    physics: Physics  # the real plant, with traces
+    payload: Payload  # the real payload
+    belief: Physics  # the plant that the nominal model describes
+    believed_payload: Payload  # the payload that it describes
+    control: Controller  # the position controller (known exactly)
+    envelope: Envelope  # where the experiments run
+    rated_torque_nm: float  # of the drive
+    torque_noise_nm: float  # standard deviation of the reported torque's white noise
+    torque_quantum_nm: float  # step of the reported torque
+    experiments: tuple[Experiment, ...]  # what is recorded, in order
 
     @property
     def floor_nm(self) -> float:

@@ -40,23 +40,15 @@ AGREEMENT = 1.25
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One answer of the diagnosis.
+    """One answer of the diagnosis."""
 
-    Attributes:
-        verdict: ``none``, ``explained``, ``ambiguous``, ``unknown``, or ``error`` where the diagnosis raised.
-        causes: ranked (effect, confidence).
-        confusable: effects that the first cause could be mistaken for.
-        gap: before, after, noise_floor on validation logs, each a mapping of figures; empty after an error.
-        seconds: time it took.
-        message: of the error.
-    """
-
-    verdict: str
-    causes: tuple[tuple[str, float], ...] = ()
-    confusable: tuple[str, ...] = ()
+    verdict: str  # ``none``, ``explained``, ``ambiguous``, ``unknown``, or ``error`` where the diagnosis raised
+    causes: tuple[tuple[str, float], ...] = ()  # ranked (effect, confidence)
+    confusable: tuple[str, ...] = ()  # effects that the first cause could be mistaken for
+    # Before, after, noise_floor on validation logs, each a mapping of figures; empty after an error.
     gap: Mapping[str, Mapping[str, float | None]] | None = None
-    seconds: float = math.nan
-    message: str = ""
+    seconds: float = math.nan  # time it took
+    message: str = ""  # of the error
 
     @staticmethod
     def from_json(document: Mapping[str, Any]) -> Answer:

@@ -50,19 +50,12 @@ Changed = tuple[Physics, Controller]
 
 @dataclass(frozen=True, slots=True)
 class Contributor:
-    """One reason why the joint is not as believed.
+    """One reason why the joint is not as believed."""
 
-    Attributes:
-        name: of the effect that it is called.
-        role: ``tolerance``, ``withheld`` or ``outside``.
-        parameters: as the diagnosis would state them, by name; empty where it has other ones.
-        apply: from a joint to the same joint with this reason.
-    """
-
-    name: str
-    role: str
-    parameters: dict[str, float]
-    apply: Callable[[Physics, Controller], Changed]
+    name: str  # of the effect that it is called
+    role: str  # ``tolerance``, ``withheld`` or ``outside``
+    parameters: dict[str, float]  # as the diagnosis would state them, by name; empty where it has other ones
+    apply: Callable[[Physics, Controller], Changed]  # from a joint to the same joint with this reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,51 +70,28 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """All of a case that is no contributor.
+    """All of a case that is no contributor."""
 
-    Attributes:
-        size: class of joint.
-        physics: as believed, traces on it.
-        payload: known exactly.
-        control: as believed.
-        law: ``pid``, ``cascade`` or ``pid_feedforward``.
-        controller: ``known``, ``rough`` or ``unknown``.
-        rated_nm: of the drive.
-        noise_nm: of the reported torque, white part.
-        corner_hz: of a slow part of the noise; 0 for none.
-        filter_order: of the torque's report filter; 0 for none.
-        filter_s: its time constant.
-        thin: control ticks per row of a log.
-        jitter: of sampling, share of a step.
-        gaps: rows are missing here and there.
-        velocity: it is reported.
-        motions: what is recorded.
-        kind: of the motions.
-        tolerance: stated one-sigma, relative.
-        absolute: stated one-sigma in the number's unit.
-        believed: (cascade) kp, kv, ki as stated.
-    """
-
-    size: str
-    physics: Physics
-    payload: Payload
-    control: Controller
-    law: str
-    controller: str
-    rated_nm: float
-    noise_nm: float
-    corner_hz: float
-    filter_order: int
-    filter_s: float
-    thin: int
-    jitter: float
-    gaps: bool
-    velocity: bool
-    motions: tuple[Motion, ...]
-    kind: str
-    tolerance: dict[str, float]
-    absolute: dict[str, float]
-    believed: dict[str, float] = field(default_factory=dict)
+    size: str  # class of joint
+    physics: Physics  # as believed, traces on it
+    payload: Payload  # known exactly
+    control: Controller  # as believed
+    law: str  # ``pid``, ``cascade`` or ``pid_feedforward``
+    controller: str  # ``known``, ``rough`` or ``unknown``
+    rated_nm: float  # of the drive
+    noise_nm: float  # of the reported torque, white part
+    corner_hz: float  # of a slow part of the noise; 0 for none
+    filter_order: int  # of the torque's report filter; 0 for none
+    filter_s: float  # its time constant
+    thin: int  # control ticks per row of a log
+    jitter: float  # of sampling, share of a step
+    gaps: bool  # rows are missing here and there
+    velocity: bool  # it is reported
+    motions: tuple[Motion, ...]  # what is recorded
+    kind: str  # of the motions
+    tolerance: dict[str, float]  # stated one-sigma, relative
+    absolute: dict[str, float]  # stated one-sigma in the number's unit
+    believed: dict[str, float] = field(default_factory=dict)  # (cascade) kp, kv, ki as stated
 
     @property
     def step_s(self) -> float:

@@ -26,21 +26,16 @@ Documents = Mapping[str, Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """One world.
+    """One world."""
 
-    Attributes:
-        cards: (cases, seed) -> what each case shall be; plain and small, they go to other processes.
-        draw: (index, seed, card, folder) -> truth; the set is written to ``folder``.
-        score: (truths, lines of the diagnosing process), both by case -> scores.
-        headline: scores -> rates by name.
-        page: result -> Markdown.
-    """
-
+    # (cases, seed) -> what each case shall be; plain and small, they go to other processes.
     cards: Callable[[int, int], Sequence[Any]]
+    # (index, seed, card, folder) -> truth; the set is written to ``folder``.
     draw: Callable[[int, int, Any, Path], dict[str, Any]]
+    # (truths, lines of the diagnosing process), both by case -> scores.
     score: Callable[[Mapping[str, Mapping[str, Any]], Documents], dict[str, Any]]
-    headline: Callable[[Mapping[str, Any]], dict[str, Mapping[str, Any]]]
-    page: Callable[[Mapping[str, Any]], str]
+    headline: Callable[[Mapping[str, Any]], dict[str, Mapping[str, Any]]]  # scores -> rates by name
+    page: Callable[[Mapping[str, Any]], str]  # result -> Markdown
 
 
 def write_rows(folder: Path, nominal: Mapping[str, Any], rows: Sequence[wide.Row]) -> None:

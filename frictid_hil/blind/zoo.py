@@ -29,42 +29,25 @@ VISIBLE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A joint in MuJoCo's words; SI units, joint side.
+    """A joint in MuJoCo's words; SI units, joint side."""
 
-    Attributes:
-        inertia: of the link about the axis.
-        armature: rotor's part.
-        gravity: torque of the horizontal link.
-        level, static, stribeck: of the LuGre friction.
-        bristle: its stiffness.
-        viscous: of the actuator's damping.
-        cogging, poles: of the motor, joint side.
-        gain: torque that comes out over torque that is asked for.
-        lag: of the current.
-        delay: of the command, s.
-        bias: constant torque that pushes the joint.
-        limit: of the torque; 0 for none.
-        twist: stiffness of the gear; 0 for a stiff one.
-        spring: of a cable about angle 0 (nobody's library).
-        shake, shake_hz: torque of a machine nearby (nobody's library).
-    """
-
-    inertia: float
-    armature: float
-    gravity: float
+    inertia: float  # of the link about the axis
+    armature: float  # rotor's part
+    gravity: float  # torque of the horizontal link
+    # The LuGre friction, its bristle by stiffness; the viscous part is the actuator's damping.
     level: float
     static: float
     stribeck: float
     bristle: float
     viscous: float
-    gain: float = 1.0
-    cogging: float = 0.0
+    gain: float = 1.0  # torque that comes out over torque that is asked for
+    cogging: float = 0.0  # of the motor, joint side
     poles: int = 2
-    lag: float = 0.0
-    delay: float = 0.0
-    bias: float = 0.0
-    limit: float = 0.0
-    twist: float = 0.0
+    lag: float = 0.0  # of the current
+    delay: float = 0.0  # of the command, s
+    bias: float = 0.0  # constant torque that pushes the joint
+    twist: float = 0.0  # stiffness of the gear; 0 for a stiff one
+    # Nobody's library: a cable about angle 0, a machine nearby.
     spring: float = 0.0
     shake: float = 0.0
     shake_hz: float = 5.0

@@ -20,32 +20,20 @@ STANDARD_GRAVITY: Triple = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """What one joint carries up to the next; motors' rotors excluded, they belong to the joints.
+    """What one joint carries up to the next; motors' rotors excluded, they belong to the joints."""
 
-    Attributes:
-        mass_kg: of the link.
-        centre_m: of mass, in the link's frame.
-        inertia_kg_m2: about the centre, principal, along the axes of the link's frame.
-    """
-
-    mass_kg: float
-    centre_m: Triple
-    inertia_kg_m2: Triple
+    mass_kg: float  # of the link
+    centre_m: Triple  # of mass, in the link's frame
+    inertia_kg_m2: Triple  # about the centre, principal, along the axes of the link's frame
 
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """A chain of links on a fixed base.
+    """A chain of links on a fixed base."""
 
-    Attributes:
-        rows: where the joints are.
-        links: one per joint.
-        gravity_m_s2: in the base frame.
-    """
-
-    rows: tuple[DhRow, ...]
-    links: tuple[Link, ...]
-    gravity_m_s2: Triple = STANDARD_GRAVITY
+    rows: tuple[DhRow, ...]  # where the joints are
+    links: tuple[Link, ...]  # one per joint
+    gravity_m_s2: Triple = STANDARD_GRAVITY  # in the base frame
 
     @staticmethod
     def from_mapping(mapping: Mapping[str, Any], rows: Mapping[str, Mapping[str, float]]) -> ArmModel:

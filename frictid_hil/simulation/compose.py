@@ -33,19 +33,12 @@ _MARKER = re.compile(r"^(?P<indent> *)# effects at (?P<stage>\w+) (?:transform (
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where every effect's numbers live in the kernel's flat vectors.
+    """Where every effect's numbers live in the kernel's flat vectors."""
 
-    Attributes:
-        parameters: first parameter slot by effect.
-        states: first state slot by effect.
-        curve_at: slot of the rate curve's first knot.
-        state_size: length of the state vector.
-    """
-
-    parameters: Mapping[str, int]
-    states: Mapping[str, int]
-    curve_at: int
-    state_size: int
+    parameters: Mapping[str, int]  # first parameter slot by effect
+    states: Mapping[str, int]  # first state slot by effect
+    curve_at: int  # slot of the rate curve's first knot
+    state_size: int  # length of the state vector
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,53 +55,34 @@ class Region(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect.
+    """One number of an effect."""
 
-    Attributes:
-        name: with its unit as suffix; ``_share`` is a fraction of the joint's Coulomb level unless described otherwise.
-        lower: bound of what a file may say and a fit may find.
-        upper: bound.
-        typical: a size met on real joints; the default of a parameter that a file leaves out.
-        description: what it is.
-        off: the value that makes the whole effect vanish, or None where the parameter only shapes it.
-        replayed: a replay of the closed loop can refine it; false where it is read elsewhere, or leaves no clear trace.
-    """
-
+    # With its unit as suffix; ``_share`` is a fraction of the joint's Coulomb level unless described otherwise.
     name: str
-    lower: float
+    lower: float  # bound of what a file may say and a fit may find
     upper: float
-    typical: float
-    description: str
-    off: float | None = None
+    typical: float  # a size met on real joints; the default of a parameter that a file leaves out
+    description: str  # what it is
+    off: float | None = None  # the value that makes the whole effect vanish, or None where the parameter only shapes it
+    # A replay of the closed loop can refine it; false where it is read elsewhere, or leaves no clear trace.
     replayed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Where an effect shows.
+    """Where an effect shows."""
 
-    Attributes:
-        channels: residuals it appears in, the clearest first.
-        regions: parts of a recording it appears in, the clearest first.
-    """
-
-    channels: tuple[Channel, ...]
-    regions: tuple[Region, ...]
+    channels: tuple[Channel, ...]  # residuals it appears in, the clearest first
+    regions: tuple[Region, ...]  # parts of a recording it appears in, the clearest first
 
 
 @dataclass(frozen=True, slots=True)
 class Illustration:
-    """Data of one small plot; each curve is (label, x, y).
+    """Data of one small plot; each curve is (label, x, y)."""
 
-    Attributes:
-        x_label: with unit.
-        y_label: with unit.
-        curves: equal-length arrays of shape (k,) each.
-    """
-
-    x_label: str
-    y_label: str
-    curves: tuple[tuple[str, Array, Array], ...]
+    x_label: str  # with unit
+    y_label: str  # with unit
+    curves: tuple[tuple[str, Array, Array], ...]  # equal-length arrays of shape (k,) each
 
     @staticmethod
     def over(x_label: str, x: Array, y_label: str, curves: Mapping[str, Array]) -> Illustration:
@@ -120,75 +101,46 @@ class Illustration:
 
 @dataclass(frozen=True, slots=True)
 class Hook:
-    """One function at one stage of the kernel.
+    """One function at one stage of the kernel."""
 
-    Attributes:
-        stage: name of the stage in ``plant.py``.
-        function: scalars in, the transformed scalar out (nothing for stages that only update ``state``).
-        order: hooks of a stage run by rising order.
-    """
-
-    stage: str
+    stage: str  # name of the stage in ``plant.py``
+    # Scalars in, the transformed scalar out (nothing for stages that only update ``state``).
     function: Callable[..., Any]
-    order: int = 50
+    order: int = 50  # hooks of a stage run by rising order
 
 
 @dataclass(frozen=True, slots=True)
 class Parting:
-    """The experiment in which an effect behaves differently from one that looks like it.
+    """The experiment in which an effect behaves differently from one that looks like it."""
 
-    Attributes:
-        rival: name of the other effect; either one's file may tell.
-        experiment: to record.
-        why: what happens in it, one line.
-        duration_s: of its motion.
-    """
-
-    rival: str
-    experiment: str
-    why: str
-    duration_s: float
+    rival: str  # name of the other effect; either one's file may tell
+    experiment: str  # to record
+    why: str  # what happens in it, one line
+    duration_s: float  # of its motion
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One physical effect; see the module's first page.
+    """One physical effect; see the module's first page."""
 
-    Attributes:
-        name: as in robot files and diagnoses; the name of its file.
-        summary: one line.
-        documentation: a paragraph: formula, when it appears, source.
-        parameters: in the order of its files.
-        signature: where it shows.
-        hooks: the forward form.
-        illustrate: a plot of the effect at given parameters, all of them.
-        inverse: how it shows in the plant; None for effects of drive and encoder.
-        actuation: how it shows between demand and reported torque, where it does.
-        kinematic: how it shows in reported position and velocity, where it does.
-        demand: how it shows in the controller's own demand, where it does.
-        belief: the number of a nominal joint that it is an error of, as ``tolerance:`` names it; empty for others.
-        tracking: what it makes of a command on its way to the position, where that alone may tell of it.
-        parted: what tells it from effects that look like it.
-        state_size: number of slots in the state vector.
-        carried: its state survives from one recording to the next (temperature).
-    """
-
-    name: str
-    summary: str
-    documentation: str
-    parameters: tuple[Parameter, ...]
-    signature: Signature
-    hooks: tuple[Hook, ...]
-    illustrate: Callable[[Mapping[str, float]], Illustration]
-    inverse: InverseForm | None = None
-    actuation: ActuationForm | None = None
-    kinematic: KinematicForm | None = None
-    demand: DemandForm | None = None
+    name: str  # as in robot files and diagnoses; the name of its file
+    summary: str  # one line
+    documentation: str  # a paragraph: formula, when it appears, source
+    parameters: tuple[Parameter, ...]  # in the order of its files
+    signature: Signature  # where it shows
+    hooks: tuple[Hook, ...]  # the forward form
+    illustrate: Callable[[Mapping[str, float]], Illustration]  # a plot of the effect at given parameters, all of them
+    inverse: InverseForm | None = None  # how it shows in the plant; None for effects of drive and encoder
+    actuation: ActuationForm | None = None  # how it shows between demand and reported torque, where it does
+    kinematic: KinematicForm | None = None  # how it shows in reported position and velocity, where it does
+    demand: DemandForm | None = None  # how it shows in the controller's own demand, where it does
+    # The number of a nominal joint that it is an error of, as ``tolerance:`` names it; empty for others.
     belief: str = ""
+    # What it makes of a command on its way to the position, where that alone may tell of it.
     tracking: TrackingForm | None = None
-    parted: tuple[Parting, ...] = ()
-    state_size: int = 0
-    carried: bool = False
+    parted: tuple[Parting, ...] = ()  # what tells it from effects that look like it
+    state_size: int = 0  # number of slots in the state vector
+    carried: bool = False  # its state survives from one recording to the next (temperature)
 
     @property
     def typical(self) -> dict[str, float]:

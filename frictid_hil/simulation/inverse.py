@@ -23,76 +23,46 @@ ENOUGH_ROWS = 60_000
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One recording on a uniform clock, with what the nominal joint makes of it; arrays have shape (n,).
+    """One recording on a uniform clock, with what the nominal joint makes of it; arrays have shape (n,)."""
 
-    Attributes:
-        step_s: sampling step.
-        start_s: time since the first experiment of the set began.
-        position_rad: measured.
-        velocity_rad_s: central difference of position.
-        acceleration_rad_s2: second difference of position.
-        torque_nm: measured, centred on the position sample.
-        slip: state of the slip spring (20) driven by the measured motion, -1..1.
-        rate_nm: nominal phi_0(v).
-        gravity_nm: nominal gravity torque of the joint without payload.
-        payload_gravity_nm: of the payload, 0 where none is mounted.
-        gravity_slope_nm_per_rad: derivative of the whole gravity torque by position.
-        load_nm: torque through the transmission: gravity and link inertia, payload included.
-        coulomb_nm: F_0.
-        stiffness_nm_per_rad: of the slip spring.
-        motor_inertia_kg_m2: motor side.
-        link_inertia_kg_m2: link side without payload.
-        payload_inertia_kg_m2: 0 where none is mounted.
-        gear_ratio: motor turns per joint turn; 1 where unknown.
-        gravity_cos_nm: of joint and payload: gravity is ``cos*cos(q) + sin*sin(q)``.
-        gravity_sin_nm: see there.
-        gradual_rad: travel over which friction follows a changing level where it builds up gradually; else 0.
-    """
-
-    step_s: float
-    start_s: float
-    position_rad: Array
-    velocity_rad_s: Array
-    acceleration_rad_s2: Array
-    torque_nm: Array
-    slip: Array
-    rate_nm: Array
-    gravity_nm: Array
-    payload_gravity_nm: Array
-    gravity_slope_nm_per_rad: Array
-    load_nm: Array
-    coulomb_nm: float
-    stiffness_nm_per_rad: float
-    motor_inertia_kg_m2: float
-    link_inertia_kg_m2: float
-    payload_inertia_kg_m2: float
-    gear_ratio: float
-    gravity_cos_nm: float
+    step_s: float  # sampling step
+    start_s: float  # time since the first experiment of the set began
+    position_rad: Array  # measured
+    velocity_rad_s: Array  # central difference of position
+    acceleration_rad_s2: Array  # second difference of position
+    torque_nm: Array  # measured, centred on the position sample
+    slip: Array  # state of the slip spring (20) driven by the measured motion, -1..1
+    rate_nm: Array  # nominal phi_0(v)
+    gravity_nm: Array  # nominal gravity torque of the joint without payload
+    payload_gravity_nm: Array  # of the payload, 0 where none is mounted
+    gravity_slope_nm_per_rad: Array  # derivative of the whole gravity torque by position
+    load_nm: Array  # torque through the transmission: gravity and link inertia, payload included
+    coulomb_nm: float  # F_0
+    stiffness_nm_per_rad: float  # of the slip spring
+    motor_inertia_kg_m2: float  # motor side
+    link_inertia_kg_m2: float  # link side without payload
+    payload_inertia_kg_m2: float  # 0 where none is mounted
+    gear_ratio: float  # motor turns per joint turn; 1 where unknown
+    gravity_cos_nm: float  # of joint and payload: gravity is ``cos*cos(q) + sin*sin(q)``
     gravity_sin_nm: float
-    gradual_rad: float = 0.0
+    gradual_rad: float = 0.0  # travel over which friction follows a changing level where it builds up gradually; else 0
 
 
 @dataclass(frozen=True, slots=True)
 class InverseForm:
-    """Columns that an effect adds to the torque balance.
+    """Columns that an effect adds to the torque balance."""
 
-    Attributes:
-        shapes: grid of the nonlinear parameters; ``({},)`` where there are none.
-        regressors: (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
-        parameters: (shape, coefficients (k,)) -> the effect's own parameters.
-        first_coefficient: range of the first coefficient that makes physical sense; outside it is another effect.
-        continuous: shapes between the grid's points make sense, so that a replay may refine them.
-        shapes_for: the grid where it depends on the joint's size (a resonance, say); ``shapes`` where None.
-        swings: lets the link swing by itself, so that columns along a measured motion may lose its phase; the closed
-            loop then tries other numbers.
-    """
-
-    shapes: tuple[Shape, ...]
+    shapes: tuple[Shape, ...]  # grid of the nonlinear parameters; ``({},)`` where there are none
+    # (views in run order, shape) -> per view the columns, shape (n, k), N m per unit of coefficient.
     regressors: Callable[[Sequence[View], Shape], list[Array]]
-    parameters: Callable[[Shape, Array], dict[str, float]]
+    parameters: Callable[[Shape, Array], dict[str, float]]  # (shape, coefficients (k,)) -> the effect's own parameters
+    # Range of the first coefficient that makes physical sense; outside it is another effect.
     first_coefficient: tuple[float, float] = (-math.inf, math.inf)
-    continuous: bool = True
+    continuous: bool = True  # shapes between the grid's points make sense, so that a replay may refine them
+    # The grid where it depends on the joint's size (a resonance, say); ``shapes`` where None.
     shapes_for: Callable[[Sequence[View]], tuple[Shape, ...]] | None = None
+    # Lets the link swing by itself, so that columns along a measured motion may lose its phase; the closed loop then
+    # tries other numbers.
     swings: bool = False
 
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:

@@ -40,15 +40,10 @@ class Payload:
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """Where the position comes from.
+    """Where the position comes from."""
 
-    Attributes:
-        side: ``motor`` or ``link``.
-        counts_per_revolution: of the shaft it sits on; 0 is continuous.
-    """
-
-    side: str = "motor"
-    counts_per_revolution: float = 131072.0
+    side: str = "motor"  # ``motor`` or ``link``
+    counts_per_revolution: float = 131072.0  # of the shaft it sits on; 0 is continuous
 
     def step_rad(self, gear_ratio: float) -> float:
         """One count as an angle of the joint; 0 where continuous."""
@@ -59,23 +54,14 @@ class Encoder:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """The power stage and what it reports.
+    """The power stage and what it reports."""
 
-    Attributes:
-        rated_torque_nm: 1000 per mille, joint side.
-        torque_limit_nm: the largest torque it gives, joint side.
-        torque_quantum_per_mille: step of the reported torque.
-        torque_noise_per_mille: standard deviation of the reported torque.
-        velocity_filter_s: first-order smoothing of differenced position, in its own loop and in its report.
-        torque_filter_s: first-order smoothing of the torque that a drive on a bus reports.
-    """
-
-    rated_torque_nm: float
-    torque_limit_nm: float
-    torque_quantum_per_mille: float = 1.0
-    torque_noise_per_mille: float = 5.0
-    velocity_filter_s: float = 0.001
-    torque_filter_s: float = 0.0
+    rated_torque_nm: float  # 1000 per mille, joint side
+    torque_limit_nm: float  # the largest torque it gives, joint side
+    torque_quantum_per_mille: float = 1.0  # step of the reported torque
+    torque_noise_per_mille: float = 5.0  # standard deviation of the reported torque
+    velocity_filter_s: float = 0.001  # first-order smoothing of differenced position, in its own loop and in its report
+    torque_filter_s: float = 0.0  # first-order smoothing of the torque that a drive on a bus reports
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,37 +116,21 @@ class Simulated(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class JointModel:
-    """One joint; see the module's first page. Built by ``from_mapping``.
+    """One joint; see the module's first page. Built by ``from_mapping``."""
 
-    Attributes:
-        inertia_kg_m2: whole inertia, motor's part included, payload excluded.
-        motor_inertia_share: the motor's part, 0..1.
-        gravity_cos_nm: gravity = gravity_cos * cos(q) + gravity_sin * sin(q).
-        gravity_sin_nm: see there.
-        gear_ratio: motor revolutions per joint revolution.
-        friction: rate-dependent friction in steady sliding, before effects.
-        presliding_stiffness_nm_per_rad: of the slip spring.
-        encoder: position sensor.
-        drive: power stage.
-        servo: gains of the drive's position loop.
-        payload: mounted on request.
-        hand: the simulated person.
-        effects: parameters by effect name; complete.
-    """
-
-    inertia_kg_m2: float
-    motor_inertia_share: float
-    gravity_cos_nm: float
+    inertia_kg_m2: float  # whole inertia, motor's part included, payload excluded
+    motor_inertia_share: float  # the motor's part, 0..1
+    gravity_cos_nm: float  # gravity = gravity_cos * cos(q) + gravity_sin * sin(q)
     gravity_sin_nm: float
-    gear_ratio: float
-    friction: FrictionCurve | CoulombViscous
-    presliding_stiffness_nm_per_rad: float
-    encoder: Encoder
-    drive: Drive
-    servo: ServoGains
-    payload: Payload | None = None
-    hand: HandImpedance | None = None
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    gear_ratio: float  # motor revolutions per joint revolution
+    friction: FrictionCurve | CoulombViscous  # rate-dependent friction in steady sliding, before effects
+    presliding_stiffness_nm_per_rad: float  # of the slip spring
+    encoder: Encoder  # position sensor
+    drive: Drive  # power stage
+    servo: ServoGains  # gains of the drive's position loop
+    payload: Payload | None = None  # mounted on request
+    hand: HandImpedance | None = None  # the simulated person
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # parameters by effect name; complete
 
     @staticmethod
     def from_mapping(

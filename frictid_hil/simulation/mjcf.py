@@ -36,19 +36,12 @@ _CONTROLLER = {"proportional_gain", "integral_gain", "derivative_gain"}
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """A joint in MuJoCo's words.
+    """A joint in MuJoCo's words."""
 
-    Attributes:
-        xml: the model.
-        native: what is in it, by effect or property.
-        callback: what only the callback does, by effect or property.
-        lost: what is lost, in sentences.
-    """
-
-    xml: str
-    native: Mapping[str, str]
-    callback: Mapping[str, str]
-    lost: tuple[str, ...]
+    xml: str  # the model
+    native: Mapping[str, str]  # what is in it, by effect or property
+    callback: Mapping[str, str]  # what only the callback does, by effect or property
+    lost: tuple[str, ...]  # what is lost, in sentences
 
 
 def described(model: JointModel, name: str, *, payload: bool = False) -> Exported:

@@ -20,15 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What the model did; arrays of shape (n, k) on the rows of the recording.
+    """What the model did; arrays of shape (n, k) on the rows of the recording."""
 
-    Attributes:
-        position_rad: at each row.
-        torque_nm: mean of what the joint's drive gave since the row before.
-    """
-
-    position_rad: Array
-    torque_nm: Array
+    position_rad: Array  # at each row
+    torque_nm: Array  # mean of what the joint's drive gave since the row before
 
 
 def why_not_replayed(robot: RobotModel, joints: Sequence[str], commanded: bool) -> str | None:

@@ -20,27 +20,16 @@ _NOT_JOINTS = ("equality", "fixed", "default", "sensor", "actuator")
 
 @dataclass(eq=False, slots=True)
 class Element:
-    """One element.
+    """One element."""
 
-    Attributes:
-        tag: its name.
-        attributes: as written, defaults not resolved.
-        start: first byte.
-        inside: first byte after its start tag.
-        end: first byte of its end tag; ``inside`` for an empty element.
-        empty: it has no end tag.
-        parent: None for the root.
-        file: that holds it.
-    """
-
-    tag: str
-    attributes: dict[str, str]
-    start: int
-    inside: int
-    end: int
-    empty: bool
-    parent: Element | None
-    file: XmlFile
+    tag: str  # its name
+    attributes: dict[str, str]  # as written, defaults not resolved
+    start: int  # first byte
+    inside: int  # first byte after its start tag
+    end: int  # first byte of its end tag; ``inside`` for an empty element
+    empty: bool  # it has no end tag
+    parent: Element | None  # None for the root
+    file: XmlFile  # that holds it
 
 
 @dataclass(eq=False, slots=True)

@@ -67,48 +67,29 @@ FAR_RAD = 3e5
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """How and where the joint is used.
+    """How and where the joint is used."""
 
-    Attributes:
-        speed_rad_s: speeds of the recordings, shape (n,), positive.
-        load_nm: torque passed on to the link along the recordings, shape (n,).
-        timestep_s: of the user's model.
-        own_gravity_share: gravity torque of the joint's own body over that of all that it carries.
-    """
-
-    speed_rad_s: Array
-    load_nm: Array
-    timestep_s: float
-    own_gravity_share: float = 1.0
+    speed_rad_s: Array  # speeds of the recordings, shape (n,), positive
+    load_nm: Array  # torque passed on to the link along the recordings, shape (n,)
+    timestep_s: float  # of the user's model
+    own_gravity_share: float = 1.0  # gravity torque of the joint's own body over that of all that it carries
 
 
 @dataclass(slots=True)
 class Native:
-    """What to change.
+    """What to change."""
 
-    Attributes:
-        joint: attributes of the joint.
-        actuators: attributes of its actuators, by name in MuJoCo's tables (of those that drive it).
-        gravity_share: error of the gravity of its own body; None leaves the body as it is.
-        more_joints: joints to stand after it in its body.
-        more_actuators: passive actuators.
-        more_tendons: fixed tendons.
-        placed: where each effect went, by name.
-        lost: what is lost, by effect.
-        remarks: what its user has to do.
-        reported: torque that the drive reports over the torque that it gives, which is what MuJoCo tells.
-    """
-
-    joint: dict[str, str] = field(default_factory=dict)
+    joint: dict[str, str] = field(default_factory=dict)  # attributes of the joint
+    # Attributes of its actuators, by name in MuJoCo's tables (of those that drive it).
     actuators: dict[str, str] = field(default_factory=dict)
-    gravity_share: float | None = None
-    more_joints: list[str] = field(default_factory=list)
-    more_actuators: list[str] = field(default_factory=list)
-    more_tendons: list[str] = field(default_factory=list)
-    placed: dict[str, str] = field(default_factory=dict)
-    lost: dict[str, str] = field(default_factory=dict)
-    remarks: list[str] = field(default_factory=list)
-    reported: float = 1.0
+    gravity_share: float | None = None  # error of the gravity of its own body; None leaves the body as it is
+    more_joints: list[str] = field(default_factory=list)  # joints to stand after it in its body
+    more_actuators: list[str] = field(default_factory=list)  # passive actuators
+    more_tendons: list[str] = field(default_factory=list)  # fixed tendons
+    placed: dict[str, str] = field(default_factory=dict)  # where each effect went, by name
+    lost: dict[str, str] = field(default_factory=dict)  # what is lost, by effect
+    remarks: list[str] = field(default_factory=list)  # what its user has to do
+    reported: float = 1.0  # torque that the drive reports over the torque that it gives, which is what MuJoCo tells
 
 
 def native_elements(believed: ModelJoint, model: JointModel, use: Use, form: str, *, friction: bool) -> Native:

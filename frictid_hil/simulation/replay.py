@@ -28,28 +28,19 @@ class Controller:
 
     Its integral starts at the static holding torque and is frozen while the limit is active; v is the backward
     difference of the measured position behind a first-order filter.
-
-    Attributes:
-        kp_nm_per_rad: proportional gain.
-        ki_nm_per_rad_s: integral gain.
-        kd_nm_s_per_rad: derivative gain.
-        rate_hz: of the loop.
-        velocity_filter_s: time constant of the filter.
-        torque_limit_nm: of the demand.
-        command_rate: how d cmd/dt is formed: ``central`` where the controller knows its command ahead, ``backward``
-            where it follows set-points as they come.
-        command_rate_weight: share of d cmd/dt that enters; 0 in a cascade that damps the motion itself.
-        added_nm: (command (n,), step in s) -> torque added along the command (n,); None adds none.
     """
 
-    kp_nm_per_rad: float
-    ki_nm_per_rad_s: float
-    kd_nm_s_per_rad: float
-    rate_hz: float
-    velocity_filter_s: float = 0.0
-    torque_limit_nm: float = math.inf
+    kp_nm_per_rad: float  # proportional gain
+    ki_nm_per_rad_s: float  # integral gain
+    kd_nm_s_per_rad: float  # derivative gain
+    rate_hz: float  # of the loop
+    velocity_filter_s: float = 0.0  # time constant of the filter
+    torque_limit_nm: float = math.inf  # of the demand
+    # How d cmd/dt is formed: ``central`` where the controller knows its command ahead, ``backward`` where it follows
+    # set-points as they come.
     command_rate: str = "central"
-    command_rate_weight: float = 1.0
+    command_rate_weight: float = 1.0  # share of d cmd/dt that enters; 0 in a cascade that damps the motion itself
+    # (command (n,), step in s) -> torque added along the command (n,); None adds none.
     added_nm: Callable[[Array, float], Array] | None = None
 
 
@@ -62,19 +53,12 @@ class CarryOver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """The rows of a simulated recording; every array has the shape of its time.
+    """The rows of a simulated recording; every array has the shape of its time."""
 
-    Attributes:
-        position_rad: as the encoder reports it.
-        velocity_rad_s: the drive's estimate.
-        torque_nm: as reported.
-        state: to hand to the next recording in order.
-    """
-
-    position_rad: Array
-    velocity_rad_s: Array
-    torque_nm: Array
-    state: CarryOver
+    position_rad: Array  # as the encoder reports it
+    velocity_rad_s: Array  # the drive's estimate
+    torque_nm: Array  # as reported
+    state: CarryOver  # to hand to the next recording in order
 
 
 def closed_loop(

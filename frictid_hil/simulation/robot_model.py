@@ -33,58 +33,34 @@ _ROWS_PER_THREAD = 5000
 
 @dataclass(frozen=True, slots=True)
 class Motor:
-    """The actuators of a joint, as one; every number on the joint's side of the gear.
+    """The actuators of a joint, as one; every number on the joint's side of the gear."""
 
-    Attributes:
-        names: of the actuators.
-        law: ``position`` (kp * (command - q) - kv * v), ``torque`` (the control is a force), or ``other``.
-        kp_nm_per_rad: gain of a position law.
-        kv_nm_s_per_rad: damping of a position law.
-        gear: joint torque per actuator force.
-        torque_limit_nm: of the drive; infinite where the file has none.
-        delay_s: of the control.
-        lag_s: time constant between control and force; 0 where there is none.
-    """
-
-    names: tuple[str, ...]
-    law: str
-    kp_nm_per_rad: float
-    kv_nm_s_per_rad: float
-    gear: float
-    torque_limit_nm: float
-    delay_s: float
-    lag_s: float
+    names: tuple[str, ...]  # of the actuators
+    law: str  # ``position`` (kp * (command - q) - kv * v), ``torque`` (the control is a force), or ``other``
+    kp_nm_per_rad: float  # gain of a position law
+    kv_nm_s_per_rad: float  # damping of a position law
+    gear: float  # joint torque per actuator force
+    torque_limit_nm: float  # of the drive; infinite where the file has none
+    delay_s: float  # of the control
+    lag_s: float  # time constant between control and force; 0 where there is none
 
 
 @dataclass(frozen=True, slots=True)
 class ModelJoint:
-    """What a model file says of one joint.
+    """What a model file says of one joint."""
 
-    Attributes:
-        name: of the joint.
-        prismatic: it slides: m, m/s, N.
-        range_rad: limits; None where it may turn on and on.
-        armature_kg_m2: reflected inertia of the rotor.
-        dry_nm: level of dry friction at speed (friction loss, a spring that yields, the Coulomb level of LuGre).
-        damping: (a, b, c) of a v + b v abs(v) + c v**3.
-        stribeck: (rise above the dry level in N m, speed in rad/s) of exp(-(v/vs)**2); zeros where there is none.
-        presliding_nm_per_rad: stiffness before friction slips; None where the file has none.
-        yields_gradually: friction is a LuGre element's.
-        spring_nm_per_rad: of the joint's own spring.
-        motor: None where nothing drives it.
-    """
-
-    name: str
-    prismatic: bool
-    range_rad: tuple[float, float] | None
-    armature_kg_m2: float
-    dry_nm: float
-    damping: tuple[float, float, float]
+    name: str  # of the joint
+    prismatic: bool  # it slides: m, m/s, N
+    range_rad: tuple[float, float] | None  # limits; None where it may turn on and on
+    armature_kg_m2: float  # reflected inertia of the rotor
+    dry_nm: float  # level of dry friction at speed (friction loss, a spring that yields, the Coulomb level of LuGre)
+    damping: tuple[float, float, float]  # (a, b, c) of a v + b v abs(v) + c v**3
+    # (rise above the dry level in N m, speed in rad/s) of exp(-(v/vs)**2); zeros where there is none.
     stribeck: tuple[float, float]
-    presliding_nm_per_rad: float | None
-    yields_gradually: bool
-    spring_nm_per_rad: float
-    motor: Motor | None
+    presliding_nm_per_rad: float | None  # stiffness before friction slips; None where the file has none
+    yields_gradually: bool  # friction is a LuGre element's
+    spring_nm_per_rad: float  # of the joint's own spring
+    motor: Motor | None  # None where nothing drives it
 
     def friction_nm(self, speed_rad_s: Array) -> Array:
         """Friction of steady sliding, positive speeds, any shape."""

@@ -23,21 +23,13 @@ from frictid_hil.simulation.usd import joint_numbers, prim_name
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """Friction over speed, as a file says it.
+    """Friction over speed, as a file says it."""
 
-    Attributes:
-        level_nm: at speed.
-        rise_nm: what it is higher at standstill.
-        fall_rad_s: speed of the fall, exp(-(v/fall)**2); 0 where it falls at once.
-        damping: (a, b, c) of a v + b v abs(v) + c v**3.
-        armature_kg_m2: None where the file has none.
-    """
-
-    level_nm: float
-    rise_nm: float = 0.0
-    fall_rad_s: float = 0.0
-    damping: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    armature_kg_m2: float | None = None
+    level_nm: float  # at speed
+    rise_nm: float = 0.0  # what it is higher at standstill
+    fall_rad_s: float = 0.0  # speed of the fall, exp(-(v/fall)**2); 0 where it falls at once
+    damping: tuple[float, float, float] = (0.0, 0.0, 0.0)  # (a, b, c) of a v + b v abs(v) + c v**3
+    armature_kg_m2: float | None = None  # None where the file has none
 
     def torque_nm(self, velocity_rad_s: Array, slip: Array) -> Array:
         """Against the motion, N m; ``slip`` is how much of the level has built up, -1..1. Shapes (n,)."""

@@ -23,35 +23,21 @@ from frictid_hil.simulation.robot_model import ModelJoint
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """What other simulators can hold of a joint; joint side of the gear.
+    """What other simulators can hold of a joint; joint side of the gear."""
 
-    Attributes:
-        dry_nm: level of sliding friction.
-        rise_nm: what friction is higher at standstill.
-        stribeck_rad_s: speed of the fall, exp(-(v/vs)**2).
-        damping: (a, b, c) of a v + b v abs(v) + c v**3.
-        viscous_nm_s_per_rad: the one slope that stands nearest to it.
-        straight: (level in N m, slope in N m s/rad) of the straight line nearest to all of sliding friction.
-        presliding_nm_per_rad: stiffness before friction slips.
-        armature_kg_m2: of the rotor.
-        kp_nm_per_rad: of a position law; 0 where there is none.
-        kv_nm_s_per_rad: of it.
-        torque_limit_nm: infinite where the file has none.
-        delay_s: from command to torque.
-    """
-
-    dry_nm: float
-    rise_nm: float
-    stribeck_rad_s: float
-    damping: tuple[float, float, float]
-    viscous_nm_s_per_rad: float
+    dry_nm: float  # level of sliding friction
+    rise_nm: float  # what friction is higher at standstill
+    stribeck_rad_s: float  # speed of the fall, exp(-(v/vs)**2)
+    damping: tuple[float, float, float]  # (a, b, c) of a v + b v abs(v) + c v**3
+    viscous_nm_s_per_rad: float  # the one slope that stands nearest to it
+    # (level in N m, slope in N m s/rad) of the straight line nearest to all of sliding friction.
     straight: tuple[float, float]
-    presliding_nm_per_rad: float
-    armature_kg_m2: float
-    kp_nm_per_rad: float
-    kv_nm_s_per_rad: float
-    torque_limit_nm: float
-    delay_s: float
+    presliding_nm_per_rad: float  # stiffness before friction slips
+    armature_kg_m2: float  # of the rotor
+    kp_nm_per_rad: float  # of a position law; 0 where there is none
+    kv_nm_s_per_rad: float  # of it
+    torque_limit_nm: float  # infinite where the file has none
+    delay_s: float  # from command to torque
 
 
 def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:

@@ -14,41 +14,25 @@ from frictid_hil.friction.trajectory import Array
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """One number of the chain.
+    """One number of the chain."""
 
-    Attributes:
-        name: with its unit, as reported.
-        position: (what comes in (n,), value, step_s) -> what goes on (n,).
-        start: size from which it is sought.
-        upper: largest value.
-        lower: smallest value.
-        neutral: value that changes nothing.
-        of_travel: start and upper are shares of the longest travel.
-    """
-
-    name: str
-    position: Callable[[Array, float, float], Array]
-    start: float
-    upper: float
-    lower: float = 0.0
-    neutral: float = 0.0
-    of_travel: bool = False
+    name: str  # with its unit, as reported
+    position: Callable[[Array, float, float], Array]  # (what comes in (n,), value, step_s) -> what goes on (n,)
+    start: float  # size from which it is sought
+    upper: float  # largest value
+    lower: float = 0.0  # smallest value
+    neutral: float = 0.0  # value that changes nothing
+    of_travel: bool = False  # start and upper are shares of the longest travel
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingForm:
-    """An effect in the chain.
+    """An effect in the chain."""
 
-    Attributes:
-        links: its numbers, fitted together.
-        order: effects act, and are sought, by rising order; the links of those before are fitted again beside it.
-        certainty: confidence in it where it pays on logs not fitted; position alone tells some effects better.
-        looks_like: effects that position alone cannot tell from it.
-        mimics: effects that it may imitate on few motions; it is then named beside them, never by itself.
-    """
-
-    links: tuple[Link, ...]
-    order: int
+    links: tuple[Link, ...]  # its numbers, fitted together
+    order: int  # effects act, and are sought, by rising order; the links of those before are fitted again beside it
+    # Confidence in it where it pays on logs not fitted; position alone tells some effects better.
     certainty: float = 0.6
-    looks_like: tuple[str, ...] = ()
+    looks_like: tuple[str, ...] = ()  # effects that position alone cannot tell from it
+    # Effects that it may imitate on few motions; it is then named beside them, never by itself.
     mimics: tuple[str, ...] = ()
