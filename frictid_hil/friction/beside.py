@@ -46,42 +46,26 @@ class Beside:
 
     def moved(self, weights: Array) -> Array:
         """What they explain of an average with these weights, shape (N,) for weights of shape (N, m)."""
-        explained: Array = weights @ self.values
-        return explained
+        return np.asarray(weights @ self.values)
 
     def deviation(self, weights: Array) -> Array:
         """One standard deviation of what they make of it: explained, and left open."""
         left_open = np.einsum("nj,jk,nk->n", weights, self.covariance, weights)
-        deviation: Array = np.sqrt(self.moved(weights) ** 2 + left_open)
-        return deviation
+        return np.asarray(np.sqrt(self.moved(weights) ** 2 + left_open))
 
 
 def beside(
     recording: CycleRecording, motion: Motion, solved: Fit, level_nm: float, extra: Array | None = None
 ) -> Beside:
-    """Place and load beside a solved model.
-
-    Args:
-        recording: as solved.
-        motion: as solved.
-        solved: the model without them.
-        level_nm: as solved.
-        extra: columns that the model had beyond its own, shape (n, k).
-    """
+    """Place and load beside a model, all as it was solved; ``extra`` are its columns beyond its own."""
     timed, columns = _columns(recording, motion, solved)
     own = np.zeros((timed.size, 0)) if extra is None else extra
     expected = (*[np.inf] * own.shape[1], *_EXPECTED)
     alone = fit(recording, motion, solved.knots, level_nm, extra=extra, doubtful=columns)
     on_knots = -alone.per_doubt[solved.blocks.odd]
     try:
-        more = fit(
-            recording,
-            motion,
-            solved.knots,
-            level_nm,
-            extra=np.column_stack([own, timed, columns]),
-            expected=expected,
-        )
+        every = np.column_stack([own, timed, columns])
+        more = fit(recording, motion, solved.knots, level_nm, extra=every, expected=expected)
     except IdentificationError:  # nothing is known of them but what was expected
         return Beside(columns, np.zeros(columns.shape[1]), np.diag(np.square(_EXPECTED[1:])), on_knots)
     found = slice(more.blocks.extra.start + own.shape[1] + 1, more.blocks.extra.stop)

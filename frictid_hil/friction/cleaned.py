@@ -2,26 +2,39 @@
 
 Timing comes first, for everything else is read through it: declared, or measured where the joint shook for it. Then
 what other joints took that moved along, or what the link of a soft joint took; then how well the timing fits.
+
+Before all of it, torque that a missed set-point shook is taken from beside it: a drive that misses one brakes to a
+stand, and jumps after the path with all the torque it has. At 250 Hz three samples of that in one window bent a curve
+by 6 %, with every gate passed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction import intervals
 from frictid_hil.friction.coupling import Pull, pull
-from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.identify import IdentifiedPairs
-from frictid_hil.friction.link import Link, soft_link, without
-from frictid_hil.friction.missed import without_shakes
+from frictid_hil.friction.link import Link, soft_link
 from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
-from frictid_hil.friction.skew import TimeSkew, measured_skew
+from frictid_hil.friction.skew import Delay, TimeSkew, measured_skew, seen_delay
+from frictid_hil.friction.trajectory import Array
 
 _GAP_STEPS = 3.0
 """Between two samples, in sample periods: a longer one has jerked the joint."""
+SHAKES_S = 0.02
+"""How long a position loop may take to catch up with its path: that of one with a bandwidth of 20 Hz."""
+SPIKE = 6.0
+"""Standard deviations of the torque's own noise that a sample must lie beside its neighbours to be no noise."""
+_BESIDE = 3
+"""Samples on either side whose median is taken."""
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,10 +44,7 @@ class Cleaned:
     Attributes:
         recording: with the time skew that is used, and what remains open of it.
         motion: synchronised columns, torque of link or other joints taken off.
-        windows: window averages of the same.
         level_nm: typical friction torque.
-        link: of a soft joint.
-        others: what joints that moved along took.
         time_skew: where it was measured.
         seen: what delay the cycles would ask for.
     """
@@ -46,7 +56,7 @@ class Cleaned:
     link: Link | None
     others: Pull | None
     time_skew: TimeSkew | None
-    seen: SeenDelay | None
+    seen: Delay | None
 
     @property
     def taken(self) -> Link | Pull | None:
@@ -55,18 +65,14 @@ class Cleaned:
 
 
 def cleaned(recording: CycleRecording, notes: list[str]) -> Cleaned:
-    """The recording, ready for an estimator.
-
-    Args:
-        recording: as it was made.
-        notes: gets what a person should know.
+    """The recording, ready for an estimator; the notes get what a person should know.
 
     Raises:
         IdentificationError: a window is empty, or columns do not fit together.
     """
-    recording, shaken = without_shakes(recording)
-    if shaken:
-        notes.append(f"{shaken} missed set-points shook the joint; its torque was taken from beside them")
+    recording, shakes = without_shakes(recording)
+    if shakes:
+        notes.append(f"{shakes} missed set-points shook the joint; its torque was taken from beside them")
     motion = synchronised(recording)
     others = pull(recording, motion)
     if others is not None:
@@ -76,16 +82,22 @@ def cleaned(recording: CycleRecording, notes: list[str]) -> Cleaned:
     windows = intervals.aligned_pairs(recording, motion)
     level = float(np.mean(windows.torque_nm))
     link = _link(recording, motion, level, notes)
-    time_skew = _time_skew(recording, link, notes)
-    if time_skew is not None:
-        recording = replace(recording, skew=time_skew.corrected(recording.skew))
-        motion = synchronised(recording)
+    time_skew = None
+    if (shaken := recording.shaken) is not None:
+        untold = "the torque's delay was not measured, the declared one is used"
+        measured = or_noted(lambda: measured_skew(shaken, link), untold, notes)
+        if measured is not None:
+            time_skew = TimeSkew.of(recording.skew, measured)
+            recording = replace(recording, skew=time_skew.corrected(recording.skew))
+            motion = synchronised(recording)
     if link is not None:
-        motion = without(motion, link)
+        motion = replace(motion, torque_nm=motion.torque_nm - link.torque_nm)
     if link is not None or time_skew is not None:
         windows = intervals.aligned_pairs(recording, motion)
-    unknown_pull = recording.coupled and others is None  # what it leaves looks like a delay
-    seen = None if unknown_pull else _seen_delay(recording, motion, level, notes)
+    seen = None
+    if others is not None or not recording.coupled:  # what an unknown pull leaves looks like a delay
+        untested = "the declared timing could not be tested"
+        seen = or_noted(lambda: seen_delay(recording, motion, level), untested, notes)
     if seen is not None:
         open_s = seen.open_s(recording.skew.uncertainty_s)
         recording = replace(recording, skew=replace(recording.skew, uncertainty_s=open_s))
@@ -104,11 +116,7 @@ def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[s
             "joint that jumps after its missing set-points looks like a swinging link"
         )
         return None
-    try:
-        link = soft_link(recording, motion, level)
-    except IdentificationError as problem:
-        notes.append(f"whether the link swings is not known: {problem.what}")
-        return None
+    link = or_noted(lambda: soft_link(recording, motion, level), "whether the link swings is not known", notes)
     if link is not None:
         notes.append(
             f"a soft joint: the link swings at {link.resonance_hz.value:.1f} Hz; its torque was computed from the "
@@ -117,19 +125,46 @@ def _link(recording: CycleRecording, motion: Motion, level: float, notes: list[s
     return link
 
 
-def _time_skew(recording: CycleRecording, link: Link | None, notes: list[str]) -> TimeSkew | None:
-    if recording.shaken is None:
-        return None
+def or_noted(find: Callable[[], Found], otherwise: str, notes: list[str]) -> Found | None:
+    """What is found; None where it cannot be formed, which the notes then tell with the reason."""
     try:
-        return TimeSkew.of(recording.skew, measured_skew(recording.shaken, link))
+        return find()
     except IdentificationError as problem:
-        notes.append(f"the torque's delay was not measured, the declared one is used: {problem.what}")
+        notes.append(f"{otherwise}: {problem.what}")
         return None
 
 
-def _seen_delay(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> SeenDelay | None:
-    try:
-        return seen_delay(recording, motion, level)
-    except IdentificationError as problem:
-        notes.append(f"the declared timing could not be tested: {problem.what}")
-        return None
+def without_shakes(recording: CycleRecording) -> tuple[CycleRecording, int]:
+    """The recording with the torque that missed set-points shook replaced, and after how many of them there was any.
+
+    Where the joint turns round in that time nothing is touched: friction itself jumps there.
+    """
+    time_s, torque = recording.time_s, recording.torque_nm.copy()
+    steps_s = np.diff(time_s)
+    gaps_s = time_s[:-1][steps_s > 1.5 * float(np.median(steps_s))]
+    noise = _noise(torque)
+    shaken = 0
+    for missed_s in np.union1d(gaps_s, recording.stops_s):
+        first = int(np.searchsorted(time_s, missed_s, side="right"))
+        last = int(np.searchsorted(time_s, missed_s + 2.0 * float(np.median(steps_s)) + SHAKES_S))
+        begin, end = first - _BESIDE, last + _BESIDE
+        if begin < 0 or end > time_s.size or not _one_way(recording.position_rad[begin:end]):
+            continue
+        ends = np.median(torque[begin:first]), np.median(torque[last:end])
+        line = np.interp(time_s[first:last], time_s[[first - 1, last]], ends)
+        beside = np.abs(torque[first:last] - line) > SPIKE * noise
+        if beside.any():
+            torque[first:last] = line
+            shaken += 1
+    return (replace(recording, torque_nm=torque), shaken) if shaken else (recording, 0)
+
+
+def _noise(torque: Array) -> float:
+    """One-sigma of the torque's noise, from how far samples lie beside the mean of their neighbours."""
+    beside = torque[1:-1] - 0.5 * (torque[:-2] + torque[2:])
+    return float(1.4826 * np.median(np.abs(beside)) / np.sqrt(1.5))
+
+
+def _one_way(position_rad: Array) -> bool:
+    ways = np.sign(np.diff(position_rad[::_BESIDE]))
+    return bool(np.all(ways == ways[0]))

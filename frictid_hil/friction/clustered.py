@@ -51,14 +51,9 @@ class Solved:
 
 
 def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior], where: str) -> Solved:
-    """Least squares of every target on the same columns.
+    """Least squares of every target, shape (n, 1 + m), on the same columns x, shape (n, size).
 
-    Args:
-        x: columns of the model, shape (n, size).
-        targets: shape (n, 1 + m).
-        bunch: rows of the same number err together, shape (n,).
-        priors: on the coefficients of the first target.
-        where: what to name in an error.
+    Rows of the same number in ``bunch`` err together. Priors are on the coefficients of the first target.
 
     Raises:
         IdentificationError: the columns are linearly dependent.
@@ -81,7 +76,12 @@ def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior
     alive = np.isfinite(scale)
     spectrum = np.linalg.eigvalsh(left[np.ix_(alive, alive)])
     if spectrum[0] < 1e-10 * spectrum[-1]:
-        raise _undetermined(where)
+        raise IdentificationError(
+            "the recording cannot tell the parts of the least-squares model apart",
+            where=where,
+            cause="too few cycles or too little travel",
+            next_step="use --method aligned, or more cycles or travel",
+        )
 
     solution = np.linalg.solve(left, right)
     spread, freedom = _spread(left, gram, moment[:, :, 0] - gram @ solution[:, 0])
@@ -128,8 +128,7 @@ def _pulled(left: Array, wished: Array, weights: Array, deviations: Array, solut
     towards = np.linalg.solve(left, wished.T).T
     alone = np.maximum(1.0 - weights * np.sum(towards * wished, axis=1), 1e-6)
     seen = np.hypot(wished @ solution, np.linalg.norm(spread @ wished.T, axis=0)) / alone
-    pulled: Array = (weights * np.minimum(deviations, seen))[:, None] * towards
-    return pulled
+    return np.asarray((weights * np.minimum(deviations, seen))[:, None] * towards)
 
 
 def _product(x: Array, y: Array) -> Array:
@@ -138,12 +137,3 @@ def _product(x: Array, y: Array) -> Array:
     for row in range(0, x.shape[0], 48):
         total += x[row : row + 48].T @ y[row : row + 48]
     return total
-
-
-def _undetermined(where: str) -> IdentificationError:
-    return IdentificationError(
-        "the recording cannot tell the parts of the least-squares model apart",
-        where=where,
-        cause="too few cycles or too little travel",
-        next_step="use --method aligned, or more cycles or travel",
-    )

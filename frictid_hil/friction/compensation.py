@@ -59,11 +59,7 @@ def stiffness_with_margin(
     Delay asks for no margin: near rest the joint obeys I q'' + sigma q = R K q(t - T), and to first order in T this is
     I q'' + R K T q' + (sigma - R K) q = 0: torque that helps, given late, damps.
 
-    Args:
-        presliding_nm_per_rad: the low end of its interval.
-        presliding_level_nm: the high end of its interval.
-        coulomb_nm: F_0.
-        ratio: R.
+    Of the two figures of presliding, the low end of the stiffness's interval and the high end of the level's.
     """
     sliding_nm_per_rad = presliding_nm_per_rad * min(1.0, coulomb_nm / presliding_level_nm)
     return sliding_nm_per_rad / ((1.0 + STIFFNESS_MARGIN) * (ratio + RATIO_MARGIN))
@@ -113,7 +109,7 @@ class CompensationSettings:
             ratio: R.
             asymmetry_nm: half the difference of forward and backward friction at the curve's pairs, 0 at rest.
             viscous_nm_s_per_rad: B_c for ``mol``; least squares on phi - F_0 unless given.
-            gradual: the joint's presliding yields gradually.
+            gradual: see ``CompensationSettings``.
 
         Raises:
             UsageError: no such form.
@@ -136,11 +132,7 @@ class CompensationSettings:
         )
 
     def refuse_unstable(self, presliding_nm_per_rad: float | None, *, where: str = "") -> None:
-        """Refuse what would hunt or run away.
-
-        Args:
-            presliding_nm_per_rad: as identified; None where it is not known (only R is then checked).
-            where: what to name in the error.
+        """Refuse what would hunt or run away; only R is checked where the presliding stiffness is not known.
 
         Raises:
             UsageError: with the reason.
@@ -169,9 +161,7 @@ class CompensationSettings:
 class Compensation:
     """One joint's compensation; nothing is allocated per step but floats.
 
-    Args:
-        settings: checked by ``refuse_unstable``.
-        period_s: between two steps; used only where a reference velocity drives the spring.
+    The period between two steps is used only where a reference velocity drives the spring.
     """
 
     __slots__ = (
@@ -202,13 +192,10 @@ class Compensation:
     def step(
         self, position_increment_rad: float, velocity_rad_s: float, reference_velocity_rad_s: float | None = None
     ) -> float:
-        """f_c of (24c), N m, for the cycle to come.
+        """f_c of (24c), N m, for the cycle to come; the increment is since the last step, from the encoder.
 
-        Args:
-            position_increment_rad: since the last step, from the encoder.
-            velocity_rad_s: measured.
-            reference_velocity_rad_s: where it is known what the joint will do, friction is that of this velocity: it
-                is neither late nor noisy, and its sign changes when the motion does.
+        Where it is known what the joint will do, friction is that of the reference velocity: it is neither late nor
+        noisy, and its sign changes when the motion does.
         """
         if reference_velocity_rad_s is not None:
             velocity_rad_s = reference_velocity_rad_s
@@ -245,8 +232,5 @@ def least_squares_viscosity(curve: FrictionCurve) -> float:
 
 def _sections(speeds: tuple[float, ...], levels: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
     """(level at speed 0, slope) of each line section."""
-    sections = []
-    for low, high, f_low, f_high in zip(speeds, speeds[1:], levels, levels[1:], strict=False):
-        slope = (f_high - f_low) / (high - low)
-        sections.append((f_low - slope * low, slope))
-    return tuple(sections)
+    slopes = (np.diff(levels) / np.diff(speeds)).tolist()
+    return tuple((level - slope * low, slope) for level, slope, low in zip(levels, slopes, speeds, strict=False))

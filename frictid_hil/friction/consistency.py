@@ -51,20 +51,12 @@ CONTINUED = 2.0
 curve is only continued ..."""
 SLOWEST_SHARE = 0.5
 """... down to this share of that pair's speed."""
-
 _STEPS = 1000.0
 _LEAST_SAMPLES = 50
 
 
 def consistency(recording: CycleRecording, motion: Motion, result: Estimate, most_changed: float) -> list[Gate]:
-    """All questions that this recording allows to ask.
-
-    Args:
-        recording: as measured.
-        motion: the same, synchronised.
-        result: what was identified.
-        most_changed: see ``GateLimits.other_stretches``.
-    """
+    """All questions that a recording allows to ask; the last argument is ``GateLimits.other_stretches``."""
     asked = [_delay(recording, result), _turnover(recording, motion, result), _velocity(recording, motion)]
     asked += [_inertia(recording, result), _flat(recording)]
     return [gate for gate in (*asked, _elsewhere(recording, result, most_changed)) if gate is not None]

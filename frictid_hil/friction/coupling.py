@@ -57,8 +57,7 @@ class Pull:
     @property
     def torque_nm(self) -> Array:
         """Shape (n,)."""
-        torque: Array = self.columns @ self.inertia_kg_m2
-        return torque
+        return np.asarray(self.columns @ self.inertia_kg_m2)
 
 
 def pull(recording: CycleRecording, motion: Motion) -> Pull | None:
@@ -74,10 +73,7 @@ def pull(recording: CycleRecording, motion: Motion) -> Pull | None:
 def without_gravity(motion: Motion, solved: Fit, others: Pull | None) -> tuple[Motion, Pull | None]:
     """A motion freed of the gravity of the combined motion, and what was taken off it so far with its uncertainty.
 
-    Args:
-        motion: with the other joints' accelerations taken off already.
-        solved: the model of the same motion.
-        others: what these took; None where that is not known.
+    ``motion``, of which ``solved`` is the model, is free of what the others' accelerations took, where that is known.
     """
     first = solved.blocks.gravity
     if first is None:
@@ -118,15 +114,11 @@ def _acceleration(other: Companion, motion: Motion) -> Array:
     true_s = time - other.position_delay_s
     if true_s.size == motion.time_s.size and np.allclose(true_s, motion.time_s, rtol=0.0, atol=1e-3 * step_s):
         return curvature
-    inside: Array = CubicSpline(true_s, curvature)(np.clip(motion.time_s, true_s[0], true_s[-1]))
-    return inside
+    return np.asarray(CubicSpline(true_s, curvature)(np.clip(motion.time_s, true_s[0], true_s[-1])))
 
 
 def coupled_inertia(stretches: Mapping[str, CycleRecording]) -> dict[str, dict[str, tuple[float, float]]]:
-    """The off-diagonal part of the inertia matrix.
-
-    Args:
-        stretches: every joint's recording of the coupling stretch, by name; times of all on one clock.
+    """The off-diagonal part of the inertia matrix, from every joint's recording of the coupling stretch, on one clock.
 
     Returns:
         Per joint and other joint: M_ij and its standard deviation, kg m2 (kg, kg m where axes are linear).
@@ -158,10 +150,7 @@ def companions(
 ) -> tuple[Companion, ...]:
     """The joints that moved along with one, with what each of them takes.
 
-    Args:
-        stretches: recordings of the coupling stretch.
-        cycles: recordings of the cycles, times on the clock of ``joint``'s.
-        joint: whose torque is to be freed of them.
+    Stretches are recordings of the coupling stretch; times of the cycles are on the clock of ``joint``'s.
 
     Raises:
         IdentificationError: see ``coupled_inertia``.

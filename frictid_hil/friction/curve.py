@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.trajectory import Array
@@ -29,12 +28,7 @@ class FrictionCurve:
 
     @staticmethod
     def through(velocity_rad_s: Array, torque_nm: Array, *, where: str = "") -> FrictionCurve:
-        """The curve through pairs in any order.
-
-        Args:
-            velocity_rad_s: V_n, shape (N,), N >= 2.
-            torque_nm: F_n, shape (N,).
-            where: what to name in an error (``joint 1``).
+        """The curve through N >= 2 pairs in any order, shape (N,) each; ``where`` names them in an error.
 
         Raises:
             IdentificationError: fewer than two pairs, non-finite or non-positive V_n, duplicate V_n, or F_0 <= 0.
@@ -91,8 +85,7 @@ class FrictionCurve:
     def torque(self, velocity_rad_s: Array) -> Array:
         """phi(v) of (8), N m, any shape; 0 at v = 0. Uses abs(v) in (9g)."""
         v = np.asarray(velocity_rad_s, dtype=np.float64)
-        torque: Array = np.sign(v) * self.magnitude(np.abs(v))
-        return torque
+        return np.asarray(np.sign(v) * self.magnitude(np.abs(v)))
 
     def magnitude(self, speed_rad_s: Array) -> Array:
         """phi(abs(v)) with phi(0) = F_0, N m, any shape."""
@@ -100,17 +93,9 @@ class FrictionCurve:
         knots = np.concatenate([[0.0], self.velocity_rad_s])
         levels = np.concatenate([[self.coulomb_nm], self.torque_nm])
         n = np.clip(np.searchsorted(knots, speed, side="right") - 1, 0, len(knots) - 1)
-        torque: Array = levels[n] + self.slopes_nm_s_per_rad[n] * (speed - knots[n])
-        return torque
+        return np.asarray(levels[n] + self.slopes_nm_s_per_rad[n] * (speed - knots[n]))
 
     def rate_part(self, velocity_rad_s: Array) -> Array:
         """phi_0(v) = phi(v) - F_0 sgn(v) of (17): continuous through zero, N m."""
         v = np.asarray(velocity_rad_s, dtype=np.float64)
-        torque: Array = np.sign(v) * (self.magnitude(np.abs(v)) - self.coulomb_nm)
-        return torque
-
-    def extrapolated(self, velocity_rad_s: Array) -> NDArray[np.bool_]:
-        """True where abs(v) lies outside [V_1, V_N]."""
-        speed = np.abs(np.asarray(velocity_rad_s, dtype=np.float64))
-        low, high = self.measured_range_rad_s
-        return (speed < low) | (speed > high)
+        return np.asarray(np.sign(v) * (self.magnitude(np.abs(v)) - self.coulomb_nm))

@@ -18,19 +18,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from frictid_hil.errors import IdentificationError, UsageError
+from frictid_hil.errors import UsageError
 from frictid_hil.friction import intervals, least_squares
 from frictid_hil.friction.beside import Beside, beside
-from frictid_hil.friction.cleaned import Cleaned, cleaned
+from frictid_hil.friction.cleaned import Cleaned, cleaned, or_noted
 from frictid_hil.friction.coupling import posture, without_gravity
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.delay import SeenDelay
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
 from frictid_hil.friction.least_squares import RippleTable
-from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.regression import Fit, fit
 from frictid_hil.friction.rigid_body import COVERAGE, Measured, RigidBody, rigid_body
-from frictid_hil.friction.skew import TimeSkew
+from frictid_hil.friction.skew import Delay, TimeSkew
 from frictid_hil.friction.trajectory import Array
 
 METHODS = ("function-a", "aligned", "least-squares")
@@ -43,7 +42,6 @@ class Estimate:
 
     Attributes:
         method: one of METHODS, or ``plateaus``.
-        curve: phi of (8).
         half_width_nm: half of the 95 % interval at each knot of the curve, shape (K,).
         coulomb_nm: F_0 with its interval.
         asymmetry_nm: half the difference of forward and backward friction at each knot, its constant part left to
@@ -53,11 +51,7 @@ class Estimate:
         published: Function A as published; None where its windows are empty or there is no drive velocity.
         rigid_body: inertia, gravity, bias; None where they could not be separated, or are not of this joint alone.
         ripple: over one motor revolution; None where it is unknown or lost in its uncertainty.
-        link_resonance_hz: of a soft joint; None where the joint looks rigid.
         time_skew: declared, measured and used; None where the joint did not shake.
-        drift: the repeated cycle against its first run; None without one.
-        terms: what the intervals are made of.
-        notes: what a person should know (unobserved speeds, what could not be formed and why).
         figures: further numbers by name, units in the names.
     """
 
@@ -79,11 +73,7 @@ class Estimate:
 
 
 def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimate:
-    """Identify one joint.
-
-    Args:
-        recording: of the procedure; see ``CycleRecording``.
-        method: one of METHODS.
+    """Identify one joint by one of METHODS.
 
     Raises:
         UsageError: no such method, or ``function-a`` without a drive velocity.
@@ -95,7 +85,9 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
     clean = cleaned(recording, notes)
     solved = _solved(clean, notes, required=method == "least-squares")
     drift = intervals.repeated(clean.recording, clean.motion, clean.windows, solved)
-    others = None if solved is None else _beside(clean, solved)
+    others = None
+    if solved is not None:
+        others = beside(clean.recording, clean.motion, solved, clean.level_nm, _postures(clean))
     if method == "least-squares":
         assert solved is not None
         found = _by_least_squares(clean, solved, drift, others, notes)
@@ -121,7 +113,11 @@ def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimat
         pairs=found.pairs,
         published=published,
         rigid_body=body,
-        ripple=_ripple(clean.recording, clean.motion, clean.level_nm, notes),
+        ripple=or_noted(
+            lambda: least_squares.ripple_table(clean.recording, clean.motion, clean.level_nm),
+            "the torque ripple is not known",
+            notes,
+        ),
         link_resonance_hz=None if clean.link is None else clean.link.resonance_hz,
         time_skew=clean.time_skew,
         drift=drift,
@@ -144,29 +140,22 @@ def _refuse(recording: CycleRecording, method: str) -> None:
 
 def _solved(clean: Cleaned, notes: list[str], *, required: bool) -> Fit | None:
     """The least-squares model of the whole recording; None where it cannot be solved."""
-    recording, motion, taken = clean.recording, clean.motion, clean.taken
-    try:
+
+    def solved() -> Fit:
         return fit(
-            recording,
-            motion,
-            least_squares.curve_knots(recording),
+            clean.recording,
+            clean.motion,
+            least_squares.curve_knots(clean.recording),
             clean.level_nm,
             extra=_postures(clean),
-            doubtful=None if taken is None else taken.columns,
+            doubtful=None if clean.taken is None else clean.taken.columns,
         )
-    except IdentificationError as problem:
-        if required:
-            raise
-        notes.append(f"inertia, gravity and bias are not known: {problem.what}")
-        return None
+
+    return solved() if required else or_noted(solved, "inertia, gravity and bias are not known", notes)
 
 
 def _postures(clean: Cleaned) -> Array | None:
     return posture(clean.motion) if clean.recording.coupled else None
-
-
-def _beside(clean: Cleaned, solved: Fit) -> Beside:
-    return beside(clean.recording, clean.motion, solved, clean.level_nm, _postures(clean))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +177,7 @@ def _by_least_squares(
         notes.append(f"too few samples at {slow} rad/s: the curve is extended to there from faster ones")
     kept = least_squares.trusted(recording, solved, clean.level_nm)
     terms = intervals.least_squares_terms(recording, clean.motion, solved, kept, drift, others, clean.taken)
-    curve = least_squares.curve_of(solved, kept, recording.where)
+    curve = FrictionCurve.through(solved.knots[kept], solved.odd_nm[kept], where=recording.where)
     return _Found(curve, terms.half_width_nm, clean.windows, terms)
 
 
@@ -218,39 +207,23 @@ def asymmetry(pairs: IdentifiedPairs, speed_rad_s: Array) -> Array:
     """
     middle = (pairs.torque_plus_nm + pairs.torque_minus_nm) / 2
     slope = np.polyfit(pairs.mean_speed_rad_s, middle, 1)[0]
-    even: Array = slope * np.asarray(speed_rad_s, dtype=np.float64)
-    return even
+    return np.asarray(slope * np.asarray(speed_rad_s, dtype=np.float64))
 
 
 def _published(recording: CycleRecording, notes: list[str], *, required: bool) -> IdentifiedPairs | None:
-    if recording.velocity_rad_s is None:
+    time_s, velocity, torque = recording.time_s, recording.velocity_rad_s, recording.torque_nm
+    if velocity is None:
         notes.append("no drive velocity: the published Function A is not shown beside")
         return None
-    try:
-        return function_a(
-            recording.time_s,
-            recording.velocity_rad_s,
-            recording.torque_nm,
-            recording.procedure,
-            where=recording.where,
-        )
-    except IdentificationError as problem:
-        if required:
-            raise
-        notes.append(f"the published Function A fails: {problem.what}")
-        return None
+
+    def published() -> IdentifiedPairs:
+        return function_a(time_s, velocity, torque, recording.procedure, where=recording.where)
+
+    return published() if required else or_noted(published, "the published Function A fails", notes)
 
 
-def _figures(solved: Fit | None, seen: SeenDelay | None) -> dict[str, float]:
+def _figures(solved: Fit | None, seen: Delay | None) -> dict[str, float]:
     figures = {} if solved is None else {"residual_rms_nm": solved.residual_rms_nm}
     if seen is not None:
         figures.update(seen_delay_s=seen.delay_s, seen_delay_deviation_s=seen.deviation_s)
     return figures
-
-
-def _ripple(recording: CycleRecording, motion: Motion, level: float, notes: list[str]) -> RippleTable | None:
-    try:
-        return least_squares.ripple_table(recording, motion, level)
-    except IdentificationError as problem:
-        notes.append(f"the torque ripple is not known: {problem.what}")
-        return None

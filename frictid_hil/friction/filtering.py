@@ -86,14 +86,9 @@ class Gaussian:
 
 
 def uniform(time_s: Array, *columns: Array) -> tuple[Array, tuple[Array, ...]]:
-    """The columns on a uniform grid of the median step; returned as they are when they already lie on one.
+    """A uniform grid of the median step, and the columns, shape (n,) each, on it by cubic splines.
 
-    Args:
-        time_s: strictly increasing, shape (n,).
-        columns: shape (n,) each; interpolated by cubic splines.
-
-    Returns:
-        The grid and the columns on it.
+    Both as they are where they already lie on one; times are strictly increasing.
     """
     steps = np.diff(time_s)
     step_s = float(np.median(steps))

@@ -9,7 +9,7 @@ no inertia in it, one over a short travel no gravity.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from frictid_hil.friction.trajectory import Array
 
 _SHARES = np.array([0.02, 0.05, 0.1, 0.18, 0.3, 0.45, 0.65, 0.85, 1.0])
 """Knots as shares of the highest speed."""
+_BODY = ("inertia_kg_m2", "bias_nm", "gravity_cos_nm", "gravity_sin_nm")
 _LEAST_S = 0.2
 """Time that must be spent around a knot in each direction."""
 _LEAST_SAMPLES = 5
@@ -43,20 +44,15 @@ MOST_APART = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMotion:
-    """What any motion says of one joint.
+    """What any motion says of one joint; figures of the rigid body are None where the motion cannot tell.
 
     Attributes:
-        curve: through the knots.
-        half_width_nm: half of the 95 % interval at each knot.
+        half_width_nm: half of the 95 % interval at each knot of the curve.
         coulomb_nm: F_0.
-        inertia_kg_m2: None where the motion cannot tell, as the others.
-        gravity_cos_nm: see there.
-        gravity_sin_nm: see there.
-        bias_nm: see there; a constant direction asymmetry of friction is in it.
+        bias_nm: a constant direction asymmetry of friction is in it.
         untold: why a figure is None, by its name.
         residual_rms_nm: what the model leaves.
         torque_rms_nm: of the torque without its mean.
-        gates: questions and answers.
     """
 
     curve: FrictionCurve
@@ -95,9 +91,9 @@ def free_motion(
     """Identify friction, inertia and gravity from any motion.
 
     Args:
-        time_s: strictly increasing, any rate, shape (n,).
-        position_rad: shape (n,).
-        torque_nm: shape (n,); what a rigid-body model explains may be taken off before.
+        time_s: strictly increasing, any rate, shape (n,) as the other columns.
+        position_rad: measured.
+        torque_nm: what a rigid-body model explains may be taken off before.
         torque_delay_s: by which the torque lags the position.
         prismatic: gravity does not turn.
         where: for errors.
@@ -113,36 +109,31 @@ def free_motion(
     odd, half = solved.values[:n], COVERAGE * np.sqrt(np.diag(solved.covariance))
     level = float(np.median(np.abs(odd)))
     curve = FrictionCurve.through(knots, odd, where=where)
-    names = ["inertia_kg_m2", "bias_nm", *(("gravity_cos_nm", "gravity_sin_nm") if gravity else ())]
+    names = _BODY if gravity else _BODY[:2]
     units = [float(np.quantile(np.abs(rows.columns[:, k]), 0.9)) for k in range(len(names))]
-    found: dict[str, Measured | None] = {}
+    found: dict[str, Measured | None] = dict.fromkeys(_BODY)
     untold: dict[str, str] = {}
     for k, name in enumerate(names):
         measured = Measured(float(solved.values[n + k]), float(half[n + k]))
         if units[k] == 0.0:
-            found[name], untold[name] = None, "the accelerations are no larger than their noise"
+            untold[name] = "the accelerations are no larger than their noise"
         elif measured.half_width * units[k] > 0.3 * max(level, abs(measured.value) * units[k]):
             untold[name] = f"this motion tells it to +- {measured.half_width:.2g} only"
-            found[name] = None
         else:
             found[name] = measured
     if not gravity and not prismatic:
         travel = np.rad2deg(float(np.ptp(position_rad)))
-        for name in ("gravity_cos_nm", "gravity_sin_nm"):
+        for name in _BODY[2:]:
             untold[name] = f"a travel of {travel:.3g} deg is too short; it is in the bias"
-    coulomb = Measured(curve.coulomb_nm, coulomb_half_width_nm(curve, half[:n]))
     return FreeMotion(
         curve=curve,
         half_width_nm=half[:n],
-        coulomb_nm=coulomb,
-        inertia_kg_m2=found.get("inertia_kg_m2"),
-        gravity_cos_nm=found.get("gravity_cos_nm"),
-        gravity_sin_nm=found.get("gravity_sin_nm"),
-        bias_nm=found.get("bias_nm"),
+        coulomb_nm=Measured(curve.coulomb_nm, coulomb_half_width_nm(curve, half[:n])),
+        **found,
         untold=untold,
         residual_rms_nm=solved.residual_rms,
         torque_rms_nm=float(np.std(rows.torque)),
-        gates=_gates(rows, knots, odd, half[:n], level, found.get("inertia_kg_m2"), where),
+        gates=_gates(rows, knots, odd, half[:n], level, found["inertia_kg_m2"], where),
     )
 
 
@@ -253,13 +244,8 @@ def _gates(
     middle = rows.bunch[rows.bunch.size // 2]
     curves = []
     for chosen in (rows.bunch <= middle, rows.bunch > middle):
-        part = replace(
-            rows,
-            velocity=rows.velocity[chosen],
-            columns=rows.columns[chosen],
-            torque=rows.torque[chosen],
-            bunch=rows.bunch[chosen],
-        )
+        v, x, torque, bunch = rows.velocity, rows.columns, rows.torque, rows.bunch
+        part = _Rows(v[chosen], x[chosen], torque[chosen], bunch[chosen], rows.step_s)
         try:
             solved = _solve(part, knots, where)
         except IdentificationError:

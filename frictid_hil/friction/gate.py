@@ -8,15 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One question and its answer.
-
-    Attributes:
-        name: of the gate.
-        passed: the answer.
-        value: what was measured.
-        limit: what was allowed.
-        reason: a sentence for a person, whether passed or not.
-    """
+    """One question and its answer; the reason is a sentence for a person, whether passed or not."""
 
     name: str
     passed: bool
@@ -34,21 +26,8 @@ class Gate:
 class GateLimits:
     """What the gates allow where it is a matter of the machine; the defaults suit a geared joint with a usual servo.
 
-    The gates that find wrong columns (delays, scales, torque that is cut off) are not among them: their limits are the
-    same for every machine. Shares are fractions of one.
-
-    Attributes:
-        tracking_least: least peak speed of a cycle over the commanded one.
-        tracking_most: the same, at most.
-        high_frequency_torque: jitter of the torque over the friction.
-        samples_per_window: fewest samples that a pair may be the mean of.
-        late_cycles: share of control cycles that were late or missed.
-        direction_asymmetry: how far either direction may lie from the mean of both, over that mean.
-        straightness: how far a pair may leave the line through its neighbours, over the mean friction.
-        saturation: share of the samples with torque at its limit.
-        drift: change of the friction over the run.
-        link_resonance: frequency of the fastest cycle over the link's resonance.
-        other_stretches: change of the friction in other stretches of the run, against the curve.
+    ``config.robot.GatesFile``, by which a robot file changes them, says what each means. Shares are fractions of one.
+    The gates that find wrong columns (delays, scales, torque that is cut off) have the same limits for every machine.
     """
 
     tracking_least: float = 0.95

@@ -35,8 +35,7 @@ class IdentifiedPairs:
         velocity_minus_rad_s: mean speed of the backward window, as a positive number.
         torque_plus_nm: F_sn+ of (7g), gravity and bias included.
         torque_minus_nm: F_sn- of (7h), signed as measured.
-        samples_plus: samples in the forward window.
-        samples_minus: samples in the backward window.
+        samples_plus: samples in the forward window; ``samples_minus`` in the backward one.
     """
 
     velocity_rad_s: Array
@@ -46,11 +45,6 @@ class IdentifiedPairs:
     torque_minus_nm: Array
     samples_plus: NDArray[np.int64]
     samples_minus: NDArray[np.int64]
-
-    @property
-    def velocity_plus_rad_s(self) -> Array:
-        """Mean speed of the forward window; the same as V_n (7f)."""
-        return self.velocity_rad_s
 
     @property
     def mean_speed_rad_s(self) -> Array:
@@ -67,12 +61,7 @@ def function_a(
 ) -> IdentifiedPairs:
     """Algorithm (7) as published: thresholds on the measured velocity, plain averages.
 
-    Args:
-        time_s: increasing, 0 at the start of cycle 1, shape (n,). Samples outside [0, T_{N+1}) are ignored.
-        velocity_rad_s: measured velocity, shape (n,).
-        torque_nm: applied torque, shape (n,).
-        procedure: V, A, N and c.
-        where: what to name in an error (``joint 1``).
+    Time is 0 at the start of cycle 1; samples outside [0, T_{N+1}) are ignored. All columns have shape (n,).
 
     Raises:
         IdentificationError: shapes differ, a value is not finite, or a window is empty (cycle and direction named).

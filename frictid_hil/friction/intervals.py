@@ -2,7 +2,7 @@
 
 * **scatter**: the two halves of the travel, forwards and backwards, are four looks at one F_n; torque noise and ripple
   show as their disagreement. What comes again in every cycle is no chance, and their mean has none of it;
-* **skew**: what the data leave open of the declared uncertainty of the delay between torque and position (``delay``),
+* **skew**: what the data leave open of the declared uncertainty of the delay between torque and position (``skew``),
   through the very same windows;
 * **model**: the distance between windows and global least squares, two estimators that fail differently, beyond the
   scatter of both;
@@ -37,8 +37,6 @@ FINER = 8
 """Points per sample at which windows begin and end: one sample too many on one side is an error of its own."""
 STEADY = 0.28
 """Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
-
-
 _ENOUGH = 6
 """Cycles from which on two parameters can be told from the scatter of so many differences."""
 
@@ -49,26 +47,15 @@ class TakenOff(Protocol):
     @property
     def columns(self) -> Array:
         """By how the torque changes with each of its parameters, shape (n, m)."""
-        ...
 
     @property
     def covariance(self) -> Array:
         """Of these parameters, shape (m, m)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """Standard deviations at each knot of a curve, N m, shape (N,) each.
-
-    Attributes:
-        scatter: noise and disagreement of directions.
-        skew: undeclared torque delay.
-        model: what the estimator leaves out.
-        drift: friction that changed while it was measured.
-        beside: friction that depends on place or load.
-        link: torque of the swinging link, or of the joints that moved along.
-    """
+    """Standard deviations at each knot of a curve, N m, shape (N,) each; the beginning of this file says of what."""
 
     scatter: Array
     skew: Array
@@ -81,31 +68,20 @@ class Terms:
     def half_width_nm(self) -> Array:
         """Half of the 95 % interval, shape (N,)."""
         terms = self.scatter, self.skew, self.model, self.drift, self.beside, self.link
-        half: Array = COVERAGE * np.sqrt(sum(term**2 for term in terms))
-        return half
+        return np.asarray(COVERAGE * np.sqrt(sum(term**2 for term in terms)))
 
 
 def aligned_pairs(recording: CycleRecording, motion: Motion, column: Array | None = None) -> IdentifiedPairs:
     """(7) on synchronised columns, both smoothed alike, windows begun and ended between samples.
 
-    Args:
-        recording: for its procedure.
-        motion: synchronised columns.
-        column: averaged in place of the torque, shape (n,).
+    Another column, shape (n,), may be averaged in place of the torque.
     """
     velocity, torque = _steady(recording, motion, motion.torque_nm if column is None else column)
     fine = np.linspace(motion.time_s[0], motion.time_s[-1], (motion.time_s.size - 1) * FINER + 1)
     velocity, torque = np.interp(fine, motion.time_s, velocity), np.interp(fine, motion.time_s, torque)
     pairs = function_a(fine, velocity, torque, recording.procedure, where=recording.where)
-    return IdentifiedPairs(
-        pairs.velocity_rad_s,
-        pairs.torque_nm,
-        pairs.velocity_minus_rad_s,
-        pairs.torque_plus_nm,
-        pairs.torque_minus_nm,
-        np.round(pairs.samples_plus / FINER).astype(np.int64),
-        np.round(pairs.samples_minus / FINER).astype(np.int64),
-    )
+    plus, minus = (np.round(n / FINER).astype(np.int64) for n in (pairs.samples_plus, pairs.samples_minus))
+    return replace(pairs, samples_plus=plus, samples_minus=minus)
 
 
 def _steady(recording: CycleRecording, motion: Motion, column: Array) -> tuple[Array, Array]:
@@ -126,16 +102,9 @@ def window_terms(
     others: Beside | None,
     link: TakenOff | None,
 ) -> Terms:
-    """Terms of the aligned Function A.
+    """Terms of the aligned Function A: its pairs, the least-squares model of the same columns, what stands beside it.
 
-    Args:
-        recording: with its declared skew.
-        motion: synchronised columns.
-        pairs: of the same columns.
-        solved: the least-squares model of the same columns; None where it could not be solved.
-        drift: the repeated cycle; None without one.
-        others: place and load beside the solved model; None where it could not be solved.
-        link: what was taken off the torque; None of a rigid joint.
+    None is given for what could not be solved, was not repeated, or was not taken off the torque.
     """
     rate = np.gradient(motion.torque_nm, motion.smoother.step_s)
     slope = aligned_pairs(recording, motion, rate).torque_nm
@@ -163,8 +132,7 @@ def _windowed(recording: CycleRecording, motion: Motion, columns: Array) -> Arra
 
 def _spread(weights: Array, covariance: Array) -> Array:
     """Standard deviation of ``weights @ x``, shape (N,) for weights of shape (N, m)."""
-    spread: Array = np.sqrt(np.einsum("nj,jk,nk->n", weights, covariance, weights))
-    return spread
+    return np.asarray(np.sqrt(np.einsum("nj,jk,nk->n", weights, covariance, weights)))
 
 
 def least_squares_terms(
@@ -226,9 +194,7 @@ class Drift:
     def over(self, duration_s: float, change: float | None = None) -> float:
         """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most.
 
-        Args:
-            duration_s: of the run.
-            change: in place of the one that was seen.
+        Another change may be told in place of the one that was seen.
         """
         return (self.change if change is None else change) * min(duration_s / self.apart_s, 3.0)
 
@@ -280,8 +246,7 @@ def _drift_shares(recording: CycleRecording, seen_s: Array, drift: Drift | None)
     duration_s = recording.procedure.duration_s
     most = abs(drift.over(duration_s)) + drift.over(duration_s, drift.chance)
     farthest = 0.5 + np.abs(seen_s / duration_s - 0.5)
-    shares: Array = most * farthest / np.sqrt(3.0)
-    return shares
+    return np.asarray(most * farthest / np.sqrt(3.0))
 
 
 def _apart(pairs: IdentifiedPairs, solved: Fit, scatter_nm: Array, others: Beside, weights: Array) -> Array:
@@ -294,8 +259,7 @@ def _apart(pairs: IdentifiedPairs, solved: Fit, scatter_nm: Array, others: Besid
     known = np.einsum("nj,jk,nk->n", hats, solved.covariance[odd, odd], hats)
     distance = pairs.torque_nm - hats @ solved.odd_nm - others.moved(weights - hats @ others.on_knots)
     beyond = _pooled(distance**2) - _pooled(known + scatter_nm**2)
-    apart: Array = np.sqrt(np.maximum(beyond, 0.0))
-    return apart
+    return np.asarray(np.sqrt(np.maximum(beyond, 0.0)))
 
 
 def _pooled(power: Array) -> Array:
@@ -330,8 +294,7 @@ def _scatter(recording: CycleRecording, motion: Motion, solved: Fit | None) -> A
             single[n] += (early.mean() - late.mean()) / 4 if late.size else 0.0
     chance, free = _by_chance(recording, single)
     # One degree of freedom each at most: pooled over five neighbours, and widened for those.
-    spread: Array = np.sqrt(_pooled(chance**2)) * float(stdtrit(5 * free, 0.975)) / COVERAGE
-    return spread
+    return np.asarray(np.sqrt(_pooled(chance**2)) * float(stdtrit(5 * free, 0.975)) / COVERAGE)
 
 
 def _by_chance(recording: CycleRecording, single: Array) -> tuple[Array, float]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import RIPPLE_ORDERS, Fit, fit
 from frictid_hil.friction.rigid_body import COVERAGE
@@ -25,12 +24,7 @@ _TRUSTED = 0.015
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RippleTable:
-    """Torque that depends on where the motor stands, repeating over ``period_rad`` of the joint.
-
-    Attributes:
-        period_rad: joint travel after which it repeats.
-        torque_nm: at equal steps over one period, the first at position 0.
-    """
+    """Torque that repeats over a stretch of joint travel: at equal steps over one period, the first at position 0."""
 
     period_rad: float
     torque_nm: tuple[float, ...]
@@ -54,11 +48,6 @@ def trusted(recording: CycleRecording, solved: Fit, level_nm: float) -> slice:
     return slice(int(np.argmin(good[::-1]) and good.size - np.argmin(good[::-1])), good.size)
 
 
-def curve_of(solved: Fit, kept: slice, where: str) -> FrictionCurve:
-    """phi through the trusted knots."""
-    return FrictionCurve.through(solved.knots[kept], solved.odd_nm[kept], where=where)
-
-
 def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, points: int = 64) -> RippleTable | None:
     """The ripple over one motor revolution, or None where it is not known or not larger than its uncertainty.
 
@@ -67,9 +56,8 @@ def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, 
     """
     if recording.prismatic or not np.isfinite(recording.gear_ratio):
         return None
-    solved = fit(
-        recording, motion, few_knots(recording), level_nm, width_rad=0.0
-    )  # the narrowest kernel: ripple is fast
+    # The narrowest kernel: ripple is fast.
+    solved = fit(recording, motion, few_knots(recording), level_nm, width_rad=0.0)
     count = (solved.blocks.ripple.stop - solved.blocks.ripple.start) // 3
     plain = slice(solved.blocks.ripple.start, solved.blocks.ripple.start + count)
     values = solved.values[plain]

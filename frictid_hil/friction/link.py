@@ -14,7 +14,7 @@ the search cannot take one for the other. What that column finds is thrown away;
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +69,7 @@ class Link:
     @property
     def torque_nm(self) -> Array:
         """What the swinging takes beyond a rigid joint, shape (n,)."""
-        torque: Array = self.inertia_kg_m2 * self.columns[:, 0]
-        return torque
+        return np.asarray(self.inertia_kg_m2 * self.columns[:, 0])
 
 
 def swinging(motion: Motion, frequency_hz: float, damping: float) -> Array:
@@ -145,8 +144,3 @@ def soft_link(recording: CycleRecording, motion: Motion, level_nm: float) -> Lin
     relative = np.array([0.5 / (whole - inertia), 1.0, 0.0])
     half = COVERAGE * resonance * float(np.sqrt(relative @ covariance @ relative))
     return Link(float(frequency), float(damping), inertia, Measured(resonance, half), extra * scale, covariance)
-
-
-def without(motion: Motion, link: Link | None) -> Motion:
-    """The motion as a rigid joint would need it."""
-    return motion if link is None else replace(motion, torque_nm=motion.torque_nm - link.torque_nm)

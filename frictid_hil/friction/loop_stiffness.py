@@ -18,14 +18,7 @@ _EXPLAINED = 0.9
 
 
 def loop_stiffness(time_s: Array, command_rad: Array, position_rad: Array, torque_nm: Array) -> float | None:
-    """k, N m/rad, to a few per cent; None where the loop is not of this kind.
-
-    Args:
-        time_s: shape (n,).
-        command_rad: in force, shape (n,).
-        position_rad: shape (n,).
-        torque_nm: of the loop, shape (n,).
-    """
+    """k, N m/rad, to a few per cent, from columns of shape (n,); None where the loop is not of this kind."""
     inside = slice(_BESIDE, -_BESIDE)
     span_s = time_s[2 * _BESIDE :] - time_s[: -2 * _BESIDE]
     velocity = (position_rad[2 * _BESIDE :] - position_rad[: -2 * _BESIDE]) / span_s

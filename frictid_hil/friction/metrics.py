@@ -17,13 +17,9 @@ from frictid_hil.friction.trajectory import Array
 
 @dataclass(frozen=True, slots=True)
 class CurveDistance:
-    """How far a curve is from a reference, over [0, V] and over the curve's own measured range [V_1, V_N].
+    """How far a curve is from a reference: E of (15), and in percent of the reference's mean.
 
-    Attributes:
-        e_nm: E of (15) over [0, V].
-        e_percent: in percent of the reference's mean over [0, V].
-        e_measured_nm: the same integral over [V_1, V_N].
-        e_percent_measured_range: in percent of the reference's mean over [V_1, V_N].
+    Over [0, V], and over the curve's own measured range [V_1, V_N].
     """
 
     e_nm: float
@@ -35,10 +31,7 @@ class CurveDistance:
 def curve_distance(curve: FrictionCurve, reference: FrictionCurve, velocity_rad_s: float) -> CurveDistance:
     """E(curve, reference) of (15) and its percentages.
 
-    Args:
-        curve: the identified curve; its measured range is the second interval, cut at V.
-        reference: the curve to be reached (truth, A = 50 deg, another profile).
-        velocity_rad_s: V, upper end of the first interval.
+    The identified curve's measured range is the second interval, cut at V, the upper end of the first.
     """
     low, high = curve.measured_range_rad_s
     high = min(high, velocity_rad_s)
@@ -85,19 +78,13 @@ def plain_rms(values: Array) -> float:
 
 def rms_by_part(values: Array, parts: int) -> Array:
     """Root mean squares of parts of equal length, one after the other, shape (parts,); unit of ``values``."""
-    roots: Array = np.array([np.sqrt(np.mean(np.square(part))) for part in np.array_split(values, parts)])
-    return roots
+    return np.array([np.sqrt(np.mean(np.square(part))) for part in np.array_split(values, parts)])
 
 
 def ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
-    """95 % interval of a root mean square over another, from those of repetitions of the same motion.
+    """95 % interval of a root mean square over another, from those of repetitions of the same motion, (n,) and (m,).
 
-    Args:
-        before: of each repetition, shape (n,).
-        after: of each repetition, shape (m,); against ones, the interval is that of ``after`` itself.
-
-    Returns:
-        None where one of them was not repeated, or vanishes.
+    Against ones, it is the interval of ``after`` itself. None where one of them was not repeated, or vanishes.
     """
     squares = [np.square(one) for one in (before, after)]
     if min(one.size for one in squares) < 2 or min(float(np.mean(one)) for one in squares) <= 0.0:
@@ -110,14 +97,9 @@ def ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
 
 
 def paired_ratio_interval(before: Array, after: Array) -> tuple[float, float] | None:
-    """95 % interval of a root mean square over another, of two models along the same parts of a motion.
+    """95 % interval of a root mean square over another, of two models along the same parts of a motion, shape (n,).
 
-    Args:
-        before: RMS of each part, shape (n,).
-        after: RMS of the same parts, shape (n,).
-
-    Returns:
-        None with fewer than two parts, or where ``before`` vanishes.
+    None with fewer than two parts, or where ``before`` vanishes.
     """
     was, now = np.square(before), np.square(after)
     if was.size < 2 or float(np.mean(was)) <= 0.0:

@@ -18,13 +18,7 @@ _WORST_MISFIT = 0.1
 
 
 def cycles_start_s(time_s: Array, position_rad: Array, procedure: Procedure, *, where: str = "") -> float:
-    """Time at which cycle 1 begins, on the clock of ``time_s``.
-
-    Args:
-        time_s: increasing, shape (n,).
-        position_rad: commanded or measured, shape (n,).
-        procedure: V, A, N, c of the motion.
-        where: what to name in an error.
+    """Time at which cycle 1 begins, on the clock of ``time_s``; the path is commanded or measured, shape (n,).
 
     Raises:
         IdentificationError: the recording does not hold this motion.

@@ -37,14 +37,7 @@ _SETTLE_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateauEstimate:
-    """What plateaus say of one joint.
-
-    Attributes:
-        pairs: of every speed held both ways, slowest first.
-        curve: phi of (8) through them.
-        half_width_nm: half of the 95 % interval of each F_n, shape (N,).
-        coulomb_nm: F_0 with its interval.
-    """
+    """What plateaus say of one joint: pairs of every speed held both ways, slowest first, the curve, its intervals."""
 
     pairs: IdentifiedPairs
     curve: FrictionCurve
@@ -77,9 +70,9 @@ def plateaus(
     """Pairs of every speed that the recording holds in both directions, slowest first, and their intervals.
 
     Args:
-        time_s: strictly increasing, shape (n,).
-        position_rad: measured (m on a prismatic axis), shape (n,).
-        torque_nm: applied (N on a prismatic axis), shape (n,).
+        time_s: strictly increasing, shape (n,) as the other columns.
+        position_rad: measured (m on a prismatic axis).
+        torque_nm: applied (N on a prismatic axis).
         command_rad: position set-points, where recorded: they show the plateaus without noise.
         torque_delay_s: torque delay minus position delay.
         where: what to name in an error.
@@ -136,11 +129,11 @@ def _find(path: Array, step_s: float) -> list[_Plateau]:
     constant = (np.abs(speed) > _SLOWEST * top) & (np.abs(change) < _CONSTANT_PER_S * np.abs(speed))
     edges = np.flatnonzero(np.diff(constant.astype(np.int8), prepend=0, append=0))
     settle = round(_SETTLE_S / step_s)
-    found = []
-    for start, stop in zip(edges[::2] + settle, edges[1::2] - settle, strict=True):
-        if stop - start > 4:
-            found.append(_Plateau(int(start), int(stop), float(np.median(speed[start:stop]))))
-    return found
+    return [
+        _Plateau(int(start), int(stop), float(np.median(speed[start:stop])))
+        for start, stop in zip(edges[::2] + settle, edges[1::2] - settle, strict=True)
+        if stop - start > 4
+    ]
 
 
 def _groups(found: list[_Plateau]) -> list[list[_Plateau]]:
@@ -201,8 +194,7 @@ def _half_widths(position: Array, force: Array, groups: list[list[_Plateau]]) ->
     pass_power = sum(within) / free_within if free_within else 0.0
     # Both directions pass the same places, and a place that resists more resists both ways.
     deviation = np.sqrt(place_power * (1 / counts).mean(axis=1) + pass_power / 2)
-    half: Array = stdtrit(min(free_between, 30), 0.975) * deviation
-    return half
+    return np.asarray(stdtrit(min(free_between, 30), 0.975) * deviation)
 
 
 def _places(position: Array, halves: list[slice]) -> NDArray[np.int64]:

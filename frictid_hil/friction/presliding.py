@@ -50,13 +50,7 @@ _LEAST_CLARITY = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Presliding:
-    """A joint before it slides.
-
-    Attributes:
-        stiffness_nm_per_rad: sigma.
-        level_nm: friction of creeping motion, half of D.
-        gradual: it yields gradually, not at once.
-    """
+    """A joint before it slides: sigma, the friction of creeping motion (half of D), and whether it yields gradually."""
 
     stiffness_nm_per_rad: Measured
     level_nm: Measured
@@ -82,11 +76,7 @@ class _Fitted:
 def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: str = "") -> Presliding:
     """Stiffness of the joint before it slides, and the friction at which it does, with their 95 % intervals.
 
-    Args:
-        time_s: increasing, shape (n,).
-        position_rad: measured, shape (n,); several slow reversals, each a few times longer than the presliding travel.
-        torque_nm: as reported, shape (n,).
-        where: what to name in an error.
+    Columns, shape (n,), hold several slow reversals, each a few times longer than the presliding travel.
 
     Raises:
         IdentificationError: fewer than two reversals, or no passage from one sliding level to the other in them.
@@ -119,13 +109,9 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
 def least_stiffness(recording: CycleRecording, body: RigidBody, coulomb_nm: float) -> float | None:
     """The least stiffness that the turning points of the cycles allow, N m/rad; None where they tell nothing.
 
-    For joints whose encoder or position loop hides the passage itself. While friction goes from the one direction to
-    the other, the joint has moved by no more than its position shows and one encoder step.
-
-    Args:
-        recording: of the cycles.
-        body: inertia, gravity and bias, which are taken off the torque.
-        coulomb_nm: F_0.
+    For joints whose encoder or position loop hides the passage itself. While friction, the torque without what the body
+    takes, goes from the one direction to the other, the joint has moved by no more than its position shows and one
+    encoder step.
     """
     motion = synchronised(recording)
     friction = motion.torque_nm - body.torque_nm(motion.position_rad, motion.acceleration_rad_s2)
@@ -179,13 +165,11 @@ def _passage(position: Array, torque: Array, start: int, stop: int) -> _Passage:
 
 
 def _at_once(travel: Array, start: float, stiffness: float, change: float) -> Array:
-    falling: Array = start - np.minimum(stiffness * travel, change)
-    return falling
+    return np.asarray(start - np.minimum(stiffness * travel, change))
 
 
 def _gradually(travel: Array, start: float, stiffness: float, change: float) -> Array:
-    falling: Array = start - change * (1.0 - np.exp(-2.0 * stiffness * travel / change))
-    return falling
+    return np.asarray(start - change * (1.0 - np.exp(-2.0 * stiffness * travel / change)))
 
 
 def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> _Fitted | None:

@@ -39,12 +39,7 @@ class Skew:
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """One cycle of the procedure run again at the end, to see drift.
-
-    Attributes:
-        cycle: which, 1..N.
-        start_s: when it starts again.
-    """
+    """One cycle of the procedure, 1..N, run again at the end, to see drift."""
 
     cycle: int
     start_s: float
@@ -55,9 +50,7 @@ class Companion:
     """Another joint that moved at the same time; columns of shape (n,).
 
     Attributes:
-        name: of the joint.
         time_s: on the clock of the joint that it went along with.
-        position_rad: measured.
         position_delay_s: declared, see ``Skew``.
         inertia_kg_m2: M_ij, torque of the joint per acceleration of this one.
         deviation_kg_m2: one standard deviation of it.
@@ -79,17 +72,12 @@ class CycleRecording:
         time_s: strictly increasing, 0 at the start of cycle 1.
         position_rad: measured; radians or metres.
         torque_nm: as the drive reports it.
-        procedure: V, A, N, c.
         velocity_rad_s: the drive's own velocity, where it has one.
-        command_rad: position set-points, where recorded.
-        skew: declared timing of the columns.
         gear_ratio: motor revolutions per joint revolution; NaN where unknown (torque ripple is then not modelled).
         prismatic: a linear axis: gravity does not depend on the position.
-        torque_limit_nm: at which the drive saturates.
         limited_share: share of the recording in which the drive said that one of its limits was active.
         torque_quantum_nm: one step of the reported torque.
         repeat: the repeated cycle, where there is one.
-        late_cycles: control cycles that were late or missed while recording.
         coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
             combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
         companions: those joints, as far as it is known how much they take.
@@ -127,15 +115,9 @@ class CycleRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Position, its derivatives and the torque, lightly smoothed, all true at the same instants.
+    """Position, its derivatives and the torque, all true at the same instants, shape (n,) each.
 
-    Attributes:
-        time_s: uniform grid, time of the cycles, shape (n,).
-        position_rad: shape (n,).
-        velocity_rad_s: shape (n,).
-        acceleration_rad_s2: shape (n,).
-        torque_nm: shape (n,).
-        smoother: the kernel that all four columns went through.
+    The time is a uniform grid on the clock of the cycles. All four columns went through the smoother.
     """
 
     time_s: Array
@@ -149,10 +131,7 @@ class Motion:
 def passes(motion: Motion, *, slowest_share: float, guard_rad: float) -> NDArray[np.int64]:
     """From turn to turn, the number of the pass that each sample belongs to, shape (n,); -1 near a turn.
 
-    Args:
-        motion: of the joint.
-        slowest_share: samples below this share of the highest speed are near a turn.
-        guard_rad: and so are those of the first so many radians after it.
+    Near it are samples below this share of the highest speed, and those of the first so many radians after it.
     """
     v = motion.velocity_rad_s
     number = np.zeros(v.size, dtype=np.int64)
@@ -167,12 +146,8 @@ def passes(motion: Motion, *, slowest_share: float, guard_rad: float) -> NDArray
 def synchronised(recording: CycleRecording, extra_torque_delay_s: float = 0.0) -> Motion:
     """Zero-phase velocity and acceleration from the position, torque brought to the instants of the position.
 
-    Only the declared skew is used; it is never searched for in the data, where unmodelled ripple would drag it by
-    milliseconds.
-
-    Args:
-        recording: the samples.
-        extra_torque_delay_s: added to the declared torque delay, to see what a wrong declaration would do.
+    Only the declared skew is used (and what may be added to it, to see what a wrong declaration would do); it is never
+    searched for in the data, where unmodelled ripple would drag it by milliseconds.
 
     Raises:
         IdentificationError: shapes differ, time does not increase, or a value is not finite.

@@ -98,14 +98,12 @@ class Fit:
     def even_nm(self, speed_rad_s: Array) -> Array:
         """Even part of the friction, 0 at rest, same shape as the speeds."""
         levels = np.concatenate([[0.0], self.values[self.blocks.even]])
-        even: Array = np.interp(speed_rad_s, self.knots[-1] * EVEN_KNOTS, levels)
-        return even
+        return np.asarray(np.interp(speed_rad_s, self.knots[-1] * EVEN_KNOTS, levels))
 
     def deviation(self, skew_uncertainty_s: float) -> Array:
         """One standard deviation of every coefficient, undeclared skew included, shape (size,)."""
         skew = self.per_second_of_skew * skew_uncertainty_s
-        deviation: Array = np.sqrt(np.diag(self.covariance) + skew**2)
-        return deviation
+        return np.asarray(np.sqrt(np.diag(self.covariance) + skew**2))
 
 
 def fit(
@@ -179,16 +177,11 @@ class Unexplained:
         self._rest = self._outside(both[:, -1:])[:, 0]
 
     def power_with(self, columns: Array) -> Array:
-        """Mean square that remains with each of the columns added alone, never with a negative amount, shape (k,).
-
-        Args:
-            columns: shape (n, k).
-        """
+        """Mean square that remains with each column of (n, k) added alone, never with a negative amount, shape (k,)."""
         outside = self._outside(self._smoothed(columns))
         power = np.sum(outside**2, axis=0)
         gained = np.maximum(self._rest @ outside, 0.0) ** 2 / np.where(power > 0, power, np.inf)
-        remaining: Array = (self._rest @ self._rest - gained) / self._rest.size
-        return remaining
+        return np.asarray((self._rest @ self._rest - gained) / self._rest.size)
 
     @property
     def power(self) -> float:
@@ -204,21 +197,12 @@ class Unexplained:
         return _smoothed_rows(columns, self._chosen.rows, self._chosen.width)
 
     def _outside(self, columns: Array) -> Array:
-        outside: Array = columns - self._basis @ (self._basis.T @ columns)
-        return outside
+        return np.asarray(columns - self._basis @ (self._basis.T @ columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Chosen:
-    """Which samples the model is solved on, and by which kernel.
-
-    Attributes:
-        width: of the kernel, in samples.
-        quarter: quarter cycle of every sample.
-        kept: samples that are not guarded.
-        rows: those that are used of them.
-        rows_alike: rows that are not independent of each other.
-    """
+    """Which samples the model is solved on (``rows``, some of those that are not guarded), and by which kernel."""
 
     width: float
     quarter: NDArray[np.int64]
@@ -229,8 +213,7 @@ class _Chosen:
     def observed(self, motion: Motion, knots: Array) -> NDArray[np.bool_]:
         """Hats that enough samples saw."""
         seen = np.square(hat_functions(np.abs(motion.velocity_rad_s[self.kept]), knots)).sum(axis=0)
-        observed: NDArray[np.bool_] = seen > 10
-        return observed
+        return np.asarray(seen > 10)
 
 
 def _choose(recording: CycleRecording, motion: Motion, width_rad: float) -> _Chosen:

@@ -21,12 +21,7 @@ COVERAGE = 1.96
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A figure with its 95 % interval.
-
-    Attributes:
-        value: best estimate.
-        half_width: the truth lies within value +- half_width in 95 of 100 cases.
-    """
+    """A figure with its 95 % interval, value +- half_width."""
 
     value: float
     half_width: float
@@ -46,11 +41,7 @@ class Measured:
 class RigidBody:
     """Inertia, gravity and bias of one joint (kg and N on a prismatic axis, where gravity is part of the bias).
 
-    Attributes:
-        inertia_kg_m2: of everything that moves, joint side.
-        gravity_cos_nm: of gravity_cos cos(q) + gravity_sin sin(q).
-        gravity_sin_nm: see there.
-        bias_nm: constant torque, half the constant difference of the directions' friction included.
+    Inertia is that of all that moves, joint side. The bias holds half of what the directions' friction differs by.
     """
 
     inertia_kg_m2: Measured
@@ -60,13 +51,12 @@ class RigidBody:
 
     def torque_nm(self, position_rad: Array, acceleration_rad_s2: Array) -> Array:
         """Torque that this body needs without friction, same shape as the arguments."""
-        torque: Array = (
+        return np.asarray(
             self.inertia_kg_m2.value * acceleration_rad_s2
             + self.gravity_cos_nm.value * np.cos(position_rad)
             + self.gravity_sin_nm.value * np.sin(position_rad)
             + self.bias_nm.value
         )
-        return torque
 
 
 def rigid_body(recording: CycleRecording, fit: Fit) -> RigidBody:

@@ -13,8 +13,11 @@ moved by what was found and solved again, until nothing remains. A link on a spr
 cycles showed of it is taken off, and what they left open of it is counted.
 
 The cycles themselves cannot tell as much: there frequency rises with speed, so that delay and friction differ only in
-what happens between the peaks, where ripple is as large (``delay``). Whole sines of one speed and unlike travel, the
-other choice, reverse: the level of the friction enters, and 0.3 % of it is 0.4 ms at 20 deg.
+what happens between the peaks, where ripple is as large. Whole sines of one speed and unlike travel, the other choice,
+reverse: the level of the friction enters, and 0.3 % of it is 0.4 ms at 20 deg. Still, ``seen_delay`` asks them: the
+least-squares model with one more column, the torque's own rate, shows what delay the data would ask for. Effects that
+the model lacks drag that figure by milliseconds, so that it corrects nothing. But where it lies near zero, a wrong
+declaration can hardly hide: what the declaration leaves open then shrinks to the delay seen and its own uncertainty.
 """
 
 from __future__ import annotations
@@ -30,9 +33,10 @@ from scipy.special import stdtrit
 from frictid_hil.errors import IdentificationError
 from frictid_hil.friction.clustered import Prior, Solved, solve
 from frictid_hil.friction.filtering import Gaussian
+from frictid_hil.friction.least_squares import few_knots
 from frictid_hil.friction.link import Link, by_parameter
 from frictid_hil.friction.recording import CycleRecording, Motion, Skew, around, passes, synchronised
-from frictid_hil.friction.regression import hat_functions, ripple_waves
+from frictid_hil.friction.regression import fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
@@ -56,33 +60,30 @@ _LINK_SHARE, _LINK_MOST_S = 0.2, 300e-6
 says; one that would feign more than this delay swings too much."""
 MOST_APART = 3.0
 """Standard deviations between declared and measured beyond which the declaration is wrong: 0.3 % by chance."""
+DRAGGED = 3.0
+"""Standard deviations by which effects outside the model may have moved the delay that is seen, about as far as ripple
+does (`benchmarks/interval_coverage.py`)."""
 _JERK, _INERTIA, _PLACE = 0, 1, slice(2, 6)
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredSkew:
-    """What the shaking says of the torque's delay.
-
-    Attributes:
-        delay_s: beyond the declared one; positive where torque is later than declared.
-        deviation_s: one standard deviation.
-    """
+class Delay:
+    """Of the torque beyond the declared one, positive where it is later, with one standard deviation."""
 
     delay_s: float
     deviation_s: float
 
+    def open_s(self, declared_s: float) -> float:
+        """One standard deviation of the skew that may remain where it is seen; never more than the declared one."""
+        return min(declared_s, math.hypot(self.delay_s, DRAGGED * self.deviation_s))
+
 
 @dataclass(frozen=True, slots=True)
 class TimeSkew:
-    """Torque delay minus position delay: what is declared, what was measured, and what was used of both.
+    """Torque delay minus position delay: what is declared, what the excitation measured, and what was used of both.
 
-    Attributes:
-        declared_s: by the drive or its robot file.
-        declared_deviation_s: one standard deviation.
-        measured_s: by the excitation.
-        measured_deviation_s: one standard deviation.
-        used_s: mean of both, weighed by their precision; the measured one alone where they disagree.
-        used_deviation_s: one standard deviation.
+    Each with one standard deviation. Used is the mean of both, weighed by their precision; the measured one alone where
+    they disagree.
     """
 
     declared_s: float
@@ -93,15 +94,13 @@ class TimeSkew:
     used_deviation_s: float
 
     @staticmethod
-    def of(declared: Skew, measured: MeasuredSkew) -> TimeSkew:
+    def of(declared: Skew, measured: Delay) -> TimeSkew:
         """Both, and what follows from them."""
         before, prior = declared.torque_delay_s - declared.position_delay_s, declared.uncertainty_s
-        whole = measured.delay_s, measured.deviation_s
-        if abs(measured.delay_s) > MOST_APART * math.hypot(prior, measured.deviation_s):
-            return TimeSkew(before, prior, before + whole[0], whole[1], before + whole[0], whole[1])
-        weight = prior**2 / (prior**2 + whole[1] ** 2)
-        used = before + weight * whole[0]
-        return TimeSkew(before, prior, before + whole[0], whole[1], used, math.sqrt(weight) * whole[1])
+        later, sigma = measured.delay_s, measured.deviation_s
+        apart = abs(later) > MOST_APART * math.hypot(prior, sigma)
+        weight = 1.0 if apart else prior**2 / (prior**2 + sigma**2)
+        return TimeSkew(before, prior, before + later, sigma, before + weight * later, math.sqrt(weight) * sigma)
 
     def corrected(self, declared: Skew) -> Skew:
         """The declared timing with the torque's delay as used."""
@@ -123,12 +122,8 @@ class TimeSkew:
         return self.apart <= MOST_APART
 
 
-def measured_skew(shaken: CycleRecording, link: Link | None = None) -> MeasuredSkew:
-    """The delay that the shaking shows.
-
-    Args:
-        shaken: the joint while it shakes; ``procedure`` is that of its cycles.
-        link: of a soft joint, from its cycles.
+def measured_skew(shaken: CycleRecording, link: Link | None = None) -> Delay:
+    """The delay that the shaking shows, with the link of a soft joint as its cycles show it.
 
     Raises:
         IdentificationError: the stretch is cut short, does not shake, or shakes the link more than the joint.
@@ -146,7 +141,19 @@ def measured_skew(shaken: CycleRecording, link: Link | None = None) -> MeasuredS
     deviation_s = math.hypot(seen_s, _UNSEEN[0], _UNSEEN[1] * whole_s)
     if link is not None:
         deviation_s = math.hypot(deviation_s, _link_deviation_s(solved, link, shaken.where))
-    return MeasuredSkew(delay_s, deviation_s)
+    return Delay(delay_s, deviation_s)
+
+
+def seen_delay(recording: CycleRecording, motion: Motion, level_nm: float) -> Delay:
+    """The delay that would explain most of the cycles.
+
+    Raises:
+        IdentificationError: as ``regression.fit``.
+    """
+    rate = np.gradient(motion.torque_nm, motion.smoother.step_s)[:, None]
+    solved = fit(recording, motion, few_knots(recording), level_nm, width_rad=0.0, extra=rate)
+    index = solved.blocks.extra.start
+    return Delay(-float(solved.values[index]), float(np.sqrt(solved.covariance[index, index])))
 
 
 def _link_deviation_s(solved: Solved, link: Link, where: str) -> float:

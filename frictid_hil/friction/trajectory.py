@@ -83,13 +83,8 @@ def in_whole_ticks(procedure: Procedure, tick_s: float, fastest_rad_s: float = m
     """The same procedure for a controller that interpolates on its own clock: every cycle a multiple of four ticks.
 
     Both speed peaks and both reversals of a cycle then fall on ticks. Peak speeds change with the lengths (by at most
-    0.73 % for the paper's cycles at 4 ms) and stand in ``shares``. Where cycles are so short that two of them would
-    become equal, multiples of two or one are taken.
-
-    Args:
-        procedure: as asked for.
-        tick_s: the controller's clock.
-        fastest_rad_s: no cycle is rounded to a higher peak speed, unless it was above already.
+    0.73 % for the paper's cycles at 4 ms) and stand in ``shares``; none is rounded above ``fastest_rad_s`` that was not
+    above it already. Where cycles are so short that two of them would become equal, multiples of two or one are taken.
 
     Raises:
         ValueError: two cycles last equally many ticks.

@@ -35,11 +35,6 @@ def test_rate_part_is_continuous_through_zero():
     assert np.allclose(c.rate_part(np.array([-1e-9, 0.0, 1e-9])), 0.0, atol=1e-8)
 
 
-def test_flags_both_extrapolated_ranges():
-    flags = curve().extrapolated(np.array([0.0, 0.1, 0.2, 1.0, 1.6, 1.7, -1.0, -1.7]))
-    assert flags.tolist() == [True, True, False, False, False, True, False, True]
-
-
 def test_pairs_may_come_in_any_order():
     order = [2, 0, 3, 1]
     assert FrictionCurve.through(V[order], F[order]) == curve()

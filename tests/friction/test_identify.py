@@ -83,7 +83,7 @@ def test_mean_velocity_counts_forward_motion_only_and_reports_the_other():
     pairs = function_a(time, v, f, P)
     straight = function_a(*perfect(), P)
     assert np.array_equal(pairs.velocity_rad_s, straight.velocity_rad_s)
-    assert np.all(pairs.velocity_minus_rad_s > 1.04 * pairs.velocity_plus_rad_s)
+    assert np.all(pairs.velocity_minus_rad_s > 1.04 * pairs.velocity_rad_s)
 
 
 def test_time_skew_errs_as_predicted():

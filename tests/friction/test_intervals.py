@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.friction.delay import SeenDelay, seen_delay
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.intervals import aligned_pairs, coulomb_half_width_nm, window_terms
 from frictid_hil.friction.recording import Skew, synchronised
+from frictid_hil.friction.skew import Delay, seen_delay
 
 UNKNOWN = {
     "ripple": {"ripple": 0.1},
@@ -80,7 +80,7 @@ def test_the_seen_delay_widens_an_interval_and_moves_no_curve(plants, monkeypatc
     recording = plants.record(plants.arm[1], plants.procedure(10))
     recording = replace(recording, skew=Skew(torque_delay_s=1e-3, uncertainty_s=1e-3))
     with_it = estimate(recording)
-    monkeypatch.setattr("frictid_hil.friction.cleaned.seen_delay", lambda *_: SeenDelay(1.0, 1.0))
+    monkeypatch.setattr("frictid_hil.friction.cleaned.seen_delay", lambda *_: Delay(1.0, 1.0))
     without = estimate(recording)
     assert with_it.curve == without.curve
     assert np.all(with_it.half_width_nm <= without.half_width_nm)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from frictid_hil.friction.cleaned import without_shakes
 from frictid_hil.friction.estimate import estimate
-from frictid_hil.friction.missed import without_shakes
 
 SHOOK_NM = (-80.0, 57.0, 50.0)
 """What a drive at 250 Hz did after one missed set-point, as parts of its torque."""

@@ -11,7 +11,7 @@ from frictid_hil.friction.link import soft_link
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.quality import gates
 from frictid_hil.friction.recording import Skew, synchronised
-from frictid_hil.friction.skew import MeasuredSkew, TimeSkew, measured_skew
+from frictid_hil.friction.skew import Delay, TimeSkew, measured_skew
 from frictid_hil.jobs.identification.skew_stretch import shaking
 
 STEP_S = 0.001
@@ -102,7 +102,7 @@ def test_a_right_declaration_gives_narrower_intervals_and_passes(plants):
 
 
 def test_both_count_by_their_precision():
-    both = TimeSkew.of(Skew(torque_delay_s=1e-3, position_delay_s=2e-4, uncertainty_s=3e-4), MeasuredSkew(4e-4, 4e-4))
+    both = TimeSkew.of(Skew(torque_delay_s=1e-3, position_delay_s=2e-4, uncertainty_s=3e-4), Delay(4e-4, 4e-4))
     assert both.declared_s == pytest.approx(8e-4)
     assert both.measured_s == pytest.approx(12e-4)
     assert both.used_s == pytest.approx(8e-4 + 4e-4 * 9 / 25)
