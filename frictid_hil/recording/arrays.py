@@ -30,13 +30,9 @@ class ArrayTable:
     """Named arrays of one file; a ``Table``.
 
     Attributes:
-        path: of the file.
-        shapes: of each array, one or two dimensions.
-        load: an array by its name.
         labels: names of the columns of a matrix, by the matrix' name.
         standard: what the columns mean, where the format says so.
         sparse: rows in which a column holds NaN say nothing of it.
-        told: what was found out about the file.
         read: arrays that were asked for, kept.
     """
 

@@ -81,12 +81,8 @@ def frame_objects(
 ) -> bytes:
     """Frames as objects, in order; more than 8 bytes make a frame a CAN FD frame.
 
-    Args:
-        t_ns: run time, shape (n,).
-        can_id: bit 31 set for extended ids, bit 29 (``FD_FRAME``) for CAN FD frames, shape (n,).
-        length: bytes used, shape (n,).
-        sent: by us, shape (n,).
-        data: shape (n, 8 or more).
+    Columns have shape (n,), data (n, 8 or more). Bit 31 of an id is set for extended ids, bit 29 (``FD_FRAME``) for CAN
+    FD frames; ``length`` are the bytes used, ``sent`` says by us.
     """
     fd = ((can_id & FD_FRAME) != 0) | (length > 8)
     classical = _objects(FRAME, CAN_FRAME, t_ns[~fd], can_id[~fd], sent[~fd])
@@ -169,13 +165,10 @@ def container(objects: bytes) -> bytes:
 
 
 def containers(data: bytes, most: int) -> Iterator[tuple[bytes, str]]:
-    """The content of each container of a file, and what is wrong with it ("" when nothing).
+    """The content of each container of a whole file, and what is wrong with it ("" when nothing).
 
-    A container that is cut off, or unpacks to more than it says, gives what can be unpacked of it, and ends the file.
-
-    Args:
-        data: the whole file.
-        most: bytes that one container may unpack to.
+    A container that is cut off, or unpacks to more than it says or than ``most``, gives what can be unpacked of it, and
+    ends the file.
     """
     at = FILE_HEADER.unpack_from(data)[1]
     while at < len(data):

@@ -19,12 +19,7 @@ def allowed_bytes(packed: int) -> int:
 
 
 def check_expansion(packed: int, unpacked: int, where: str) -> None:
-    """Refuse what unpacks to more than is allowed.
-
-    Args:
-        packed: size of the file.
-        unpacked: bytes that it says it holds, or that came out of it so far.
-        where: the file.
+    """Refuse a file that says it holds, or of which there came out so far, more than is allowed.
 
     Raises:
         InputFileError: too much.

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 
 import can
 import numpy as np
@@ -23,7 +22,7 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.protocol.driver import FD_FRAME
 from frictid_hil.recording import blf
 from frictid_hil.recording.bounds import allowed_bytes, check_expansion
-from frictid_hil.recording.growing_file import GrowingFile
+from frictid_hil.recording.growing_file import GrowingLog
 
 EXTENDED = 0x8000_0000
 """Bit of ``can_id`` that says the frame has a 29-bit id."""
@@ -45,8 +44,7 @@ class Frames:
     Attributes:
         t_ns: run time (since the start of the log, where it tells the time of day), shape (n,).
         can_id: bit 31 set for extended ids, bit 29 (``driver.FD_FRAME``) for CAN FD frames, shape (n,).
-        length: bytes used, shape (n,).
-        data: shape (n, 8), or (n, 64) where a frame is a CAN FD one.
+        data: as many bytes as ``length`` of shape (n, 8), or (n, 64) where a frame is a CAN FD one.
         sent: by the host; False throughout where the format does not tell, shape (n,).
         skipped: error and remote frames, which carry no data, and what no wire can carry.
         damage: where the log ends before its end ("" for a whole one).
@@ -64,18 +62,15 @@ class Frames:
         return int(self.t_ns.size)
 
 
-class BusLogWriter:
-    """Writes frames to a BLF file.
-
-    Args:
-        path: of the new file; an existing one is replaced.
+class BusLogWriter(GrowingLog):
+    """Writes frames to a new BLF file; an existing one is replaced.
 
     Raises:
         FrictidError: the file cannot be created (no permission, disk full).
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = GrowingFile(path)
+        super().__init__(path)
         self._pending: list[bytes] = []
         self._single: list[tuple[int, int, bytes, bool]] = []
         self._frames = 0
@@ -93,37 +88,15 @@ class BusLogWriter:
             data = np.frombuffer(rows["data"].tobytes(), np.uint8).reshape(rows.size, -1)
             self._take(rows["t_ns"], rows["can_id"], rows["length"], rows["sent"] != 0, data)
 
-    def flush(self) -> None:
-        """Write what was taken and have it on the disk before returning.
-
-        Raises:
-            FrictidError: disk full; what was flushed before is kept and readable.
-        """
+    def _write_taken(self) -> None:
         self._take_singles()
         pending, self._pending = self._pending, []
         for objects in pending:
             self._file.write(blf.container(objects))
             self._content_size += blf.OBJECT_HEAD.size + blf.CONTAINER_HEAD.size + len(objects)
-        self._file.sync()
 
-    def close(self) -> None:
-        """Flush, and fill in the file header; safe to call twice."""
-        if self._file.closed:
-            return
-        try:
-            self.flush()
-            self._file.rewrite_head(blf.file_header(self._file.end, self._content_size, self._frames))
-            self._file.sync()
-        finally:
-            self._file.close()
-
-    def __enter__(self) -> BusLogWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def _finish(self) -> None:
+        self._file.rewrite_head(blf.file_header(self._file.end, self._content_size, self._frames))
 
     def _take_singles(self) -> None:
         if self._single:
@@ -154,8 +127,7 @@ class BusLogWriter:
 def read_frames(path: Path) -> Frames:
     """All data frames of a bus log, whole or cut off.
 
-    Args:
-        path: ``.blf``, ``.asc``, ``.log`` (candump), ``.trc``, ``.db``; also gzipped (``.asc.gz``).
+    Read are ``.blf``, ``.asc``, ``.log`` (candump), ``.trc`` and ``.db``; also gzipped (``.asc.gz``).
 
     Raises:
         InputFileError: unreadable, of no known format, or without a single frame.

@@ -54,12 +54,9 @@ _ORDER = (
 
 
 def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:
-    """The recording in a CSV file: one joint under the standard header, or what a column map says.
+    """The recording in a CSV file (``.csv`` or ``.csv.gz``): one joint under the standard header, or what a map says.
 
-    Args:
-        path: ``.csv`` or ``.csv.gz``.
-        columns: of a foreign file.
-        joint: its name ("0" unless told); with a column map the only one wanted.
+    ``joint`` is its name ("0" unless told); with a column map the only one wanted.
 
     Raises:
         InputFileError: unreadable, or a value that cannot be used, with line and column.
@@ -99,12 +96,7 @@ def write_csv(path: Path, samples: Samples) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How a file is written.
-
-    Attributes:
-        separator: between cells.
-        decimal_comma: 1,5 is one and a half.
-    """
+    """How a file is written: what separates its cells, and whether 1,5 is one and a half."""
 
     separator: str = ","
     decimal_comma: bool = False

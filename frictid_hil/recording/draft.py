@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.recording.proofs import travelled
 from frictid_hil.recording.table import Table, unwrapped
 
 _WORDS: dict[str, str] = {
@@ -49,14 +50,7 @@ _FITTING = {
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """One column.
-
-    Attributes:
-        quantity: what it holds.
-        joint: whose; "" where the name does not say.
-        column: its name in the file.
-        unit: as read from the name; "" where it does not say.
-    """
+    """What one column holds, and whose it is; joint and unit are "" where its name does not say."""
 
     quantity: str
     joint: str
@@ -66,17 +60,11 @@ class Guess:
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A column map to begin with.
-
-    Attributes:
-        document: the map, ready for YAML.
-        findings: how each unit was found, what is odd, what must be said by a person.
-        left_out: columns that no quantity was found for.
-    """
+    """A column map, ready for YAML; how its units were found and what a person must say; columns left out."""
 
     document: Mapping[str, object]
     findings: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = field(default=())
+    left_out: tuple[str, ...] = ()
 
 
 def guessed(name: str) -> Guess | None:
@@ -110,10 +98,6 @@ def without_unit(name: str) -> tuple[str, str]:
 def draft(table: Table, name: str) -> Draft:
     """A column map for a table.
 
-    Args:
-        table: of the file.
-        name: of the map.
-
     Raises:
         InputFileError: no column of a position was found; the message lists the columns there are.
     """
@@ -131,9 +115,9 @@ def draft(table: Table, name: str) -> Draft:
         )
     findings = list(table.told)
     time_s, time_document = _time(table, times, findings)
-    documents: dict[str, object] = {}
-    for joint, columns in joints.items():
-        documents[joint or "0"] = _joint(table, joint or "0", columns, time_s, findings)
+    documents = {
+        joint or "0": _joint(table, joint or "0", columns, time_s, findings) for joint, columns in joints.items()
+    }
     used = {guess.column for columns in joints.values() for guess in columns.values()} | {t.column for t in times[:1]}
     left = tuple(column for column in table.names if column not in used)
     document = {"schema": "frictid.columns/1", "name": name, "time": time_document, "joints": documents}
@@ -206,10 +190,7 @@ def _velocity_unit(
     if not time_s.size:
         return "rad/s"
     angle = unwrapped(np.deg2rad(position) if unit == "deg" else position)[0]
-    width = max(2, min(50, time_s.size // 20))
-    moved = angle[width:] - angle[:-width]
-    area = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(time_s))])
-    summed = area[width:] - area[:-width]
+    moved, summed = travelled(time_s, angle, speeds)
     square = float(moved @ moved)
     if square <= 0.0:
         return "rad/s"

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Self
 
 from frictid_hil.files import could_not_write
 
 
 class GrowingFile:
-    """Appends pieces to a new file, each of them all or nothing.
+    """Appends pieces to a new file, each of them all or nothing; ``end`` tells the bytes written so far.
 
-    Args:
-        path: of the new file; an existing one is replaced, a link is not followed.
-
-    Attributes:
-        end: bytes written so far.
+    An existing file is replaced, a link is not followed.
 
     Raises:
         FrictidError: the file cannot be created (no permission, disk full).
@@ -77,3 +74,42 @@ class GrowingFile:
     def close(self) -> None:
         """Release the file; safe to call twice."""
         self._file.close()
+
+
+class GrowingLog:
+    """A log in a file that grows: what was taken is written by ``flush``, what only the end knows by ``close``."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = GrowingFile(path)
+
+    def flush(self) -> None:
+        """Write what was taken and have it on the disk before returning.
+
+        Raises:
+            FrictidError: disk full; what was flushed before is kept and readable.
+        """
+        self._write_taken()
+        self._file.sync()
+
+    def close(self) -> None:
+        """Flush, and finish the file; safe to call twice."""
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+            self._finish()
+            self._file.sync()
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write_taken(self) -> None:
+        raise NotImplementedError
+
+    def _finish(self) -> None:
+        raise NotImplementedError

@@ -8,10 +8,10 @@ seek; a file without it is read just as well, only slower.
 from __future__ import annotations
 
 import json
+import struct
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from frictid_hil.recording import mcap_layout as layout
-from frictid_hil.recording.growing_file import GrowingFile
+from frictid_hil.recording.growing_file import GrowingLog
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.version import __version__
 
@@ -45,14 +45,10 @@ _MARKS_CHANNEL = 1
 _ROTARY_SCHEMA, _LINEAR_SCHEMA, _MARK_SCHEMA = 1, 2, 3
 
 
-class SampleWriter:
-    """Writes one MCAP file, one channel per joint.
+class SampleWriter(GrowingLog):
+    """Writes one new MCAP file, one channel per joint; an existing file is replaced.
 
-    Args:
-        path: of the new file; an existing one is replaced.
-        joints: names.
-        meta: provenance common to all joints; plain values.
-        prismatic: names of the linear axes among ``joints``.
+    ``meta`` is provenance common to all joints, plain values; ``prismatic`` names the linear axes.
 
     Raises:
         FrictidError: the file cannot be created (no permission, disk full).
@@ -66,7 +62,7 @@ class SampleWriter:
         *,
         prismatic: Collection[str] = (),
     ) -> None:
-        self._file = GrowingFile(path)
+        super().__init__(path)
         self._channels = {joint: number for number, joint in enumerate(joints, start=_MARKS_CHANNEL + 1)}
         self._rows: list[NDArray[np.void]] = []
         self._pending = 0
@@ -80,12 +76,9 @@ class SampleWriter:
             self.metadata("recording", meta)
 
     def append(self, joint: str, rows: NDArray[np.void]) -> None:
-        """Take rows of one joint.
+        """Take rows of one joint, shape (n,).
 
-        Args:
-            joint: one of ``joints``.
-            rows: structured, shape (n,), with ``t_ns`` and any of ``mcap_layout.VALUES`` and ``COUNTS``; further fields
-                are ignored.
+        They are structured, with ``t_ns`` and any of ``mcap_layout.VALUES`` and ``COUNTS``; further fields are ignored.
         """
         if not rows.size:
             return
@@ -138,38 +131,16 @@ class SampleWriter:
         self._metadata_index.append(MetadataIndex(offset=self._file.end, length=len(data), name=name))
         self._file.write(data)
 
-    def flush(self) -> None:
-        """Write what was taken and have it on the disk before returning.
-
-        Raises:
-            FrictidError: disk full; what was flushed before is kept and readable.
-        """
+    def _write_taken(self) -> None:
         self._write_rows()
         self._write_marks()
-        self._file.sync()
 
-    def close(self) -> None:
-        """Flush, and add the summary; safe to call twice."""
-        if self._file.closed:
-            return
-        try:
-            self.flush()
-            self._file.write(_bytes(DataEnd(0)))
-            start = self._file.end
-            summary = _bytes(*self._head, self._statistics(), *self._index, *self._metadata_index)
-            footer = Footer(summary_start=start, summary_offset_start=0, summary_crc=0)
-            self._file.write(summary + _bytes(footer) + MAGIC)
-            self._file.sync()
-        finally:
-            self._file.close()
-
-    def __enter__(self) -> SampleWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def _finish(self) -> None:
+        self._file.write(_bytes(DataEnd(0)))
+        start = self._file.end
+        summary = _bytes(*self._head, self._statistics(), *self._index, *self._metadata_index)
+        footer = Footer(summary_start=start, summary_offset_start=0, summary_crc=0)
+        self._file.write(summary + _bytes(footer) + MAGIC)
 
     def _write_rows(self) -> None:
         if not self._rows:
@@ -287,14 +258,7 @@ def _schemas() -> list[McapRecord]:
 def _message_index(channel: int, entries: NDArray[np.uint64]) -> bytes:
     """The record by which tools find a channel's messages in a chunk: (log time, offset) pairs."""
     pairs = entries.astype("<u8").tobytes()
-    length = 2 + 4 + len(pairs)
-    return (
-        b"\x07"
-        + length.to_bytes(8, "little")
-        + channel.to_bytes(2, "little")
-        + len(pairs).to_bytes(4, "little")
-        + pairs
-    )
+    return struct.pack("<BQHI", 0x07, 2 + 4 + len(pairs), channel, len(pairs)) + pairs
 
 
 def _bytes(*records: McapRecord) -> bytes:

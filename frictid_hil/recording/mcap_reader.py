@@ -40,11 +40,7 @@ Rows = NDArray[np.void]
 
 
 def read_mcap(path: Path, joint: str | None = None) -> list[Samples]:
-    """The recordings of all joints (or one) in a file.
-
-    Args:
-        path: of the file.
-        joint: name of the only one wanted.
+    """The recordings of all joints in a file, or of the only one wanted.
 
     Raises:
         InputFileError: not an MCAP file, none of this product's, without samples, without that joint, or with samples

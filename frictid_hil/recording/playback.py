@@ -17,12 +17,9 @@ from frictid_hil.recording.bus_log import EXTENDED, Frames
 
 
 class LogBus(can.BusABC):
-    """The frames of a log, received.
+    """The frames of a log, received at recorded speed (``paced``), or as fast as they are taken.
 
-    Args:
-        frames: of the log.
-        paced: at recorded speed; else as fast as they are taken.
-        echo: a bus on which every frame is sent again for others to see; None for none.
+    Every frame is sent again on the ``echo`` bus, for others to see.
     """
 
     def __init__(self, frames: Frames, *, paced: bool = False, echo: can.BusABC | None = None) -> None:

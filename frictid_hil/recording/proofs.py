@@ -40,18 +40,13 @@ _BLOCK, _BLOCKS = 2000, 10
 
 
 def doubts_of(samples: Samples, *, where: str = "") -> tuple[str, ...]:
-    """What looks odd in a recording.
-
-    Args:
-        samples: of one joint.
-        where: for the error.
+    """What looks odd in a recording of one joint.
 
     Raises:
         InputFileError: velocity and position contradict each other by a factor that a unit explains.
     """
     parts = _parts(samples)
-    doubts = [*_of_velocity(samples, parts, where), *_of_motion(samples), *_of_torque(samples, parts)]
-    return tuple(doubts)
+    return (*_of_velocity(samples, parts, where), *_of_motion(samples), *_of_torque(samples, parts))
 
 
 def _parts(samples: Samples) -> list[slice]:
@@ -63,30 +58,28 @@ def _parts(samples: Samples) -> list[slice]:
 
 
 def velocity_factor(samples: Samples, parts: list[slice]) -> tuple[float, float] | None:
-    """Velocity over differenced position, and their correlation; None where nothing moves or nothing is recorded.
+    """Velocity over differenced position in stretches of a recording, and their correlation.
 
-    Args:
-        samples: of one joint.
-        parts: stretches of it that are looked at.
+    None where nothing moves or nothing is recorded.
     """
     if samples.velocity_rad_s is None:
         return None
-    travelled, integrated = [], []
-    times = samples.time_s
-    for part in parts:
-        time, q, v = times[part], samples.position_rad[part], samples.velocity_rad_s[part]
-        if not np.isfinite(v).all():
-            return None
-        width = max(2, min(50, time.size // 20))
-        area = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time))])
-        travelled.append(q[width:] - q[:-width])
-        integrated.append(area[width:] - area[:-width])
-    moved, summed = np.concatenate(travelled), np.concatenate(integrated)
+    columns = samples.time_s, samples.position_rad, samples.velocity_rad_s
+    if not all(np.isfinite(samples.velocity_rad_s[part]).all() for part in parts):
+        return None
+    moved, summed = np.hstack([travelled(*(column[part] for column in columns)) for part in parts])
     square, other = float(moved @ moved), float(summed @ summed)
     if square <= 0.0 or other <= 0.0 or moved.size < 20:
         return None
     both = float(moved @ summed)
     return both / square, both / math.sqrt(square * other)
+
+
+def travelled(time_s: Array, position_rad: Array, velocity_rad_s: Array) -> tuple[Array, Array]:
+    """Travel over short stretches: as differenced, and as the integral of the velocity, shape (n - width,) each."""
+    width = max(2, min(50, time_s.size // 20))
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (velocity_rad_s[1:] + velocity_rad_s[:-1]) * np.diff(time_s))])
+    return position_rad[width:] - position_rad[:-width], area[width:] - area[:-width]
 
 
 def _of_velocity(samples: Samples, parts: list[slice], where: str) -> list[str]:
@@ -170,5 +163,4 @@ def _of_torque(samples: Samples, parts: list[slice]) -> list[str]:
 
 
 def _slope(q: Array, time: Array, at: NDArray[np.intp], span: int) -> Array:
-    slope: Array = (q[at + span] - q[at - span]) / (time[at + span] - time[at - span])
-    return slope
+    return np.asarray((q[at + span] - q[at - span]) / (time[at + span] - time[at - span]))

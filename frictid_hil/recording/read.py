@@ -64,11 +64,7 @@ def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None =
 
 
 def open_table(path: Path, topic: str | None = None) -> Table:
-    """The named columns of a file or data set of other tools.
-
-    Args:
-        path: of the file or folder.
-        topic: of a ROS bag that has several.
+    """The named columns of a file, folder or data set of other tools; ``topic`` is of a ROS bag that has several.
 
     Raises:
         InputFileError: unreadable, or of an unknown kind.

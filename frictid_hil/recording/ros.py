@@ -40,11 +40,9 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path, topic: str | None = None) -> ArrayTable:
-    """The joint states in a bag.
+    """The joint states in a bag: folder of rosbag2, ``.mcap``, ``.db3`` beside its metadata, or ``.bag``.
 
-    Args:
-        path: folder of rosbag2, ``.mcap``, ``.db3`` beside its metadata, or ``.bag``.
-        topic: where several hold joint states.
+    ``topic`` says which where several hold joint states.
 
     Raises:
         InputFileError: unreadable, no such messages, several topics of them, or rosbags is not installed.
@@ -103,14 +101,7 @@ def _of_all_groups(topics: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """Messages that differ in nothing but their numbers.
-
-    Attributes:
-        joints: names, in order.
-        places: byte offset of each list, by its path in the message; its length.
-        stamp: byte offsets of seconds and nanoseconds, or None.
-        fixed: mask of the bytes that all have alike, shape (length,).
-    """
+    """Messages that differ in nothing but their numbers: byte offset (and length) of each list, and of the stamp."""
 
     joints: Sequence[str]
     places: Mapping[str, tuple[int, int]]

@@ -23,12 +23,8 @@ Nanoseconds = NDArray[np.int64]
 class Mark:
     """A named stretch of run time, half-open: ``[start_ns, end_ns)``.
 
-    Attributes:
-        name: ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``coupling``, ``reversal``,
-            an experiment's name, ...
-        start_ns: run time.
-        end_ns: run time.
-        details: parameters of the stretch (for ``cycles``: amplitude_rad, velocity_rad_s, cycles, ratio).
+    Names are ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``coupling``, ``reversal``, an experiment's
+    name, ...; details are parameters of the stretch (for ``cycles``: amplitude_rad, velocity_rad_s, cycles, ratio).
     """
 
     name: str
@@ -42,17 +38,13 @@ class Samples:
     """One joint's recording; every column has shape (n,), absent optional columns are None.
 
     Attributes:
-        joint: name.
         time_ns: run time, integer nanoseconds, strictly increasing.
-        position_rad: measured.
         velocity_rad_s: the drive's own velocity.
         torque_nm: the drive's own torque, or None (position-only recordings).
-        position_command_rad: commanded.
         external_torque_nm: force sensor.
         temperature_c: motor or gear.
         rigid_body_torque_nm: the part of the torque that the user's own rigid-body model explains.
         torque_demand_nm: the controller's own demand.
-        marks: what the joint was doing, in order of time.
         prismatic: the axis is linear: m, m/s, N instead of rad, rad/s, N m.
         meta: provenance that travels with the columns (torque_source, timing, robot, ...); plain values only.
     """

@@ -27,63 +27,42 @@ _MAY_BE_MISSING = ("external_torque_nm", "temperature_c")
 
 
 class Table(Protocol):
-    """Named columns of equal length; a constant is a column of one value.
-
-    Attributes:
-        names: of the columns.
-        standard: what they mean, where the format itself says so.
-        sparse: a row in which a column holds NaN says nothing of it (several publishers, several joints).
-        told: what was found out about the file, in sentences.
-    """
+    """Named columns of equal length; a constant is a column of one value."""
 
     @property
     def path(self) -> Path:
         """The file that was read."""
-        ...
 
     @property
     def names(self) -> Sequence[str]:
         """Names of the columns."""
-        ...
 
     @property
     def standard(self) -> ColumnMap | None:
-        """What the columns mean, where the format says so."""
-        ...
+        """What the columns mean, where the format itself says so."""
 
     @property
     def sparse(self) -> bool:
-        """Rows may say nothing of a column."""
-        ...
+        """A row in which a column holds NaN says nothing of it (several publishers, several joints)."""
 
     @property
     def told(self) -> tuple[str, ...]:
-        """What was found out about the file."""
-        ...
+        """What was found out about the file, in sentences."""
 
     def numbers(self, names: Sequence[str]) -> list[Array]:
         """Columns as float64, shape (n,) each (or (1,) for a constant); ``InputFileError`` for a name it has not."""
-        ...
 
     def elements(self, name: str, index: int) -> Array:
         """One value of each cell of a column whose cells are lists, shape (n,)."""
-        ...
 
     def place(self, row: int) -> str:
         """Where row ``row`` (from 0) stands, for a person: ``line 17``."""
-        ...
 
 
 def mapped(
     open_table: Callable[[Path], Table], table: Table, columns: ColumnMap, joint: str | None = None
 ) -> list[Samples]:
-    """The joints of a foreign file.
-
-    Args:
-        open_table: opens a companion file.
-        table: of the file.
-        columns: which column is which.
-        joint: name of the only one wanted.
+    """The joints of a foreign file, or the only one wanted; ``open_table`` opens a companion file.
 
     Raises:
         InputFileError: a column is missing or cannot be used; a companion file does not fit; no such joint.
@@ -94,7 +73,8 @@ def mapped(
         raise InputFileError(
             f"column map {columns.name} knows no joint {joint!r}; it has {', '.join(joints)}", where=str(path)
         )
-    wanted = [source for known in _chosen(joints, joint).values() for source in known.sources.values()]
+    chosen = {name: known for name, known in joints.items() if joint in (None, name)}
+    wanted = [source for known in chosen.values() for source in known.sources.values()]
     here = [name for source in wanted if source.file is None and source.index is None for name in source.columns]
     table.numbers([*columns.time.columns, *here])  # all at once; tables keep what they have read
     time = _time(table, columns)
@@ -109,14 +89,7 @@ def mapped(
             companions[source.file] = _onto(companion, columns, time, path)
         return companions[source.file](values)
 
-    return [
-        _joint_samples(name, known, time, columns.time.scale, table, values_of)
-        for name, known in _chosen(joints, joint).items()
-    ]
-
-
-def _chosen(joints: Mapping[str, JointColumns], joint: str | None) -> dict[str, JointColumns]:
-    return {name: known for name, known in joints.items() if joint in (None, name)}
+    return [_joint_samples(name, known, time, columns.time.scale, table, values_of) for name, known in chosen.items()]
 
 
 def expanded(columns: ColumnMap, table: Table) -> dict[str, JointColumns]:
@@ -137,14 +110,13 @@ def expanded(columns: ColumnMap, table: Table) -> dict[str, JointColumns]:
                 f"no column {position!r}; the file has {', '.join(table.names)[:300]}", where=str(table.path)
             )
         for name in names:
-            sources = {quantity: _of_joint(source, name) for quantity, source in known.sources.items()}
+            sources = {
+                quantity: replace(source, columns=tuple(column.replace(JOINT, name) for column in source.columns))
+                for quantity, source in known.sources.items()
+            }
             present = {q: s for q, s in sources.items() if s.file or set(s.columns) <= set(table.names)}
             found[pattern.replace(JOINT, name)] = replace(known, sources=present)
     return found
-
-
-def _of_joint(source: Source, joint: str) -> Source:
-    return replace(source, columns=tuple(column.replace(JOINT, joint) for column in source.columns))
 
 
 def own_names(table: Table, joint: str) -> ColumnMap:
@@ -177,14 +149,8 @@ def samples_of(
 ) -> Samples:
     """Samples from columns in SI units, after every check a reader owes its user.
 
-    Args:
-        table: names the place of a bad value.
-        joint: name.
-        time: in its own unit, shape (n,).
-        columns: by the names of ``Samples``.
-        unit_ns: nanoseconds in the unit of ``time``.
-        prismatic: the values are m, m/s, N.
-        meta: provenance.
+    The table names the place of a bad value. Times are in units of ``unit_ns`` nanoseconds, columns by the names of
+    ``Samples``, shape (n,) each.
 
     Raises:
         InputFileError: a blank, NaN or infinite value, or time that does not increase, with column and line.
@@ -288,8 +254,7 @@ def _values(table: Table, source: Source) -> Array:
                     where=str(table.path),
                 )
             product = product * other
-    scaled: Array = product * source.scale + source.offset
-    return scaled
+    return np.asarray(product * source.scale + source.offset)
 
 
 def _run_time(time: Array, unit_ns: float, table: Table) -> Nanoseconds:
@@ -297,8 +262,7 @@ def _run_time(time: Array, unit_ns: float, table: Table) -> Nanoseconds:
         time = time - time[0]
     if time.size and np.abs(time).max() > 9e18 / unit_ns:
         raise InputFileError("a time is out of range", where=str(table.path))
-    time_ns: Nanoseconds = np.rint(time * unit_ns).astype(np.int64)
-    return time_ns
+    return np.asarray(np.rint(time * unit_ns).astype(np.int64))
 
 
 def _beside(path: Path, name: str) -> Path:

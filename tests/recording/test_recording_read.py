@@ -16,7 +16,7 @@ from frictid_hil.columns import ColumnMap, JointColumns, Source
 from frictid_hil.config.columns import load_columns
 from frictid_hil.errors import InputFileError
 from frictid_hil.recording.csv import write_csv
-from frictid_hil.recording.mat5 import read_numbers
+from frictid_hil.recording.mat import read_numbers
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Mark, Samples
