@@ -25,14 +25,7 @@ _SHOWN = 0.03
 class JointRun:
     """One joint along a log that was not fitted: measured, and the user's model in closed loop; arrays (n,).
 
-    Attributes:
-        joint: its name.
-        log: name of the log.
-        quantity: what is drawn, with its unit.
-        time_s: of the log.
-        measured: recorded.
-        nominal: of the model as it was.
-        improved: of the model with the causes; None where nothing was added.
+    ``quantity`` is what is drawn, with its unit; ``improved`` is None where nothing was added to the model.
     """
 
     joint: str
@@ -54,17 +47,10 @@ def arm_page(
     why_no_runs: str = "",
     exports: Sequence[Sequence[str]] = (),
 ) -> Page:
-    """The page of an arm.
+    """The page of an arm, by joint the diagnosis and the address of its own page, relative to this one.
 
-    Args:
-        name: of the arm.
-        summary: the one sentence.
-        found: diagnosis by joint.
-        pages: address of each joint's own page, relative to this one.
-        notes: what is said of the arm as a whole.
-        runs: of the joints, in closed loop.
-        why_no_runs: why there are none.
-        exports: what was written: target, where it ran, torque error before and after, and what is lost.
+    Notes are of the arm as a whole, runs of the joints in closed loop, or why there are none. An export says what was
+    written: target, where it ran, torque error before and after, and what is lost.
     """
     rows = tuple(_row(joint, d, pages.get(joint)) for joint, d in found.items())
     headings = ("joint", "verdict", "causes (confidence)", "gap lies", "gap before", "after", "noise floor")

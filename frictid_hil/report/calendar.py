@@ -21,13 +21,9 @@ _WEEKS = 53
 
 @dataclass(frozen=True, slots=True)
 class Day:
-    """One square.
+    """One square, of a date ``2026-03-01``; the words are for pointer and screen reader.
 
-    Attributes:
-        date: ``2026-03-01``.
-        state: key of ``STATES``; "" for a day without a recalibration.
-        words: for pointer and screen reader.
-        address: of the night's page; "" where there is none.
+    The state is a key of ``STATES``, "" for a day without a recalibration; the address is of the night's page, if any.
     """
 
     date: str
@@ -43,24 +39,14 @@ class Day:
 
 @dataclass(frozen=True, slots=True)
 class Calendar:
-    """Weeks from Monday to Sunday, oldest first.
-
-    Attributes:
-        weeks: seven days each; None before the first and after the last day.
-        caption: in words.
-    """
+    """Weeks of seven days from Monday on, oldest first; None before the first and after the last day."""
 
     weeks: tuple[tuple[Day | None, ...], ...]
     caption: str
 
 
 def calendar(nights: Sequence[Attempt], addresses: Mapping[str, str]) -> Calendar:
-    """The newest year of nights.
-
-    Args:
-        nights: oldest first, one at least; the last of a day counts.
-        addresses: of the page of a night, by its ``utc``.
-    """
+    """The newest year of one night at least, oldest first, the last of a day counting; addresses by their ``utc``."""
     days = {one.utc[:10]: one for one in nights}
     last = date.fromisoformat(max(days))
     first = max(date.fromisoformat(min(days)), last - timedelta(weeks=_WEEKS - 1, days=last.weekday()))

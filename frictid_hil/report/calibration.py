@@ -12,17 +12,7 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile, ProcedureU
 from frictid_hil.friction.metrics import curve_distance
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.recording.samples import Samples
-from frictid_hil.report.figures import (
-    IDENTIFIED,
-    MEASURED,
-    PUBLISHED,
-    REFERENCE,
-    Figure,
-    band,
-    cloud,
-    line,
-    points,
-)
+from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, REFERENCE, Figure, band, cloud, line, points
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.words import estimate, sentence, when, with_interval
 from frictid_hil.units import degrees
@@ -36,14 +26,9 @@ def calibration_page(
     error: str = "",
     previous: FrictionProfile | None = None,
 ) -> Page:
-    """The page of one run.
+    """The page of one run that ended with this outcome, a word of its JSON, and why where it ended early.
 
-    Args:
-        profile: what was identified.
-        samples: of each joint's own motion, where the recording is at hand.
-        outcome: word of the run's JSON.
-        error: why it ended early, in a sentence.
-        previous: the profile that was active before, to compare with.
+    ``samples`` are of each joint's own motion; ``previous`` is the profile that was active before, to compare with.
     """
     joints = profile.joints
     good = sum(all(gate.passed for gate in joint.gates) for joint in joints.values())
@@ -55,11 +40,8 @@ def calibration_page(
     overview = (_overview(joints, previous),) if len(joints) > 1 else ()
     sections = [Section("Summary", words=done, tables=(_summary(joints, previous),), figures=overview)]
     sections += [_joint(name, joint, samples.get(name), previous) for name, joint in joints.items()]
-    sections.append(
-        Section(
-            "The pairs in numbers", tables=tuple(_pairs(name, joint, len(joints)) for name, joint in joints.items())
-        )
-    )
+    pairs = tuple(_pairs(name, joint, len(joints)) for name, joint in joints.items())
+    sections.append(Section("The pairs in numbers", tables=pairs))
     return Page(f"Friction of {profile.robot}", headline, sections, _facts(profile))
 
 
@@ -81,11 +63,8 @@ def _joints_were(names: Sequence[str]) -> str:
 def _moved(procedure: ProcedureUsed | None, samples: Samples | None, *, prismatic: bool) -> str:
     if procedure is None:
         return "identified from a recording that followed no procedure"
-    travel, peak = (
-        (f"{procedure.amplitude_rad * 1e3:.4g} mm", f"{procedure.velocity_rad_s:.4g} m/s")
-        if prismatic
-        else (f"{degrees(procedure.amplitude_rad):.4g} deg", f"{degrees(procedure.velocity_rad_s):.4g} deg/s")
-    )
+    travel = f"{procedure.amplitude_rad * 1e3:.4g} mm" if prismatic else f"{degrees(procedure.amplitude_rad):.4g} deg"
+    peak = f"{procedure.velocity_rad_s:.4g} m/s" if prismatic else f"{degrees(procedure.velocity_rad_s):.4g} deg/s"
     rate = "" if samples is None else f", sampled at {1.0 / samples.step_s:.4g} Hz"
     company = "in phase, all at once" if procedure.together else "one at a time with the others locked"
     return (
@@ -146,14 +125,15 @@ def _cycles(samples: Samples | None) -> Samples | None:
     return samples.during(marks[0]) if marks else None
 
 
-def _axes(joint: JointProfile) -> tuple[str, str, float]:
+def axes_of(joint: JointProfile) -> tuple[str, str, float]:
+    """Units of speed and friction, and what turns a speed into the first."""
     return ("m/s", "N", 1.0) if joint.prismatic else ("deg/s", "N m", degrees(1.0))
 
 
 def _overview(joints: Mapping[str, JointProfile], previous: FrictionProfile | None) -> Figure:
     """Every joint's curve with its interval, one small panel each, and whether its gates passed."""
     first = next(iter(joints.values()))
-    unit, force, _ = _axes(first)
+    unit, force, _ = axes_of(first)
     traces: list[Mapping[str, Any]] = []
     for number, (name, joint) in enumerate(joints.items()):
         traces += [{**trace, "panel": number} for trace in _curves(name, joint, previous)]
@@ -175,7 +155,7 @@ def _light(joint: JointProfile) -> str:
 
 def _curves(name: str, joint: JointProfile, previous: FrictionProfile | None) -> list[Mapping[str, Any]]:
     """The interval, the curve that was active before, and the curve: solid where measured, dotted elsewhere."""
-    scale, curve, known = _axes(joint)[2], joint.curve(), np.array(joint.velocity_rad_s)
+    scale, curve, known = axes_of(joint)[2], joint.curve(), np.array(joint.velocity_rad_s)
     low, high = curve.measured_range_rad_s
     measured = np.linspace(low, high, 150)
     traces: list[Mapping[str, Any]] = []
@@ -195,20 +175,25 @@ def _curves(name: str, joint: JointProfile, previous: FrictionProfile | None) ->
     return traces
 
 
+def pairs_of(joint: JointProfile) -> dict[str, Any]:
+    """The pairs of a joint, with their intervals where known."""
+    x, y = np.array(joint.velocity_rad_s) * axes_of(joint)[2], np.array(joint.torque_nm)
+    half = None if joint.torque_interval_nm is None else _half_width(joint)
+    return points("pairs V_n, F_n", x, y, IDENTIFIED, half_width=half)
+
+
 def _half_width(joint: JointProfile) -> Array:
     return np.array([(high - low) / 2 for low, high in joint.torque_interval_nm or ()])
 
 
 def _curve_figure(name: str, joint: JointProfile, previous: FrictionProfile | None) -> Figure:
     """The curve alone, close enough to see its intervals."""
-    unit, force, scale = _axes(joint)
+    unit, force, scale = axes_of(joint)
     traces = _curves(name, joint, previous) + _one_way(joint, scale)
     if joint.published is not None:
         velocity, torque = np.array(joint.published.velocity_rad_s), np.array(joint.published.torque_nm)
         traces.append(points("as published (Function A)", velocity * scale, torque, PUBLISHED, symbol="x-thin-open"))
-    half = None if joint.torque_interval_nm is None else _half_width(joint)
-    known = np.array(joint.velocity_rad_s)
-    traces.append(points("pairs V_n, F_n", known * scale, np.array(joint.torque_nm), IDENTIFIED, half_width=half))
+    traces.append(pairs_of(joint))
     low, high = joint.curve().measured_range_rad_s
     return Figure(
         f"Joint {name}: friction over speed",
@@ -238,7 +223,7 @@ def _top(joint: JointProfile) -> float:
 
 def _loops_figure(name: str, joint: JointProfile, part: Samples, velocity: Array, torque: Array) -> Figure:
     """Torque over velocity as measured, with what lies in the windows of (7) told apart, and the curve through it."""
-    unit, force, scale = _axes(joint)
+    unit, force, scale = axes_of(joint)
     middle = float(np.mean([np.quantile(torque, q) for q in (0.05, 0.95)]))
     inside = _in_windows(joint.procedure, part.time_s - part.time_s[0], velocity)
     traces = [cloud("measured", velocity[~inside] * scale, torque[~inside] - middle, MEASURED)]
@@ -269,8 +254,7 @@ def _in_windows(used: ProcedureUsed | None, time_s: Array, velocity: Array) -> N
     cycle = procedure.cycle_of(time_s)
     known = (cycle >= 0) & (cycle < procedure.cycles)
     peak = procedure.peak_velocities_rad_s[np.clip(cycle, 0, procedure.cycles - 1)]
-    inside: NDArray[np.bool_] = known & (np.abs(velocity) >= procedure.ratio * peak)
-    return inside
+    return np.asarray(known & (np.abs(velocity) >= procedure.ratio * peak))
 
 
 def _tracking_figure(name: str, part: Samples, command: Array) -> Figure:
@@ -286,11 +270,11 @@ def _tracking_figure(name: str, part: Samples, command: Array) -> Figure:
 
 
 def _pairs(name: str, joint: JointProfile, of: int) -> Table:
-    unit, force = ("m/s", "N") if joint.prismatic else ("deg/s", "N m")
+    unit, force, scale = axes_of(joint)
     intervals: Sequence[tuple[float, float] | None] = joint.torque_interval_nm or [None] * len(joint.torque_nm)
     rows = tuple(
         (
-            f"{velocity if joint.prismatic else degrees(velocity):.4g}",
+            f"{velocity * scale:.4g}",
             f"{torque:.4g}",
             f"{interval[0]:.4g} .. {interval[1]:.4g}" if interval else "",
         )

@@ -12,11 +12,9 @@ _NEWEST = 100
 
 
 def home_page(robots: Mapping[str, str], runs: Sequence[tuple[str, Mapping[str, Any]]]) -> Page:
-    """Robots of the store and runs on the disk.
+    """Robots of the store and runs on the disk, newest first.
 
-    Args:
-        robots: when the newest profile of each was measured (UTC), by name; "" where no night gave one yet.
-        runs: address and manifest of each, newest first.
+    Of a robot it is told when its newest profile was measured (UTC); "" where no night gave one yet.
     """
     moving = [address for address, manifest in runs if manifest["outcome"] is None]
     headline = f"{_count(len(robots), 'robot')}, {_count(len(runs), 'run')}; {len(moving)} at work or cut off."

@@ -23,11 +23,6 @@ class Figure:
     """One figure of a page.
 
     Attributes:
-        title: what it shows.
-        traces: plotly traces.
-        x_title: quantity and unit.
-        y_title: quantity and unit.
-        caption: how to read it.
         panels: titles of panels side by side, all over one range of x; the key ``panel`` of a trace says where it goes.
         stacked: bars of one label stand one behind the other, the first label on top.
     """
@@ -100,17 +95,16 @@ def _in_its_panel(trace: Mapping[str, Any]) -> dict[str, Any]:
     return given if number == 1 else {**given, "xaxis": f"x{number}", "yaxis": f"y{number}"}
 
 
+def scatter(name: str, mode: str, x: Sequence[Any], y: Sequence[Any], **look: Any) -> dict[str, Any]:
+    """A trace of points that may be joined; its look as plotly says it."""
+    return {"type": "scatter", "mode": mode, "name": name, "x": x, "y": y, **look}
+
+
 def line(name: str, x: Array, y: Array, color: str, *, dash: str = "solid", width: float = 2) -> dict[str, Any]:
     """A line through points; of more than a screen can show, the lowest and the highest of each stretch."""
     kept = _extremes(y)
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": name,
-        "x": rounded(x[kept]),
-        "y": rounded(y[kept]),
-        "line": {"color": color, "dash": dash, "width": width},
-    }
+    look = {"color": color, "dash": dash, "width": width}
+    return scatter(name, "lines", rounded(x[kept]), rounded(y[kept]), line=look)
 
 
 def _extremes(y: Array) -> NDArray[np.intp]:
@@ -125,29 +119,16 @@ def _extremes(y: Array) -> NDArray[np.intp]:
 def cloud(name: str, x: Array, y: Array, color: str, *, opacity: float = 0.5) -> dict[str, Any]:
     """Measured points, small and pale."""
     every = max(1, -(-len(x) // _MOST_DOTS))
-    return {
-        "type": "scatter",
-        "mode": "markers",
-        "name": name,
-        "x": rounded(x[::every], digits=4),
-        "y": rounded(y[::every], digits=4),
-        "marker": {"color": color, "size": 3, "opacity": opacity},
-        "hoverinfo": "skip",
-    }
+    look = {"color": color, "size": 3, "opacity": opacity}
+    shown = (rounded(column[::every], digits=4) for column in (x, y))
+    return scatter(name, "markers", *shown, marker=look, hoverinfo="skip")
 
 
 def points(
     name: str, x: Array, y: Array, color: str, *, half_width: Array | None = None, symbol: str = "circle"
 ) -> dict[str, Any]:
     """Identified pairs, with their intervals where known."""
-    trace: dict[str, Any] = {
-        "type": "scatter",
-        "mode": "markers",
-        "name": name,
-        "x": rounded(x),
-        "y": rounded(y),
-        "marker": {"color": color, "size": 7, "symbol": symbol},
-    }
+    trace = scatter(name, "markers", rounded(x), rounded(y), marker={"color": color, "size": 7, "symbol": symbol})
     if half_width is not None:
         trace["error_y"] = {"type": "data", "array": rounded(half_width), "visible": True, "color": color}
     return trace
@@ -155,17 +136,8 @@ def points(
 
 def band(name: str, x: Array, low: Array, high: Array) -> dict[str, Any]:
     """A shaded interval."""
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": name,
-        "x": rounded(np.concatenate([x, x[::-1]])),
-        "y": rounded(np.concatenate([high, low[::-1]])),
-        "fill": "toself",
-        "fillcolor": _BAND,
-        "line": {"width": 0},
-        "hoverinfo": "skip",
-    }
+    around = rounded(np.concatenate([x, x[::-1]])), rounded(np.concatenate([high, low[::-1]]))
+    return scatter(name, "lines", *around, fill="toself", fillcolor=_BAND, line={"width": 0}, hoverinfo="skip")
 
 
 def bars(name: str, labels: Sequence[str], values: Sequence[float | None], color: str) -> dict[str, Any]:
@@ -175,15 +147,8 @@ def bars(name: str, labels: Sequence[str], values: Sequence[float | None], color
 
 def rows_of_bars(name: str, labels: Sequence[str], values: Sequence[float], number: int) -> dict[str, Any]:
     """One part of each label's row; the number chooses its colour."""
-    color = _ROWS[number % len(_ROWS)]
-    return {
-        "type": "bar",
-        "orientation": "h",
-        "name": name,
-        "y": list(labels),
-        "x": rounded(np.array(values), digits=3),
-        "marker": {"color": color},
-    }
+    shown = {"x": rounded(np.array(values), digits=3), "marker": {"color": _ROWS[number % len(_ROWS)]}}
+    return {"type": "bar", "orientation": "h", "name": name, "y": list(labels), **shown}
 
 
 def rounded(values: Array, *, digits: int = 5) -> list[float | None]:

@@ -20,16 +20,9 @@ from frictid_hil.units import degrees
 
 @dataclass(frozen=True, slots=True)
 class SideBySide:
-    """One validation log, measured and simulated; every column has shape (n,).
+    """One validation log, measured and simulated by the nominal and the improved joint; every column has shape (n,).
 
-    Attributes:
-        log: its name.
-        time_s: of the log.
-        torque_nm: measured.
-        nominal_torque_nm: of the nominal joint in closed loop.
-        improved_torque_nm: of the improved joint; None where nothing was applied.
-        nominal_position_error_rad: simulated minus measured.
-        improved_position_error_rad: None where nothing was applied.
+    The improved ones are None where nothing was applied. Position errors are simulated minus measured.
     """
 
     log: str
@@ -44,10 +37,7 @@ class SideBySide:
 def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profiles: tuple[Profile, ...] = ()) -> Page:
     """The page of one diagnosis.
 
-    Args:
-        found: the diagnosis.
-        side_by_side: measured, nominal and improved, by validation log.
-        profiles: the missing torque over what it may depend on.
+    Logs are those of the validation; profiles show the missing torque over what it may depend on.
     """
     pictures = (_where_figure(found), *(_profile(p) for p in profiles)) if found.where else ()
     sections = [
@@ -61,12 +51,8 @@ def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profil
     ]
     if found.next_experiment is not None:
         asked = found.next_experiment
-        sections.append(
-            Section(
-                "What to record next",
-                words=(f"{asked.description} ({asked.duration_s:.0f} s); it parts {' from '.join(asked.separates)}.",),
-            )
-        )
+        told = f"{asked.description} ({asked.duration_s:.0f} s); it parts {' from '.join(asked.separates)}."
+        sections.append(Section("What to record next", words=(told,)))
     if found.reasons:
         words = tuple(f"{subject}: {why}" for subject, why in found.reasons.items())
         sections.append(Section("What could not be concluded", words=words))
@@ -113,28 +99,15 @@ def _causes(causes: tuple[Cause, ...]) -> Table:
             for name, value in cause.parameters.items()
         ]
         closed = "" if cause.gap_closed_percent is None else f"{cause.gap_closed_percent:.0f} %"
-        rows.append(
-            (
-                cause.effect,
-                f"{cause.confidence:.2f}",
-                closed,
-                "; ".join(parameters),
-                ", ".join(cause.confusable_with),
-            )
-        )
-    return Table(
-        ("effect", "confidence", "closes of the gap", "parameters (95 % interval)", "confusable with"), tuple(rows)
-    )
+        alike = ", ".join(cause.confusable_with)
+        rows.append((cause.effect, f"{cause.confidence:.2f}", closed, "; ".join(parameters), alike))
+    headings = ("effect", "confidence", "closes of the gap", "parameters (95 % interval)", "confusable with")
+    return Table(headings, tuple(rows))
 
 
 def _how_far(found: Diagnosis) -> Table:
     rows = [
-        (
-            name,
-            _text(getattr(found.before, key)),
-            _text(getattr(found.after, key)),
-            _text(getattr(found.noise_floor, key)),
-        )
+        (name, *(_text(getattr(figures, key)) for figures in (found.before, found.after, found.noise_floor)))
         for name, key in (
             ("inverse dynamics [N m]", "inverse_nm"),
             ("torque in closed loop [N m]", "forward_torque_nm"),

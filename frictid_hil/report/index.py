@@ -24,16 +24,10 @@ def index_page(
     baseline: str | None,
     addresses: Mapping[str, str] | None = None,
 ) -> Page:
-    """The page of one robot.
+    """The page of one robot: trends of every joint, promotions, and nights, all oldest first.
 
-    Args:
-        robot: name.
-        trends: of every joint, oldest first.
-        promotions: the journal, oldest first.
-        nights: recalibrations, oldest first.
-        active: what is in force; None where nothing is.
-        baseline: id of the profile that drift is measured from.
-        addresses: of the page of a night, by its ``utc``; only of nights that have one.
+    ``active`` is what is in force, ``baseline`` the id of the profile that drift is measured from. Addresses are of the
+    pages of nights, by their ``utc``; only of nights that have one.
     """
     addresses = addresses or {}
     headline = f"Profile {active.id} is active since {when(active.utc)}." if active else "No profile was promoted yet."
@@ -45,11 +39,14 @@ def index_page(
             headline += f" Drifted: joint{'s' if len(last.drifted) > 1 else ''} {', '.join(last.drifted)}."
         if not last.promoted and last.next_step:
             headline += f" Next step: {sentence(last.next_step)}"
+    measured_from = "There is no baseline to measure from."
+    if baseline:
+        measured_from = f"Drift is measured from the baseline {baseline}."
     sections = [
         Section("Nights", calendar=calendar(nights, addresses)) if nights else None,
         Section(
             "Joints",
-            words=(_baseline(baseline),),
+            words=(measured_from,),
             tables=(_joints(trends),),
             figures=trend_figures(trends, drift_limit_percent=_limit(nights)),
         ),
@@ -64,10 +61,6 @@ def index_page(
 def _limit(nights: Sequence[Attempt]) -> float | None:
     """The policy's limit of drift when the newest night began that tells it."""
     return next((one.drift_limit_percent for one in reversed(nights) if one.drift_limit_percent is not None), None)
-
-
-def _baseline(baseline: str | None) -> str:
-    return f"Drift is measured from the baseline {baseline}." if baseline else "There is no baseline to measure from."
 
 
 def _word(outcome: str) -> str:
@@ -107,11 +100,8 @@ def _nights(nights: Sequence[Attempt], addresses: Mapping[str, str]) -> Table:
         )
         for one in reversed(nights[-_SHOWN:])
     )
-    return Table(
-        ("began", "outcome", "profile", "drifted joints", "why", "next step"),
-        rows,
-        caption=_newest(len(nights)),
-    )
+    headings = ("began", "outcome", "profile", "drifted joints", "why", "next step")
+    return Table(headings, rows, caption=_newest(len(nights)))
 
 
 def _promotions(promotions: Sequence[Promotion]) -> Table:

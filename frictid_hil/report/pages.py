@@ -39,14 +39,8 @@ class Table:
 class Section:
     """A part of a page, in reading order: words, verdicts, tables, figures.
 
-    Attributes:
-        title: heading.
-        words: paragraphs; what stands between backquotes is set as code.
-        checks: (passed, sentence) pairs.
-        tables: of facts.
-        figures: of data.
-        links: title and relative address of pages that lie beside this one.
-        calendar: of nights.
+    In words, what stands between backquotes is set as code. Checks are (passed, sentence) pairs, links (title, relative
+    address) of pages that lie beside this one.
     """
 
     title: str
@@ -60,14 +54,7 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A whole page.
-
-    Attributes:
-        title: of the page.
-        headline: the one sentence that a reader must not miss.
-        sections: in order.
-        facts: provenance, by name.
-    """
+    """A whole page; the headline is the one sentence that a reader must not miss, the facts are provenance."""
 
     title: str
     headline: str

@@ -10,11 +10,11 @@ import numpy as np
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.profiles.summary import TrendPoint
-from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure, line, points
+from frictid_hil.report.calibration import axes_of, pairs_of
+from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure, line
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
 from frictid_hil.report.words import change, estimate, sentence, when
-from frictid_hil.units import degrees
 
 _REFERENCE = {"baseline": "baseline", "active": "active profile"}
 
@@ -27,15 +27,9 @@ def recalibration_page(
     baseline: FrictionProfile | None,
     trends: Mapping[str, Sequence[TrendPoint]],
 ) -> Page:
-    """The page of one night.
+    """The page of one night: the JSON of the verb, what was measured, the profile in force before, and the baseline.
 
-    Args:
-        result: JSON of the verb.
-        policy: that was applied.
-        newer: measured.
-        active: in force before; None where none was.
-        baseline: that drift is measured from; None where there is none yet.
-        trends: of every joint, this night included.
+    Both are None where there is none yet. Trends are of every joint, this night included.
     """
     verdict = "promoted" if result["promoted"] else f"not promoted ({result['outcome'].replace('_', ' ')})"
     headline = f"The new profile was {verdict}: {sentence(result['reason'])} Next step: {result['next_step']}."
@@ -59,15 +53,11 @@ def recalibration_page(
 
 
 def _policy(policy: Policy) -> str:
-    promotion = (
-        "What passes is promoted at once."
-        if policy.promotion == "automatic"
-        else "What passes waits for a person to promote it."
-    )
+    how = "is promoted at once" if policy.promotion == "automatic" else "waits for a person to promote it"
     return (
         f"The robot file's policy: a joint further than {policy.drift_percent:g} % from the "
         f"{_REFERENCE[policy.drift_reference]} is told as drifted; one that changed by more than "
-        f"{policy.refuse_percent:g} % since the active profile is refused. {promotion}"
+        f"{policy.refuse_percent:g} % since the active profile is refused. What passes {how}."
     )
 
 
@@ -127,11 +117,8 @@ def _drift(result: Mapping[str, Any], newer: FrictionProfile) -> Table:
 
 
 def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, baseline: FrictionProfile | None) -> Figure:
-    unit, force, scale = ("m/s", "N", 1.0) if joint.prismatic else ("deg/s", "N m", degrees(1.0))
+    unit, force, scale = axes_of(joint)
     speeds = np.linspace(0.0, joint.velocity_rad_s[-1], 200)[1:]
-    half = None
-    if joint.torque_interval_nm is not None:
-        half = np.array([(high - low) / 2 for low, high in joint.torque_interval_nm])
     traces = []
     for title, other, color in (("active before", active, REFERENCE), ("baseline", baseline, PUBLISHED)):
         if other is not None and name in other.joints:
@@ -139,18 +126,10 @@ def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, base
             traces.append(line(title, speeds * scale, curve.magnitude(speeds), color, dash="dash"))
     traces += [
         line("measured now", speeds * scale, joint.curve().magnitude(speeds), IDENTIFIED),
-        points(
-            "pairs V_n, F_n",
-            np.array(joint.velocity_rad_s) * scale,
-            np.array(joint.torque_nm),
-            IDENTIFIED,
-            half_width=half,
-        ),
+        pairs_of(joint),
     ]
-    caption = "Bars are 95 % intervals."
-    return Figure(
-        f"Joint {name}: friction over speed", tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption=caption
-    )
+    title, caption = f"Joint {name}: friction over speed", "Bars are 95 % intervals."
+    return Figure(title, tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption=caption)
 
 
 def _number(value: float | None) -> str:

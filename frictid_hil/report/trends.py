@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.profiles.summary import TrendPoint
-from frictid_hil.report.figures import Figure, rounded
+from frictid_hil.report.figures import Figure, rounded, scatter
 
 _COLORS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#b2477f", "#7a6cc0", "#6b7785", "#b5a11f", "#2aa3a3")
 _MOST_POINTS = 1500
@@ -18,11 +18,9 @@ _MOST_POINTS = 1500
 def trend_figures(
     trends: Mapping[str, Sequence[TrendPoint]], *, drift_limit_percent: float | None = None
 ) -> tuple[Figure, ...]:
-    """F_0, distance from the baseline, temperature; a figure without a single value is left out.
+    """F_0, distance from the baseline, temperature of every joint, oldest first; what has no value at all is left out.
 
-    Args:
-        trends: of every joint, oldest first.
-        drift_limit_percent: of the policy, drawn beside the distance.
+    The policy's limit of drift is drawn beside the distance.
     """
     figures = (
         _figure(
@@ -73,39 +71,20 @@ def _figure(
         first = next((point for point in points if point.joint.coulomb_nm), points[0])
         known = [(point, y) for point in shown if (y := value(point, first)) is not None]
         if known:
-            trace = _trace(name, [point for point, _ in known], [y for _, y in known], _COLORS[number % len(_COLORS)])
+            color = _COLORS[number % len(_COLORS)]
+            when, values = [point.created_utc for point, _ in known], rounded(np.array([y for _, y in known]))
+            look = {"line": {"color": color, "width": 1.5}, "marker": {"color": color, "size": 5}}
+            trace = scatter(f"joint {name}", "lines+markers", when, values, **look)
             if half_width is not None:
                 widths = [half_width(point, first) for point, _ in known]
                 array = [0.0 if width is None else width for width in widths]
                 trace["error_y"] = {"type": "data", "array": rounded(np.array(array)), "visible": True, "thickness": 1}
             traces.append(trace)
-            dates += [point.created_utc for point, _ in known]
+            dates += when
     if limit is not None and dates:
-        traces.append(_limit_line([min(dates), max(dates)], limit))
+        dots = {"color": "#c0392b", "dash": "dot", "width": 1.5}
+        traces.append(scatter("limit of the policy", "lines", [min(dates), max(dates)], [limit, limit], line=dots))
     return Figure(title, tuple(traces), "date [UTC]", y_title, caption=caption)
-
-
-def _trace(name: str, points: Sequence[TrendPoint], values: Sequence[float], color: str) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "mode": "lines+markers",
-        "name": f"joint {name}",
-        "x": [point.created_utc for point in points],
-        "y": rounded(np.array(values)),
-        "line": {"color": color, "width": 1.5},
-        "marker": {"color": color, "size": 5},
-    }
-
-
-def _limit_line(dates: list[str], limit: float) -> dict[str, Any]:
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": "limit of the policy",
-        "x": dates,
-        "y": [limit, limit],
-        "line": {"color": "#c0392b", "dash": "dot", "width": 1.5},
-    }
 
 
 def _coulomb_percent(point: TrendPoint, first: TrendPoint) -> float | None:
