@@ -33,12 +33,12 @@ class Running:
         for joint in (FIRST, SECOND):
             self.driver.enable(joint, Mode.POSITION)
 
-    def cycles(self, count: int, *, step_rad: float = 0.0) -> list[Feedback]:
+    def cycles(self, count: int, *, step_rad: float = 0.0, torque_nm: float = 0.0) -> list[Feedback]:
         clock = self.driver.clock
         for _ in range(count):
             self.at_rad += step_rad
             begun_ns = clock.now_ns()
-            reports = self.driver.exchange([SetPoint(position_rad=self.at_rad), SetPoint()])
+            reports = self.driver.exchange([SetPoint(position_rad=self.at_rad, torque_nm=torque_nm), SetPoint()])
             clock.wait_until(begun_ns + 5_000_000)
         return list(reports)
 
@@ -123,6 +123,25 @@ def test_a_stop_does_not_follow_a_reading_that_jumped(mode: Mode) -> None:
     run.driver.quick_stop()
     run.cycles(40)
     assert abs(run.servo(FIRST).plant.position_rad - before_rad) < 0.1
+
+
+def test_a_stop_of_a_joint_whose_reading_froze_takes_it_there_slowly() -> None:
+    """Its position loop took it over from a current, far from where it was last read, and it snapped there."""
+    run = Running("XL330-M288", {"kind": "freeze", "quantity": "position", "joint": FIRST, "at_s": 0.1})
+    run.cycles(20)
+    servo, most_rad_s = run.servo(FIRST), run.driver.setup.joint(FIRST).max_velocity_rad_s
+    run.driver.enable(FIRST, Mode.TORQUE)
+    run.cycles(45, torque_nm=0.5)
+    assert abs(servo.plant.position_rad) > 0.25
+    run.driver.quick_stop()
+    fastest = [0.0]
+    for _ in range(100):
+        run.cycles(1)
+        # It is driven back, and its own overshoot is what is left above half of that speed.
+        if servo.plant.velocity_rad_s * servo.plant.position_rad < 0.0:
+            fastest.append(abs(servo.plant.velocity_rad_s))
+    assert abs(servo.plant.position_rad) < 0.02
+    assert max(fastest) < 0.8 * most_rad_s
 
 
 def test_a_stop_after_lost_goals_does_not_send_the_joint_to_a_far_one() -> None:

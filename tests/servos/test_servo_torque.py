@@ -16,7 +16,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Hold, JointPlan, Plan
 from frictid_hil.protocol.driver import JointState, Severity
 
-MODE, P_GAIN, WATCHDOG, GOAL_CURRENT, CURRENT_LIMIT, TORQUE = 11, 84, 98, 102, 38, 64
+MODE, P_GAIN, WATCHDOG, GOAL_CURRENT, CURRENT_LIMIT, TORQUE, PROFILE = 11, 84, 98, 102, 38, 64, 112
 JOINT = "shoulder_pan"
 
 
@@ -70,6 +70,25 @@ def test_gains_and_mode_are_as_they_were_afterwards() -> None:
     bench.driver.enable(JOINT, Mode.TORQUE)
     bench.driver.close()
     assert (register(bench, MODE, 1), register(bench, P_GAIN), bench.servo(0).on) == (3, 300, False)
+
+
+def test_a_profile_slows_the_way_to_where_a_joint_shall_hold_and_no_further_one() -> None:
+    bench = Bench(setup_of("XL330-M288"))
+    bench.servo(0).write(PROFILE, (500).to_bytes(4, "little"))
+    in_torque_mode(bench)
+    bench.driver.enable(JOINT, Mode.POSITION)
+    (report, _) = bench.cycles(1)
+    half_of_its_speed = 0.5 * bench.setup.joints[0].max_velocity_rad_s / (0.229 * 2 * math.pi / 60)
+    assert register(bench, PROFILE, 4) == math.floor(half_of_its_speed)
+    bench.set_points[0].position_rad = report.position_rad + 0.01
+    bench.cycles(1)
+    assert register(bench, PROFILE, 4) == 500
+    bench.driver.enable(JOINT, Mode.TORQUE)
+    bench.cycles(2)
+    bench.driver.quick_stop()
+    assert register(bench, PROFILE, 4) == math.floor(half_of_its_speed)
+    bench.driver.close()
+    assert register(bench, PROFILE, 4) == 500
 
 
 def test_no_goal_is_beyond_the_servos_own_current_limit() -> None:

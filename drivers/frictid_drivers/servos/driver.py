@@ -49,6 +49,8 @@ _SETTLE_S = 1.5
 _BUSIEST = 0.45
 """Share of a cycle that the line may take: the reading begins in its middle."""
 _WATCHDOG_STEP_S = 0.02
+_HOLD_SHARE = 0.5
+"""Of its highest speed: so fast a joint goes to where it shall hold, when its position loop takes it over."""
 
 
 class ServoDriver:
@@ -230,7 +232,8 @@ class ServoDriver:
         self._energised.clear()
         for at, mine in enumerate(self._joints):
             if mine.model.registers.goal_current:
-                self._modes[at] = OperatingMode(line, mine)
+                most_rad_s = _HOLD_SHARE * self.setup.joints[at].max_velocity_rad_s
+                self._modes[at] = OperatingMode(line, mine, most_rad_s)
                 if self._told[self.setup.joints[at].name].mode != self._registers.position_mode:
                     self._modes[at].take_positions(None, powered=True)
                 if not line.put(mine.id, self._registers.watchdog, self._watchdog(self._line_settings.watchdog_s)):
@@ -404,8 +407,11 @@ class ServoDriver:
             told[registers.goal_current][mine.id] = to_bytes(current, 2, mine.model)
         if not on or reader.takes_currents(at):
             self._goals[at] = None
+        before = self._goals[at]
         counts = self._counts(at, self._goal_rad(at, order) if order.do is Do.FOLLOW else math.nan)
         if on and counts is not None and not reader.takes_currents(at):
+            if counts != before and at in self._modes and self._modes[at].slowed:
+                self._modes[at].follow_goals()
             told[registers.goal][mine.id] = to_bytes(counts, registers.goal_bytes, mine.model)
         if on is not self._powered[at] and (counts is not None or not on):
             told[registers.torque][mine.id], self._powered[at] = bytes([on]), on
@@ -507,6 +513,8 @@ class ServoDriver:
             for at in off:
                 if at in self._modes and self._reader is not None and self._reader.takes_currents(at):
                     self._modes[at].take_positions(None, powered=False)
+                elif at in self._modes and self._modes[at].slowed:
+                    self._modes[at].follow_goals()
         line.heard = None
 
     def _seen_off(self, at: int) -> bool:

@@ -3,9 +3,14 @@
 Its register lies in EEPROM, which opens while the servo has no torque, and a change resets gains, profile and goal
 current (ROBOTIS e-Manual, "Operating Mode"). So a change under power costs a joint its torque for one question and one
 answer on the line, about 2 ms at 1 Mbit/s. What the change resets is written back.
+
+A joint that comes under its position loop from a current may be elsewhere than it was last read, and may move. The
+servo's own profile then bounds how fast it goes to its goal (e-Manual, "Profile Velocity"), until it follows goals.
 """
 
 from __future__ import annotations
+
+import math
 
 from frictid_drivers.servos.line import Line
 from frictid_drivers.servos.logs import to_bytes
@@ -15,6 +20,10 @@ from frictid_hil.errors import HardwareError
 _RESET = ((80, 6), (88, 4), (108, 8))
 """Gains of the position loop, its feed-forward, its profile: first byte, and bytes."""
 _OFF, _ON = b"\0", b"\1"
+_DRIVE_MODE, _BY_TIME = 10, 4
+_PROFILE, _PROFILE_RAD_S = 112, 0.229 * 2 * math.pi / 60
+"""Highest speed on the way to a goal, in these steps; 0 is none. By time it is the length of the way in ms instead."""
+_WAY_MS = 300
 
 
 class OperatingMode:
@@ -23,16 +32,23 @@ class OperatingMode:
     Args:
         line: open.
         mine: the servo.
+        most_rad_s: how fast it may go to where it shall hold.
+
+    Attributes:
+        slowed: its profile is in force.
 
     Raises:
         HardwareError: it does not answer.
     """
 
-    def __init__(self, line: Line, mine: JointSettings) -> None:
+    def __init__(self, line: Line, mine: JointSettings, most_rad_s: float) -> None:
         self._line = line
         self._mine = mine
         self._registers = mine.model.registers
         self._kept = {address: line.ask(mine.id, address, count) for address, count in _RESET}
+        by_time = line.ask(mine.id, _DRIVE_MODE, 1)[0] & _BY_TIME
+        self._slow = _WAY_MS if by_time else max(1, math.floor(most_rad_s / _PROFILE_RAD_S))
+        self.slowed = False
 
     def take_currents(self, goal: int, *, powered: bool) -> None:
         """Current mode, beginning with this goal; under power if it was.
@@ -54,8 +70,7 @@ class OperatingMode:
         self._change(self._registers.position_mode, powered)
         self._restore()
         if powered and goal is not None:
-            self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
-            self._tell(self._registers.torque, _ON)
+            self._hold(goal)
 
     def stop(self, goal: int | None) -> None:
         """Hold a position at once; waits for no answer.
@@ -67,12 +82,25 @@ class OperatingMode:
         self._tell(self._registers.mode, bytes([self._registers.position_mode]))
         self._restore()
         if goal is not None:
-            self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
-            self._tell(self._registers.torque, _ON)
+            self._hold(goal)
 
     def follow_current(self, goal: int) -> None:
         """Another goal."""
         self._tell(self._registers.goal_current, to_bytes(goal, 2, self._mine.model))
+
+    def follow_goals(self) -> None:
+        """From now on it goes as fast as its goals, with the profile that its owner gave it."""
+        for address, data in self._kept.items():
+            if address <= _PROFILE < address + len(data):
+                self._tell(address, data)
+        self.slowed = False
+
+    def _hold(self, goal: int) -> None:
+        """Power at a goal; wherever the joint is, it goes there slowly."""
+        self._tell(_PROFILE, self._slow.to_bytes(4, "little"))
+        self.slowed = True
+        self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
+        self._tell(self._registers.torque, _ON)
 
     def _change(self, mode: int, powered: bool) -> None:
         if powered:
@@ -87,6 +115,7 @@ class OperatingMode:
     def _restore(self) -> None:
         for address, data in self._kept.items():
             self._tell(address, data)
+        self.slowed = False
 
     def _tell(self, address: int, data: bytes) -> None:
         self._line.tell(address, {self._mine.id: data})

@@ -23,6 +23,8 @@ from frictid_hil.testing.wire import ManualClock
 _LOOP_NS = 500_000
 _TORQUE_MODE = 10
 _EEPROM_END = 64
+_PROFILE, _PROFILE_RAD_S = 112, 0.023981
+"""Of a Dynamixel: speed of the way to a goal; 0 is at once."""
 _ACCESS, _RANGE, _LIMIT = 7, 4, 6
 """Errors of protocol 2.0."""
 _P_GAIN = {"feetech": 32, "dynamixel": 400}
@@ -98,7 +100,7 @@ class Servo:
             self._number((registers.current_limit, 2), 1750 if mine.model.current_a < 0.002 else 1193)
         self.error = 0
         self.on = False
-        self._goal_rad = joint.locked_position_rad
+        self._goal_rad = self._way_rad = joint.locked_position_rad
         self._now_ns = self._heard_ns = 0
         self._delivered = bytes(self.memory)
 
@@ -138,6 +140,8 @@ class Servo:
         return 0
 
     def _switch(self, on: bool) -> None:
+        if on and not self.on:
+            self._way_rad = self.plant.measured_position_rad
         self.on = on
         self.plant.power(on)
 
@@ -179,8 +183,17 @@ class Servo:
         at, size = registers.p_gain
         share = int.from_bytes(self.memory[at : at + size], self._order) / _P_GAIN[self.mine.model.wire]
         # A goal comes in steps: its damping acts on the measured speed alone.
-        torque_nm = share * gains.kp_nm_per_rad * (self._goal_rad - plant.measured_position_rad)
+        torque_nm = share * gains.kp_nm_per_rad * (self._on_its_way() - plant.measured_position_rad)
         return torque_nm - gains.kd_nm_s_per_rad * plant.velocity_rad_s
+
+    def _on_its_way(self) -> float:
+        """Where its position loop is now: at the goal, or by its profile on the way there."""
+        rest_rad, steps = self._goal_rad - self._way_rad, 0
+        if self.mine.model.wire == "dynamixel":
+            steps = int.from_bytes(self.memory[_PROFILE : _PROFILE + 4], self._order)
+        most_rad = steps * _PROFILE_RAD_S * _LOOP_NS * 1e-9 if steps else math.inf
+        self._way_rad += min(max(rest_rad, -most_rad), most_rad)
+        return self._way_rad
 
     def block(self, address: int, count: int) -> bytes:
         """A stretch of the control table, as of now."""
