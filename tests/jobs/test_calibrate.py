@@ -213,7 +213,7 @@ def test_a_run_whose_robot_file_is_gone_is_continued_with_its_own_copy(
     shutil.copytree(run, whole)
     manifest = load_manifest(whole)
     (whole / "manifest.json").write_text(json.dumps({**manifest, "robot_file": str(tmp_path / "gone.yaml")}))
-    assert plan_calibration(CalibrateOptions(resume=whole)).robot.path == whole / "config.yaml"
+    assert plan_calibration(CalibrateOptions(resume=whole)).order.robot.path == whole / "config.yaml"
     (whole / "manifest.json").write_text(json.dumps({**manifest, "verb": "gap-record"}))
     with pytest.raises(UsageError, match="a run of gap-record"):
         plan_calibration(CalibrateOptions(robot, resume=whole))
