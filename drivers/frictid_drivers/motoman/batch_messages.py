@@ -23,51 +23,31 @@ TABLE_POINTS: Final = 21
 
 @dataclass(frozen=True, slots=True)
 class BatchHello:
-    """What the batch application says of itself.
+    """What the batch application says of itself."""
 
-    Attributes:
-        tick_us: interpolation clock.
-        axes: how many it has.
-        most_ticks: longest job.
-        torque_measured: feedback torque is measured, not commanded.
-        averaging_ms: moving average on the command, None where it does not know.
-        table_points: points of a friction table, 0 where it cannot compensate.
-        name: of the application.
-        reads_while_running: it hands over what is recorded already while the job runs.
-    """
-
-    tick_us: int
-    axes: int
-    most_ticks: int
-    torque_measured: bool
-    averaging_ms: int | None
-    table_points: int
-    name: str
-    reads_while_running: bool = False
+    tick_us: int  # interpolation clock
+    axes: int  # how many it has
+    most_ticks: int  # longest job
+    torque_measured: bool  # feedback torque is measured, not commanded
+    averaging_ms: int | None  # moving average on the command, None where it does not know
+    table_points: int  # points of a friction table, 0 where it cannot compensate
+    name: str  # of the application
+    reads_while_running: bool = False  # it hands over what is recorded already while the job runs
 
 
 @dataclass(frozen=True, slots=True)
 class JobOrder:
-    """One job of one axis; positions and bounds in pulses.
+    """One job of one axis; positions and bounds in pulses."""
 
-    Attributes:
-        number: 1..65535, to tell it from the job before.
-        start: where it begins; the axis must stand there.
-        step: most pulses per tick.
-        torque_micro: torque limit at the motor shaft, uN m.
-        watchdog_ticks: ticks without a word from the host after which it stops.
-        segments: see ``motion_segments``.
-    """
-
-    number: int
+    number: int  # 1..65535, to tell it from the job before
     axis: int
-    start: int
+    start: int  # where it begins; the axis must stand there
     lowest: int
     highest: int
-    step: int
-    torque_micro: int
-    watchdog_ticks: int
-    segments: Sequence[str]
+    step: int  # most pulses per tick
+    torque_micro: int  # torque limit at the motor shaft, uN m
+    watchdog_ticks: int  # ticks without a word from the host after which it stops
+    segments: Sequence[str]  # see ``motion_segments``
 
     def text(self) -> str:
         """The FJOB command, with its CRC over everything up to and including the last comma."""
@@ -93,26 +73,16 @@ class JobState:
 
 @dataclass(frozen=True, slots=True)
 class FrictionTable:
-    """One axis's compensation: the curve at equal steps of speed from standstill, and how to apply it.
-
-    Attributes:
-        ratio: R of (24c).
-        step_tenths: 0.1 pulse/s between two points.
-        stiffness_nano: K of (24a) at the motor shaft, nN m per pulse.
-        turn_pulses: pulses per revolution of the joint.
-        gravity_cos_micro: what holds the joint against gravity, uN m at the motor shaft; cosine part.
-        gravity_sin_micro: sine part.
-        points_micro: phi at 0, 1 .. 20 steps, uN m at the motor shaft; the first is F_0.
-    """
+    """One axis's compensation: the curve at equal steps of speed from standstill, and how to apply it."""
 
     axis: int
-    ratio: float
-    step_tenths: int
-    stiffness_nano: int
-    turn_pulses: int
-    gravity_cos_micro: int
-    gravity_sin_micro: int
-    points_micro: Sequence[int]
+    ratio: float  # R of (24c)
+    step_tenths: int  # 0.1 pulse/s between two points
+    stiffness_nano: int  # K of (24a) at the motor shaft, nN m per pulse
+    turn_pulses: int  # pulses per revolution of the joint
+    gravity_cos_micro: int  # what holds the joint against gravity, uN m at the motor shaft; cosine part
+    gravity_sin_micro: int  # sine part
+    points_micro: Sequence[int]  # phi at 0, 1 .. 20 steps, uN m at the motor shaft; the first is F_0
 
     def encoded(self) -> str:
         """Base64 with its CRC."""

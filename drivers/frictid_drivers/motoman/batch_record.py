@@ -132,12 +132,9 @@ class JobRecord:
 
 
 class BlockCollector:
-    """Cuts the text of a reply into base64 blocks as it comes, and keeps the rows of every intact one.
+    """Cuts the text of a reply into base64 blocks as it comes, and fills ``rows`` from every intact one of this job.
 
-    Args:
-        number: of the job; blocks of another are dropped.
-        rows: filled.
-        shifts: of velocity and torque for the whole job; None where every block carries its own.
+    ``shifts`` are those of velocity and torque for the whole job; None where every block carries its own.
     """
 
     def __init__(self, number: int, rows: Rows, shifts: tuple[int, int] | None) -> None:

@@ -28,38 +28,22 @@ _COMES_BACK_S = 10.0
 
 @dataclass
 class BatchRun:
-    """Runs one job.
+    """Runs one job; ``columns`` are filled in also where it was stopped, or its transfer broke."""
 
-    Attributes:
-        batch: the controller application.
-        joint: who moves.
-        units: of its axis.
-        limits: of its travel and torque.
-        watchdog_s: the job stops when the controller hears nothing for so long.
-        tick_s: interpolation clock.
-        number: of the job.
-        now_ns: run time.
-        while_running: the controller application hands samples over while the job runs.
-        stop: see ``MotomanDriver.run_batch``; so are ``progress`` and ``arrived``.
-        look: called once per question about the running job, with how long it may take.
-        running: the controller may be moving the arm for this job.
-        columns: what was fetched; filled in also where the job was stopped, or its transfer broke.
-    """
-
-    batch: BatchClient
+    batch: BatchClient  # the controller application
     joint: JointSetup
     units: AxisUnits
     limits: Limits
-    watchdog_s: float
-    tick_s: float
+    watchdog_s: float  # the job stops when the controller hears nothing for so long
+    tick_s: float  # interpolation clock
     number: int
-    now_ns: Callable[[], int]
-    while_running: bool
-    stop: Callable[[], bool]
+    now_ns: Callable[[], int]  # of run time
+    while_running: bool  # the controller application hands samples over while the job runs
+    stop: Callable[[], bool]  # see ``MotomanDriver.run_batch``; so are ``progress`` and ``arrived``
     progress: Callable[[str, float], None]
-    look: Callable[[float], None]
+    look: Callable[[float], None]  # asked once per question about the running job, told how long it may take
     arrived: Callable[[Mapping[str, Any]], None]
-    running: bool = False
+    running: bool = False  # the controller may be moving the arm for this job
     columns: dict[str, Any] = field(default_factory=dict)
     _started_ns: int = 0
 

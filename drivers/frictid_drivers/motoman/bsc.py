@@ -10,14 +10,322 @@ One station bids with ENQ, sends its blocks, each answered by an alternating ack
 Framing, codes, timers and retry counts are public. How a controller recovers (what ENQ means in the middle of a
 message, who yields when both bid) is not; this module does what BSC always did: ENQ asks for the last answer again.
 
-The line is idle, ours (``bsc_sender``) or the other side's (``bsc_receiver``).
+The line is idle, ours (``Sender``) or the other side's (``Receiver``).
 """
 
 from __future__ import annotations
 
-from frictid_drivers.motoman.bsc_block import ENQ, EOT, BscTiming, Event, Message, encode_blocks
-from frictid_drivers.motoman.bsc_receiver import Receiver
-from frictid_drivers.motoman.bsc_sender import Outcome, Sender, Yielded
+from collections.abc import Sequence
+
+from frictid_drivers.motoman.bsc_block import (
+    ACK,
+    DLE,
+    ENQ,
+    EOT,
+    NAK,
+    SOH,
+    STX,
+    BlockReader,
+    BlockReceived,
+    BscTiming,
+    Event,
+    Failed,
+    Message,
+    Received,
+    Sent,
+    decode_block,
+    encode_blocks,
+)
+
+
+class Yielded:
+    """Both sides bid for the line, and it is the other one's now."""
+
+
+Outcome = Sent | Failed | Yielded | None
+"""How the sending ended; None while it goes on."""
+
+
+class Sender:
+    """One message on its way, once ``bid`` for; what to say is appended to ``output``.
+
+    Attributes:
+        timing: may be exchanged.
+        deadline_s: when ``expire`` must be called at the latest.
+        contended: the other side bid at the same moment.
+    """
+
+    def __init__(self, timing: BscTiming, output: bytearray) -> None:
+        self.timing = timing
+        self._output = output
+        self.contended = self._dle_seen = False
+
+    def bid(self, blocks: Sequence[bytes], now_s: float) -> None:
+        """Ask for the line, to send these."""
+        self._blocks = blocks
+        self._index = -1
+        """The block under way, -1 while bidding."""
+        self._response_retries = self._text_retries = self._contentions = 0
+        self._asked_again = False
+        self._output.append(ENQ)
+        self._await_answer(now_s)
+
+    def take(self, byte: int, now_s: float) -> Outcome:
+        """One byte of an answer."""
+        after_dle, self._dle_seen = self._dle_seen, byte == DLE
+        if after_dle and byte in (0x30, 0x31):
+            return self._acknowledged(byte - 0x30, now_s)
+        if byte == NAK:
+            return self._rejected(now_s)
+        if byte == EOT and not self._bidding:
+            return Failed("the other side ended the transmission")
+        if byte == ENQ and self._bidding:
+            return self._contention(now_s)
+        return self._garbled(now_s)
+
+    def expire(self, now_s: float) -> Outcome:
+        """No answer in time."""
+        self._response_retries += 1
+        if self._response_retries > self.timing.response_retries:
+            what = "ENQ" if self._bidding else "a block"
+            return self._give_up(f"no answer to {what}, asked {self._response_retries} times")
+        return self._ask_again(now_s)
+
+    # -- inside ------------------------------------------------------------------------------------------------
+
+    @property
+    def _bidding(self) -> bool:
+        return self._index < 0
+
+    def _acknowledged(self, number: int, now_s: float) -> Outcome:
+        if self._bidding:
+            return self._next_block(now_s) if number == 0 else self._garbled(now_s)
+        if number == (self._index + 1) % 2:
+            return self._next_block(now_s)
+        if not self._asked_again:
+            return self._garbled(now_s)
+        # Asked again, the other side repeats the acknowledgement of the block before: this one never arrived.
+        self._response_retries += 1
+        if self._response_retries > self.timing.response_retries:
+            return self._give_up(f"a block was never acknowledged, sent {self._response_retries} times")
+        return self._send_block(now_s)
+
+    def _next_block(self, now_s: float) -> Outcome:
+        if not self._bidding:
+            self._response_retries = self._text_retries = 0
+        self._index += 1
+        if self._index < len(self._blocks):
+            return self._send_block(now_s)
+        self._output.append(EOT)
+        return Sent()
+
+    def _rejected(self, now_s: float) -> Outcome:
+        if self._bidding:
+            # Not ready to receive: the same ENQ again, a little later.
+            return self._garbled(now_s)
+        if self._index > 0 and not self._asked_again:
+            # An acknowledgement damaged into a NAK would double a continuation block, which carries no number.
+            return self._ask_again(now_s)
+        self._text_retries += 1
+        if self._text_retries > self.timing.text_retries:
+            return self._give_up(f"a block was rejected (NAK) {self._text_retries} times")
+        return self._send_block(now_s)
+
+    def _contention(self, now_s: float) -> Outcome:
+        """Both bid at once: hold on the first time, yield the second.
+
+        That ends it against a controller that yields at once as well as against one that never does.
+        """
+        self._contentions += 1
+        self.contended = True
+        return self._garbled(now_s) if self._contentions == 1 else Yielded()
+
+    def _garbled(self, now_s: float) -> Outcome:
+        """An answer that is none, or half of one: wait until the line is quiet, then ask again."""
+        self.deadline_s = min(now_s + self.timing.quiet_s, self._answer_due_s)
+        return None
+
+    def _ask_again(self, now_s: float) -> Outcome:
+        self._asked_again = True
+        self._output.append(ENQ)
+        self._await_answer(now_s)
+        return None
+
+    def _send_block(self, now_s: float) -> Outcome:
+        self._asked_again = False
+        self._output += self._blocks[self._index]
+        self._await_answer(now_s)
+        return None
+
+    def _await_answer(self, now_s: float) -> None:
+        self.deadline_s = self._answer_due_s = now_s + self.timing.sequence_s
+        self._dle_seen = False
+
+    def _give_up(self, reason: str) -> Failed:
+        self._output.append(EOT)
+        return Failed(reason)
+
+
+class Receiver:
+    """The other side's messages, one after another; what to say, and what happens, is appended to the lists given.
+
+    Attributes:
+        timing: may be exchanged.
+        deadline_s: when ``expire`` must be called at the latest.
+        over: the line is free again.
+    """
+
+    def __init__(self, timing: BscTiming, output: bytearray, events: list[Event]) -> None:
+        self.timing = timing
+        self._output = output
+        self._events = events
+        self._reader = BlockReader()
+        self._header = ""
+        self._texts: list[str] = []
+        self._complete = False
+        """The last block is acknowledged, EOT expected."""
+        self._last_answer = b""
+        self._repeats = 0
+        self._rejections = 0
+        self._block_due_s = 0.0
+        self._broken = False
+        self._last_broken_byte = 0
+        self.deadline_s = 0.0
+        self.over = True
+
+    def grant(self, now_s: float) -> None:
+        """The line is the peer's: ACK0, and a message from its beginning."""
+        if self.over or self._complete:
+            self._repeats = 0
+        elif self._texts:
+            self._events.append(Failed("the other side started anew in the middle of a message"))
+        self._header, self._texts = "", []
+        self._rejections = 0
+        self._last_answer = ACK[0]
+        self.over = self._complete = False
+        self._repeat_answer(now_s)
+
+    def take(self, byte: int, now_s: float) -> None:
+        """One byte of the peer's, which holds the line."""
+        if self._broken:
+            self._break(byte, now_s)
+        elif self._reader.open or byte in (SOH, STX):
+            self._read(byte, now_s)
+        elif byte == ENQ:
+            self._asked_for_answer(now_s)
+        elif byte == EOT:
+            self._peer_ended()
+        elif not self._complete and self._texts:
+            # A byte that belongs to no block follows an accepted one: that block's end may have been a damaged byte.
+            self._give_up("bytes outside any block in the middle of a message")
+        elif not self._complete:
+            self._block_due_s = now_s + self.timing.text_end_s
+            self._break(byte, now_s)
+
+    def expire(self, now_s: float) -> None:
+        """Nothing more in time."""
+        if self._broken and self._last_broken_byte == EOT:
+            self._peer_ended()
+        elif self._broken or self._reader.open:
+            self._reject(now_s)
+        elif self._complete:
+            # The peer's EOT was lost; its message was not.
+            self.end()
+        else:
+            self._give_up("the other side fell silent in the middle of a message")
+
+    def end(self) -> None:
+        """The line is free."""
+        self._reader.clear()
+        self._broken = False
+        self.over = True
+
+    # -- one block ---------------------------------------------------------------------------------------------
+
+    def _read(self, byte: int, now_s: float) -> None:
+        if not self._reader.open:
+            self.deadline_s = self._block_due_s = now_s + self.timing.text_end_s
+        try:
+            raw = self._reader.take(byte)
+        except ValueError:
+            self._break(byte, now_s)
+            return
+        if raw is not None:
+            self._take_block(raw, now_s)
+
+    def _break(self, byte: int, now_s: float) -> None:
+        """This block is lost: discard what comes until the line is quiet, then reject it.
+
+        A control code here may be a damaged byte of the block as well as the peer's impatience; the quiet tells.
+        """
+        self._broken = True
+        self._last_broken_byte = byte
+        self.deadline_s = min(now_s + self.timing.quiet_s, self._block_due_s)
+
+    def _take_block(self, raw: bytes, now_s: float) -> None:
+        block = decode_block(raw)
+        if block is None or not (block.header or self._texts):
+            self._reject(now_s)
+        elif self._complete:
+            # The last block once more: its acknowledgement did not arrive.
+            self._repeat_answer(now_s)
+        else:
+            if block.header:
+                # Seen twice, its acknowledgement did not arrive; the message simply starts anew.
+                self._header, self._texts = block.header, []
+            self._accept(block.text, block.last, now_s)
+
+    def _accept(self, text: str, last: bool, now_s: float) -> None:
+        self._events.append(BlockReceived(text, len(self._texts)))
+        self._texts.append(text)
+        self._rejections = self._repeats = 0
+        self._complete = last
+        self._answer(ACK[len(self._texts) % 2], now_s)
+        if last:
+            self._events.append(Received(Message(self._header, "".join(self._texts))))
+
+    # -- answers -----------------------------------------------------------------------------------------------
+
+    def _reject(self, now_s: float) -> None:
+        self._rejections += 1
+        if self._rejections > self.timing.text_retries + 1:
+            self._give_up(f"a block was unreadable {self._rejections} times")
+        else:
+            self._answer(bytes([NAK]), now_s)
+
+    def _asked_for_answer(self, now_s: float) -> None:
+        if not self._texts or self._repeats >= 2:
+            # Nothing accepted yet; or the peer has had its answer twice, so its EOT was lost and this is its next bid.
+            self.grant(now_s)
+        else:
+            self._repeat_answer(now_s)
+
+    def _repeat_answer(self, now_s: float) -> None:
+        self._repeats += 1
+        if self._repeats > self.timing.response_retries + 1:
+            self._give_up(f"the other side asked for the same answer {self._repeats} times")
+        else:
+            self._answer(self._last_answer, now_s)
+
+    def _answer(self, answer: bytes, now_s: float) -> None:
+        self._last_answer = answer
+        self._output += answer
+        # A sender that misses this answer asks after its own timer A; being still here then costs nothing.
+        self.deadline_s = now_s + (2 * self.timing.sequence_s if self._complete else self.timing.text_end_s)
+        self._reader.clear()
+        self._broken = False
+
+    # -- the end -----------------------------------------------------------------------------------------------
+
+    def _peer_ended(self) -> None:
+        if not self._complete and self._texts:
+            self._events.append(Failed("the other side ended in the middle of a message"))
+        self.end()
+
+    def _give_up(self, reason: str) -> None:
+        self._output.append(EOT)
+        self._events.append(Failed(reason))
+        self.end()
 
 
 class BscLink:
@@ -47,11 +355,6 @@ class BscLink:
         return self._free and self._waiting is None
 
     @property
-    def busy_sending(self) -> bool:
-        """A message of ours is not through yet."""
-        return self._waiting is not None
-
-    @property
     def contended(self) -> bool:
         """The peer bid at the same moment as our newest message did."""
         return self._sender.contended
@@ -76,14 +379,9 @@ class BscLink:
         return events
 
     def send(self, message: Message, now_s: float) -> None:
-        """Send a message as soon as the line is free.
-
-        Raises:
-            RuntimeError: the previous one is not through yet.
-            ValueError: it cannot be put into blocks.
-        """
+        """Send a message as soon as the line is free; one before it that is not through yet is given up."""
         if self._waiting is not None:
-            raise RuntimeError("a message is being sent already")
+            self.abort()
         self._waiting = encode_blocks(message)
         self._sender.contended = False
         self._use_free_line(now_s)

@@ -47,21 +47,13 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class BscTiming:
-    """Timers and retries, defaults of the controller's parameters RS034-RS037.
+    """Timers and retries, defaults of the controller's parameters RS034-RS037."""
 
-    Attributes:
-        sequence_s: timer A (RS034): how long an answer may take.
-        text_end_s: timer B (RS035): how long the rest of a text, or the next block, may take.
-        response_retries: retry 1 (RS036): invalid or missing answers before giving up.
-        text_retries: retry 2 (RS037): NAKs to the same text before giving up.
-        quiet_s: silence after which garbage on the line is considered over (our choice, no controller parameter).
-    """
-
-    sequence_s: float = 3.0
-    text_end_s: float = 20.0
-    response_retries: int = 10
-    text_retries: int = 3
-    quiet_s: float = 0.1
+    sequence_s: float = 3.0  # timer A (RS034): how long an answer may take
+    text_end_s: float = 20.0  # timer B (RS035): how long the rest of a text, or the next block, may take
+    response_retries: int = 10  # retry 1 (RS036): invalid or missing answers before giving up
+    text_retries: int = 3  # retry 2 (RS037): NAKs to the same text before giving up
+    quiet_s: float = 0.1  # silence after which garbage on the line is considered over (our choice, no parameter)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,9 +29,6 @@ class TickClock:
     """Run time by the controller's ticks; see the module's first page. Zero while nothing streams.
 
     Between jobs of a batch there are no ticks to go by: it is then the time on this side since ``start``.
-
-    Args:
-        lock_step: the controller is an emulator in this process, on virtual time.
     """
 
     def __init__(self, *, lock_step: bool = False) -> None:
@@ -75,11 +72,7 @@ class TickClock:
         return self.tick_ns(session.report.tick + self._lead_ticks + overdue_ticks)
 
     def wait_until(self, deadline_ns: int) -> None:
-        """Return when the report has come after which targets for the deadline are to be sent.
-
-        Raises:
-            HardwareError: the controller fell silent.
-        """
+        """Return when the report has come after which targets for the deadline are to be sent."""
         session = self._session
         if session is not None:
             ticks = -(-deadline_ns // self._tick_ns)
@@ -92,8 +85,7 @@ class StreamCycle:
     Args:
         session: greeted, no target sent yet.
         joints: order of set-points and feedback.
-        units: by joint name.
-        limits: by joint name.
+        units: by joint name, like ``limits``.
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
         lead_ticks: between a report and the tick that its answer is due at.

@@ -191,11 +191,7 @@ class MotomanDriver:
         )
 
     def enable(self, joint: str, mode: Mode) -> None:
-        """Let the joint follow its set-points from here on.
-
-        Raises:
-            HardwareError: a mode other than position.
-        """
+        """Let the joint follow its set-points from here on; ``HardwareError`` for a mode other than position."""
         if mode is not Mode.POSITION:
             raise HardwareError(f"a serial controller cannot do mode {mode.name}", where=f"joint {joint}")
         self._cycling().wanted.add(joint)
@@ -321,8 +317,7 @@ class MotomanDriver:
     def standing(self, *, within_s: float | None = None) -> Sequence[Feedback]:
         """Every joint as stock host control sees it: position and state, no velocity and no torque; about 0.1 s.
 
-        Args:
-            within_s: give up after this time for each of the two instead of the link's own.
+        ``within_s`` bounds each of the two questions.
         """
         host = self._open_line().host
         status, pulses = host.status(within_s=within_s), host.pulses(within_s=within_s)

@@ -9,7 +9,7 @@ From public documents, untested on hardware.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -17,6 +17,7 @@ from frictid_drivers.motoman.bsc import BscLink
 from frictid_drivers.motoman.bsc_block import BlockReceived, BscTiming, Event, Failed, Message, Received, Sent
 from frictid_drivers.motoman.controller_errors import BadReply, LinkError, controller_error
 from frictid_drivers.motoman.port import BytePort, Sink, unheard
+from frictid_hil.errors import FrictidError, HardwareError
 
 _COMMAND: Final = "01,000"
 _RESULT: Final = "90,000"
@@ -26,6 +27,11 @@ _FAREWELL_S: Final = 0.3
 """How long the EOT of a reply may take before the port goes to another protocol without it."""
 
 _USUAL_TIMING: Final = BscTiming()
+_ON_WITHIN_S: Final = 5.0
+_AT_REST_WITHIN_S: Final = 1.0
+_STILL_PULSES: Final = 2
+_URGENT_S: Final = 0.5
+
 _LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that is off"
 _LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
 
@@ -49,16 +55,12 @@ PROFILES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The reply to RSTATS: both figures as sent, and the names of the bits that are set.
-
-    Attributes:
-        reports_mode: this generation reports teach, play and command remote at all.
-    """
+    """The reply to RSTATS."""
 
     data_1: int
     data_2: int
-    conditions: frozenset[str]
-    reports_mode: bool
+    conditions: frozenset[str]  # names of the bits that are set
+    reports_mode: bool  # this generation reports teach, play and command remote at all
 
     @property
     def holds(self) -> list[str]:
@@ -88,15 +90,7 @@ def decode_status(profile: ControllerProfile, data_1: int, data_2: int) -> Statu
 
 
 class HostControl:
-    """Commands and replies over one link.
-
-    Args:
-        port: open.
-        profile: generation of the controller.
-        timing: of the link.
-        reply_s: how long the controller may think about a command before it bids to reply.
-        sink: of the bytes on the wire.
-    """
+    """Commands and replies over one link; the controller may think about each for ``reply_s`` before it replies."""
 
     def __init__(
         self,
@@ -150,12 +144,7 @@ class HostControl:
     # -- the exchange ------------------------------------------------------------------------------------------
 
     def order(self, text: str, *, within_s: float | None = None) -> None:
-        """A command that is answered by ``0000``.
-
-        Raises:
-            ControllerError: the controller refused it.
-            LinkError: no answer.
-        """
+        """A command that is answered by ``0000``; raises as ``ask`` does."""
         reply = self._exchange(text, within_s=within_s)
         if reply.header != _RESULT:
             raise self.bad_reply(f"{reply.header} {reply.text!r} instead of a result", text)
@@ -199,9 +188,6 @@ class HostControl:
     ) -> Message:
         where = text if len(text) <= 24 else f"{text[:21]}..."
         self._settle(within_s)
-        if self._link.busy_sending:
-            # The port failed in the middle of the message before this one.
-            self._link.abort()
         self._owed += 1
         self._link.send(Message(_COMMAND, text), self.port.now_s())
         reply = self._await_reply(where, on_text, within_s)
@@ -251,11 +237,7 @@ class HostControl:
             self._step(until_s)
 
     def reconnect(self) -> None:
-        """On a port that was lost: have it back, with nothing under way.
-
-        Raises:
-            HardwareError: it is not there (yet).
-        """
+        """On a port that was lost: have it back, with nothing under way. ``HardwareError`` where it is not there."""
         self.port.reopen()
         self._link = BscLink(self._timing)
         self._owed = 1  # what the controller still says of before belongs to no command of ours
@@ -288,3 +270,58 @@ class HostControl:
         if output:
             self.sink(output, True)
             self.port.write(output)
+
+
+class ServoPower:
+    """Power of all axes at once, on once it may be, off once they stand.
+
+    Going off while an axis still moves, it would drop it into its brake, so standstill is looked for first - in the
+    positions, which every controller reports. ``ours`` as long as we switched it on and have not switched it off yet.
+    """
+
+    def __init__(self, host: HostControl) -> None:
+        self._host = host
+        self.ours = False
+
+    def on(self) -> None:
+        """Release a command hold that was left behind, switch servo power on, and see that it is.
+
+        Raises:
+            ControllerError: refused, by name.
+            HardwareError: ordered, but not seen.
+        """
+        status = self._host.status()
+        if "command hold" in status.conditions:
+            self._host.order("HOLD 0")
+        self.ours = True
+        if status.servo_on:
+            return
+        self._host.order("SVON 1")
+        until_s = self._host.port.now_s() + _ON_WITHIN_S
+        while not self._host.status().servo_on:
+            if self._host.port.now_s() > until_s:
+                raise HardwareError(
+                    f"servo power is not on {_ON_WITHIN_S:g} s after it was ordered",
+                    where="controller",
+                    next_step="look at the pendant: safety circuit, e-stops, alarms",
+                )
+
+    def off(self, *, urgent: bool = False) -> None:
+        """Wait for standstill, a second at most, then switch it off.
+
+        ``urgent``: something failed; half a second per command, and power goes off also where the arm cannot be seen.
+        """
+        within_s = _URGENT_S if urgent else None
+        with suppress(FrictidError) if urgent else nullcontext():
+            self._await_rest(within_s)
+        self._host.order("SVON 0", within_s=within_s)
+        self.ours = False
+
+    def _await_rest(self, within_s: float | None) -> None:
+        until_s = self._host.port.now_s() + _AT_REST_WITHIN_S
+        before = self._host.pulses(within_s=within_s)
+        while self._host.port.now_s() < until_s:
+            here = self._host.pulses(within_s=within_s)
+            if max(abs(a - b) for a, b in zip(here, before, strict=True)) <= _STILL_PULSES:
+                return
+            before = here

@@ -54,14 +54,7 @@ def identity(joint: JointSetup, units: AxisUnits, options: SerialOptions, reach:
 
 
 def capabilities(reach: Reach, options: SerialOptions, tick_us: int, *, lock_step: bool) -> Capabilities:
-    """What the layer that was found can do; without torque, nothing.
-
-    Args:
-        reach: see there.
-        options: of the robot file.
-        tick_us: interpolation clock that the robot file names.
-        lock_step: the controller is emulated on virtual time.
-    """
+    """What the layer that was found can do on the tick that the robot file names; without torque, nothing."""
     application = reach.application
     if application is None:
         return Capabilities(max_cycle_hz=0.0, modes=frozenset())

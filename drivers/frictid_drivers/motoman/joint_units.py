@@ -28,21 +28,13 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AxisUnits:
-    """Conversions of one axis.
+    """Conversions of one axis."""
 
-    Attributes:
-        axis: index on the controller, from 0.
-        pulses_per_rad: signed by the joint's direction.
-        gear_ratio: motor revolutions per joint revolution.
-        rated_torque_nm: joint side.
-        direction: +1 or -1.
-    """
-
-    axis: int
-    pulses_per_rad: float
-    gear_ratio: float
-    rated_torque_nm: float
-    direction: int
+    axis: int  # index on the controller, from 0
+    pulses_per_rad: float  # signed by the joint's direction
+    gear_ratio: float  # motor revolutions per joint revolution
+    rated_torque_nm: float  # joint side
+    direction: int  # +1 or -1
 
     def pulses(self, position_rad: float) -> int:
         """The nearest pulse."""

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from frictid_drivers.motoman.batch import BatchClient
 from frictid_drivers.motoman.batch_messages import BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
-from frictid_drivers.motoman.host_control import PROFILES, HostControl
+from frictid_drivers.motoman.host_control import PROFILES, HostControl, ServoPower
 from frictid_drivers.motoman.port import BytePort, Sink
-from frictid_drivers.motoman.power import ServoPower
 from frictid_drivers.motoman.settings import SerialOptions
 from frictid_drivers.motoman.stream import StreamSession
 from frictid_drivers.motoman.stream_frames import Welcome, feedback_bytes, set_point_bytes
@@ -28,17 +27,11 @@ _USABLE_SHARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """What the controller can do.
+    """What the controller can do."""
 
-    Attributes:
-        reasons: why each better layer is not available, by its name.
-        welcome: of the streaming application, all axes; None where there is none.
-        batch: of the batch application; None where there is none.
-    """
-
-    reasons: dict[str, str] = field(default_factory=dict)
-    welcome: Welcome | None = None
-    batch: BatchHello | None = None
+    reasons: dict[str, str] = field(default_factory=dict)  # why each better layer is not available, by its name
+    welcome: Welcome | None = None  # of the streaming application, all axes; None where there is none
+    batch: BatchHello | None = None  # of the batch application; None where there is none
 
     @property
     def application(self) -> Welcome | BatchHello | None:

@@ -43,23 +43,14 @@ class BytePort(Protocol):
         """Change speed and parity; bytes under way are sent first."""
 
     def reopen(self) -> None:
-        """Try to have a port back that was lost; takes half a second at least where it is not there.
-
-        Raises:
-            HardwareError: it is not there (yet).
-        """
+        """Try to have a port back that was lost. ``HardwareError`` where it is not there, after half a second."""
 
     def close(self) -> None:
         """Release the port; safe to call twice."""
 
 
 class SerialPort:
-    """A serial port of this machine, held exclusively.
-
-    Args:
-        path: device, e.g. ``/dev/ttyUSB0``.
-        baud: bits per second.
-        parity: E, O or N; never changed silently, a wrong one garbles every byte.
+    """A serial port of this machine, held exclusively; its parity is never changed silently.
 
     Raises:
         HardwareBusy: another process holds it.

@@ -33,19 +33,12 @@ _WHOLE_TICK = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class JobMotion:
-    """A whole plan of one joint in the controller's terms.
+    """A whole plan of one joint in the controller's terms."""
 
-    Attributes:
-        start: pulses.
-        segments: texts of the job.
-        command: pulses at every tick from the start, shape (n,).
-        motion_ticks: tick at which each motion begins, and the end: shape (motions + 1,).
-    """
-
-    start: int
-    segments: tuple[str, ...]
-    command: NDArray[np.int64]
-    motion_ticks: tuple[int, ...]
+    start: int  # pulses
+    segments: tuple[str, ...]  # texts of the job
+    command: NDArray[np.int64]  # pulses at every tick from the start, shape (n,)
+    motion_ticks: tuple[int, ...]  # tick at which each motion begins, and the end: shape (motions + 1,)
 
 
 def motion_segments(motions: Sequence[Motion], units: AxisUnits, tick_s: float) -> JobMotion:

@@ -32,41 +32,23 @@ def _number(usual: _Usual, low: float, high: float) -> _Usual:
 
 @dataclass(frozen=True, slots=True)
 class SerialOptions:
-    """What a robot file may say beside its joints; every default is the controller's own or ours where it has none.
+    """What a robot file may say beside its joints; every default is the controller's own or ours where it has none."""
 
-    Attributes:
-        controller: generation: erc, xrc, nx, dx.
-        layer: auto takes the best that the controller knows; stream, batch or host insist.
-        baud: of host control (RS032).
-        parity: E, O or N (RS033); "" is E on hardware and N on a pseudo terminal, which can do nothing else.
-        stream_baud: asked of FSTREAM; 0 where the port is no gateway port.
-        lead_ticks: how far ahead of the report that they answer targets are due; what the host may be late by.
-        silence_ms: without feedback for so long, the controller counts as lost.
-        command_delay_ms: what the controller may delay the motion by where it does not say how much it averages.
-        watchdog_s: a batch job stops when it hears nothing from us for so long.
-        reply_s: how long the controller may think about a command.
-        timer_a_s: RS034.
-        timer_b_s: RS035.
-        retry_1: RS036.
-        retry_2: RS037.
-        timing: when reported figures were true.
-    """
-
-    controller: str = _choice("nx", tuple(PROFILES))
-    layer: str = _choice("auto", ("auto", "stream", "batch", "host"))
-    baud: int = _number(19200, 300, 4_000_000)
-    parity: str = _choice("", ("E", "O", "N"))
-    stream_baud: int = _number(0, 0, 4_000_000)
-    lead_ticks: int = _number(8, 2, 60)
-    silence_ms: float = _number(300.0, 10, 10_000)
-    command_delay_ms: float = _number(300.0, 0, 2_000)
-    watchdog_s: float = _number(5.0, 0.5, 60)
-    reply_s: float = _number(10.0, 0.1, 120)
-    timer_a_s: float = _number(3.0, 0.1, 10)
-    timer_b_s: float = _number(20.0, 0.1, 25.5)
-    retry_1: int = _number(10, 0, 30)
-    retry_2: int = _number(3, 0, 10)
-    timing: Timing = _ASSUMED
+    controller: str = _choice("nx", tuple(PROFILES))  # generation: erc, xrc, nx, dx
+    layer: str = _choice("auto", ("auto", "stream", "batch", "host"))  # auto: the best there is; the others insist
+    baud: int = _number(19200, 300, 4_000_000)  # of host control (RS032)
+    parity: str = _choice("", ("E", "O", "N"))  # (RS033); "" is E on hardware, and N on a pseudo terminal
+    stream_baud: int = _number(0, 0, 4_000_000)  # asked of FSTREAM; 0 where the port is no gateway port
+    lead_ticks: int = _number(8, 2, 60)  # between a report and when the targets that answer it are due
+    silence_ms: float = _number(300.0, 10, 10_000)  # without feedback for so long, the controller counts as lost
+    command_delay_ms: float = _number(300.0, 0, 2_000)  # of the motion, where the controller does not tell its own
+    watchdog_s: float = _number(5.0, 0.5, 60)  # a batch job stops when it hears nothing from us for so long
+    reply_s: float = _number(10.0, 0.1, 120)  # how long the controller may think about a command
+    timer_a_s: float = _number(3.0, 0.1, 10)  # RS034
+    timer_b_s: float = _number(20.0, 0.1, 25.5)  # RS035
+    retry_1: int = _number(10, 0, 30)  # RS036
+    retry_2: int = _number(3, 0, 10)  # RS037
+    timing: Timing = _ASSUMED  # when reported figures were true
 
     def parity_on(self, path: str) -> str:
         """The parity of host control on this port: decided by the port's kind, never by trying."""

@@ -194,10 +194,9 @@ class StreamSession:
         return SafetyAbort(what, where="controller", cause=cause, next_step=next_step)
 
     def halt(self, *, leave: bool = False) -> None:
-        """STOP, several times over, waiting for nothing; the session is dead after it.
+        """STOP, several times over; the session is dead after it.
 
-        Args:
-            leave: give the line back to host control, and wait a moment for the controller's goodbye.
+        It waits for nothing but, with ``leave`` (the line goes back to host control), a moment for the goodbye.
         """
         self.halted = True
         for _ in range(_STOP_REPEATS):

@@ -104,37 +104,21 @@ class AxisLimits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """HELLO as the controller answers it.
+    """HELLO as the controller answers it."""
 
-    Attributes:
-        version: chosen.
-        session: now open.
-        axis_mask: axes in every frame of this session.
-        feed_forward: torque may ride on set-points.
-        torque_measured: feedback torque is measured, not commanded.
-        compensated: a downloaded friction table is being applied.
-        tick_us: interpolation clock.
-        watchdog_ticks: ticks without a target before it stops the arm.
-        queue_limit: how many ticks ahead a target may be due.
-        averaging_ms: moving average on the command, None where the controller does not know.
-        torque_unit: 0: uN m at the motor shaft; 1: 0.01 % of rated torque.
-        tick: now.
-        limits: per axis in the mask.
-    """
-
-    version: int
-    session: int
-    axis_mask: int
-    feed_forward: bool
-    torque_measured: bool
-    compensated: bool
-    tick_us: int
-    watchdog_ticks: int
-    queue_limit: int
-    averaging_ms: int | None
-    torque_unit: int
-    tick: int
-    limits: tuple[AxisLimits, ...]
+    version: int  # chosen
+    session: int  # now open
+    axis_mask: int  # axes in every frame of this session
+    feed_forward: bool  # torque may ride on set-points
+    torque_measured: bool  # feedback torque is measured, not commanded
+    compensated: bool  # a downloaded friction table is being applied
+    tick_us: int  # interpolation clock
+    watchdog_ticks: int  # ticks without a target before it stops the arm
+    queue_limit: int  # how many ticks ahead a target may be due
+    averaging_ms: int | None  # moving average on the command, None where the controller does not know
+    torque_unit: int  # 0: uN m at the motor shaft; 1: 0.01 % of rated torque
+    tick: int  # now
+    limits: tuple[AxisLimits, ...]  # per axis in the mask
 
 
 class Stopped(NamedTuple):

@@ -51,22 +51,14 @@ class Servo(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """What the controller knows of an axis.
+    """What the controller knows of an axis."""
 
-    Attributes:
-        pulses_per_rad: signed; negative where positive pulses turn the joint backwards.
-        gear_ratio: motor revolutions per joint revolution.
-        rated_torque_nm: joint side.
-        lowest: software limit, pulses; so is ``highest``.
-        step: most pulses per tick.
-    """
-
-    pulses_per_rad: float
-    gear_ratio: float
-    rated_torque_nm: float
-    lowest: int
+    pulses_per_rad: float  # signed; negative where positive pulses turn the joint backwards
+    gear_ratio: float  # motor revolutions per joint revolution
+    rated_torque_nm: float  # joint side
+    lowest: int  # software limit, pulses; so is ``highest``
     highest: int
-    step: int
+    step: int  # most pulses per tick
 
     @property
     def sign(self) -> float:
@@ -75,12 +67,7 @@ class Plate:
 
 
 class Axis:
-    """See the module's first page.
-
-    Args:
-        plate: its figures.
-        servo: the joint, unpowered, standing.
-        averaging_ticks: length of the moving average on the command; 1 is none.
+    """See the module's first page; ``servo`` stands unpowered, and the command is averaged over ``averaging_ticks``.
 
     Attributes:
         issued: command after the limiter, pulses; what an application reads back.

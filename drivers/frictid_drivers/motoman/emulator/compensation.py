@@ -13,25 +13,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """What FTABLE brought for one axis.
+    """What FTABLE brought for one axis."""
 
-    Attributes:
-        ratio: R, part of the friction that is compensated.
-        step_tenths: 0.1 pulse/s between two points.
-        stiffness_micro: K, uN m per pulse.
-        turn_pulses: pulses per revolution of the joint, for gravity.
-        gravity_cos_micro: uN m at the motor shaft.
-        gravity_sin_micro: uN m at the motor shaft.
-        points_micro: the curve.
-    """
-
-    ratio: float
-    step_tenths: float
-    stiffness_micro: float
-    turn_pulses: float
-    gravity_cos_micro: float
-    gravity_sin_micro: float
-    points_micro: tuple[int, ...]
+    ratio: float  # R, part of the friction that is compensated
+    step_tenths: float  # 0.1 pulse/s between two points
+    stiffness_micro: float  # K, uN m per pulse
+    turn_pulses: float  # pulses per revolution of the joint, for gravity
+    gravity_cos_micro: float  # uN m at the motor shaft
+    gravity_sin_micro: float  # uN m at the motor shaft
+    points_micro: tuple[int, ...]  # the curve
 
     def curve_micro(self, speed_tenths: float) -> float:
         """phi of a speed >= 0."""
@@ -42,13 +32,7 @@ class Table:
 
 
 class Compensator:
-    """The slip spring of one axis, and what the table adds to it.
-
-    Args:
-        table: of the axis.
-        pulses: where the axis is now; the spring is relaxed there.
-        delay_ticks: how much later than the tick that it was computed from a torque acts.
-    """
+    """The slip spring of one axis, relaxed at ``pulses``, and what the table adds to it; ``delay_ticks`` late."""
 
     def __init__(self, table: Table, pulses: int, delay_ticks: int = 0) -> None:
         self.table = table

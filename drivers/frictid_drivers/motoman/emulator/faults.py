@@ -43,19 +43,12 @@ _WRITTEN = re.compile(r"^([a-z_]+)@(\d+)(?:x(\d+))?(?::(-?\d+(?:\.\d+)?))?$", re
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that shall go wrong.
+    """One thing that shall go wrong."""
 
-    Attributes:
-        kind: see ``OCCASIONS``.
-        at: first occasion, from 0.
-        times: occasions in a row.
-        value: figure of the kind (seconds, alarm number, pulses).
-    """
-
-    kind: str
-    at: int
-    times: int = 1
-    value: float = 0.0
+    kind: str  # see ``OCCASIONS``
+    at: int  # first occasion, from 0
+    times: int = 1  # occasions in a row
+    value: float = 0.0  # figure of the kind (seconds, alarm number, pulses)
 
     @staticmethod
     def parse(text: str) -> Fault:
@@ -74,11 +67,7 @@ class Fault:
 
 
 class FaultPlan:
-    """Counts occasions and says which faults are due.
-
-    Attributes:
-        counted: occasions so far, by name.
-    """
+    """Counts occasions, by name, and says which faults are due."""
 
     def __init__(self, faults: Iterable[Fault] = ()) -> None:
         self._faults = tuple(faults)

@@ -27,33 +27,19 @@ def data(text: str) -> Reply:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How this controller is made.
+    """How this controller is made."""
 
-    Attributes:
-        generation: erc, xrc, nx or dx; decides the bits of RSTATS.
-        baud: of host control.
-        parity: E, O or N; a byte costs 11 bits with, 10 without.
-        stream_bauds: speeds that FSTREAM may ask for; none on an ordinary port.
-        batch: the batch application is installed.
-        tick_s: interpolation clock.
-        averaging_ticks: moving average on the command; 1 is none.
-        thinking_s: between a command and the bid to reply.
-        table_delay_ticks: between the tick that a table's torque is computed in and the tick that it acts in.
-        reads_while_running: the batch application hands samples over while a job runs (FREAD 2).
-        parameters: of the link.
-    """
-
-    generation: str = "nx"
-    baud: int = 19200
-    parity: str = "E"
-    stream_bauds: tuple[int, ...] = (115200, 921600)
-    batch: bool = True
-    tick_s: float = 0.004
-    averaging_ticks: int = 1
-    thinking_s: float = 0.012
-    table_delay_ticks: int = 0
-    reads_while_running: bool = True
-    parameters: Parameters = field(default_factory=Parameters)
+    generation: str = "nx"  # erc, xrc, nx or dx; decides the bits of RSTATS
+    baud: int = 19200  # of host control
+    parity: str = "E"  # E, O or N; a byte costs 11 bits with, 10 without
+    stream_bauds: tuple[int, ...] = (115200, 921600)  # speeds that FSTREAM may ask for; none on an ordinary port
+    batch: bool = True  # the batch application is installed
+    tick_s: float = 0.004  # interpolation clock
+    averaging_ticks: int = 1  # moving average on the command; 1 is none
+    thinking_s: float = 0.012  # between a command and the bid to reply
+    table_delay_ticks: int = 0  # between the tick that a table's torque is computed in and the tick that it acts in
+    reads_while_running: bool = True  # the batch application hands samples over while a job runs (FREAD 2)
+    parameters: Parameters = field(default_factory=Parameters)  # of the link
 
     @property
     def tick_us(self) -> int:
@@ -69,28 +55,19 @@ class Settings:
 class Panel:
     """State of the controller and its stock commands.
 
-    Attributes:
-        axes: the arm.
-        settings: how the controller is made.
-        teach: key switch at teach.
-        remote: command remote is set.
-        holds: pendant, external, command - whichever are on.
-        alarm: its number, 0 for none.
-        servo_blocked: an e-stop keeps servo power off.
-        operating: something is moving the arm.
-        on_stop: called when motion must end at once; told why.
+    ``on_stop`` is called when motion must end at once, and told why.
     """
 
     def __init__(self, axes: Sequence[Axis], settings: Settings, on_stop: Callable[[str], None]) -> None:
         self.axes = list(axes)
         self.settings = settings
-        self.teach = False
-        self.remote = True
-        self.holds: set[str] = set()
-        self.alarm = 0
-        self.servo_blocked = False
+        self.teach = False  # what the key switch says
+        self.remote = True  # command remote is set
+        self.holds: set[str] = set()  # pendant, external, command
+        self.alarm = 0  # its number, 0 for none
+        self.servo_blocked = False  # by an e-stop
         self.servo_on = False
-        self.operating = False
+        self.operating = False  # something is moving the arm
         self.position_known = True
         self.on_stop = on_stop
         self._commands: dict[str, tuple[int, Callable[..., Reply]]] = {

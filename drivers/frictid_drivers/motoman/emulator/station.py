@@ -20,21 +20,13 @@ Delivering = Generator[float | None, int | None, bool]
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """RS034 to RS037 of the controller.
+    """RS034 to RS037 of the controller."""
 
-    Attributes:
-        timer_a_s: answer to ENQ or to a text.
-        timer_b_s: end of a text.
-        retry_1: invalid or no response.
-        retry_2: NAK to a text.
-        hush_s: silence after which rubbish on the line has ended.
-    """
-
-    timer_a_s: float = 3.0
-    timer_b_s: float = 20.0
-    retry_1: int = 10
-    retry_2: int = 3
-    hush_s: float = 0.1
+    timer_a_s: float = 3.0  # answer to ENQ or to a text
+    timer_b_s: float = 20.0  # end of a text
+    retry_1: int = 10  # invalid or no response
+    retry_2: int = 3  # NAK to a text
+    hush_s: float = 0.1  # silence after which rubbish on the line has ended
 
 
 class Voice(Protocol):
@@ -56,13 +48,8 @@ class Voice(Protocol):
 class Station:
     """Answers the host's messages and sends the controller's own.
 
-    Args:
-        parameters: timers and retries.
-        voice: where utterances go.
-        on_message: called with header and text (without CR) of every whole message.
-
-    Attributes:
-        deadline_s: when ``tick`` is wanted, None while only bytes matter.
+    ``on_message`` is told header and text (without CR) of every whole message; ``deadline_s`` says when ``tick`` is
+    wanted, None while only bytes matter.
     """
 
     def __init__(self, parameters: Parameters, voice: Voice, on_message: Callable[[str, str], None]) -> None:
