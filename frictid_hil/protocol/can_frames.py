@@ -23,7 +23,7 @@ from typing import Protocol
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from frictid_hil.protocol.driver import FD_FRAME
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME
 
 Heard = tuple[int, bytes, float]
 """Identifier, data, and when it came, s of python-can's time stamps."""
@@ -52,11 +52,9 @@ class Frames(Protocol):
         Raises:
             Exception: one of ``can_bus.BUS_ERRORS``; those before the one that failed are sent.
         """
-        ...
 
     def send_alone(self, can_id: int, data: bytes) -> None:
         """Send one, from any thread."""
-        ...
 
     def receive(self, timeout_s: float) -> list[Heard] | None:
         """What has come, at least one frame; None where nothing came in time. Empty where it was of no meaning.
@@ -64,7 +62,6 @@ class Frames(Protocol):
         Raises:
             Exception: one of ``can_bus.BUS_ERRORS``.
         """
-        ...
 
 
 def frames_of(bus: can.BusABC) -> Frames:
@@ -89,11 +86,7 @@ def controller_state(can_id: int, data: bytes | bytearray) -> str:
 
 
 class MessageFrames:
-    """Any interface of python-can, frame by frame.
-
-    Args:
-        bus: nobody else reads it meanwhile.
-    """
+    """Any interface of python-can, frame by frame; nobody else reads it meanwhile."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
@@ -105,14 +98,14 @@ class MessageFrames:
         for can_id, data in frames:
             message = self._messages.get(can_id)
             if message is None:
-                message = self._messages[can_id] = _message(can_id, data)
+                message = self._messages[can_id] = message_of(can_id, data)
             # Bytes of its own each time: some interfaces (gs_usb) pad them in place.
             message.data, message.dlc = bytearray(data), len(data)
             self._bus.send(message)
 
     def send_alone(self, can_id: int, data: bytes) -> None:
         """Send one, from any thread."""
-        self._bus.send(_message(can_id, data))
+        self._bus.send(message_of(can_id, data))
 
     def receive(self, timeout_s: float) -> list[Heard] | None:
         """All that has come."""
@@ -124,17 +117,26 @@ class MessageFrames:
             if message.is_error_frame:
                 self.controller = controller_state(message.arbitration_id, message.data) or self.controller
             elif not message.is_extended_id and not message.is_remote_frame:
-                can_id = message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
-                heard.append((can_id, bytes(message.data), message.timestamp))
+                heard.append((identifier_of(message), bytes(message.data), message.timestamp))
             message = self._bus.recv(0.0)
         return heard
 
 
-def _message(can_id: int, data: bytes) -> can.Message:
-    fd = can_id & FD_FRAME != 0
+def message_of(can_id: int, data: bytes) -> can.Message:
+    """A frame for python-can, with bytes of its own: some interfaces pad the message that they are given."""
+    fd, extended = can_id & FD_FRAME != 0, can_id & EXTENDED != 0
     return can.Message(
-        arbitration_id=can_id & ~FD_FRAME, is_extended_id=False, data=bytearray(data), is_fd=fd, bitrate_switch=fd
+        arbitration_id=can_id & (0x1FFF_FFFF if extended else 0x7FF),
+        is_extended_id=extended,
+        is_fd=fd,
+        bitrate_switch=fd,
+        data=bytearray(data),
     )
+
+
+def identifier_of(message: can.Message) -> int:
+    """Of a message, with its flags."""
+    return message.arbitration_id | EXTENDED * message.is_extended_id | FD_FRAME * message.is_fd
 
 
 class _Header(ctypes.Structure):
@@ -223,7 +225,8 @@ class SocketFrames:
         """All of them; a full transmit buffer is an error at once."""
         if len(frames) > MOST:
             self.send(frames[:MOST])
-            return self.send(frames[MOST:])
+            self.send(frames[MOST:])
+            return
         room, sizes, stride = self._out.room, self._out.sizes, self._stride
         stamp = (time.monotonic_ns(),) if self._stamped else ()
         for at, (can_id, data) in enumerate(frames):
@@ -238,7 +241,6 @@ class SocketFrames:
                 raise _failed()
             done += sent
             first = ctypes.c_void_p(self._out.address + done * ctypes.sizeof(_Message))
-        return None
 
     def send_alone(self, can_id: int, data: bytes) -> None:
         """Send one, from any thread."""

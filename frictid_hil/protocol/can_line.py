@@ -9,8 +9,6 @@ import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-import can
-
 from frictid_hil.errors import HardwareError
 from frictid_hil.protocol.can_bus import (
     BUS_ERRORS,
@@ -20,8 +18,9 @@ from frictid_hil.protocol.can_bus import (
     BusLock,
     open_bus,
 )
+from frictid_hil.protocol.can_frames import identifier_of, message_of
 from frictid_hil.protocol.can_load import BitRates, highest_rate_hz
-from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock, FrameSink
+from frictid_hil.protocol.driver import Clock, FrameSink
 
 _WIRE_FAILURES = 3
 
@@ -85,16 +84,8 @@ class CanLine:
             HardwareError: several frames in a row could not be sent.
         """
         t_ns = self._clock.now_ns()
-        message = can.Message(
-            arbitration_id=can_id & (0x1FFF_FFFF if can_id & EXTENDED else 0x7FF),
-            is_extended_id=bool(can_id & EXTENDED),
-            is_fd=bool(can_id & FD_FRAME),
-            bitrate_switch=bool(can_id & FD_FRAME),
-            # Bytes of its own: some interfaces pad the message that they are given.
-            data=bytearray(data),
-        )
         try:
-            self._bus.send(message)
+            self._bus.send(message_of(can_id, data))
         except BUS_ERRORS as error:
             self._failures += 1
             if self._failures >= _WIRE_FAILURES:
@@ -133,12 +124,7 @@ class CanLine:
                 return
             if message.is_error_frame or message.is_remote_frame:
                 continue
-            can_id = (
-                message.arbitration_id
-                | (EXTENDED if message.is_extended_id else 0)
-                | (FD_FRAME if message.is_fd else 0)
-            )
-            t_ns, data = self._clock.now_ns(), bytes(message.data)
+            t_ns, can_id, data = self._clock.now_ns(), identifier_of(message), bytes(message.data)
             if self._sink is not None:
                 self._sink(t_ns, can_id, data, False)
             yield t_ns, can_id, data

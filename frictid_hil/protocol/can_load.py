@@ -41,15 +41,10 @@ _LONGER = 20
 
 @dataclass(frozen=True, slots=True)
 class BitRates:
-    """What the wire does.
+    """What the wire does."""
 
-    Attributes:
-        nominal: bit/s; of arbitration, where frames are CAN FD.
-        data: bit/s of the data of CAN FD frames; None on a classical bus.
-    """
-
-    nominal: int
-    data: int | None = None
+    nominal: int  # bit/s; of arbitration, where frames are CAN FD
+    data: int | None = None  # bit/s of the data of CAN FD frames; None on a classical bus
 
     def __str__(self) -> str:
         nominal = f"{self.nominal / 1000:g} kbit/s"
@@ -58,15 +53,10 @@ class BitRates:
 
 @dataclass(frozen=True, slots=True)
 class FrameBits:
-    """Length of one frame on the wire, with inter-frame space, in bits of the arbitration rate.
+    """Length of one frame on the wire, with inter-frame space, in bits of the arbitration rate."""
 
-    Attributes:
-        least: without a single stuff bit.
-        worst: with the most stuff bits there can be.
-    """
-
-    least: float
-    worst: float
+    least: float  # without a single stuff bit
+    worst: float  # with the most stuff bits there can be
 
 
 def frame_bits(data_bytes: int, *, extended: bool = False) -> FrameBits:

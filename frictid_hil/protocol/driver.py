@@ -274,11 +274,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Run time now."""
-        ...
 
     def wait_until(self, deadline_ns: int) -> None:
         """Return at the deadline (or at once if it has passed)."""
-        ...
 
 
 class WallClock:
@@ -315,51 +313,39 @@ class Driver(Protocol):
     @property
     def clock(self) -> Clock:
         """Whose time everything runs on."""
-        ...
 
     def open(self, frame_sink: FrameSink | None = None) -> None:
         """Take the bus exclusively and reach every joint; nothing is enabled. ``HardwareBusy`` when held by another."""
-        ...
 
     def identify(self) -> dict[str, JointIdentity]:
         """Read what every drive says of itself; reads only."""
-        ...
 
     def capabilities(self) -> Capabilities:
         """What this hardware can do; after ``open``."""
-        ...
 
     def check(self, plan: Plan | None) -> list[Finding]:
         """Everything that can be said without moving or writing: drives, modes, limits, bus load at the plan's rate."""
-        ...
 
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
         """Write and read back mapping, timing, watchdogs and limits for this rate; ``active`` report every cycle."""
-        ...
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Set and read back the drive's own limits (6072, 607D); before cycling."""
-        ...
 
     def start_cycling(self) -> None:
         """Begin cyclic traffic; run time starts at zero. From here until ``stop_cycling`` no SDO is sent."""
-        ...
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power in ``mode`` with a bumpless set-point; progress is seen in the feedback of later exchanges."""
-        ...
 
     def disable(self, joint: str) -> None:
         """Ask for power off (after standstill); progress is seen in the feedback."""
-        ...
 
     def lock(self, joint: str) -> None:
         """Hold the joint where it stands, tightly; it is watched on every report."""
-        ...
 
     def unlock(self, joint: str) -> None:
         """End ``lock``; the joint stays enabled and follows its set-point again."""
-        ...
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """Send one cycle's set-points (order of ``setup.joints``) and return all joints' feedback.
@@ -367,22 +353,18 @@ class Driver(Protocol):
         The returned objects are the driver's own and change with the next call. A joint that did not report this
         cycle keeps its last figures with ``age_cycles`` counted up.
         """
-        ...
 
     def quick_stop(self) -> None:
         """Stop every joint by the fastest safe way, from any state; never raises, never waits for an answer."""
-        ...
 
     def stop_cycling(self) -> None:
         """End cyclic traffic after standstill; SDO is possible again."""
-        ...
 
     def close(self) -> None:
         """Bring everything to rest and release the bus; safe to call twice and after errors.
 
         Joints whose power was not seen to go off are named afterwards by ``may_be_powered``, where a driver can tell.
         """
-        ...
 
 
 @runtime_checkable
@@ -391,7 +373,6 @@ class FrameMapped(Protocol):
 
     def frame_map_values(self) -> Mapping[str, Any]:
         """Which frame carries what, as configured, as plain values that name their ``schema``; after ``configure``."""
-        ...
 
 
 @runtime_checkable
@@ -400,7 +381,6 @@ class Remarking(Protocol):
 
     def remarks(self) -> list[Finding]:
         """What could not be set, and what that means; after ``configure``."""
-        ...
 
 
 @runtime_checkable
@@ -409,11 +389,9 @@ class Resettable(Protocol):
 
     def faults(self) -> list[Finding]:
         """What keeps drives from running again; after ``open``, reads only."""
-        ...
 
     def reset_faults(self) -> None:
         """Bring those drives back; nothing gets power. ``HardwareError`` where one stays in fault."""
-        ...
 
 
 @runtime_checkable
@@ -431,7 +409,6 @@ class Batched(Protocol):
 
     def standing(self) -> Sequence[Feedback]:
         """Position and state of every joint, slowly read; without velocity and torque."""
-        ...
 
     def run_batch(
         self,
@@ -460,7 +437,6 @@ class Batched(Protocol):
         Raises:
             FrictidError: whatever ended it; ``batch_columns`` keep what was measured.
         """
-        ...
 
 
 @runtime_checkable
@@ -469,7 +445,6 @@ class Ticked(Protocol):
 
     def cycle_quantum_s(self) -> float:
         """As in ``Capabilities``; before ``open``, so that a plan can be made and shown without any hardware."""
-        ...
 
 
 def known_drivers() -> list[str]:

@@ -28,42 +28,28 @@ class DecodedRow(Protocol):
     @property
     def t_ns(self) -> int:
         """Run time at which the row began."""
-        ...
 
     @property
     def feedback(self) -> Sequence[Feedback]:
         """Of all joints, in the order of the frame map, with the set-points in force."""
-        ...
 
 
 class LogDecoder(Protocol):
-    """Decodes one log, once.
+    """Decodes one log, once."""
 
-    Attributes:
-        unknown: frames that nothing describes, counted by name.
-        services: frames around the cycles (network management, parameters), counted by name.
-        repeated: reports that came twice in a row.
-        backwards: frames with a time before that of the frame before them.
-    """
-
-    unknown: Counter[str]
-    services: Counter[str]
-    repeated: int
-    backwards: int
+    unknown: Counter[str]  # frames that nothing describes, by name
+    services: Counter[str]  # frames around the cycles (network management, parameters), by name
+    repeated: int  # reports that came twice in a row
+    backwards: int  # frames with a time before that of the frame before them
 
     def rows(self, frames: Iterable[LoggedFrame]) -> Iterator[DecodedRow]:
         """Row by row; raises nothing, whatever the log holds."""
-        ...
 
 
 class FrameDecoders(Protocol):
-    """What an entry point of the group gives; a class or module with these three.
+    """What an entry point of the group gives; a class or module with these three."""
 
-    Attributes:
-        schema: of the frame maps it understands.
-    """
-
-    schema: str
+    schema: str  # of the frame maps it understands
 
     def decoder(self, frame_map: Mapping[str, Any]) -> LogDecoder:
         """A decoder for logs with this frame map.
@@ -71,7 +57,6 @@ class FrameDecoders(Protocol):
         Raises:
             InvalidFields: every field of the map that is wrong.
         """
-        ...
 
     def map_from_eds(self, path: Path, setup: RobotSetup) -> Mapping[str, Any]:
         """The frame map of drives that were mapped as their EDS or DCF file says.
@@ -79,7 +64,6 @@ class FrameDecoders(Protocol):
         Raises:
             InputFileError: unreadable, or it maps no position.
         """
-        ...
 
 
 def frame_decoders(schema: str) -> FrameDecoders:

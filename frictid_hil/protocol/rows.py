@@ -17,39 +17,25 @@ from frictid_hil.protocol.frames import LoggedFrame
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A frame that commands a joint, or all of them.
+    """A frame that commands a joint, or all of them."""
 
-    Attributes:
-        joint: index.
-        position_rad: target that it sets; NaN for none.
-        others: the same of further joints, where one frame commands several.
-    """
-
-    joint: int
-    position_rad: float
-    others: tuple[tuple[int, float], ...] = ()
+    joint: int  # index
+    position_rad: float  # target that it sets; NaN for none
+    others: tuple[tuple[int, float], ...] = ()  # the same of further joints, where one frame commands several
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A frame that brings figures of a joint, which are in its ``Feedback`` by now.
+    """A frame that brings figures of a joint, which are in its ``Feedback`` by now."""
 
-    Attributes:
-        joint: index.
-    """
-
-    joint: int
+    joint: int  # index
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """A frame around the cycles.
+    """A frame around the cycles."""
 
-    Attributes:
-        name: what a person would call it.
-    """
-
-    name: str
+    name: str  # what a person would call it
 
 
 class Decode(Protocol):
@@ -57,16 +43,10 @@ class Decode(Protocol):
 
     def __call__(self, can_id: int, data: bytes) -> Command | Report | Service | None:
         """Take one frame."""
-        ...
 
 
 class RowDecoder:
-    """One robot's frames.
-
-    Args:
-        feedback: one per joint, filled by ``decode``.
-        decode: of the driver.
-    """
+    """One robot's frames; ``feedback``, one per joint, is filled by the driver's ``decode``."""
 
     def __init__(self, feedback: Sequence[Feedback], decode: Decode) -> None:
         self.feedback = list(feedback)

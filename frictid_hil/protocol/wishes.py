@@ -38,21 +38,13 @@ class Do(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """For the coming cycle, joint side.
+    """For the coming cycle, joint side."""
 
-    Attributes:
-        do: what.
-        mode: which of the figures rules.
-        position_rad: target in position mode.
-        velocity_rad_s: target in velocity mode, feed-forward in position mode.
-        torque_nm: target in torque mode, added in the others; within the torque limit.
-    """
-
-    do: Do
-    mode: Mode = Mode.NONE
-    position_rad: float = math.nan
-    velocity_rad_s: float = 0.0
-    torque_nm: float = 0.0
+    do: Do  # what
+    mode: Mode = Mode.NONE  # which of the figures rules
+    position_rad: float = math.nan  # target in position mode
+    velocity_rad_s: float = 0.0  # target in velocity mode, feed-forward in position mode
+    torque_nm: float = 0.0  # target in torque mode, added in the others; within the torque limit
 
 
 class Wish:

@@ -68,19 +68,15 @@ class Bench(Protocol):
 
     def driver(self) -> Driver:
         """A new driver on a fresh wire; what the others do concerns the newest one."""
-        ...
 
     def truth(self, joint: str) -> Truth:
         """Of the newest wire, now."""
-        ...
 
     def silence(self, silent: bool) -> None:
         """From now on nothing of the newest wire reaches the host, or everything again."""
-        ...
 
     def decoder(self, driver: Driver) -> LogDecoder | None:
         """A fresh decoder for logs of this driver; None where it brings none."""
-        ...
 
 
 class Rig:

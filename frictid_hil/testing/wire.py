@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import can
 
-from frictid_hil.protocol.driver import EXTENDED, FD_FRAME, Clock
+from frictid_hil.protocol.can_frames import identifier_of, message_of
+from frictid_hil.protocol.driver import Clock
 
 Frame = tuple[int, bytes]
 """Identifier (bit 31: 29 bits, bit 29: CAN FD) and data."""
@@ -20,11 +21,9 @@ class Devices(Protocol):
 
     def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
         """A frame of the host arrives; the frames that answer it."""
-        ...
 
     def advance(self, to_ns: int) -> None:
         """Time goes on."""
-        ...
 
 
 class ManualClock:
@@ -78,19 +77,9 @@ class FakeCanBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Let every device hear the frame."""
         self._go_on()
-        flags = (EXTENDED if msg.is_extended_id else 0) | (FD_FRAME if msg.is_fd else 0)
-        frame = (msg.arbitration_id | flags, bytes(msg.data))
-        for can_id, data in self._through(frame, False):
-            for answer in self._devices.receive(can_id, data):
-                for answered_id, answered in self._through(answer, True):
-                    self._queue.append(
-                        can.Message(
-                            arbitration_id=answered_id & (0x1FFF_FFFF if answered_id & EXTENDED else 0x7FF),
-                            is_extended_id=bool(answered_id & EXTENDED),
-                            is_fd=bool(answered_id & FD_FRAME),
-                            data=answered,
-                        )
-                    )
+        for frame in self._through((identifier_of(msg), bytes(msg.data)), False):
+            for answer in self._devices.receive(*frame):
+                self._queue += [message_of(*answered) for answered in self._through(answer, True)]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """The next answer, or None once ``timeout`` seconds have passed."""
