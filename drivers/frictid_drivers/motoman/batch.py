@@ -40,11 +40,7 @@ class BatchClient:
         self.host = host
 
     def hello(self) -> BatchHello:
-        """FHELLO, and whether FREAD 2 is known.
-
-        Raises:
-            ControllerError: 1010 where there is no such application.
-        """
+        """FHELLO, and whether FREAD 2 is known; ``UnknownCommand`` where there is no such application."""
         reply = self.host.ask("FHELLO 1")
         try:
             version, tick_us, axes, most_ticks, source, averaging, points, name = reply.split(",", 7)
@@ -171,11 +167,7 @@ class BatchClient:
                         self.host.listen(min(0.05, pause_until_s - now_s()))
 
     def download(self, table: FrictionTable) -> None:
-        """FTABLE, read back and compared.
-
-        Raises:
-            BadReply: what comes back is not what was sent.
-        """
+        """FTABLE, read back and compared; ``BadReply`` where what comes back is not what was sent."""
         coded = table.encoded()
         self.host.order(f"FTABLE 1,{coded}")
         if self.host.ask(f"FTREAD 1,{table.axis}") != coded:

@@ -34,7 +34,6 @@ class TickClock:
     def __init__(self, *, lock_step: bool = False) -> None:
         self.lock_step = lock_step
         self._session: StreamSession | None = None
-        self._now_s = 0.0
         self._first_tick = 0
         self._tick_ns = 1
         self._lead_ticks = 0

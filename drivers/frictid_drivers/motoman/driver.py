@@ -48,9 +48,7 @@ _URGENT_S = 0.5
 class MotomanDriver:
     """A MOTOMAN-class controller on a serial port.
 
-    Args:
-        setup: the robot; every joint needs ``options.pulses_per_degree``.
-        port_factory: opens the port; an emulator in the same process brings its own, on virtual time.
+    An emulator in the same process brings its own ``port_factory``, on virtual time.
 
     Raises:
         InvalidFields: an option is unknown or impossible, or pulses per degree are missing.
@@ -127,11 +125,7 @@ class MotomanDriver:
     # -- preparing ---------------------------------------------------------------------------------------------
 
     def configure(self, cycle_hz: float, active: Sequence[str]) -> None:
-        """Choose the axes of the stream; there is nothing to write to the controller.
-
-        Raises:
-            PlanRefused: the controller cannot do this, or not at this rate.
-        """
+        """Choose the axes of the stream; ``PlanRefused`` where the controller cannot do this, or not at this rate."""
         if self._reach.layer == "host":
             raise PlanRefused(
                 "this controller offers no torque: " + "; ".join(self._reach.reasons.values()),
@@ -144,7 +138,7 @@ class MotomanDriver:
         self._active = list(active)
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
-        """Bounds that this side keeps on every target, and sends along with every job; the controller has its own.
+        """Bounds that this side keeps on every target, and sends along with every job.
 
         Raises:
             HardwareError: the controller's own travel is narrower.
@@ -209,12 +203,7 @@ class MotomanDriver:
         self._cycling().locked.discard(joint)
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
-        """Targets out, newest report in.
-
-        Raises:
-            SafetyAbort: the controller stopped, or a target is out of bounds.
-            HardwareError: it fell silent.
-        """
+        """Targets out, newest report in; ``SafetyAbort`` where the controller stopped, or a target is out of bounds."""
         return self._cycling().exchange(set_points)
 
     def stop_cycling(self) -> None:
@@ -279,10 +268,9 @@ class MotomanDriver:
 
         Raises:
             PlanRefused: a motion that the controller cannot make.
-            SafetyAbort: the controller stopped, or ``look`` did; what was recorded is in ``batch_columns``.
-            Interrupted: ``stop`` asked for it; likewise.
-            HardwareError: the line failed (``batch_columns`` then hold what had come), or the joint does not stand at
-                the start.
+            SafetyAbort: the controller stopped, or ``look`` did.
+            Interrupted: ``stop`` asked for it.
+            HardwareError: the line failed, or the joint does not stand at the start.
         """
         line, hello = self._open_line(), self._reach.batch
         if hello is None:
@@ -344,15 +332,10 @@ class MotomanDriver:
         gravity_cos_nm: float = 0.0,
         gravity_sin_nm: float = 0.0,
     ) -> None:
-        """Give the controller one joint's friction curve, to be compensated on its own tick; read back and compared.
+        """Give the controller one joint's friction curve, to be compensated on its own tick.
 
-        Args:
-            joint: name.
-            curve: phi(v), joint side.
-            ratio: R of (24c).
-            stiffness_nm_per_rad: K of (24a).
-            gravity_cos_nm: what holds the joint: gravity_cos cos(q) + gravity_sin sin(q); used while it floats.
-            gravity_sin_nm: see there.
+        The ratio is R of (24c), the stiffness K of (24a); while the joint floats, gravity_cos cos(q) + gravity_sin
+        sin(q) holds it.
 
         Raises:
             HardwareError: no such application, or the table reads back differently.

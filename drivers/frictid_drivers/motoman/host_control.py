@@ -132,10 +132,8 @@ class HostControl:
     def impatient(self, longest_s: float) -> Iterator[None]:
         """Inside, no timer of ours runs for longer than this; the controller keeps its own."""
         timing = self._timing
-        brief = replace(
-            timing, sequence_s=min(timing.sequence_s, longest_s), text_end_s=min(timing.text_end_s, longest_s)
-        )
-        self._link.retime(brief)
+        sequence_s, text_end_s = min(timing.sequence_s, longest_s), min(timing.text_end_s, longest_s)
+        self._link.retime(replace(timing, sequence_s=sequence_s, text_end_s=text_end_s))
         try:
             yield
         finally:
@@ -287,7 +285,6 @@ class ServoPower:
         """Release a command hold that was left behind, switch servo power on, and see that it is.
 
         Raises:
-            ControllerError: refused, by name.
             HardwareError: ordered, but not seen.
         """
         status = self._host.status()

@@ -49,12 +49,7 @@ class Reach:
 class Line:
     """One port that is either in host control or in a stream, and what can be asked for on it.
 
-    Args:
-        port: open, at the host control's speed.
-        options: of the robot file.
-        parity: of host control.
-        tick_us: interpolation clock that we ask for.
-        sink: of all bytes on the wire.
+    ``port`` is open, at the speed of host control and with its ``parity``.
     """
 
     def __init__(self, port: BytePort, options: SerialOptions, parity: str, tick_us: int, sink: Sink) -> None:
@@ -92,11 +87,7 @@ class Line:
 
 
 def find_layer(line: Line, options: SerialOptions, axis_mask: int) -> Reach:
-    """Ask for streaming, then for batch, unless the robot file insists on one.
-
-    Raises:
-        HardwareError: the robot file insists on a layer that the controller does not have.
-    """
+    """Ask for streaming, then for batch; ``HardwareError`` where the robot file insists on one that is not there."""
     reasons: dict[str, str] = {}
     welcome: Welcome | None = None
     hello: BatchHello | None = None
@@ -130,11 +121,7 @@ def find_layer(line: Line, options: SerialOptions, axis_mask: int) -> Reach:
 
 
 def streamed_mask(all_axes: int, active_axes: int, baud: int, tick_us: int) -> int:
-    """All axes where their frames fit into a tick, else only the active ones.
-
-    Raises:
-        PlanRefused: not even those fit.
-    """
+    """All axes where their frames fit into a tick, else the active ones; ``PlanRefused`` where not even those fit."""
     for mask in (all_axes, active_axes):
         if busy_share(mask.bit_count(), baud, tick_us) <= _USABLE_SHARE:
             return mask

@@ -67,11 +67,12 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
         case Move():
             return [f"M:{ticks}:{units.pulses(motion.to_rad)}"]
         case Sine():
-            return [_alike(motion.amplitude_rad, motion.duration_s / motion.repeats, motion.repeats, units, tick_s)]
+            each = max(4, round(motion.duration_s / motion.repeats / tick_s))
+            return [_cycles(motion.amplitude_rad, [each] * motion.repeats, units)]
         case WarmUp():
             # A job cannot end early: friction that has settled before is warmed on to the end.
-            repeats = round(motion.duration_s / motion.cycle_s)
-            return [_alike(motion.amplitude_rad, motion.cycle_s, repeats, units, tick_s)]
+            each = max(4, round(motion.cycle_s / tick_s))
+            return [_cycles(motion.amplitude_rad, [each] * round(motion.duration_s / motion.cycle_s), units)]
         case Cycles():
             boundaries = motion.procedure.cycle_starts_s / tick_s
             whole = np.round(boundaries).astype(np.int64)
@@ -80,8 +81,7 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
                     f"the cycles are no whole number of {tick_s * 1e3:g} ms ticks",
                     next_step="round their durations to the controller's tick (capability cycle_quantum_s)",
                 )
-            travel = str(_travel(motion.procedure.amplitude_rad, units))
-            return [":".join(["C", travel, *map(str, np.diff(whole).tolist())])]
+            return [_cycles(motion.procedure.amplitude_rad, np.diff(whole).tolist(), units)]
         case Corners():
             corners = np.round(np.asarray(motion.times_s) / tick_s).astype(np.int64)
             return [
@@ -92,28 +92,19 @@ def _segments_of(motion: Motion, units: AxisUnits, tick_s: float) -> list[str]:
     raise PlanRefused(f"a serial controller in batch has no segment for the motion {motion.name!r}")
 
 
-def _alike(amplitude_rad: float, cycle_s: float, repeats: int, units: AxisUnits, tick_s: float) -> str:
-    each = max(4, round(cycle_s / tick_s))
-    return ":".join(["C", str(_travel(amplitude_rad, units)), *[str(each)] * repeats])
-
-
-def _travel(amplitude_rad: float, units: AxisUnits) -> int:
-    return round(amplitude_rad * units.pulses_per_rad)
+def _cycles(amplitude_rad: float, ticks: Sequence[int], units: AxisUnits) -> str:
+    return ":".join(map(str, ["C", units.pulses(amplitude_rad), *ticks]))
 
 
 def _command(text: str, here: int) -> list[int]:
     """The command of one segment, tick by tick, as the table above says."""
-    kind, *rest = text.split(":")
-    figures = [int(figure) for figure in rest]
+    kind, first, *rest = text.split(":")
     if kind in ("H", "G"):
-        return [here] * figures[0]
+        return [here] * int(first)
     if kind == "C":
-        path: list[NDArray[np.int64]] = []
-        for ticks in figures[1:]:
-            angle = 2 * np.pi * np.arange(1, ticks + 1) / ticks
-            path.append(np.rint(here + figures[0] / 2 * (1 - np.cos(angle))).astype(np.int64))
-        return [int(pulses) for part in path for pulses in part]
-    ticks, goal = figures
-    u = np.arange(1, ticks + 1) / ticks
-    share = u if kind == "L" else 10 * u**3 - 15 * u**4 + 6 * u**5
-    return [int(pulses) for pulses in np.rint(here + (goal - here) * share)]
+        angles = np.concatenate([2 * np.pi * np.arange(1, int(n) + 1) / int(n) for n in rest])
+        path = here + int(first) / 2 * (1 - np.cos(angles))
+    else:
+        u = np.arange(1, int(first) + 1) / int(first)
+        path = here + (int(rest[0]) - here) * (u if kind == "L" else 10 * u**3 - 15 * u**4 + 6 * u**5)
+    return [int(pulses) for pulses in np.rint(path)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from frictid_drivers.motoman.emulator.compensation import Compensator, Table
-from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, data, refusal
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, data, require
 
 SAMPLES_PER_BLOCK = 18
 MOST_TICKS = 60_000
@@ -68,12 +68,8 @@ class Job:
 class BatchApplication:
     """FHELLO, FJOB, FRUN, FSTAT, FSTOP, FREAD, FTABLE, FTREAD, FCOMP.
 
-    Args:
-        panel: the controller.
-        on_guided: told when an axis is given into a person's hands, and taken back.
-
-    Attributes:
-        compensated: mask of axes whose table is applied every tick.
+    ``on_guided`` is told when an axis is given into a person's hands, and taken back; ``compensated`` is the mask of
+    axes whose table is applied every tick.
     """
 
     def __init__(self, panel: Panel, on_guided: Callable[[int, bool], None]) -> None:
@@ -120,12 +116,12 @@ class BatchApplication:
         action = self._commands[command]
         if (command, version) == ("FREAD", "2") and self._settings.reads_while_running:
             action = self._read_so_far
-        elif version != "1":
-            return refusal(5170)
+        else:
+            require(version == "1", 5170)
         try:
             return action(text, operands)
         except (ValueError, struct.error):
-            return refusal(1012)
+            raise Refused(1012) from None
 
     def heard_host(self) -> None:
         """The host said something whole: it lives."""
@@ -198,8 +194,10 @@ class BatchApplication:
 
     # -- commands ----------------------------------------------------------------------------------------------
 
-    def _asked_for(self, number: int) -> Job | None:
-        return self._job if self._job is not None and self._job.number == number else None
+    def _asked_for(self, number: int) -> Job:
+        if self._job is None or self._job.number != number:
+            raise Refused(4040)
+        return self._job
 
     def _hello(self, text: str, operands: list[str]) -> Reply:
         figures = (1, self._settings.tick_us, len(self._axes), MOST_TICKS, 1, self._settings.averaging_ms, 21)
@@ -207,41 +205,29 @@ class BatchApplication:
 
     def _accept(self, text: str, operands: list[str]) -> Reply:
         body, _, check = text.rpartition(",")
-        if len(check) != 4 or int(check, 16) != crc16((body + ",").encode("ascii")):
-            return refusal(5170)
-        if self.moving:
-            return refusal(2010)
+        require(len(check) == 4 and int(check, 16) == crc16((body + ",").encode("ascii")), 5170)
+        require(not self.moving, 2010)
         number, axis_number, start, lowest, highest, step, torque, watchdog = map(int, operands[:8])
-        if not (0 < number < 65536 and 0 <= axis_number < len(self._axes) and watchdog > 0):
-            return refusal(1012)
-        axis = self._axes[axis_number]
+        require(0 < number < 65536 and 0 <= axis_number < len(self._axes) and watchdog > 0, 1012)
         path, floating = [start], [False]
         for segment in operands[8:-1]:
             _append_segment(segment, path, floating)
-            if len(path) > MOST_TICKS:
-                return refusal(1013)
-        if len(path) < 2:
-            return refusal(1011)
-        plate = axis.plate
-        fastest = max(abs(b - a) for a, b in pairwise(path))
-        if min(path) < max(lowest, plate.lowest) or max(path) > min(highest, plate.highest) or fastest > step:
-            return refusal(1012)
+            require(len(path) <= MOST_TICKS, 1013)
+        require(len(path) >= 2, 1011)
+        plate = self._axes[axis_number].plate
+        require(min(path) >= max(lowest, plate.lowest) and max(path) <= min(highest, plate.highest), 1012)
+        require(max(abs(b - a) for a, b in pairwise(path)) <= step, 1012)
         self._job = Job(number, axis_number, path, floating, torque, watchdog)
         return DONE
 
     def _run(self, text: str, operands: list[str]) -> Reply:
         (number,) = map(int, operands)
         job = self._asked_for(number)
-        if job is None:
-            return refusal(4040)
         forbidden = self._panel.moving_forbidden()
-        if forbidden:
-            return refusal(forbidden)
-        if job.state != ACCEPTED:
-            return refusal(2080)
+        require(not forbidden, forbidden)
+        require(job.state == ACCEPTED, 2080)
         axis = self._axes[job.axis]
-        if abs(axis.pulses - job.path[0]) > abs(_START_TOLERANCE * axis.plate.pulses_per_rad):
-            return refusal(3040)
+        require(abs(axis.pulses - job.path[0]) <= abs(_START_TOLERANCE * axis.plate.pulses_per_rad), 3040)
         job.state = RUNNING
         self._panel.operating = True
         self._unheard_ticks = self._overload_ticks = 0
@@ -249,8 +235,8 @@ class BatchApplication:
 
     def _stat(self, text: str, operands: list[str]) -> Reply:
         (number,) = map(int, operands)
-        job = self._asked_for(number)
-        if job is None:
+        job = self._job
+        if job is None or job.number != number:
             return data(f"{number},0,0,0,{self._panel.alarm},0,0,0,0")
         velocity_shift, torque_shift = job.shifts() if job.state != RUNNING else (0, 0)
         figures = (
@@ -265,8 +251,7 @@ class BatchApplication:
 
     def _read(self, text: str, operands: list[str]) -> Reply:
         """FREAD 1: of a job that is over, every block shifted alike."""
-        if self.moving:
-            return refusal(2010)
+        require(not self.moving, 2010)
         return self._blocks(operands, each_shifted=False)
 
     def _read_so_far(self, text: str, operands: list[str]) -> Reply:
@@ -276,10 +261,7 @@ class BatchApplication:
     def _blocks(self, operands: list[str], *, each_shifted: bool) -> Reply:
         number, first, count = map(int, operands)
         job = self._asked_for(number)
-        if job is None:
-            return refusal(4040)
-        if not (0 <= first < len(job.samples) and count > 0):
-            return refusal(1012)
+        require(0 <= first < len(job.samples) and count > 0, 1012)
         blocks = []
         shifts = (0, 0) if each_shifted else job.shifts()
         last = min(first + count, len(job.samples))
@@ -300,15 +282,12 @@ class BatchApplication:
     def _table(self, text: str, operands: list[str]) -> Reply:
         (coded,) = operands
         raw = base64.b64decode(coded, validate=True)
-        if len(raw) < 34 or int.from_bytes(raw[-2:], "little") != crc16(raw[:-2]):
-            return refusal(5170)
+        require(len(raw) >= 34 and int.from_bytes(raw[-2:], "little") == crc16(raw[:-2]), 5170)
         number, count, ratio, step, stiffness, turn, cosine, sine = struct.unpack_from("<BBHIIIii", raw)
-        if len(raw) != 24 + 4 * count + 2:
-            return refusal(1013)
+        require(len(raw) == 24 + 4 * count + 2, 1013)
         points = struct.unpack_from(f"<{count}i", raw, 24)
-        plausible = step > 0 and stiffness > 0 and turn > 0 and count >= 2 and points[0] > 0 and ratio <= 10_000
-        if number >= len(self._axes) or not plausible:
-            return refusal(1012)
+        require(step > 0 and stiffness > 0 and turn > 0 and count >= 2 and points[0] > 0 and ratio <= 10_000, 1012)
+        require(number < len(self._axes), 1012)
         table = Table(ratio * 1e-4, float(step), stiffness * 1e-3, float(turn), float(cosine), float(sine), points)
         self._tables[number] = (raw, table)
         self._compensators.pop(number, None)
@@ -316,14 +295,12 @@ class BatchApplication:
 
     def _table_back(self, text: str, operands: list[str]) -> Reply:
         (number,) = map(int, operands)
-        if number not in self._tables:
-            return refusal(4040)
+        require(number in self._tables, 4040)
         return data(base64.b64encode(self._tables[number][0]).decode("ascii"))
 
     def _comp(self, text: str, operands: list[str]) -> Reply:
         (mask,) = map(int, operands)
-        if any(mask >> number & 1 and number not in self._tables for number in range(8)):
-            return refusal(4040)
+        require(all(number in self._tables for number in range(8) if mask >> number & 1), 4040)
         self.compensated = mask
         self._compensators.clear()
         for number, axis in enumerate(self._axes):
@@ -362,9 +339,5 @@ def _ticks(count: int) -> range:
 
 def _shifts(samples: Sequence[tuple[int, int, int]]) -> tuple[int, int]:
     """The smallest of velocity and of torque by which all of these fit 24 bits."""
-    speed, torque = (max((abs(sample[k]) for sample in samples), default=0) for k in (1, 2))
-    return _shift(speed), _shift(torque)
-
-
-def _shift(largest: int) -> int:
-    return max(0, largest.bit_length() - 23)
+    largest = [max((abs(sample[k]) for sample in samples), default=0) for k in (1, 2)]
+    return max(0, largest[0].bit_length() - 23), max(0, largest[1].bit_length() - 23)

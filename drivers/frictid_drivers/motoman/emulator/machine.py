@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from frictid_drivers.motoman.emulator.axis import Axis
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.jobs import BatchApplication
-from frictid_drivers.motoman.emulator.panel import DONE, Panel, Reply, Settings, refusal
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, Settings, require
 from frictid_drivers.motoman.emulator.station import Station
 from frictid_drivers.motoman.emulator.streaming import StreamApplication
 
@@ -24,18 +24,9 @@ Line = tuple[int, str]
 
 
 class Emulator:
-    """See the module's first page.
+    """See the module's first page; the arm stands unpowered, and ``panel`` is what a person sees of it all.
 
-    Args:
-        axes: the arm; standing, unpowered.
-        settings: how it is made.
-        faults: what shall go wrong.
-        on_guided: told when an axis is given into a person's hands, and taken back.
-
-    Attributes:
-        panel: what a person sees; tests press its buttons.
-        line: speed and parity now.
-        now_s: time of this controller.
+    ``on_guided`` is told when an axis is given into a person's hands, and taken back.
     """
 
     def __init__(
@@ -216,31 +207,28 @@ class Emulator:
         self._replies.append((self.now_s + self.settings.thinking_s, self._reply(header, text)))
 
     def _reply(self, header: str, text: str) -> Reply:
+        try:
+            return self._obey(header, text)
+        except Refused as refused:
+            return "90,000", f"{refused.args[0]:04d}"
+
+    def _obey(self, header: str, text: str) -> Reply:
         command, _, rest = text.partition(" ")
         operands = [operand.strip() for operand in rest.split(",")] if rest else []
-        if header != "01,000":
-            return refusal(1010)
+        require(header == "01,000", 1010)
         if self.panel.knows(command):
             return self.panel.obey(command, operands)
         if self.settings.batch and self.batch.knows(command):
             return self.batch.obey(text)
-        if command == "FSTREAM" and self.settings.stream_bauds:
-            return self._begin_streaming(operands)
-        return refusal(1010)
-
-    def _begin_streaming(self, operands: list[str]) -> Reply:
-        if len(operands) != 4:
-            return refusal(1011)
+        require(command == "FSTREAM" and self.settings.stream_bauds, 1010)
+        require(len(operands) == 4, 1011)
         try:
             version, baud, tick_us, mask = map(int, operands)
         except ValueError:
-            return refusal(5170)
-        if version != 1 or baud not in self.settings.stream_bauds or tick_us != self.settings.tick_us:
-            return refusal(1012)
-        if not 0 < mask < 1 << len(self.axes):
-            return refusal(1012)
-        if self.batch.moving:
-            return refusal(2010)
+            raise Refused(5170) from None
+        require(version == 1 and baud in self.settings.stream_bauds and tick_us == self.settings.tick_us, 1012)
+        require(0 < mask < 1 << len(self.axes), 1012)
+        require(not self.batch.moving, 2010)
         self._next_line = ((baud, "N"), mask)
         return DONE
 

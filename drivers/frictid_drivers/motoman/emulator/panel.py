@@ -15,9 +15,14 @@ Reply = tuple[str, str]
 DONE: Reply = ("90,000", "0000")
 
 
-def refusal(number: int) -> Reply:
-    """``90,000`` with an error number."""
-    return "90,000", f"{number:04d}"
+class Refused(Exception):
+    """``90,000`` with this error number is the reply."""
+
+
+def require(condition: object, number: int) -> None:
+    """Refuse with this error number what must be so and is not."""
+    if not condition:
+        raise Refused(number)
 
 
 def data(text: str) -> Reply:
@@ -88,7 +93,8 @@ class Panel:
     def obey(self, command: str, operands: list[str]) -> Reply:
         """Execute one stock command."""
         count, action = self._commands[command]
-        return action(*operands) if len(operands) == count else refusal(1011)
+        require(len(operands) == count, 1011)
+        return action(*operands)
 
     def words(self) -> tuple[int, int]:
         """The two figures of RSTATS."""
@@ -135,28 +141,23 @@ class Panel:
     # -- stock commands ----------------------------------------------------------------------------------------
 
     def _rposj(self) -> Reply:
-        if not self.position_known:
-            return refusal(3070)
+        require(self.position_known, 3070)
         pulses = [axis.pulses for axis in self.axes]
         return data(",".join(f"{value:>8d}" for value in pulses + [0] * (12 - len(pulses))))
 
     def _svon(self, wanted: str) -> Reply:
-        if wanted not in ("0", "1"):
-            return refusal(1012)
-        if not self.remote:
-            return refusal(2100)
+        require(wanted in ("0", "1"), 1012)
+        require(self.remote, 2100)
         if wanted == "0":
             self.on_stop("servo off")
-        elif self.alarm:
-            return refusal(2060)
-        elif self.servo_blocked:
-            return refusal(3450)
+        else:
+            require(not self.alarm, 2060)
+            require(not self.servo_blocked, 3450)
         self.power(wanted == "1")
         return DONE
 
     def _hold(self, wanted: str) -> Reply:
-        if wanted not in ("0", "1"):
-            return refusal(1012)
+        require(wanted in ("0", "1"), 1012)
         if wanted == "1":
             self.press_hold("command")
         else:

@@ -65,11 +65,7 @@ class Waits:
 class Terminal:
     """The controller's end of a pseudo terminal that can be pulled out and plugged in again.
 
-    Args:
-        link: name that it is found under as long as it is there; its own where None.
-
-    Raises:
-        UsageError: something else has that name.
+    While it is there it is found under the name ``link``, or its own; ``UsageError`` where something else has that.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -134,7 +130,7 @@ def serve(
     """Run until told to stop, or until a fault takes the port away.
 
     Args:
-        setup: the robot whose joints are behind the controller; its ``options.emulator`` says what kind it is.
+        setup: the robot; its ``options.emulator`` says what kind of controller it is.
         announce: told the name of the port once it can be opened.
         link: name for the port; without one, a port that a fault takes away stays away.
         faults: ``kind@n`` and so on.

@@ -243,21 +243,17 @@ class Station:
         """Bytes of a block including its two sum bytes, and whether it ended in a farewell instead."""
         until_s = self._now_s + self._p.timer_b_s
         raw = bytearray([first])
-        while len(raw) < 266:
+        ends_at = 0
+        while len(raw) != ends_at:
             byte = yield max(0.0, until_s - self._now_s)
             if byte is None:
-                return bytes(raw), False
+                break
             raw.append(byte)
-            if byte in (0x03, 0x17):
-                for _ in range(2):
-                    byte = yield max(0.0, until_s - self._now_s)
-                    if byte is None:
-                        return bytes(raw), False
-                    raw.append(byte)
-                return bytes(raw), False
-            if byte < 0x20 and byte not in (0x0D, 0x02):
+            if byte in (0x03, 0x17) and not ends_at:
+                ends_at = len(raw) + 2
+            elif not ends_at and (len(raw) == 266 or (byte < 0x20 and byte not in (0x0D, 0x02))):
                 return (yield from self._hush(byte))
-        return (yield from self._hush(raw[-1]))
+        return bytes(raw), False
 
     def _hush(self, last: int) -> Generator[float | None, int | None, tuple[bytes, bool]]:
         """Wait until the line is silent; nothing of it is a block, but a last EOT is a farewell."""

@@ -27,6 +27,10 @@ _SILENT_TICKS = 500
 """A line on which nobody speaks and nothing moves goes back to host control."""
 
 
+class _Refused(Exception):
+    """A frame is answered by NACK: code, axis, due tick."""
+
+
 class StreamApplication:
     """One streaming session after another, until the host leaves.
 
@@ -36,9 +40,6 @@ class StreamApplication:
         say: puts a frame on the wire; told kind and bytes.
         on_leave: the line goes back to host control.
         compensated: a friction table is being applied.
-
-    Attributes:
-        tick_number: of the interpolation clock, since streaming began.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class StreamApplication:
         self._extrapolated = False
         self._idle_ticks = 0
         self._home: list[int] = []
-        self.tick_number = 0
+        self.tick_number = 0  # since streaming began
 
     @property
     def moving(self) -> bool:
@@ -126,32 +127,21 @@ class StreamApplication:
 
     def _take(self, version: int, kind: int, sequence: int, payload: bytes) -> None:
         self._idle_ticks = 0
-        if version != VERSION:
-            self._nack(sequence, BAD_VERSION)
-        elif kind == HELLO:
-            self._open(sequence, payload)
-        elif kind == STOP:
-            self._stop(sequence, payload)
-        else:
-            self._set_point(sequence, payload)
+        try:
+            _require(version == VERSION, BAD_VERSION)
+            {HELLO: self._open, STOP: self._stop, SET_POINT: self._set_point}[kind](sequence, payload)
+        except _Refused as refused:
+            self._nack(sequence, *refused.args)
 
     # -- sessions ----------------------------------------------------------------------------------------------
 
     def _open(self, sequence: int, payload: bytes) -> None:
-        if len(payload) != 4:
-            self._nack(sequence, BAD_CRC)
-            return
+        _require(len(payload) == 4, BAD_CRC)
         oldest, newest, mask, session = payload
-        if not oldest <= VERSION <= newest:
-            self._nack(sequence, BAD_VERSION)
-            return
-        if session == 0 or mask == 0 or mask & ~self._granted:
-            self._nack(sequence, BAD_SESSION)
-            return
+        _require(oldest <= VERSION <= newest, BAD_VERSION)
+        _require(session and mask and not mask & ~self._granted, BAD_SESSION)
         if session != self._session:
-            if session == self._old_session:
-                self._nack(sequence, BAD_SESSION)
-                return
+            _require(session != self._old_session, BAD_SESSION)
             self._old_session, self._session = self._session, session
             self._mask = mask
             self._moved = [axis for number, axis in enumerate(self._axes) if mask >> number & 1]
@@ -176,13 +166,9 @@ class StreamApplication:
         self._send(HELLO, payload + b"".join(limits))
 
     def _stop(self, sequence: int, payload: bytes) -> None:
-        if len(payload) != 4:
-            self._nack(sequence, BAD_SESSION)
-            return
+        _require(len(payload) == 4, BAD_SESSION)
         session, kind = payload[0], payload[1]
-        if session != self._session and kind == 0:
-            self._nack(sequence, BAD_SESSION)
-            return
+        _require(session == self._session or kind != 0, BAD_SESSION)
         if self._armed:
             self.halt("host")
         self._send(STOP, payload)
@@ -203,15 +189,11 @@ class StreamApplication:
 
     def _set_point(self, sequence: int, payload: bytes) -> None:
         count = len(self._moved)
-        if len(payload) not in (4 + 4 * count, 4 + 6 * count) or not count:
-            self._nack(sequence, BAD_SESSION)
-            return
+        _require(count and len(payload) in (4 + 4 * count, 4 + 6 * count), BAD_SESSION)
         session, mask, due = struct.unpack_from("<BBH", payload)
         targets = list(struct.unpack_from(f"<{count}i", payload, 4))
         torques = list(struct.unpack_from(f"<{count}h", payload, 4 + 4 * count)) if len(payload) > 4 + 4 * count else []
-        if session != self._session or mask != self._mask:
-            self._nack(sequence, BAD_SESSION, due=due)
-            return
+        _require(session == self._session and mask == self._mask, BAD_SESSION, due=due)
         assert self._last_heard is not None
         ahead = (sequence - self._last_heard) & 0xFFFF
         if ahead != 1:
@@ -220,10 +202,7 @@ class StreamApplication:
             return
         self._last_heard = sequence
         wide_due = self.tick_number + ((due - self.tick_number) & 0xFFFF)
-        code, axis = self._judge(targets, wide_due)
-        if code:
-            self._nack(sequence, code, axis=axis, due=due)
-            return
+        self._judge(targets, wide_due, due)
         if not self._armed:
             self._armed = self._panel.operating = True
             self._misses = 0
@@ -231,20 +210,17 @@ class StreamApplication:
         self._last_due, self._last_asked = wide_due, targets
         self._queue[wide_due] = (targets, torques)
 
-    def _judge(self, targets: Sequence[int], due: int) -> tuple[int, int]:
-        """Why these targets are refused (0: they are not), and the axis that is to blame."""
-        if self._panel.alarm:
-            return ALARM, 0xFF
-        if self._latched or self._panel.moving_forbidden() not in (0, 2010):
-            return NOT_ARMED, 0xFF
-        if not 2 <= due - self.tick_number <= QUEUE or (self._armed and due <= self._last_due):
-            return LATE, 0xFF
-        ticks = due - self._last_due if self._armed else 1
+    def _judge(self, targets: Sequence[int], wide_due: int, due: int) -> None:
+        """Refuse what must not be followed; ``wide_due`` is the due tick in full."""
+        _require(not self._panel.alarm, ALARM, due=due)
+        _require(not self._latched and self._panel.moving_forbidden() in (0, 2010), NOT_ARMED, due=due)
+        _require(2 <= wide_due - self.tick_number <= QUEUE, LATE, due=due)
+        _require(not self._armed or wide_due > self._last_due, LATE, due=due)
+        ticks = wide_due - self._last_due if self._armed else 1
         for axis, target, before in zip(self._moved, targets, self._last_asked, strict=True):
             plate = axis.plate
-            if not plate.lowest <= target <= plate.highest or abs(target - before) > plate.step * ticks:
-                return LIMIT, self._axes.index(axis)
-        return 0, 0xFF
+            allowed = plate.lowest <= target <= plate.highest and abs(target - before) <= plate.step * ticks
+            _require(allowed, LIMIT, self._axes.index(axis), due)
 
     # -- the interpolation clock -------------------------------------------------------------------------------
 
@@ -342,3 +318,8 @@ class StreamApplication:
         )
         axes = [struct.pack("<iii", axis.pulses, axis.speed_tenths, axis.torque_micro) for axis in self._moved]
         self._send(FEEDBACK, payload + b"".join(axes))
+
+
+def _require(condition: object, code: int, axis: int = 0xFF, due: int = 0) -> None:
+    if not condition:
+        raise _Refused(code, axis, due)
