@@ -97,8 +97,8 @@ def batch_examples() -> dict[str, str]:
     made["FSTOP"] = wire.written(lambda: client.stop(7))
     units = axis_units(wire.bench.setup.joints)["0"]
     table = friction_table(units, CURVE, 0.9, 8000.0, 4.0, 0.0)
-    made["FTABLE"] = wire.written(lambda: host.order(f"FTABLE 1,{table.encoded()}"))
-    made["FTABLE-raw"] = base64.b64decode(table.encoded()).hex(" ") + "\n"
+    made["FTABLE"] = wire.written(lambda: host.order(f"FTABLE 1,{table}"))
+    made["FTABLE-raw"] = base64.b64decode(table).hex(" ") + "\n"
     made["FTREAD"] = asked("FTREAD 1,0")
     made["FCOMP"] = wire.written(lambda: client.compensate(1))
     made["FSTREAM"] = wire.written(lambda: host.order("FSTREAM 1,921600,4000,1"))

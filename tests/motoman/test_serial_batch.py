@@ -509,7 +509,7 @@ def test_the_downloaded_table_gives_the_curve_back(direction: int) -> None:
 
 def test_a_damaged_table_is_refused() -> None:
     bench = make_bench()
-    coded = friction_table(UNITS, CURVE, 0.9, 8000.0, 0.0, 0.0).encoded()
+    coded = friction_table(UNITS, CURVE, 0.9, 8000.0, 0.0, 0.0)
     with pytest.raises(FormatMistake):
         bench.host().order(f"FTABLE 1,{coded[:20]}{'A' if coded[20] != 'A' else 'B'}{coded[21:]}")
     bench.host().order(f"FTABLE 1,{coded}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from frictid_drivers.motoman.batch_messages import BatchHello, FrictionTable, JobOrder, JobState
+from frictid_drivers.motoman.batch_messages import BatchHello, JobOrder, JobState
 from frictid_drivers.motoman.controller_errors import (
     BadReply,
     ControllerError,
@@ -43,19 +43,12 @@ class BatchClient:
         """FHELLO, and whether FREAD 2 is known; ``UnknownCommand`` where there is no such application."""
         reply = self.host.ask("FHELLO 1")
         try:
-            version, tick_us, axes, most_ticks, source, averaging, points, name = reply.split(",", 7)
+            version, *figures, name = reply.split(",", 7)
             if int(version) != 1:
                 raise BadReply(f"the batch application speaks version {version}, we speak 1", where="FHELLO")
-            return BatchHello(
-                tick_us=int(tick_us),
-                axes=int(axes),
-                most_ticks=int(most_ticks),
-                torque_measured=int(source) == 1,
-                averaging_ms=None if int(averaging) < 0 else int(averaging),
-                table_points=int(points),
-                name=name,
-                reads_while_running=self._reads_while_running(),
-            )
+            tick_us, axes, most_ticks, source, averaging, table_points = map(int, figures)
+            averaging_ms, more = None if averaging < 0 else averaging, self._reads_while_running()
+            return BatchHello(tick_us, axes, most_ticks, source == 1, averaging_ms, table_points, name, more)
         except ValueError:
             raise self.host.bad_reply(f"{reply!r} instead of a greeting", "FHELLO") from None
 
@@ -166,12 +159,11 @@ class BatchClient:
                     if not follow(state, within_s):
                         self.host.listen(min(0.05, pause_until_s - now_s()))
 
-    def download(self, table: FrictionTable) -> None:
+    def download(self, axis: int, coded: str) -> None:
         """FTABLE, read back and compared; ``BadReply`` where what comes back is not what was sent."""
-        coded = table.encoded()
         self.host.order(f"FTABLE 1,{coded}")
-        if self.host.ask(f"FTREAD 1,{table.axis}") != coded:
-            raise BadReply("the friction table reads back differently", where=f"axis {table.axis}")
+        if self.host.ask(f"FTREAD 1,{axis}") != coded:
+            raise BadReply("the friction table reads back differently", where=f"axis {axis}")
 
     def compensate(self, axis_mask: int) -> None:
         """FCOMP: apply the tables of these axes from now on; 0 ends it."""

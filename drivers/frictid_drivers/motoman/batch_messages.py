@@ -71,30 +71,6 @@ class JobState:
     dropped_pulses: int
 
 
-@dataclass(frozen=True, slots=True)
-class FrictionTable:
-    """One axis's compensation: the curve at equal steps of speed from standstill, and how to apply it."""
-
-    axis: int
-    ratio: float  # R of (24c)
-    step_tenths: int  # 0.1 pulse/s between two points
-    stiffness_nano: int  # K of (24a) at the motor shaft, nN m per pulse
-    turn_pulses: int  # pulses per revolution of the joint
-    gravity_cos_micro: int  # what holds the joint against gravity, uN m at the motor shaft; cosine part
-    gravity_sin_micro: int  # sine part
-    points_micro: Sequence[int]  # phi at 0, 1 .. 20 steps, uN m at the motor shaft; the first is F_0
-
-    def encoded(self) -> str:
-        """Base64 with its CRC."""
-        raw = struct.pack(
-            "<BBHIIIii",
-            *(self.axis, len(self.points_micro), round(self.ratio * 1e4), self.step_tenths, self.stiffness_nano),
-            *(self.turn_pulses, self.gravity_cos_micro, self.gravity_sin_micro),
-        )
-        raw += struct.pack(f"<{len(self.points_micro)}i", *self.points_micro)
-        return base64.b64encode(raw + crc16(raw).to_bytes(2, "little")).decode("ascii")
-
-
 def friction_table(
     units: AxisUnits,
     curve: FrictionCurve,
@@ -102,20 +78,23 @@ def friction_table(
     stiffness_nm_per_rad: float,
     gravity_cos_nm: float,
     gravity_sin_nm: float,
-) -> FrictionTable:
-    """21 points from standstill to the fastest identified speed, in the controller's units; see ``download_table``."""
+) -> str:
+    """One axis's compensation, base64 with its CRC; see ``download_table``.
+
+    The curve is given at 21 equal steps of speed from standstill to the fastest identified one, in the controller's
+    units: torque in uN m at the motor shaft, positions in pulses, speed in 0.1 pulse/s, stiffness in nN m per pulse.
+    """
     pulses_per_rad = abs(units.pulses_per_rad)
     fastest_rad_s = curve.measured_range_rad_s[1]
     step_tenths = max(1, round(fastest_rad_s / (TABLE_POINTS - 1) * pulses_per_rad * 10.0))
     speeds_rad_s = np.arange(TABLE_POINTS) * step_tenths * 0.1 / pulses_per_rad
-    return FrictionTable(
-        axis=units.axis,
-        ratio=ratio,
-        step_tenths=step_tenths,
-        stiffness_nano=max(1, round(stiffness_nm_per_rad / units.gear_ratio / pulses_per_rad * 1e9)),
-        turn_pulses=round(2 * math.pi * pulses_per_rad),
+    stiffness_nano = max(1, round(stiffness_nm_per_rad / units.gear_ratio / pulses_per_rad * 1e9))
+    raw = struct.pack(
+        f"<BBHIIIii{TABLE_POINTS}i",
+        *(units.axis, TABLE_POINTS, round(ratio * 1e4), step_tenths, stiffness_nano),
+        round(2 * math.pi * pulses_per_rad),
         # Where positive pulses turn the joint backwards, torque and angle change sign: cosine flips, sine stays.
-        gravity_cos_micro=units.motor_micro(gravity_cos_nm) * units.direction,
-        gravity_sin_micro=units.motor_micro(gravity_sin_nm),
-        points_micro=[units.motor_micro(float(torque)) for torque in curve.magnitude(speeds_rad_s)],
+        *(units.motor_micro(gravity_cos_nm) * units.direction, units.motor_micro(gravity_sin_nm)),
+        *(units.motor_micro(float(torque)) for torque in curve.magnitude(speeds_rad_s)),
     )
+    return base64.b64encode(raw + crc16(raw).to_bytes(2, "little")).decode("ascii")

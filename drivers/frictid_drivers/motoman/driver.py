@@ -342,9 +342,9 @@ class MotomanDriver:
         """
         if not self.capabilities().table_download:
             raise HardwareError("this controller takes no friction table", where=f"joint {joint}")
-        self._open_line().batch.download(
-            friction_table(self._units[joint], curve, ratio, stiffness_nm_per_rad, gravity_cos_nm, gravity_sin_nm)
-        )
+        units = self._units[joint]
+        table = friction_table(units, curve, ratio, stiffness_nm_per_rad, gravity_cos_nm, gravity_sin_nm)
+        self._open_line().batch.download(units.axis, table)
 
     def compensate_by_table(self, joints: Sequence[str]) -> None:
         """Apply the downloaded tables of these joints from now on; none ends it."""

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import select
 import termios
@@ -17,6 +18,7 @@ import serial
 from frictid_hil.errors import HardwareBusy, HardwareError
 
 _REOPEN_EVERY_S = 0.5
+_LOST = (serial.SerialException, OSError, termios.error)
 
 
 Sink = Callable[[bytes, bool], None]
@@ -61,9 +63,10 @@ class SerialPort:
         self._path = path
         self._line = (baud, parity)
         self._serial: serial.Serial | None = None
-        self._connect(path, baud, parity)
+        self._connect()
 
-    def _connect(self, path: str, baud: int, parity: str) -> None:
+    def _connect(self) -> None:
+        path, (baud, parity) = self._path, self._line
         try:
             self._serial = serial.Serial(
                 path, baud, bytesize=8, parity=parity, stopbits=1, timeout=0, write_timeout=1.0, exclusive=True
@@ -86,7 +89,7 @@ class SerialPort:
             raise HardwareError(
                 "the port accepts no more bytes", where=self._path, cause="flow control, or a stuck adapter"
             ) from None
-        except (serial.SerialException, OSError, termios.error) as error:
+        except _LOST as error:
             raise self._gone(error) from None
 
     def read(self, timeout_s: float) -> bytes:
@@ -97,7 +100,7 @@ class SerialPort:
             if not ready:
                 return b""
             data: bytes = port.read(max(1, port.in_waiting))
-        except (serial.SerialException, OSError, termios.error) as error:
+        except _LOST as error:
             raise self._gone(error) from None
         return data
 
@@ -118,17 +121,15 @@ class SerialPort:
         """Open the same device again, at the speed that it was opened with."""
         self.close()
         time.sleep(_REOPEN_EVERY_S)
-        self._connect(self._path, *self._line)
+        self._connect()
 
     def close(self) -> None:
         """Release the port and its lock."""
         port, self._serial = self._serial, None
         if port is not None:
-            try:
+            # Where it was unplugged, the kernel has taken it back already.
+            with contextlib.suppress(*_LOST):
                 port.close()
-            except (serial.SerialException, OSError, termios.error):
-                # It was unplugged; the kernel has taken it back already.
-                return
 
     def _verify(self, baud: int, parity: str) -> None:
         """Read back: a pseudo terminal may drop the parity bit without a word."""
