@@ -30,21 +30,13 @@ _BY_DRIVE = "the drive stops by itself (1016, 6007)"
 
 @dataclass(frozen=True, slots=True)
 class StopPath:
-    """One way in which motion ends.
+    """One way in which motion ends."""
 
-    Attributes:
-        trip: what happens.
-        seen: how soon it is noticed.
-        reaction: what is done.
-        time: how long the reaction may take until the joint stands.
-        ending: whose exit code it is; None where this program is no more.
-    """
-
-    trip: str
-    seen: str
-    reaction: str
-    time: str
-    ending: type[FrictidError] | None
+    trip: str  # what happens
+    seen: str  # how soon it is noticed
+    reaction: str  # what is done
+    time: str  # how long the reaction may take until the joint stands
+    ending: type[FrictidError] | None  # whose exit code it is; None where this program is no more
 
 
 def _paths() -> list[StopPath]:

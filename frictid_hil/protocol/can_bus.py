@@ -40,11 +40,7 @@ _CLASSICAL_MTU = 16
 
 
 def split_bus(bus: str) -> tuple[str, str]:
-    """``"socketcan:can0"`` to interface and channel.
-
-    Raises:
-        UsageError: no colon.
-    """
+    """``"socketcan:can0"`` to interface and channel; ``UsageError`` for anything else."""
     interface, colon, channel = bus.partition(":")
     if not (interface and colon and channel):
         raise UsageError(
@@ -55,11 +51,7 @@ def split_bus(bus: str) -> tuple[str, str]:
 
 
 def open_bus(bus: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open any python-can interface.
-
-    Args:
-        bus: ``interface:channel``.
-        options: of the robot file; bit rates and a few others go to the interface.
+    """Open any python-can interface; bit rates and a few other options of the robot file go to it.
 
     Raises:
         UsageError: not of that form, or faults for a bus that injects none.
@@ -132,11 +124,7 @@ def _settings(bus: str, interface: str, options: Mapping[str, Any]) -> dict[str,
 
 
 def _fd_settings(bus: str, interface: str, settings: dict[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """What makes an interface CAN FD; each family of python-can's has its own way of being told.
-
-    Raises:
-        HardwareError: an interface that python-can cannot make CAN FD.
-    """
+    """What makes an interface CAN FD; each family of python-can's has its own way of being told."""
     bitrate = int(options.get("bitrate", DEFAULT_BITRATE))
     data_bitrate = int(options.get("data_bitrate", max(DEFAULT_DATA_BITRATE, bitrate)))
     if interface in _FD_BY_LINK:

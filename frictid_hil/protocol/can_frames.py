@@ -38,13 +38,9 @@ CONTROLLER_STATES = {
 
 
 class Frames(Protocol):
-    """A bus for one cycle.
+    """A bus for one cycle."""
 
-    Attributes:
-        controller: what error frames last said of our own CAN controller: a key of ``CONTROLLER_STATES``, or "".
-    """
-
-    controller: str
+    controller: str  # what error frames last said of our own CAN controller: a key of ``CONTROLLER_STATES``, or ""
 
     def send(self, frames: Sequence[tuple[int, bytes]]) -> None:
         """Send all of them, in order.

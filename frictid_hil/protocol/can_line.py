@@ -70,11 +70,7 @@ class CanLine:
             raise
 
     def highest_rate_hz(self, cycle_frames: Iterable[tuple[int, int]]) -> float:
-        """The highest whole rate at which these frames of one cycle leave a fifth of this bus.
-
-        Args:
-            cycle_frames: identifiers with their flags, each with its number of data bytes.
-        """
+        """The highest whole rate at which the frames of a cycle (identifier, data bytes) leave a fifth of this bus."""
         return highest_rate_hz(cycle_frames, self._rates)
 
     def send(self, can_id: int, data: bytes) -> int:
@@ -103,11 +99,7 @@ class CanLine:
         return t_ns
 
     def received(self, until_ns: int | None = None) -> Iterator[tuple[int, int, bytes]]:
-        """Frames as they come: run time, identifier, data.
-
-        Args:
-            until_ns: wait for more until then; None for those that are here already.
-        """
+        """Frames as they come: run time, identifier, data; waits for more until ``until_ns``."""
         while True:
             left_s = 0.0 if until_ns is None else max(0.0, (until_ns - self._clock.now_ns()) * 1e-9)
             # In lock-step answers are there when ``send`` returns: what is not there will not come.

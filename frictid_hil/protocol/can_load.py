@@ -60,15 +60,7 @@ class FrameBits:
 
 
 def frame_bits(data_bytes: int, *, extended: bool = False) -> FrameBits:
-    """Bits of a classical data frame.
-
-    Args:
-        data_bytes: 0 to 8.
-        extended: with a 29-bit identifier.
-
-    Raises:
-        ValueError: not a classical frame.
-    """
+    """Bits of a classical data frame; ``ValueError`` for more than 8 bytes. ``extended``: with a 29-bit identifier."""
     if not 0 <= data_bytes <= 8:
         raise ValueError(f"a classical CAN frame carries 0..8 bytes, not {data_bytes}")
     more = _LONGER * extended + 8 * data_bytes
@@ -77,24 +69,14 @@ def frame_bits(data_bytes: int, *, extended: bool = False) -> FrameBits:
 
 
 def fd_size(data_bytes: int) -> int:
-    """The shortest CAN FD frame that so many bytes fit into; the rest is padding.
-
-    Raises:
-        ValueError: more than 64.
-    """
-    for size in FD_SIZES:
-        if data_bytes <= size:
-            return size
-    raise ValueError(f"a CAN FD frame carries at most 64 bytes, not {data_bytes}")
+    """The shortest CAN FD frame that so many bytes fit into; the rest is padding. ``ValueError`` for more than 64."""
+    if data_bytes > FD_SIZES[-1]:
+        raise ValueError(f"a CAN FD frame carries at most 64 bytes, not {data_bytes}")
+    return next(size for size in FD_SIZES if size >= data_bytes)
 
 
 def fd_frame_bits(data_bytes: int, rates: BitRates, *, extended: bool = False) -> FrameBits:
-    """Length of a CAN FD frame with bit-rate switch; see the head of this file.
-
-    Args:
-        data_bytes: as mapped; padded to the next size that there is.
-        rates: both.
-        extended: with a 29-bit identifier.
+    """Length of a CAN FD frame with bit-rate switch, padded to the next size that there is; see the head of this file.
 
     Raises:
         ValueError: more than 64 bytes, or a classical bus.
@@ -113,12 +95,7 @@ def fd_frame_bits(data_bytes: int, rates: BitRates, *, extended: bool = False) -
 
 
 def highest_rate_hz(cycle_frames: Iterable[tuple[int, int]], rates: BitRates) -> float:
-    """The highest whole rate at which these frames leave a fifth of the bus.
-
-    Args:
-        cycle_frames: of one cycle, each an identifier with its flags and its data bytes.
-        rates: of the bus.
-    """
+    """The highest whole rate at which the frames of a cycle (identifier, data bytes) leave a fifth of the bus."""
     bits = 0.0
     for can_id, data_bytes in cycle_frames:
         extended = bool(can_id & EXTENDED)

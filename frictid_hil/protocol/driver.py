@@ -47,174 +47,114 @@ class Timing:
     """When a row's figures were true, relative to the row's time stamp (declared by the drive or its robot file).
 
     A delay of 2 ms says that the value reported at t was true at t - 2 ms.
-
-    Attributes:
-        position_delay_s: of the reported position.
-        velocity_delay_s: of the reported velocity, filters included.
-        torque_delay_s: of the reported torque, filters and zero-order hold included.
-        torque_lag_s: the part of it that is a first-order low-pass, which can be undone and not only shifted back.
-        uncertainty_s: one standard deviation of the torque-to-velocity skew that remains.
-        source: where these figures come from (``drive``, ``robot file``, ``assumed``).
     """
 
-    position_delay_s: float = 0.0
-    velocity_delay_s: float = 0.0
-    torque_delay_s: float = 0.0
+    position_delay_s: float = 0.0  # of the reported position
+    velocity_delay_s: float = 0.0  # of the reported velocity, filters included
+    torque_delay_s: float = 0.0  # of the reported torque, filters and zero-order hold included
+    # The part of it that is a first-order low-pass, which can be undone and not only shifted back.
     torque_lag_s: float = 0.0
-    uncertainty_s: float = 0.0002
-    source: str = "assumed"
+    uncertainty_s: float = 0.0002  # one standard deviation of the torque-to-velocity skew that remains
+    source: str = "assumed"  # where these figures come from (``drive``, ``robot file``, ``assumed``)
 
 
 @dataclass(frozen=True, slots=True)
 class JointIdentity:
-    """What a drive says of itself; recorded in every profile as provenance.
+    """What a drive says of itself; recorded in every profile as provenance."""
 
-    Attributes:
-        joint: name.
-        serial: the drive's serial number ("" where it has none).
-        firmware: its version.
-        product: vendor and product codes or names.
-        rated_torque_nm: joint side, as read back from the drive (object 6076 times gear ratio).
-        gear_ratio: as read back, or as configured where the drive does not know it.
-        position_resolution_rad: one count.
-        torque_resolution_nm: one step of the reported torque.
-        torque_source: what the reported torque is (``6077 actual torque``, ``mpSvsGetVelTrqFb``, ``simulated``).
-        timing: when reported figures were true.
-        settings: friction compensation, feed-forward, filters, as far as objects are known; values as read.
-    """
-
-    joint: str
-    serial: str = ""
-    firmware: str = ""
-    product: str = ""
-    rated_torque_nm: float = NAN
-    gear_ratio: float = NAN
-    position_resolution_rad: float = NAN
-    torque_resolution_nm: float = NAN
-    torque_source: str = ""
-    timing: Timing = Timing()
+    joint: str  # name
+    serial: str = ""  # the drive's serial number ("" where it has none)
+    firmware: str = ""  # its version
+    product: str = ""  # vendor and product codes or names
+    rated_torque_nm: float = NAN  # joint side, as read back from the drive (object 6076 times gear ratio)
+    gear_ratio: float = NAN  # as read back, or as configured where the drive does not know it
+    position_resolution_rad: float = NAN  # one count
+    torque_resolution_nm: float = NAN  # one step of the reported torque
+    torque_source: str = ""  # what the reported torque is (``6077 actual torque``, ``mpSvsGetVelTrqFb``, ``simulated``)
+    timing: Timing = Timing()  # when reported figures were true
+    # Friction compensation, feed-forward, filters, as far as objects are known; values as read.
     settings: Mapping[str, str | float | int | bool] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What this driver can do with this hardware; the runner asks rather than tries.
+    """What this driver can do with this hardware; the runner asks rather than tries."""
 
-    Attributes:
-        max_cycle_hz: highest cycle rate of the configured layout.
-        modes: set-point modes that every joint supports.
-        torque_offset: a torque can be added on top of position or velocity control (60B2, or a goal that moves).
-        drive_watchdog: the drive stops by itself when the host dies.
-        batch_only: no cyclic exchange; the driver is ``Batched`` instead.
-        lock_step: virtual time: cycles run as fast as the processor allows and never late.
-        cycle_quantum_s: durations of motions are rounded to multiples of this (0: no rounding); 4 ms ticks on serial.
-        external_torque: feedback carries a force sensor's torque.
-        temperature: feedback carries a motor or gear temperature.
-        table_download: a friction table can be compensated on the controller's own tick.
-        command_delay_s: delay from the set-point in force (``Feedback.position_command_rad``) to motion that is normal
-            here; following errors are judged with it.
-        digital_inputs: a joint with the option ``digital_inputs: true`` reports its inputs in the feedback, so that an
-            interlock can be watched.
-        droop_rad: how far a joint may stand beside its set-point because its position loop has no integral part, by
-            joint; following error and standstill are judged with it.
-    """
-
-    max_cycle_hz: float
-    modes: frozenset[Mode]
+    max_cycle_hz: float  # highest cycle rate of the configured layout
+    modes: frozenset[Mode]  # set-point modes that every joint supports
+    # A torque can be added on top of position or velocity control (60B2, or a goal that moves).
     torque_offset: bool = False
-    drive_watchdog: bool = False
-    batch_only: bool = False
-    lock_step: bool = False
+    drive_watchdog: bool = False  # the drive stops by itself when the host dies
+    batch_only: bool = False  # no cyclic exchange; the driver is ``Batched`` instead
+    lock_step: bool = False  # virtual time: cycles run as fast as the processor allows and never late
+    # Durations of motions are rounded to multiples of this (0: no rounding); 4 ms ticks on serial.
     cycle_quantum_s: float = 0.0
-    external_torque: bool = False
-    temperature: bool = False
-    table_download: bool = False
+    external_torque: bool = False  # feedback carries a force sensor's torque
+    temperature: bool = False  # feedback carries a motor or gear temperature
+    table_download: bool = False  # a friction table can be compensated on the controller's own tick
+    # Delay from the set-point in force (``Feedback.position_command_rad``) to motion that is normal here; following
+    # errors are judged with it.
     command_delay_s: float = 0.0
+    # A joint with the option ``digital_inputs: true`` reports its inputs in the feedback, so that an interlock can be
+    # watched.
     digital_inputs: bool = False
+    # How far a joint may stand beside its set-point because its position loop has no integral part, by joint; following
+    # error and standstill are judged with it.
     droop_rad: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class DriverKind:
-    """What a driver is, known before anything is opened: its class attribute ``kind``.
+    """What a driver is, known before anything is opened: its class attribute ``kind``."""
 
-    Attributes:
-        simulated: nothing real moves, so nobody is asked and no payload has to be mounted by hand.
-        line: what it speaks on: ``can`` (any python-can interface), ``serial``, or ``virtual``.
-        addressed_by: key of a joint in the robot file that says where it is found: ``node``, ``axis`` or ``id``.
-        addresses: lowest and highest address there is.
-        elsewhere: names of the drivers that reach the same robot on another line, by line.
-        care: bounds of the supervisor that suit these devices, where other than usual, by name (``runner.care.Care``);
-            a robot file overrides them.
-        gates: the same of what quality gates allow (``friction.gate.GateLimits``).
-    """
-
-    simulated: bool = False
-    line: str = "can"
+    simulated: bool = False  # nothing real moves, so nobody is asked and no payload has to be mounted by hand
+    line: str = "can"  # what it speaks on: ``can`` (any python-can interface), ``serial``, or ``virtual``
+    # Key of a joint in the robot file that says where it is found: ``node``, ``axis`` or ``id``.
     addressed_by: str = "id"
-    addresses: tuple[int, int] = (0, 0x7FF)
+    addresses: tuple[int, int] = (0, 0x7FF)  # lowest and highest address there is
+    # Names of the drivers that reach the same robot on another line, by line.
     elsewhere: Mapping[str, str] = field(default_factory=dict)
+    # Bounds of the supervisor that suit these devices, where other than usual, by name (``runner.care.Care``); a robot
+    # file overrides them.
     care: Mapping[str, float] = field(default_factory=dict)
+    # The same of what quality gates allow (``friction.gate.GateLimits``).
     gates: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class SetPoint:
-    """What one joint shall do in the coming cycle; reused from cycle to cycle, never reallocated.
+    """What one joint shall do in the coming cycle; reused from cycle to cycle, never reallocated."""
 
-    Attributes:
-        position_rad: target in position mode; beside the measured position in the recording in other modes.
-        velocity_rad_s: target in velocity mode; in position mode how fast ``position_rad`` moves (feed-forward).
-        torque_nm: target in torque mode.
-        torque_offset_nm: added in every mode.
-    """
-
-    position_rad: float = 0.0
+    position_rad: float = 0.0  # target in position mode; beside the measured position in the recording in other modes
+    # Target in velocity mode; in position mode how fast ``position_rad`` moves (feed-forward).
     velocity_rad_s: float = 0.0
-    torque_nm: float = 0.0
-    torque_offset_nm: float = 0.0
+    torque_nm: float = 0.0  # target in torque mode
+    torque_offset_nm: float = 0.0  # added in every mode
 
 
 @dataclass(slots=True)
 class Feedback:
-    """What one joint reported last; reused from cycle to cycle, never reallocated.
+    """What one joint reported last; reused from cycle to cycle, never reallocated."""
 
-    Attributes:
-        t_ns: run time of the sample (the SYNC that latched it), integer nanoseconds.
-        position_rad: actual position.
-        velocity_rad_s: the drive's own velocity.
-        torque_nm: the drive's own torque.
-        external_torque_nm: force sensor, NaN where there is none.
-        temperature_c: NaN where unknown.
-        position_command_rad: the set-point in force at ``t_ns`` as it went out, rounded to the drive's counts; NaN
-            where the driver does not tell, none was sent yet, or the mode follows none.
-        digital_inputs: bits of the drive's inputs (60FD), None before their first report or where none is configured.
-        digital_inputs_age_cycles: cycles since they were reported.
-        state: of the power stage.
-        mode: as displayed by the drive (6061), NONE where not yet reported.
-        status_raw: statusword or controller status as sent.
-        error_code: 603F or alarm number; 0 when healthy.
-        age_cycles: cycles since this joint last reported; 0 = this cycle.
-        valid: False until the first report, and when the report could not be decoded.
-        limited: the drive says that one of its limits cuts the set-point or the torque (statusword bit 11).
-    """
-
-    t_ns: int = 0
-    position_rad: float = NAN
-    velocity_rad_s: float = NAN
-    torque_nm: float = NAN
-    external_torque_nm: float = NAN
-    temperature_c: float = NAN
+    t_ns: int = 0  # run time of the sample (the SYNC that latched it), integer nanoseconds
+    position_rad: float = NAN  # actual position
+    velocity_rad_s: float = NAN  # the drive's own velocity
+    torque_nm: float = NAN  # the drive's own torque
+    external_torque_nm: float = NAN  # force sensor, NaN where there is none
+    temperature_c: float = NAN  # NaN where unknown
+    # The set-point in force at ``t_ns`` as it went out, rounded to the drive's counts; NaN where the driver does not
+    # tell, none was sent yet, or the mode follows none.
     position_command_rad: float = NAN
+    # Bits of the drive's inputs (60FD), None before their first report or where none is configured.
     digital_inputs: int | None = None
-    digital_inputs_age_cycles: int = 0
-    state: JointState = JointState.UNKNOWN
-    mode: Mode = Mode.NONE
-    status_raw: int = 0
-    error_code: int = 0
-    age_cycles: int = 0
-    valid: bool = False
-    limited: bool = False
+    digital_inputs_age_cycles: int = 0  # cycles since they were reported
+    state: JointState = JointState.UNKNOWN  # of the power stage
+    mode: Mode = Mode.NONE  # as displayed by the drive (6061), NONE where not yet reported
+    status_raw: int = 0  # statusword or controller status as sent
+    error_code: int = 0  # 603F or alarm number; 0 when healthy
+    age_cycles: int = 0  # cycles since this joint last reported; 0 = this cycle
+    valid: bool = False  # False until the first report, and when the report could not be decoded
+    limited: bool = False  # the drive says that one of its limits cuts the set-point or the torque (statusword bit 11)
 
 
 class Severity(Enum):
@@ -236,21 +176,13 @@ A calibration then measures the stiffness of that loop."""
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of ``frictid-hil check``.
+    """One line of ``frictid-hil check``."""
 
-    Attributes:
-        severity: an ``error`` forbids motion.
-        subject: joint, object or setting (``joint 1``, ``bus``).
-        message: what was found, with numbers and units.
-        next_step: what to do about it ("" when nothing).
-        topic: by which a job recognises what it judges by itself; "" for most.
-    """
-
-    severity: Severity
-    subject: str
-    message: str
-    next_step: str = ""
-    topic: str = ""
+    severity: Severity  # an ``error`` forbids motion
+    subject: str  # joint, object or setting (``joint 1``, ``bus``)
+    message: str  # what was found, with numbers and units
+    next_step: str = ""  # what to do about it ("" when nothing)
+    topic: str = ""  # by which a job recognises what it judges by itself; "" for most
 
 
 EXTENDED = 1 << 31
@@ -264,13 +196,9 @@ sent it."""
 
 
 class Clock(Protocol):
-    """Run time: integer nanoseconds since ``start_cycling``. Wall clock or lock-step, the loop cannot tell.
+    """Run time: integer nanoseconds since ``start_cycling``. Wall clock or lock-step, the loop cannot tell."""
 
-    Attributes:
-        lock_step: time is virtual. Where it is not, the loop gets a process of its own.
-    """
-
-    lock_step: bool
+    lock_step: bool  # time is virtual. Where it is not, the loop gets a process of its own
 
     def now_ns(self) -> int:
         """Run time now."""
@@ -400,12 +328,9 @@ class Batched(Protocol):
 
     Its ``start_cycling`` and ``stop_cycling`` begin and end a stretch under power; in between there are ``standing``
     and ``run_batch`` instead of ``exchange``, and all joints but the one that runs are held by the controller.
-
-    Attributes:
-        batch_columns: what was fetched of the last job; after an error, as far as the transfer came.
     """
 
-    batch_columns: Mapping[str, Any]
+    batch_columns: Mapping[str, Any]  # what was fetched of the last job; after an error, as far as the transfer came
 
     def standing(self) -> Sequence[Feedback]:
         """Position and state of every joint, slowly read; without velocity and torque."""
@@ -497,11 +422,7 @@ def unknown_options(
 ) -> list[FieldProblem]:
     """A problem for every option that the driver does not take, with the option that was probably meant.
 
-    Args:
-        given: the options of the robot file, or those of one joint.
-        known: what the driver takes there.
-        path: of ``given`` in the robot file.
-        driver: its name, as the robot file has it.
+    ``given`` are the options of the robot file, or those of one joint, and ``path`` says where they stand in it.
     """
     problems = []
     for name in given:
@@ -521,16 +442,9 @@ def number_option(
     path: tuple[str, ...],
     problems: list[FieldProblem],
 ) -> float:
-    """A number among the options; where it is none from ``low`` to ``high``, a problem is added.
+    """A number among the options, ``usual`` where it is not given; not from ``low`` to ``high``, it is a problem more.
 
-    Args:
-        given: the options of the robot file, or those of one joint.
-        name: of the option.
-        usual: its value where it is not given.
-        low: smallest value.
-        high: largest value.
-        path: of ``given`` in the robot file.
-        problems: found so far.
+    ``given`` are the options of the robot file, or those of one joint, and ``path`` says where they stand in it.
     """
     value = given.get(name, usual)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:

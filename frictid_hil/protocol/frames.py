@@ -52,11 +52,7 @@ class FrameDecoders(Protocol):
     schema: str  # of the frame maps it understands
 
     def decoder(self, frame_map: Mapping[str, Any]) -> LogDecoder:
-        """A decoder for logs with this frame map.
-
-        Raises:
-            InvalidFields: every field of the map that is wrong.
-        """
+        """A decoder for logs with this frame map; ``InvalidFields`` names every field of the map that is wrong."""
 
     def map_from_eds(self, path: Path, setup: RobotSetup) -> Mapping[str, Any]:
         """The frame map of drives that were mapped as their EDS or DCF file says.
@@ -67,11 +63,7 @@ class FrameDecoders(Protocol):
 
 
 def frame_decoders(schema: str) -> FrameDecoders:
-    """The decoders for frame maps of this schema.
-
-    Raises:
-        InvalidFields: nobody installed understands it.
-    """
+    """The decoders for frame maps of this schema; ``InvalidFields`` where nobody installed understands it."""
     known = []
     for point in entry_points(group=GROUP):
         loaded: FrameDecoders = point.load()

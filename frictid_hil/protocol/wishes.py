@@ -48,11 +48,9 @@ class Order:
 
 
 class Wish:
-    """What is asked of one joint.
+    """What is asked of one joint, whose own limits hold until ``limit`` sets others.
 
-    Args:
-        joint: of the robot; its limits hold until ``limit`` sets others.
-        feedback: the driver's own object of this joint; orders depend on its state and position.
+    ``feedback`` is the driver's own object of this joint; orders depend on its state and position.
     """
 
     def __init__(self, joint: JointSetup, feedback: Feedback) -> None:

@@ -42,29 +42,18 @@ from frictid_hil.protocol.frames import LogDecoder
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a fake knows of a joint, joint side, in the joint's direction.
+    """What a fake knows of a joint, joint side, in the joint's direction."""
 
-    Attributes:
-        position_rad: where it is.
-        velocity_rad_s: how fast it moves.
-        torque_nm: what its motor gives.
-        powered: its power stage is on.
-    """
-
-    position_rad: float
-    velocity_rad_s: float
-    torque_nm: float
-    powered: bool
+    position_rad: float  # where it is
+    velocity_rad_s: float  # how fast it moves
+    torque_nm: float  # what its motor gives
+    powered: bool  # its power stage is on
 
 
 class Bench(Protocol):
-    """Your fake: a robot of one joint or more that stands without power at its locked positions.
+    """Your fake: a robot of one joint or more that stands without power at its locked positions."""
 
-    Attributes:
-        setup: of the robot; its ``cycle_hz`` is used. Joints need some friction or inertia, and room to move.
-    """
-
-    setup: RobotSetup
+    setup: RobotSetup  # of the robot; its ``cycle_hz`` is used. Joints need some friction or inertia, and room to move
 
     def driver(self) -> Driver:
         """A new driver on a fresh wire; what the others do concerns the newest one."""
@@ -80,17 +69,9 @@ class Bench(Protocol):
 
 
 class Rig:
-    """A driver that cycles.
+    """A driver that is opened, configured at the bench's rate, and cycles; set-points are at the locked positions.
 
-    Args:
-        bench: yours.
-
-    Attributes:
-        driver: opened, configured at the bench's rate, cycling.
-        set_points: of all joints, at their locked positions.
-        frames: all that was told to the frame sink.
-        rows: what each cycle reported, as text, where ``keep`` was set.
-        keep: whether to.
+    ``frames`` are all that was told to the frame sink, ``rows`` what each cycle reported, as text, where ``keep`` is.
     """
 
     def __init__(self, bench: Bench) -> None:

@@ -29,8 +29,7 @@ class Devices(Protocol):
 class ManualClock:
     """Run time in lock-step: it passes only while somebody waits for it.
 
-    Args:
-        advance: told how far time goes on, ns since this clock was made.
+    ``advance`` is told how far time goes on, ns since this clock was made.
     """
 
     lock_step = True
