@@ -21,7 +21,8 @@ from frictid_drivers.motoman.bsc_block import (
     decode_block,
     encode_blocks,
 )
-from frictid_drivers.motoman.emulator.station import Parameters, Station, _pieces, _read
+from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.motoman.emulator.station import Station, _pieces, _read
 
 GOLDEN = {
     ("01,000", "RSTATS"): "01 30 31 2c 30 30 30 02 52 53 54 41 54 53 0d 03 10 03",
@@ -82,7 +83,7 @@ def test_golden_exchange_as_controller() -> None:
         def doubts_block(self) -> bool:
             return False
 
-    station = Station(Parameters(), Voice(), lambda header, text: station.post("90,001", "1,0", 0.0))
+    station = Station(Settings(), Voice(), lambda header, text: station.post("90,001", "1,0", 0.0))
     for heard, answer in [
         ("05", "10 30"),
         ("01 30 31 2c 30 30 30 02 52 53 54 41 54 53 0d 03 10 03", "10 31"),
@@ -242,7 +243,7 @@ class Pair:
 
     def __post_init__(self) -> None:
         self.link = BscLink()
-        self.station = Station(Parameters(), self, lambda header, text: self.heard.append((header, text)))
+        self.station = Station(Settings(), self, lambda header, text: self.heard.append((header, text)))
 
     def say(self, kind: str, data: bytes) -> None:
         self.to_host += data

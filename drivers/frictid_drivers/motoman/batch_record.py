@@ -37,15 +37,7 @@ Rows = dict[int, tuple[int, int, int]]
 class JobRecord:
     """The samples of one job that are here so far.
 
-    Args:
-        host: link and stock commands.
-        number: of the job.
-        while_running: the application hands blocks over while the job runs (FREAD 2); else only afterwards (FREAD 1).
-        arrived: told the numbers [first, last) of samples that joined those that are here without a gap.
-
-    Attributes:
-        count: samples from the first on that are here without a gap.
-        dropped_pulses: how many the speed limiter had dropped, as the newest state says.
+    ``arrived`` is told the numbers [first, last) of samples that joined those that are here without a gap.
     """
 
     def __init__(
@@ -58,12 +50,12 @@ class JobRecord:
     ) -> None:
         self._host = host
         self._number = number
-        self._version = 2 if while_running else 1
+        self._version = 2 if while_running else 1  # of FREAD: 2 hands blocks over while the job runs, too
         self._failures = 0
         self._arrived = arrived
         self._rows: Rows = {}
-        self.count = 0
-        self.dropped_pulses = 0
+        self.count = 0  # of samples from the first on that are here without a gap
+        self.dropped_pulses = 0  # by the speed limiter, as the newest state says
 
     def follow(self, state: JobState, within_s: float) -> bool:
         """While the job runs: fetch some of what waits, where it fills a block of the link; whether any came.

@@ -49,22 +49,19 @@ Outcome = Sent | Failed | Yielded | None
 class Sender:
     """One message on its way, once ``bid`` for; what to say is appended to ``output``.
 
-    Attributes:
-        timing: may be exchanged.
-        deadline_s: when ``expire`` must be called at the latest.
-        contended: the other side bid at the same moment.
+    ``expire`` must be called by ``deadline_s`` at the latest.
     """
 
     def __init__(self, timing: BscTiming, output: bytearray) -> None:
         self.timing = timing
         self._output = output
-        self.contended = self._dle_seen = False
+        self.contended = False  # the other side bid at the same moment
+        self._dle_seen = False
 
     def bid(self, blocks: Sequence[bytes], now_s: float) -> None:
         """Ask for the line, to send these."""
         self._blocks = blocks
-        self._index = -1
-        """The block under way, -1 while bidding."""
+        self._index = -1  # of the block under way; -1 while bidding
         self._response_retries = self._text_retries = self._contentions = 0
         self._asked_again = False
         self._output.append(ENQ)
@@ -169,10 +166,7 @@ class Sender:
 class Receiver:
     """The other side's messages, one after another; what to say, and what happens, is appended to the lists given.
 
-    Attributes:
-        timing: may be exchanged.
-        deadline_s: when ``expire`` must be called at the latest.
-        over: the line is free again.
+    ``expire`` must be called by ``deadline_s`` at the latest; the line is free again when it is ``over``.
     """
 
     def __init__(self, timing: BscTiming, output: bytearray, events: list[Event]) -> None:
@@ -182,8 +176,7 @@ class Receiver:
         self._reader = BlockReader()
         self._header = ""
         self._texts: list[str] = []
-        self._complete = False
-        """The last block is acknowledged, EOT expected."""
+        self._complete = False  # the last block is acknowledged, EOT expected
         self._last_answer = b""
         self._repeats = 0
         self._rejections = 0
@@ -339,8 +332,8 @@ class BscLink:
         timing = timing or BscTiming()
         self._output = bytearray()
         self._events: list[Event] = []
+        # Of our message, until it is through; it may have to wait for the line.
         self._waiting: list[bytes] | None = None
-        """Blocks of our message until it is through; it may have to wait for the line."""
         self._sending = False
         self._sender = Sender(timing, self._output)
         self._receiver = Receiver(timing, self._output, self._events)

@@ -79,19 +79,15 @@ class TickClock:
 
 
 class StreamCycle:
-    """All joints of one stream.
+    """All joints of one stream, whose session is greeted, with no target sent yet.
 
     Args:
-        session: greeted, no target sent yet.
+        session: see there.
         joints: order of set-points and feedback.
         units: by joint name, like ``limits``.
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
         lead_ticks: between a report and the tick that its answer is due at.
-
-    Attributes:
-        wanted: joints that follow their set-points; the others hold.
-        locked: those of them that hold at their last target all the same.
     """
 
     def __init__(
@@ -115,8 +111,8 @@ class StreamCycle:
         self._index = {joint.name: k for k, joint in enumerate(joints)}
         self._units = [units[joint.name] for joint in joints]
         self._feedback = [Feedback() for _ in joints]
-        self.wanted: set[str] = set()
-        self.locked: set[str] = set()
+        self.wanted: set[str] = set()  # joints that follow their set-points; the others hold
+        self.locked: set[str] = set()  # those of them that hold at their last target all the same
         # Once armed, a session must be fed until it is stopped, or the controller takes us for dead.
         self._following = False
         self._last_tick = -1

@@ -46,24 +46,13 @@ _REFUSED: Mapping[int, tuple[str, str]] = {
 
 
 class StreamSession:
-    """One session, from HELLO to STOP.
-
-    Args:
-        host: has left its port, which is at the stream's speed.
-        lead_ticks: between the newest report and the tick that a target is due at.
-        silence_s: without any report for so long, the controller counts as lost.
-
-    Attributes:
-        welcome: what the controller answered to HELLO.
-        report: the one that is to be answered now.
-        halted: we asked it to stop; a latched controller is no surprise.
-    """
+    """One session, from HELLO to STOP, on a port that ``host`` has left and that is at the stream's speed."""
 
     def __init__(self, host: HostControl, *, lead_ticks: int, silence_s: float) -> None:
         self._host = host
         self._port = host.port
-        self._lead_ticks = lead_ticks
-        self._silence_s = silence_s
+        self._lead_ticks = lead_ticks  # between the newest report and the tick that a target is due at
+        self._silence_s = silence_s  # without any report for so long, the controller counts as lost
         self._reader = FrameReader()
         self._seq = 0
         self._session = 0
@@ -71,13 +60,13 @@ class StreamSession:
         self._error: FrictidError | None = None
         self._refused_at_tick = -1
         self._goodbye = False
-        self.welcome: Welcome | None = None
-        self.report: TickReport | None = None
+        self.welcome: Welcome | None = None  # what the controller answered to HELLO
+        self.report: TickReport | None = None  # the one that is to be answered now
         self._newest: TickReport | None = None
         self._reports: deque[TickReport] = deque()
         self._arrived_s = 0.0
         self._nacks: Counter[str] = Counter()
-        self.halted = False
+        self.halted = False  # we asked it to stop; a latched controller is no surprise
 
     def overdue_ns(self) -> int:
         """How long ago the report came that is to be answered now; 0 while others wait behind it."""

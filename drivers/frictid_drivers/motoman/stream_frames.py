@@ -183,14 +183,11 @@ class FrameReader:
     """Finds frames in bytes that come in any portions.
 
     A frame whose CRC is wrong costs one byte and the search goes on inside it, so that nothing behind it is lost.
-
-    Attributes:
-        damaged: frames that were dropped.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self.damaged = 0
+        self.damaged = 0  # frames that were dropped
 
     def take(self, data: bytes) -> list[Frame]:
         """The frames that these bytes complete, in order."""

@@ -67,22 +67,16 @@ class Plate:
 
 
 class Axis:
-    """See the module's first page; ``servo`` stands unpowered, and the command is averaged over ``averaging_ticks``.
-
-    Attributes:
-        issued: command after the limiter, pulses; what an application reads back.
-        feed_forward_nm: joint-side torque added by the servo.
-        floating: torque mode, no position loop (hand guiding).
-    """
+    """See the module's first page; ``servo`` stands unpowered, and the command is averaged over ``averaging_ticks``."""
 
     def __init__(self, plate: Plate, servo: Servo, averaging_ticks: int = 1) -> None:
         self.plate = plate
         self.servo = servo
         self._window: deque[int] = deque(maxlen=max(1, averaging_ticks))
-        self.issued = self.pulses
+        self.issued = self.pulses  # command after the limiter; what an application reads back
         self._goal_rad = servo.measured_position_rad
-        self.feed_forward_nm = 0.0
-        self.floating = False
+        self.feed_forward_nm = 0.0  # joint-side torque added by the servo
+        self.floating = False  # torque mode, no position loop (hand guiding)
         self._powered = False
 
     @property

@@ -14,8 +14,7 @@ from typing import Any
 from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import FaultPlan
 from frictid_drivers.motoman.emulator.machine import Emulator
-from frictid_drivers.motoman.emulator.panel import Settings
-from frictid_drivers.motoman.emulator.station import Parameters
+from frictid_drivers.motoman.emulator.settings import Settings
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
@@ -85,11 +84,10 @@ def _options(given: Any) -> dict[str, float | bool]:
 def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Settings:
     tick_s = 1.0 / setup.cycle_hz
     stream_baud = int(setup.options.get("stream_baud", 0))
-    timers = ("timer_a_s", "timer_b_s", "retry_1", "retry_2")
+    of_line = ("baud", "parity", "timer_a_s", "timer_b_s", "retry_1", "retry_2")
     return Settings(
+        **{name: setup.options[name] for name in of_line if name in setup.options},
         generation=str(setup.options.get("controller", "nx")),
-        baud=int(setup.options.get("baud", 19200)),
-        parity=str(setup.options.get("parity", "E")),
         stream_bauds=(stream_baud,) if options["stream"] and stream_baud else (),
         batch=bool(options["batch"]),
         tick_s=tick_s,
@@ -97,7 +95,6 @@ def _settings(setup: RobotSetup, options: Mapping[str, float | bool]) -> Setting
         thinking_s=options["thinking_ms"] * 1e-3,
         table_delay_ticks=round(options["table_delay_ms"] * 1e-3 / tick_s),
         reads_while_running=bool(options["reads_while_running"]),
-        parameters=Parameters(**{name: setup.options[name] for name in timers if name in setup.options}),
     )
 
 

@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from frictid_drivers.motoman.emulator.axis import Axis
 from frictid_drivers.motoman.emulator.faults import Fault, FaultPlan
 from frictid_drivers.motoman.emulator.jobs import BatchApplication
-from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, Settings, require
+from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, require
+from frictid_drivers.motoman.emulator.settings import Settings
 from frictid_drivers.motoman.emulator.station import Station
 from frictid_drivers.motoman.emulator.streaming import StreamApplication
 
@@ -42,10 +43,10 @@ class Emulator:
         self.panel = Panel(axes, settings, self._stop_motion)
         self.axes = self.panel.axes
         self.batch = BatchApplication(self.panel, on_guided)
-        self.station = Station(self.settings.parameters, self, self._message)
+        self.station = Station(settings, self, self._message)
         self.stream: StreamApplication | None = None
         self._on_stream_line = False
-        self.line: Line = (self.settings.baud, self.settings.parity)
+        self.line: Line = (settings.baud, settings.parity)
         self._gone_until_s = -math.inf
         self.now_s = 0.0
         self._incoming: deque[tuple[float, bytes]] = deque()

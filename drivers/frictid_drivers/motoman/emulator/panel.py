@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 from frictid_drivers.motoman.emulator.axis import Axis
-from frictid_drivers.motoman.emulator.station import Parameters
+from frictid_drivers.motoman.emulator.settings import Settings
 
 Reply = tuple[str, str]
 DONE: Reply = ("90,000", "0000")
@@ -28,33 +27,6 @@ def require(condition: object, number: int) -> None:
 def data(text: str) -> Reply:
     """``90,001`` with data."""
     return "90,001", text
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How this controller is made."""
-
-    generation: str = "nx"  # erc, xrc, nx or dx; decides the bits of RSTATS
-    baud: int = 19200  # of host control
-    parity: str = "E"  # E, O or N; a byte costs 11 bits with, 10 without
-    stream_bauds: tuple[int, ...] = (115200, 921600)  # speeds that FSTREAM may ask for; none on an ordinary port
-    batch: bool = True  # the batch application is installed
-    tick_s: float = 0.004  # interpolation clock
-    averaging_ticks: int = 1  # moving average on the command; 1 is none
-    thinking_s: float = 0.012  # between a command and the bid to reply
-    table_delay_ticks: int = 0  # between the tick that a table's torque is computed in and the tick that it acts in
-    reads_while_running: bool = True  # the batch application hands samples over while a job runs (FREAD 2)
-    parameters: Parameters = field(default_factory=Parameters)  # of the link
-
-    @property
-    def tick_us(self) -> int:
-        """Interpolation clock."""
-        return round(self.tick_s * 1e6)
-
-    @property
-    def averaging_ms(self) -> int:
-        """Moving average on the command; 0 is none."""
-        return round((self.averaging_ticks - 1) * self.tick_s * 1000)
 
 
 class Panel:

@@ -8,25 +8,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
 from typing import Protocol
+
+from frictid_drivers.motoman.emulator.settings import Settings
 
 _CUT = 256
 
 Listening = Generator[float | None, int | None, None]
 Answering = Generator[float | None, int | None, str]
 Delivering = Generator[float | None, int | None, bool]
-
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """RS034 to RS037 of the controller."""
-
-    timer_a_s: float = 3.0  # answer to ENQ or to a text
-    timer_b_s: float = 20.0  # end of a text
-    retry_1: int = 10  # invalid or no response
-    retry_2: int = 3  # NAK to a text
-    hush_s: float = 0.1  # silence after which rubbish on the line has ended
 
 
 class Voice(Protocol):
@@ -52,8 +42,8 @@ class Station:
     wanted, None while only bytes matter.
     """
 
-    def __init__(self, parameters: Parameters, voice: Voice, on_message: Callable[[str, str], None]) -> None:
-        self._p = parameters
+    def __init__(self, settings: Settings, voice: Voice, on_message: Callable[[str, str], None]) -> None:
+        self._p = settings
         self._voice = voice
         self._on_message = on_message
         self._outbox: deque[tuple[str, str]] = deque()
