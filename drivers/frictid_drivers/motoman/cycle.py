@@ -84,7 +84,7 @@ class StreamCycle:
     Args:
         session: see there.
         joints: order of set-points and feedback.
-        units: by joint name, like ``limits``.
+        units: by joint name, like ``limits``, which may change meanwhile.
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
         lead_ticks: between a report and the tick that its answer is due at.
@@ -108,7 +108,6 @@ class StreamCycle:
         self._torque_unit = welcome.torque_unit
         self._may_feed_forward = welcome.feed_forward
         self._joints = list(joints)
-        self._index = {joint.name: k for k, joint in enumerate(joints)}
         self._units = [units[joint.name] for joint in joints]
         self._feedback = [Feedback() for _ in joints]
         self.wanted: set[str] = set()  # joints that follow their set-points; the others hold
@@ -122,9 +121,7 @@ class StreamCycle:
         order = [axis for axis in range(8) if welcome.axis_mask >> axis & 1]
         self._place = {k: order.index(units.axis) for k, units in enumerate(self._units) if units.axis in order}
         self._tick_s = welcome.tick_us * 1e-6
-        self._bounds = [(0, 0, 0)] * len(self._joints)
-        for joint in joints:
-            self.limit(joint.name, limits[joint.name])
+        self._limits = limits
         clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
         # Targets in the order of the axes; axes without a joint stay where they are.
         self._targets = [axis.pulses for axis in first.axes]
@@ -134,14 +131,6 @@ class StreamCycle:
                 report = self._feedback[k]
                 report.position_rad = unit.position_rad(pulses[unit.axis])
                 report.mode, report.valid, report.age_cycles = Mode.POSITION, True, 1
-
-    def limit(self, joint: str, limits: Limits) -> None:
-        """No target beyond these from here on."""
-        k = self._index[joint]
-        unit = self._units[k]
-        lowest, highest = unit.travel(limits)
-        step = abs(self._joints[k].max_velocity_rad_s * self._tick_s * unit.pulses_per_rad) * _STEP_MARGIN
-        self._bounds[k] = (lowest, highest, int(step) + 1)
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """Targets for the deadline that was waited for; the newest report."""
@@ -170,7 +159,8 @@ class StreamCycle:
             if not (math.isfinite(set_point.position_rad) and math.isfinite(set_point.torque_offset_nm)):
                 raise SafetyAbort("the set-point is no number", where=f"joint {joint.name}")
             target = unit.pulses(set_point.position_rad)
-            lowest, highest, step = self._bounds[k]
+            lowest, highest = unit.travel(self._limits[joint.name])
+            step = int(abs(joint.max_velocity_rad_s * self._tick_s * unit.pulses_per_rad) * _STEP_MARGIN) + 1
             moved = abs(target - self._targets[place])
             if not lowest <= target <= highest or moved > step * ticks:
                 raise SafetyAbort(

@@ -144,8 +144,6 @@ class MotomanDriver:
             HardwareError: the controller's own travel is narrower.
         """
         limits = self._limits[joint] = Limits(position_min_rad, position_max_rad, torque_nm)
-        if self._cycle is not None:
-            self._cycle.limit(joint, limits)
         welcome = self._reach.welcome
         if welcome is None:
             return
