@@ -17,8 +17,7 @@ import pytest
 from serial_bench import make_bench
 
 from frictid_drivers.motoman import stream_frames as frames
-from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder, friction_table
+from frictid_drivers.motoman.batch import BatchClient, JobOrder, friction_table
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.emulator.build import _DEFAULTS as EMULATOR_OPTIONS
 from frictid_drivers.motoman.emulator.faults import OCCASIONS

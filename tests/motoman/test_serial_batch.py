@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from serial_bench import START_RAD, make_bench
 
 from frictid_drivers.motoman import MotomanDriver
-from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder, friction_table
+from frictid_drivers.motoman.batch import BatchClient, JobOrder, friction_table
 from frictid_drivers.motoman.batch_record import BlockCollector, JobRecord
 from frictid_drivers.motoman.controller_errors import FormatMistake, OperandOutOfRange, PendantHold, WrongMode
 from frictid_drivers.motoman.emulator import jobs

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from frictid_drivers.motoman.batch_messages import JobState
+from frictid_drivers.motoman.batch import JobState
 from frictid_drivers.motoman.controller_errors import BadReply, ControllerError, LinkError
 from frictid_drivers.motoman.host_control import HostControl
 from frictid_drivers.motoman.stream_frames import crc16

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import JobOrder
+from frictid_drivers.motoman.batch import BatchClient, JobOrder
 from frictid_drivers.motoman.batch_record import JobRecord
 from frictid_drivers.motoman.controller_errors import BadReply, ControllerError, LinkError
 from frictid_drivers.motoman.joint_units import AxisUnits, Limits

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from frictid_drivers.motoman import inspection
-from frictid_drivers.motoman.batch_messages import friction_table
+from frictid_drivers.motoman.batch import friction_table
 from frictid_drivers.motoman.batch_run import BatchRun
 from frictid_drivers.motoman.cycle import StreamCycle, TickClock
 from frictid_drivers.motoman.joint_units import Limits, axis_units

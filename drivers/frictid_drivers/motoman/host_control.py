@@ -8,7 +8,7 @@ From public documents, untested on hardware.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -36,20 +36,15 @@ _LINK_CAUSE: Final = "wrong baud or parity, a broken cable, or a controller that
 _LOOK_AT_LINE: Final = "check the cable, and `options.baud` and `options.parity` against RS030-RS033"
 
 
-@dataclass(frozen=True, slots=True)
-class ControllerProfile:
-    """What differs between controller generations: the meaning of bits 0.. of both figures of RSTATS; "" is unused."""
-
-    data_1: tuple[str, ...]
-    data_2: tuple[str, ...]
-
+Profile = tuple[tuple[str, ...], tuple[str, ...]]
+"""What differs between controller generations: the meaning of bits 0.. of both figures of RSTATS; "" is unused."""
 
 _MODES_1: Final = ("step", "1-cycle", "auto", "running", "safe speed", "teach", "play", "command remote")
 _MODES_2: Final = ("", "pendant hold", "external hold", "command hold", "alarm", "error", "servo on")
 
-PROFILES: Final = {
-    "erc": ControllerProfile(_MODES_1[:5], ("panel hold", "teach box hold", *_MODES_2[2:])),
-    **dict.fromkeys(("xrc", "nx", "dx"), ControllerProfile(_MODES_1, _MODES_2)),
+PROFILES: Final[Mapping[str, Profile]] = {
+    "erc": (_MODES_1[:5], ("panel hold", "teach box hold", *_MODES_2[2:])),
+    **dict.fromkeys(("xrc", "nx", "dx"), (_MODES_1, _MODES_2)),
 }
 
 
@@ -78,15 +73,15 @@ class Status:
         return bool(self.conditions & {"alarm", "error"})
 
 
-def decode_status(profile: ControllerProfile, data_1: int, data_2: int) -> Status:
+def decode_status(profile: Profile, data_1: int, data_2: int) -> Status:
     """Name the bits of both figures of RSTATS (or of a streamed status)."""
     names = {
         name
-        for figure, bits in ((data_1, profile.data_1), (data_2, profile.data_2))
+        for figure, bits in zip((data_1, data_2), profile, strict=True)
         for bit, name in enumerate(bits)
         if name and figure >> bit & 1
     }
-    return Status(data_1, data_2, frozenset(names), "command remote" in profile.data_1)
+    return Status(data_1, data_2, frozenset(names), "command remote" in profile[0])
 
 
 class HostControl:
@@ -95,7 +90,7 @@ class HostControl:
     def __init__(
         self,
         port: BytePort,
-        profile: ControllerProfile,
+        profile: Profile,
         timing: BscTiming = _USUAL_TIMING,
         *,
         reply_s: float = 10.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
-from frictid_drivers.motoman.batch_messages import TABLE_POINTS, BatchHello
+from frictid_drivers.motoman.batch import TABLE_POINTS, BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import HostControl, Status
 from frictid_drivers.motoman.joint_units import AxisUnits

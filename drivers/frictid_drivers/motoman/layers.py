@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from frictid_drivers.motoman.batch import BatchClient
-from frictid_drivers.motoman.batch_messages import BatchHello
+from frictid_drivers.motoman.batch import BatchClient, BatchHello
 from frictid_drivers.motoman.controller_errors import ControllerError
 from frictid_drivers.motoman.host_control import PROFILES, HostControl, ServoPower
 from frictid_drivers.motoman.port import BytePort, Sink
