@@ -37,6 +37,8 @@ from frictid_drivers.motoman.bsc_block import (
     encode_blocks,
 )
 
+_BID = bytes([ENQ])
+
 
 class Yielded:
     """Both sides bid for the line, and it is the other one's now."""
@@ -63,9 +65,7 @@ class Sender:
         self._blocks = blocks
         self._index = -1  # of the block under way; -1 while bidding
         self._response_retries = self._text_retries = self._contentions = 0
-        self._asked_again = False
-        self._output.append(ENQ)
-        self._await_answer(now_s)
+        self._say(_BID, now_s)
 
     def take(self, byte: int, now_s: float) -> Outcome:
         """One byte of an answer."""
@@ -86,7 +86,7 @@ class Sender:
         if self._response_retries > self.timing.response_retries:
             what = "ENQ" if self._bidding else "a block"
             return self._give_up(f"no answer to {what}, asked {self._response_retries} times")
-        return self._ask_again(now_s)
+        return self._say(_BID, now_s, again=True)
 
     # -- inside ------------------------------------------------------------------------------------------------
 
@@ -105,14 +105,14 @@ class Sender:
         self._response_retries += 1
         if self._response_retries > self.timing.response_retries:
             return self._give_up(f"a block was never acknowledged, sent {self._response_retries} times")
-        return self._send_block(now_s)
+        return self._say(self._blocks[self._index], now_s)
 
     def _next_block(self, now_s: float) -> Outcome:
         if not self._bidding:
             self._response_retries = self._text_retries = 0
         self._index += 1
         if self._index < len(self._blocks):
-            return self._send_block(now_s)
+            return self._say(self._blocks[self._index], now_s)
         self._output.append(EOT)
         return Sent()
 
@@ -122,11 +122,11 @@ class Sender:
             return self._garbled(now_s)
         if self._index > 0 and not self._asked_again:
             # An acknowledgement damaged into a NAK would double a continuation block, which carries no number.
-            return self._ask_again(now_s)
+            return self._say(_BID, now_s, again=True)
         self._text_retries += 1
         if self._text_retries > self.timing.text_retries:
             return self._give_up(f"a block was rejected (NAK) {self._text_retries} times")
-        return self._send_block(now_s)
+        return self._say(self._blocks[self._index], now_s)
 
     def _contention(self, now_s: float) -> Outcome:
         """Both bid at once: hold on the first time, yield the second.
@@ -142,21 +142,13 @@ class Sender:
         self.deadline_s = min(now_s + self.timing.quiet_s, self._answer_due_s)
         return None
 
-    def _ask_again(self, now_s: float) -> Outcome:
-        self._asked_again = True
-        self._output.append(ENQ)
-        self._await_answer(now_s)
-        return None
-
-    def _send_block(self, now_s: float) -> Outcome:
-        self._asked_again = False
-        self._output += self._blocks[self._index]
-        self._await_answer(now_s)
-        return None
-
-    def _await_answer(self, now_s: float) -> None:
+    def _say(self, what: bytes, now_s: float, *, again: bool = False) -> Outcome:
+        """Put it on the wire, ENQ for the last answer ``again`` or a block, and wait for an answer."""
+        self._asked_again = again
+        self._output += what
         self.deadline_s = self._answer_due_s = now_s + self.timing.sequence_s
         self._dle_seen = False
+        return None
 
     def _give_up(self, reason: str) -> Failed:
         self._output.append(EOT)

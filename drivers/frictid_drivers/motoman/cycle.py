@@ -36,7 +36,6 @@ class TickClock:
         self._session: StreamSession | None = None
         self._first_tick = 0
         self._tick_ns = 1
-        self._lead_ticks = 0
         self._since: Callable[[], float] | None = None
 
     def start(self, now_s: Callable[[], float]) -> None:
@@ -44,12 +43,11 @@ class TickClock:
         begun_s = now_s()
         self._since = lambda: now_s() - begun_s
 
-    def follow(self, session: StreamSession, first_tick: int, tick_ns: int, lead_ticks: int) -> None:
+    def follow(self, session: StreamSession, first_tick: int, tick_ns: int) -> None:
         """Begin: this tick is run time zero."""
         self._session = session
         self._first_tick = first_tick
         self._tick_ns = tick_ns
-        self._lead_ticks = lead_ticks
 
     def release(self) -> None:
         """The stream, or the batch, is over."""
@@ -68,14 +66,14 @@ class TickClock:
         if session is None or session.report is None:
             return 0
         overdue_ticks = session.overdue_ns() // self._tick_ns
-        return self.tick_ns(session.report.tick + self._lead_ticks + overdue_ticks)
+        return self.tick_ns(session.report.tick + session.lead_ticks + overdue_ticks)
 
     def wait_until(self, deadline_ns: int) -> None:
         """Return when the report has come after which targets for the deadline are to be sent."""
         session = self._session
         if session is not None:
             ticks = -(-deadline_ns // self._tick_ns)
-            session.wait_for_tick(self._first_tick + ticks - self._lead_ticks)
+            session.wait_for_tick(self._first_tick + ticks - session.lead_ticks)
 
 
 class StreamCycle:
@@ -87,7 +85,6 @@ class StreamCycle:
         units: by joint name, like ``limits``, which may change meanwhile.
         pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
         clock: taken over from here.
-        lead_ticks: between a report and the tick that its answer is due at.
     """
 
     def __init__(
@@ -98,15 +95,13 @@ class StreamCycle:
         limits: Mapping[str, Limits],
         pulses: Sequence[int],
         clock: TickClock,
-        lead_ticks: int,
     ) -> None:
         welcome = session.welcome
         assert welcome is not None
         first = session.wait_for_tick(0)
         self.session = session
         self._clock = clock
-        self._torque_unit = welcome.torque_unit
-        self._may_feed_forward = welcome.feed_forward
+        self._welcome = welcome
         self._joints = list(joints)
         self._units = [units[joint.name] for joint in joints]
         self._feedback = [Feedback() for _ in joints]
@@ -122,7 +117,7 @@ class StreamCycle:
         self._place = {k: order.index(units.axis) for k, units in enumerate(self._units) if units.axis in order}
         self._tick_s = welcome.tick_us * 1e-6
         self._limits = limits
-        clock.follow(session, first.tick, welcome.tick_us * 1000, lead_ticks)
+        clock.follow(session, first.tick, welcome.tick_us * 1000)
         # Targets in the order of the axes; axes without a joint stay where they are.
         self._targets = [axis.pulses for axis in first.axes]
         self._torques = [0] * len(order)
@@ -140,7 +135,7 @@ class StreamCycle:
         self._following = self._following or bool(self.wanted)
         if self._following and not session.halted:
             self._aim(set_points, ticks=max(1, report.tick - self._last_tick) if self._last_tick >= 0 else 1)
-            feed_forward = self._may_feed_forward and any(self._torques)
+            feed_forward = self._welcome.feed_forward and any(self._torques)
             due_tick = session.send(self._targets, self._torques if feed_forward else ())
             self._under_way.append((due_tick, tuple(self._targets)))
         elif report.tick >= self._alive_until_tick:
@@ -191,7 +186,7 @@ class StreamCycle:
             feedback.t_ns = t_ns
             feedback.position_rad = unit.position_rad(axis.pulses)
             feedback.velocity_rad_s = unit.velocity_rad_s(axis.speed_tenths)
-            feedback.torque_nm = unit.torque_nm(axis.torque, self._torque_unit)
+            feedback.torque_nm = unit.torque_nm(axis.torque, self._welcome.torque_unit)
             if self._in_force is not None:
                 feedback.position_command_rad = unit.position_rad(self._in_force[place])
             feedback.mode = Mode.POSITION

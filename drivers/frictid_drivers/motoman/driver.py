@@ -178,9 +178,7 @@ class MotomanDriver:
         line.power.on()
         pulses = line.host.pulses()
         session = line.begin_stream(mask)
-        self._cycle = StreamCycle(
-            session, self._setup.joints, self._units, self._limits, pulses, self.clock, self._options.lead_ticks
-        )
+        self._cycle = StreamCycle(session, self._setup.joints, self._units, self._limits, pulses, self.clock)
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Let the joint follow its set-points from here on; ``HardwareError`` for a mode other than position."""

@@ -51,7 +51,7 @@ class StreamSession:
     def __init__(self, host: HostControl, *, lead_ticks: int, silence_s: float) -> None:
         self._host = host
         self._port = host.port
-        self._lead_ticks = lead_ticks  # between the newest report and the tick that a target is due at
+        self.lead_ticks = lead_ticks  # between the newest report and the tick that a target is due at
         self._silence_s = silence_s  # without any report for so long, the controller counts as lost
         self._reader = FrameReader()
         self._seq = 0
@@ -102,9 +102,9 @@ class StreamSession:
     def _check_welcome(self, welcome: Welcome, axis_mask: int) -> None:
         if welcome.axis_mask != axis_mask:
             raise BadReply(f"asked for axes {axis_mask:#x}, granted {welcome.axis_mask:#x}", where="HELLO")
-        if welcome.queue_limit < self._lead_ticks:
+        if welcome.queue_limit < self.lead_ticks:
             raise HardwareError(
-                f"the controller queues {welcome.queue_limit} ticks, the robot file wants {self._lead_ticks}",
+                f"the controller queues {welcome.queue_limit} ticks, the robot file wants {self.lead_ticks}",
                 where="HELLO",
                 next_step="lower `options.lead_ticks`",
             )
@@ -130,7 +130,7 @@ class StreamSession:
         """Targets of all axes of the session, due ``lead_ticks`` after the report that they answer; the due tick."""
         assert self.report is not None and self.welcome is not None
         self._seq = (self._seq + 1) & 0xFFFF
-        self._last_due = max(self._last_due + 1, self.report.tick + self._lead_ticks)
+        self._last_due = max(self._last_due + 1, self.report.tick + self.lead_ticks)
         self._write(encode_set_point(self._seq, self._session, self.welcome.axis_mask, self._last_due, pulses, torque))
         return self._last_due
 
@@ -221,7 +221,7 @@ class StreamSession:
         while reports and (self.report is None or self.report.tick < tick):
             self.report = reports.popleft()
         report, newest = self.report, self._newest
-        if report and newest and newest.tick - report.tick > self._lead_ticks - _SHORTEST_WAIT_TICKS:
+        if report and newest and newest.tick - report.tick > self.lead_ticks - _SHORTEST_WAIT_TICKS:
             self.report = newest
             reports.clear()
 
