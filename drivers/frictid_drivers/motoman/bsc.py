@@ -19,13 +19,16 @@ from collections.abc import Sequence
 
 from frictid_drivers.motoman.bsc_block import (
     ACK,
+    CR,
     DLE,
     ENQ,
     EOT,
+    ETB,
+    ETX,
+    LONGEST_BLOCK,
     NAK,
     SOH,
     STX,
-    BlockReader,
     BlockReceived,
     BscTiming,
     Event,
@@ -165,7 +168,8 @@ class Receiver:
         self.timing = timing
         self._output = output
         self._events = events
-        self._reader = BlockReader()
+        self._raw = bytearray()  # of the block that has begun
+        self._check_bytes_left = 0
         self._header = ""
         self._texts: list[str] = []
         self._complete = False  # the last block is acknowledged, EOT expected
@@ -194,7 +198,7 @@ class Receiver:
         """One byte of the peer's, which holds the line."""
         if self._broken:
             self._break(byte, now_s)
-        elif self._reader.open or byte in (SOH, STX):
+        elif self._raw or byte in (SOH, STX):
             self._read(byte, now_s)
         elif byte == ENQ:
             self._asked_for_answer(now_s)
@@ -211,7 +215,7 @@ class Receiver:
         """Nothing more in time."""
         if self._broken and self._last_broken_byte == EOT:
             self._peer_ended()
-        elif self._broken or self._reader.open:
+        elif self._broken or self._raw:
             self._reject(now_s)
         elif self._complete:
             # The peer's EOT was lost; its message was not.
@@ -221,22 +225,30 @@ class Receiver:
 
     def end(self) -> None:
         """The line is free."""
-        self._reader.clear()
-        self._broken = False
+        self._forget_block()
         self.over = True
 
     # -- one block ---------------------------------------------------------------------------------------------
 
     def _read(self, byte: int, now_s: float) -> None:
-        if not self._reader.open:
+        raw = self._raw
+        if not raw:
             self.deadline_s = self._block_due_s = now_s + self.timing.text_end_s
-        try:
-            raw = self._reader.take(byte)
-        except ValueError:
+        raw.append(byte)
+        if self._check_bytes_left:
+            self._check_bytes_left -= 1
+            if not self._check_bytes_left:
+                self._raw = bytearray()
+                self._take_block(bytes(raw), now_s)
+        elif byte in (ETX, ETB):
+            self._check_bytes_left = 2
+        elif len(raw) >= LONGEST_BLOCK or (len(raw) > 1 and not (0x20 <= byte < 0x7F or byte in (CR, STX))):
             self._break(byte, now_s)
-            return
-        if raw is not None:
-            self._take_block(raw, now_s)
+
+    def _forget_block(self) -> None:
+        self._raw.clear()
+        self._check_bytes_left = 0
+        self._broken = False
 
     def _break(self, byte: int, now_s: float) -> None:
         """This block is lost: discard what comes until the line is quiet, then reject it.
@@ -297,8 +309,7 @@ class Receiver:
         self._output += answer
         # A sender that misses this answer asks after its own timer A; being still here then costs nothing.
         self.deadline_s = now_s + (2 * self.timing.sequence_s if self._complete else self.timing.text_end_s)
-        self._reader.clear()
-        self._broken = False
+        self._forget_block()
 
     # -- the end -----------------------------------------------------------------------------------------------
 

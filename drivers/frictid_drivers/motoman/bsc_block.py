@@ -25,7 +25,7 @@ ACK: Final = (bytes([DLE, 0x30]), bytes([DLE, 0x31]))
 
 MAX_DATA_BYTES: Final = 256
 _HEADER_BYTES: Final = 6
-_LONGEST: Final = 1 + _HEADER_BYTES + 1 + MAX_DATA_BYTES + 1
+LONGEST_BLOCK: Final = 1 + _HEADER_BYTES + 1 + MAX_DATA_BYTES + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,46 +129,6 @@ def decode_block(raw: bytes) -> Block | None:
     if not (_printable(header) and _printable(data)):
         return None
     return Block(header.decode("ascii"), data.decode("ascii"), last)
-
-
-class BlockReader:
-    """Collects the bytes of one block; ``open`` from its SOH or STX until it is whole or broken."""
-
-    def __init__(self) -> None:
-        self._raw = bytearray()
-        self._check_bytes_left = 0
-
-    @property
-    def open(self) -> bool:
-        """A block has begun."""
-        return bool(self._raw)
-
-    def clear(self) -> None:
-        """Forget the block."""
-        self._raw.clear()
-        self._check_bytes_left = 0
-
-    def take(self, byte: int) -> bytes | None:
-        """One more byte; the raw block when this byte completes it.
-
-        Raises:
-            ValueError: this byte cannot stand in a block.
-        """
-        raw = self._raw
-        raw.append(byte)
-        if self._check_bytes_left:
-            self._check_bytes_left -= 1
-            if not self._check_bytes_left:
-                whole = bytes(raw)
-                self.clear()
-                return whole
-        elif byte in (ETX, ETB):
-            self._check_bytes_left = 2
-        elif len(raw) > 1 and not (0x20 <= byte < 0x7F or byte in (CR, STX)):
-            raise ValueError(f"control code {byte:02x} inside a block")
-        elif len(raw) >= _LONGEST:
-            raise ValueError(f"a block longer than {_LONGEST} bytes")
-        return None
 
 
 def _printable(data: bytes) -> bool:

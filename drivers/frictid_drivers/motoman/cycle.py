@@ -69,7 +69,7 @@ class TickClock:
         return self.tick_ns(session.report.tick + session.lead_ticks + overdue_ticks)
 
     def wait_until(self, deadline_ns: int) -> None:
-        """Return when the report has come after which targets for the deadline are to be sent."""
+        """Until the report comes after which targets for the deadline are to be sent; ``HardwareError`` on silence."""
         session = self._session
         if session is not None:
             ticks = -(-deadline_ns // self._tick_ns)

@@ -110,7 +110,7 @@ class StreamSession:
             )
 
     def wait_for_tick(self, tick: int) -> TickReport:
-        """The first report of this tick or a later one; of a later one also where too many wait to be answered."""
+        """The first report of this tick, or of a later one where too many wait; ``HardwareError`` where none comes."""
         while True:
             self._collect(0.0)
             self._go_on_to(tick)
@@ -140,7 +140,7 @@ class StreamSession:
         self._write(encode_hello(self._seq, self._session, self.welcome.axis_mask))
 
     def raise_if_stopped(self) -> None:
-        """Raise what the controller has against going on; nothing where we asked it to stop ourselves."""
+        """``SafetyAbort`` for what the controller has against going on; nothing where we asked it to stop ourselves."""
         report = self._newest
         if self.halted or report is None:
             return

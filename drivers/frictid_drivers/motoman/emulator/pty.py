@@ -42,12 +42,9 @@ class Waits:
     longest_s: float = 0.0
     _now_s: float = 0.0
 
-    def begin(self) -> None:
-        """A stretch begins, unless one is under way."""
-        self.count += self._now_s == 0.0
-
     def last(self, passed_s: float) -> None:
-        """It has gone on."""
+        """A stretch begins, or has gone on."""
+        self.count += self._now_s == 0.0
         self._now_s += passed_s
         self.longest_s = max(self.longest_s, self._now_s)
 
@@ -171,7 +168,6 @@ def _run(emulator: Emulator, terminal: Terminal, stop: Callable[[], bool], waits
         now_s = time.monotonic()
         passed_s, last_s = now_s - last_s, now_s
         if starving and not ready and now_s - heard_s < _PATIENCE_S:
-            waits.begin()
             terminal.wait(tick_s)
             last_s = time.monotonic()
             waits.last(last_s - now_s)
