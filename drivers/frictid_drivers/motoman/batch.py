@@ -196,16 +196,9 @@ class BatchClient:
         must not cost the time after which the watchdog stops the job. No answer is taken for that of another question,
         since each names itself (a job's state by its number, the others by how many figures they have).
 
-        Args:
-            number: of the job.
-            duration_s: planned.
-            stop: asked often; True ends the job.
-            progress: told the share that is done.
-            look: called once per question with how long it may take; its ``SafetyAbort`` ends the job and is raised
-                once the joint stands.
-            follow: called between two rounds of questions with the state and how long it may take, for as long as it
-                says that it did something; the line is free then.
-            watchdog_s: the job stops when it hears nothing for so long.
+        ``stop`` is asked often. ``look`` is called once per question with how long it may take; its ``SafetyAbort``
+        ends the job and is raised once the joint stands. ``follow`` is called between two rounds of questions, when the
+        line is free, with the state and how long it may take, for as long as it says that it did something.
 
         Raises:
             Interrupted: ``stop`` asked for it.
