@@ -91,8 +91,9 @@ def answer(channel: str, active: int, cycle_hz: float, *, at_once: bool) -> None
         for pdo in pdos:
             if pdo.transmit:
                 values = {0x6041: ENABLED, 0x6061: CSP}
-                packed = (values.get(entry.index, 0).to_bytes(entry.type.bits // 8, "little") for entry in pdo.entries)
-                due.append((pack(pdo.cob_id, b"".join(packed), 0), pdo.every))
+                frame = pdo.frame
+                packed = (values.get(one.index, 0).to_bytes(one.type.bits // 8, "little") for one in frame.entries)
+                due.append((pack(frame.cob_id, b"".join(packed), 0), pdo.every))
     heartbeat_every = max(1, round(0.1 * cycle_hz))
     due += [(pack(HEARTBEAT + number + 1, OPERATIONAL, 0), heartbeat_every) for number in range(active)]
     frames = np.frombuffer(b"".join(frame for frame, _ in due), np.uint8).copy()
@@ -207,9 +208,9 @@ class BareWire:
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         pdos = [pdo for one in layout_of(active, cycle_hz).pdos.values() for pdo in one]
-        self._sent = [pack(pdo.cob_id, bytes(8), 0) for pdo in pdos if not pdo.transmit and pdo.number == 1]
+        self._sent = [pack(pdo.frame.cob_id, bytes(8), 0) for pdo in pdos if not pdo.transmit and pdo.number == 1]
         self._sent.append(pack(SYNC, b"\1", 0))
-        self._awaited = {pdo.cob_id for pdo in pdos if pdo.transmit and pdo.every == 1}
+        self._awaited = {pdo.frame.cob_id for pdo in pdos if pdo.transmit and pdo.every == 1}
 
     def exchange(self, number: int) -> None:
         """One."""
@@ -262,14 +263,14 @@ class StockDrives:
         self._network.connect(interface="frictid", channel=channel)
         for node, pdos in zip(nodes, layout_of(active, cycle_hz).pdos.values(), strict=True):
             for pdo in pdos:
-                indices = [entry.index for entry in pdo.entries]
+                indices = [entry.index for entry in pdo.frame.entries]
                 if not set(indices) <= set(KINDS):
                     continue
                 maps = canopen.pdo.base.PdoMap(node.tpdo if pdo.transmit else node.rpdo, None, None)  # type: ignore[no-untyped-call]
-                maps.cob_id = pdo.cob_id
+                maps.cob_id = pdo.frame.cob_id
                 variables = [maps.add_variable(index) for index in indices]
                 if pdo.transmit:
-                    self._network.subscribe(pdo.cob_id, maps.on_message)
+                    self._network.subscribe(pdo.frame.cob_id, maps.on_message)
                     self._reports.append((maps, variables))
                 else:
                     self._commands.append((maps, variables))

@@ -44,8 +44,7 @@ import numpy as np
 
 from frictid_drivers.cia402.codec import CommandDecoder, Decoder
 from frictid_drivers.cia402.frame_map import FrameMap
-from frictid_drivers.cia402.network import Node, Wire
-from frictid_drivers.cia402.sdo import SdoDrive
+from frictid_drivers.cia402.network import Node, SdoDrive, Wire
 from frictid_drivers.mit.families import FAMILIES, Motor, Parameter
 from frictid_drivers.mit.models import MODELS
 from frictid_drivers.motoman.bsc import BscLink

@@ -8,7 +8,7 @@ import pytest
 from cia402_wire import OBJECTS, robot
 
 from frictid_drivers.cia402.eds import frame_map_from_eds
-from frictid_drivers.cia402.replay import LogDecoder
+from frictid_drivers.cia402.logs import LogDecoder
 from frictid_hil.errors import HardwareError, InputFileError
 
 TYPES = {"<B": 5, "<H": 6, "<I": 7, "<b": 2, "<h": 3, "<i": 4, "s": 9}

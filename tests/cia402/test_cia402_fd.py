@@ -10,7 +10,7 @@ import pytest
 from cia402_bench import Bench, bench, hp3j
 from cia402_wire import OBJECTS, ScriptedDrive
 
-from frictid_drivers.cia402.replay import LogDecoder
+from frictid_drivers.cia402.logs import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.errors import HardwareError, InvalidFields, PlanRefused
 from frictid_hil.plan.mode import Mode

@@ -11,9 +11,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from frictid_drivers.cia402.entry import Entry
 from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
-from frictid_drivers.cia402.objects import IntegerType
+from frictid_drivers.cia402.objects import Entry, IntegerType
 from frictid_hil.errors import InvalidFields
 
 HAND_WRITTEN = """

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from frictid_drivers.cia402.codec import packing
 from frictid_drivers.cia402.objects import IntegerType
-from frictid_drivers.cia402.packing import packing
 
 any_type = st.builds(IntegerType, st.booleans(), st.integers(1, 64))
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from frictid_drivers.cia402 import Cia402Driver, FrameMap
-from frictid_drivers.cia402.replay import LogDecoder
+from frictid_drivers.cia402.logs import LogDecoder
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import SetPoint
 

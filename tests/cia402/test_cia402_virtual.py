@@ -8,7 +8,7 @@ import pytest
 from cia402_bench import hp3j
 
 from frictid_drivers.cia402 import FrameMap
-from frictid_drivers.cia402.replay import LogDecoder
+from frictid_drivers.cia402.logs import LogDecoder
 from frictid_drivers.virtual import VirtualDriver
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import JointState, SetPoint, Severity

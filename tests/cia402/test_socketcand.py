@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from frictid_drivers.virtual.on_a_bus import BusWire
-from frictid_drivers.virtual.power_state import PowerState
+from frictid_drivers.virtual.power_stage import PowerState
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_process import SYNC_GAP_TENTHS, RackProcess
 from frictid_hil.config.robot import load_robot

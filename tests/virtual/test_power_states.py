@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from frictid_drivers.virtual.power_state import PowerState
+from frictid_drivers.virtual.power_stage import PowerState
 
 MS = 1_000_000
 DISABLED, READY, ON, ENABLED, QUICK, REACTION, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08

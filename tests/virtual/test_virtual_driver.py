@@ -14,8 +14,8 @@ import can
 import pytest
 
 from frictid_drivers.virtual import VirtualDriver, channel
+from frictid_drivers.virtual.driver import write_object
 from frictid_drivers.virtual.rack_launcher import encode_setup, start_rack
-from frictid_drivers.virtual.side_channel import write
 from frictid_drivers.virtual.socket_bus import SocketBus
 from frictid_hil.errors import HardwareBusy, HardwareError, InvalidFields, SafetyAbort, UsageError
 from frictid_hil.plan.mode import Mode
@@ -289,10 +289,10 @@ def test_drives_end_with_their_owner_in_good_order(make_robot):
     rack = start_rack(make_robot(realtime=True))
     bus = SocketBus("bench")
     assert sdo(bus, 2, 0x1000) == 0x20192
-    write(bus, 2, 0x6065, 0, 4321)
+    write_object(bus, 2, 0x6065, 0, 4321)
     assert sdo(bus, 2, 0x6065) == 4321
     with pytest.raises(HardwareError, match="06010002h"):
-        write(bus, 2, 0x6041, 0, 0)
+        write_object(bus, 2, 0x6041, 0, 0)
     bus.shutdown()
     rack.stop()
     with pytest.raises(ProcessLookupError):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
 from frictid_drivers.virtual.objects import OBJECTS, SIZE_BYTES, DataType
-from frictid_drivers.virtual.power_state import PowerState
+from frictid_drivers.virtual.power_stage import PowerState
 from frictid_drivers.virtual.rack import Rack
 
 MS = 1_000_000

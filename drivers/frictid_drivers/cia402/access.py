@@ -48,12 +48,9 @@ class Write:
     """One setting as it shall be: what `check` foresees and what ``configure`` does.
 
     Attributes:
-        item: object.
-        value: wanted.
         otherwise: what it means where the drive does not take it, the run goes on; "" where the run ends.
         instead: values that would do as well, in this order.
         mask: bits that must read back as written; drives keep some bits of a COB-ID to themselves.
-        maps: what it maps, where it is an entry of a PDO.
     """
 
     item: Object
@@ -70,12 +67,7 @@ class Write:
 
 
 class Drive(ABC):
-    """Objects of one node.
-
-    Args:
-        node_id: of the drive.
-        joint: name, for errors.
-    """
+    """Objects of one node."""
 
     def __init__(self, node_id: int, joint: str) -> None:
         self.node_id = node_id
@@ -261,12 +253,7 @@ class Drive(ABC):
                 self.write_blind(item, value)
 
     def write(self, item: Object, value: int, mask: int = -1) -> None:
-        """Write and read back, unless this very value was confirmed before.
-
-        Args:
-            item: object.
-            value: to write.
-            mask: bits that must read back as written; drives keep some bits of a COB-ID to themselves.
+        """Write and read back, unless this very value was confirmed before; only the bits of ``mask`` must read back.
 
         Raises:
             HardwareError: refused, or another value is read back.

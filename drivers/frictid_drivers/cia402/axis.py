@@ -45,7 +45,6 @@ class Axis:
     Args:
         frames: as read back: RPDO1 (controlword, target position, torque offset), RPDO2 (mode, target torque, target
             velocity).
-        scale: joint-side worth of the drive's units.
         feedback: the decoder's own object of this joint.
         max_torque_nm: no torque beyond this is commanded.
         standstill_rad_s: below this the joint stands.
@@ -150,12 +149,7 @@ class Axis:
         return abs(self.feedback.velocity_rad_s) <= self._standstill_rad_s
 
     def command(self, set_point: SetPoint, actual_units: int, *, healthy: bool) -> None:
-        """Fill both command frames for the coming cycle.
-
-        Args:
-            set_point: of the runner.
-            actual_units: last reported position in the drive's units.
-            healthy: watchdogs are armed and the heartbeat was seen; without it no power is asked for.
+        """Fill both command frames for the coming cycle; no power is asked for while the drive is not ``healthy``.
 
         Raises:
             SafetyAbort: the set-point is not a finite number.

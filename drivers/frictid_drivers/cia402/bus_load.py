@@ -37,8 +37,6 @@ class BusLoad:
     """Load of a layout at one cycle rate.
 
     Attributes:
-        cycle_hz: rate of SYNC.
-        rates: of the bus.
         least_bits: per cycle on average, no stuffing, in bits of the arbitration rate like all that follow.
         average_bits: per cycle on average, worst stuffing.
         peak_bits: in the worst single cycle, worst stuffing.

@@ -14,10 +14,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import fields
 
-from frictid_drivers.cia402.entry import ERROR, FIGURES, INPUTS, MODE, STATUS
 from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
-from frictid_drivers.cia402.objects import INTERPOLATED
-from frictid_drivers.cia402.packing import packing
+from frictid_drivers.cia402.objects import ERROR, FIGURES, INPUTS, INTERPOLATED, MODE_SHOWN, STATUS, IntegerType
 from frictid_drivers.cia402.state import JOINT_STATES
 from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState
@@ -36,6 +34,45 @@ _ATTRIBUTES = {
 _MODES = {mode.value: mode for mode in Mode} | {INTERPOLATED: Mode.POSITION}
 _LIMIT_ACTIVE = 0x0800
 """Statusword bit 11: a set-point or the torque is cut by a limit of the drive."""
+
+
+def packing(types: Sequence[IntegerType]) -> struct.Struct | BitPacking:
+    """Integers into the bytes of a PDO and back: without gaps, least significant bit first.
+
+    Layouts of whole 8, 16, 32 or 64-bit entries (all that drives use in practice) compile to ``struct``.
+    """
+    codes = [kind.code for kind in types]
+    return BitPacking(types) if None in codes else struct.Struct("<" + "".join(filter(None, codes)))
+
+
+class BitPacking:
+    """The general case: entries of 1 to 64 bits at any bit; ``size`` bytes."""
+
+    def __init__(self, types: Sequence[IntegerType]) -> None:
+        self._types = tuple(types)
+        self.size = (sum(kind.bits for kind in self._types) + 7) // 8
+
+    def pack_into(self, buffer: bytearray, offset: int, /, *values: int) -> None:
+        """Write all values; ``struct.error`` when one does not fit its type."""
+        word = shift = 0
+        for kind, value in zip(self._types, values, strict=True):
+            if not kind.low <= value <= kind.high:
+                raise struct.error(f"{value} does not fit {kind}")
+            word |= (value & ((1 << kind.bits) - 1)) << shift
+            shift += kind.bits
+        buffer[offset : offset + self.size] = word.to_bytes(self.size, "little")
+
+    def unpack_from(self, buffer: bytes | bytearray, /) -> tuple[int, ...]:
+        """Read all values from the first ``size`` bytes; ``struct.error`` when there are fewer."""
+        if len(buffer) < self.size:
+            raise struct.error(f"{len(buffer)} bytes for a PDO of {self.size}")
+        word = int.from_bytes(buffer[: self.size], "little")
+        values = []
+        for kind in self._types:
+            value = word & ((1 << kind.bits) - 1)
+            word >>= kind.bits
+            values.append(value - (1 << kind.bits) if value > kind.high else value)
+        return tuple(values)
 
 
 class _Report:
@@ -69,7 +106,7 @@ class _Report:
         self.values: tuple[int, ...] = (0,) * len(frame.entries)
         self.status_at, self.mode_at, self.error_at, self.inputs_at = (
             frame.meanings.index(meaning) if meaning in frame.meanings else -1
-            for meaning in (STATUS, MODE, ERROR, INPUTS)
+            for meaning in (STATUS, MODE_SHOWN, ERROR, INPUTS)
         )
         self.figures = tuple(
             (at, _ATTRIBUTES[meaning], float(getattr(joint, FIGURES[meaning])))
@@ -111,7 +148,6 @@ class Decoder:
     """Reports of all joints, row by row.
 
     Args:
-        frame_map: compiled once.
         awaited: names of the joints whose cyclic reports are expected in every row.
 
     Attributes:

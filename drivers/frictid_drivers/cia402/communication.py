@@ -83,7 +83,7 @@ def pdo_writes(drive: Drive, layout: Layout, joint: str) -> list[Write]:
     used = {(pdo.transmit, pdo.number) for pdo in layout.pdos[joint]}
     writes = []
     for transmit, number in _ALL:
-        cob_id = od.pdo_cob_id(transmit, number)
+        cob_id = od.pdo(transmit, number, od.PDO_COB_ID)
         present = drive.known(cob_id) if (transmit, number) not in used else None
         if present is not None and not present & _NOT_VALID:
             writes.append(Write(cob_id, present | _NOT_VALID, mask=_COB_ID_MASK))
@@ -93,18 +93,18 @@ def pdo_writes(drive: Drive, layout: Layout, joint: str) -> list[Write]:
 
 
 def _one_pdo(drive: Drive, pdo: Pdo) -> list[Write]:
-    cob_id = od.pdo_cob_id(pdo.transmit, pdo.number)
-    valid = pdo.cob_id | (_NO_REMOTE if pdo.transmit else 0)
-    settings = [Write(od.pdo_type(pdo.transmit, pdo.number), pdo.every)]
-    if pdo.transmit and drive.has(od.pdo_sync_start(pdo.number)):
-        settings.append(Write(od.pdo_sync_start(pdo.number), pdo.start))
-    items = [od.Object(entry.index, entry.sub, entry.type, entry.meaning) for entry in pdo.entries]
+    cob_id = od.pdo(pdo.transmit, pdo.number, od.PDO_COB_ID)
+    valid = pdo.frame.cob_id | (_NO_REMOTE if pdo.transmit else 0)
+    settings = [Write(od.pdo(pdo.transmit, pdo.number, od.PDO_TYPE), pdo.every)]
+    if pdo.transmit and drive.has(od.pdo(True, pdo.number, od.PDO_SYNC_START)):
+        settings.append(Write(od.pdo(True, pdo.number, od.PDO_SYNC_START), pdo.start))
+    items = [od.Object(entry.index, entry.sub, entry.type, entry.meaning) for entry in pdo.frame.entries]
     mapped = mapping(drive, pdo) == [item.mapping for item in items]
     if mapped and drive.known(cob_id) == valid and all(drive.known(write.item) == write.value for write in settings):
         return []
     writes = [Write(cob_id, valid | _NOT_VALID, mask=_COB_ID_MASK), *settings]
     if not mapped:
-        count = od.pdo_entry_count(pdo.transmit, pdo.number)
+        count = od.pdo_entry(pdo.transmit, pdo.number, 0)
         writes.append(Write(count, 0))
         for sub, item in enumerate(items, start=1):
             writes.append(Write(od.pdo_entry(pdo.transmit, pdo.number, sub), item.mapping, maps=item))
@@ -114,15 +114,15 @@ def _one_pdo(drive: Drive, pdo: Pdo) -> list[Write]:
 
 def mapping(drive: Drive, pdo: Pdo) -> list[int]:
     """The mapping words of a PDO as the drive has them, in order."""
-    count = drive.known(od.pdo_entry_count(pdo.transmit, pdo.number)) or 0
+    count = drive.known(od.pdo_entry(pdo.transmit, pdo.number, 0)) or 0
     words = [drive.known(od.pdo_entry(pdo.transmit, pdo.number, sub)) for sub in range(1, count + 1)]
     return [word for word in words if word is not None]
 
 
 def frame_of(drive: Drive, pdo: Pdo) -> Frame:
     """The frame as read back from the drive."""
-    entries = {entry.index << 16 | entry.sub << 8 | entry.type.bits: entry for entry in pdo.entries}
-    return Frame(pdo.cob_id, tuple(entries[word] for word in mapping(drive, pdo)))
+    entries = {entry.index << 16 | entry.sub << 8 | entry.type.bits: entry for entry in pdo.frame.entries}
+    return Frame(pdo.frame.cob_id, tuple(entries[word] for word in mapping(drive, pdo)))
 
 
 def lesson(drive: Drive, refused: RefusedByDrive) -> bool:
@@ -138,12 +138,8 @@ def lesson(drive: Drive, refused: RefusedByDrive) -> bool:
         drive.quirks = replace(quirks, transmission_types=(1, 253, 255))
         return True
     mapped = (refused.value >> 16, refused.value >> 8 & 0xFF)
-    if (
-        item.sub
-        and item.index & 0xFA00 in (0x1600, 0x1A00)
-        and mapped in _OPTIONAL
-        and mapped not in quirks.not_mappable
-    ):
+    is_entry = item.sub and item.index & 0xFA00 in (0x1600, 0x1A00)
+    if is_entry and mapped in _OPTIONAL and mapped not in quirks.not_mappable:
         drive.quirks = replace(quirks, not_mappable=quirks.not_mappable | {mapped})
         return True
     return False

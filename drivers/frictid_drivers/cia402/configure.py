@@ -155,12 +155,7 @@ def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
 
 
 def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> None:
-    """What the drive takes as interpolation time must be our period, whoever set it.
-
-    Args:
-        drive: after its settings were written, or as they are foreseen to be.
-        cycle_hz: rate.
-        lost: what the drive did not take.
+    """What the drive takes as interpolation time, or will take but for what it did not take, must be our period.
 
     Raises:
         HardwareError: it interpolates over another time.

@@ -70,13 +70,8 @@ class Cycle:
 
     Args:
         bus: nobody else reads it while cycling.
-        clock: run time.
         sink: told of every frame.
-        frame_map: as read back.
-        layout: the same, with rates.
-        axes: all joints, in order.
         decoder: whose feedback the axes hold.
-        settings: of the bus.
         other: given frames that are none of ours.
     """
 

@@ -11,10 +11,9 @@ from pathlib import Path
 from canopen.objectdictionary import ODVariable
 
 from frictid_drivers.cia402 import objects as od
-from frictid_drivers.cia402.entry import Entry
 from frictid_drivers.cia402.facts import read_facts
-from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
-from frictid_drivers.cia402.objects import IntegerType, Object
+from frictid_drivers.cia402.frame_map import Frame, FrameMap, joint_frames
+from frictid_drivers.cia402.objects import Entry, IntegerType, Object
 from frictid_drivers.cia402.quirks import Catalogue, dictionary_of, integer_type
 from frictid_drivers.cia402.scale import raise_on_error, scale_of
 from frictid_drivers.cia402.settings import read_settings
@@ -52,10 +51,6 @@ class _File:
 def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
     """The frames of a robot whose drives all have the mapping of one EDS or DCF file.
 
-    Args:
-        path: the file.
-        setup: node ids, gear ratios, directions, and the joints' options.
-
     Raises:
         InputFileError: not readable, or it maps no position.
         HardwareError: its figures contradict the robot file.
@@ -80,27 +75,15 @@ def frame_map_from_eds(path: Path, setup: RobotSetup) -> FrameMap:
                 cause="the drive was mapped at run time",
                 next_step="write a mapping file by hand, or export a DCF from the vendor's tool",
             )
-        joints.append(
-            JointFrames(
-                name=joint.name,
-                node=joint.address,
-                position_rad_per_unit=scale.position_rad,
-                velocity_rad_s_per_unit=scale.velocity_rad_s,
-                torque_nm_per_unit=scale.torque_nm,
-                external_torque_nm_per_unit=mine.external_torque_nm_per_unit,
-                temperature_c_per_unit=mine.temperature_c_per_unit,
-                reports=reports,
-                commands=_frames(file, False, meanings),
-            )
-        )
+        joints.append(joint_frames(joint, scale, mine, reports, _frames(file, False, meanings)))
     return FrameMap(tuple(joints))
 
 
 def _frames(file: _File, transmit: bool, meanings: dict[tuple[int, int], Entry]) -> tuple[Frame, ...]:
     frames = []
     for number in _PDOS:
-        cob_id = file.find(od.pdo_cob_id(transmit, number))
-        count = file.find(od.pdo_entry_count(transmit, number)) or 0
+        cob_id = file.find(od.pdo(transmit, number, od.PDO_COB_ID))
+        count = file.find(od.pdo_entry(transmit, number, 0)) or 0
         if cob_id is None or cob_id & _NOT_VALID or not count:
             continue
         words = [file.find(od.pdo_entry(transmit, number, sub)) or 0 for sub in range(1, count + 1)]

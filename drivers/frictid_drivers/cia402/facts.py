@@ -68,11 +68,7 @@ class Source(Protocol):
 
 
 def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | None = None) -> Facts:
-    """Ask the drive; about forty uploads, no download.
-
-    Args:
-        drive: to ask.
-        quirks_of: what is known of a vendor, product and revision besides.
+    """Ask the drive, and what is known of its vendor, product and revision; about forty uploads, no download.
 
     Raises:
         HardwareError: no answer.
@@ -106,7 +102,7 @@ def read_facts(drive: Source, quirks_of: Callable[[int, int, int], Quirks] | Non
         polarity=drive.find(od.POLARITY) or 0,
         home_offset=drive.find(od.HOME_OFFSET) or 0,
         heartbeat_consumers=drive.find(od.HEARTBEAT_CONSUMERS),
-        sync_counter=there(od.SYNC_OVERFLOW) and there(od.pdo_sync_start(1)),
+        sync_counter=there(od.SYNC_OVERFLOW) and there(od.pdo(True, 1, od.PDO_SYNC_START)),
         torque_offset=there(od.TORQUE_OFFSET),
         target_torque=there(od.TARGET_TORQUE),
         error_code=there(od.ERROR_CODE),

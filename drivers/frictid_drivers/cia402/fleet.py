@@ -14,12 +14,11 @@ from frictid_drivers.cia402.access import Drive, RefusedByDrive, Write
 from frictid_drivers.cia402.bus_load import BusLoad, highest_rate_hz
 from frictid_drivers.cia402.codec import HEARTBEAT_BASE
 from frictid_drivers.cia402.facts import Facts, read_facts
-from frictid_drivers.cia402.frame_map import FrameMap, JointFrames
+from frictid_drivers.cia402.frame_map import FrameMap, JointFrames, joint_frames
 from frictid_drivers.cia402.layout import Layout, NodeWish, plan_layout
-from frictid_drivers.cia402.network import Node, Wire
+from frictid_drivers.cia402.network import Node, SdoDrive, Wire
 from frictid_drivers.cia402.quirks import Catalogue, merged, quirks_of_eds
 from frictid_drivers.cia402.scale import Scale, raise_on_error, scale_of
-from frictid_drivers.cia402.sdo import SdoDrive
 from frictid_drivers.cia402.settings import BusSettings, JointSettings
 from frictid_hil.errors import HardwareError, PlanRefused
 from frictid_hil.plan.mode import Mode
@@ -36,18 +35,12 @@ class Fleet:
     """The drives of one robot, reached; reads only until ``configure``.
 
     Args:
-        setup: the robot.
-        settings: of the bus.
-        joint_settings: by joint name.
         bus: open.
         sink: told of every frame, at a run time that stands still while nobody cycles.
 
     Attributes:
-        wire: canopen on that bus.
         stamp_ns: run time that frames outside the cycle are stamped with.
-        drives: SDO access by joint name.
         facts: what each drive said of itself.
-        scales: joint-side factors, by joint name, once configured.
         notes: what drives did not take and the run goes on without, by joint name, once configured.
 
     Raises:
@@ -68,7 +61,7 @@ class Fleet:
         self.stamp_ns = 0
         self.wire = Wire(bus, sink, lambda: self.stamp_ns)
         self.drives: dict[str, Drive] = {}
-        self.scales: dict[str, Scale] = {}
+        self._scales: dict[str, Scale] = {}
         # Objects are addressed by index; no EDS is needed.
         empty = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]  # canopen is only partly typed
         for joint in setup.joints:
@@ -79,11 +72,10 @@ class Fleet:
         catalogue = Catalogue(setup.folder)
         self.facts: dict[str, Facts] = {}
         self.notes: dict[str, list[str]] = {}
-        for joint in setup.joints:
-            drive = self.drives[joint.name]
-            facts = self.facts[joint.name] = read_facts(drive, catalogue.of)
-            eds = joint_settings[joint.name].eds
-            drive.learn(merged(facts.quirks, quirks_of_eds(eds, joint.address)) if eds else facts.quirks)
+        for name, drive in self.drives.items():
+            facts = self.facts[name] = read_facts(drive, catalogue.of)
+            eds = joint_settings[name].eds
+            drive.learn(merged(facts.quirks, quirks_of_eds(eds, drive.node_id)) if eds else facts.quirks)
 
     @property
     def sync_counter(self) -> bool:
@@ -138,8 +130,9 @@ class Fleet:
 
     def _wish(self, joint: JointSetup) -> NodeWish:
         facts, settings = self.facts[joint.name], self._joint_settings[joint.name]
-        drive = self.drives[joint.name]
-        quirks, offset = drive.quirks, drive.quirks.typed(od.TORQUE_OFFSET)
+        drive, quirks = self.drives[joint.name], self.drives[joint.name].quirks
+        offset = quirks.typed(od.TORQUE_OFFSET)
+        timers = (drive.known(od.pdo(False, number, od.RPDO_TIMEOUT)) for number in (1, 2))
         return NodeWish(
             joint=joint.name,
             node=joint.address,
@@ -152,17 +145,11 @@ class Fleet:
             interpolated=facts.position_mode == od.INTERPOLATED,
             offset=offset,
             decimates=quirks.sends_on(10),
-            supervised_s=self._rpdo_timeout_s(drive),
+            supervised_s=min((ms for ms in timers if ms), default=0) * 1e-3,
             external_torque=settings.external_torque_object,
             temperature=settings.temperature_object,
             digital_inputs=settings.digital_inputs,
         )
-
-    @staticmethod
-    def _rpdo_timeout_s(drive: Drive) -> float:
-        """How long the drive waits for an RPDO (1400:05, 1401:05); 0 where it does not watch them."""
-        timeouts = [drive.known(od.rpdo_timeout_ms(number)) or 0 for number in (1, 2)]
-        return min((ms for ms in timeouts if ms), default=0) * 1e-3
 
     # -- writing ------------------------------------------------------------------------------------------------
 
@@ -261,9 +248,9 @@ class Fleet:
         Raises:
             HardwareError: not configured yet.
         """
-        if joint not in self.scales:
+        if joint not in self._scales:
             raise HardwareError("not configured yet", where=f"joint {joint}")
-        return self.scales[joint]
+        return self._scales[joint]
 
     def forget_set_points(self) -> None:
         """The cycle has changed these past the SDO."""
@@ -274,38 +261,30 @@ class Fleet:
         drive, facts = self.drives[joint.name], self.facts[joint.name]
         settings = self._joint_settings[joint.name]
         notes = []
-        if joint.name not in self.scales:
+        scale = self._scales.get(joint.name)
+        if scale is None:
             dependent = configure.velocity_dependent(drive)
             notes += drive.apply(configure.velocity_unit_writes(drive))
             notes += drive.apply(configure.dependent_writes(drive, facts.velocity_unit, dependent))
             scale, findings = scale_of(facts, joint, drive.known(od.VELOCITY_UNIT))
             raise_on_error(findings)
-            self.scales[joint.name] = scale
-        scale = self.scales[joint.name]
+            self._scales[joint.name] = scale
         notes += drive.apply(self._writes(joint, scale, layout))
         configure.refuse_other_period(drive, layout.cycle_hz, notes)
         target = od.INTERPOLATED_TARGET if facts.position_mode == od.INTERPOLATED else od.TARGET_POSITION
         drive.write_blind(target, drive.read(od.POSITION_ACTUAL))
         self.notes[joint.name] = notes
-        frames = {(pdo.transmit, pdo.number): communication.frame_of(drive, pdo) for pdo in layout.pdos[joint.name]}
-        return JointFrames(
-            name=joint.name,
-            node=joint.address,
-            position_rad_per_unit=scale.position_rad,
-            velocity_rad_s_per_unit=scale.velocity_rad_s,
-            torque_nm_per_unit=scale.torque_nm,
-            external_torque_nm_per_unit=settings.external_torque_nm_per_unit,
-            temperature_c_per_unit=settings.temperature_c_per_unit,
-            reports=tuple(frame for (transmit, _), frame in frames.items() if transmit),
-            commands=tuple(frame for (transmit, _), frame in frames.items() if not transmit),
+        reports, commands = (
+            [communication.frame_of(drive, pdo) for pdo in layout.pdos[joint.name] if pdo.transmit is transmit]
+            for transmit in (True, False)
         )
+        return joint_frames(joint, scale, settings, reports, commands)
 
     def _on_heartbeat(self, can_id: int, data: bytearray, _timestamp: float) -> None:
         """A boot-up frame says that nothing we wrote is there any more."""
-        if data and data[0] == 0:
-            for joint in self._setup.joints:
-                if HEARTBEAT_BASE + joint.address == can_id:
-                    self.drives[joint.name].forget()
+        for drive in self.drives.values():
+            if data and data[0] == 0 and HEARTBEAT_BASE + drive.node_id == can_id:
+                drive.forget()
 
     def _refuse_overload(self, load: BusLoad, active: Sequence[str]) -> None:
         if not load.fits:

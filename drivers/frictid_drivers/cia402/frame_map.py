@@ -31,9 +31,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from frictid_drivers.cia402.entry import FIGURES, Entry
-from frictid_drivers.cia402.objects import IntegerType
+from frictid_drivers.cia402.objects import FIGURES, Entry, IntegerType
+from frictid_drivers.cia402.scale import Scale
+from frictid_drivers.cia402.settings import JointSettings
 from frictid_hil.errors import FieldProblem, InvalidFields
+from frictid_hil.plan.setup import JointSetup
 
 SCHEMA = "frictid.frames/1"
 
@@ -66,15 +68,10 @@ class JointFrames:
     """The frames of one joint and what their integers are worth.
 
     Attributes:
-        name: joint.
         node: CANopen node id; its EMCY and heartbeat are those of this joint.
         position_rad_per_unit: of 6064 and 607A.
         velocity_rad_s_per_unit: of 606C and 60FF.
         torque_nm_per_unit: of 6077, 6071 and 60B2.
-        external_torque_nm_per_unit: of a force sensor.
-        temperature_c_per_unit: of a temperature.
-        reports: what the drive sends.
-        commands: what the host sends.
     """
 
     name: str
@@ -86,6 +83,15 @@ class JointFrames:
     temperature_c_per_unit: float = math.nan
     reports: tuple[Frame, ...] = ()
     commands: tuple[Frame, ...] = ()
+
+
+def joint_frames(
+    joint: JointSetup, scale: Scale, settings: JointSettings, reports: Sequence[Frame], commands: Sequence[Frame]
+) -> JointFrames:
+    """The frames of a joint of the robot file."""
+    figures = (scale.position_rad, scale.velocity_rad_s, scale.torque_nm)
+    sensors = (settings.external_torque_nm_per_unit, settings.temperature_c_per_unit)
+    return JointFrames(joint.name, joint.address, *figures, *sensors, tuple(reports), tuple(commands))
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,12 +163,11 @@ class _Reader:
         read = tuple(self._joint(str(name), joint) for name, joint in joints.items())
         seen: dict[int, str] = {}
         for joint in read:
-            for frame in (*joint.reports, *joint.commands):
-                other = seen.setdefault(frame.cob_id, joint.name)
-                if other != joint.name or sum(f.cob_id == frame.cob_id for f in (*joint.reports, *joint.commands)) > 1:
-                    self._problem(
-                        ("joints", joint.name), f"COB-ID {frame.cob_id:#05x} is described twice (joint {other})"
-                    )
+            ids = [frame.cob_id for frame in (*joint.reports, *joint.commands)]
+            for cob_id in ids:
+                other = seen.setdefault(cob_id, joint.name)
+                if other != joint.name or ids.count(cob_id) > 1:
+                    self._problem(("joints", joint.name), f"COB-ID {cob_id:#05x} is described twice (joint {other})")
         if self._problems:
             raise InvalidFields(self._problems)
         return FrameMap(read, sync, window_ns, host_node)
@@ -180,11 +185,10 @@ class _Reader:
         }
         factors.setdefault("position_rad_per_unit", 1.0)
         reports = self._frames((*path, "reports"), mapping.get("reports", ()))
-        for frame in reports:
-            for meaning in frame.meanings:
-                key = FIGURES.get(meaning)
-                if key and key not in factors:
-                    self._problem((*path, key), f"missing: what a unit of the reported {meaning} is worth")
+        for meaning in (meaning for frame in reports for meaning in frame.meanings):
+            key = FIGURES.get(meaning)
+            if key and key not in factors:
+                self._problem((*path, key), f"missing: what a unit of the reported {meaning} is worth")
         return JointFrames(
             name=name,
             node=self._integer((*path, "node"), mapping.get("node"), 1, 127),

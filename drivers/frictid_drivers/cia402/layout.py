@@ -29,8 +29,8 @@ from dataclasses import dataclass, field
 
 from frictid_drivers.cia402 import objects as od
 from frictid_drivers.cia402.bus_load import BusLoad, SyncFrame, bus_load
-from frictid_drivers.cia402.entry import Entry
 from frictid_drivers.cia402.frame_map import Frame
+from frictid_drivers.cia402.objects import Entry
 from frictid_hil.protocol.can_load import BitRates
 
 REPORT_INTERVAL_S = 0.010
@@ -46,24 +46,16 @@ class Pdo:
 
     Attributes:
         transmit: a TPDO of the drive, else an RPDO.
-        number: from 1.
-        cob_id: of the predefined connection set.
-        entries: what it carries.
+        frame: its COB-ID is that of the predefined connection set.
         every: transmission type: sent or applied on every so many SYNCs.
         start: SYNC counter value of the first one, 0 for none.
     """
 
     transmit: bool
     number: int
-    cob_id: int
-    entries: tuple[Entry, ...]
+    frame: Frame
     every: int = 1
     start: int = 0
-
-    @property
-    def frame(self) -> Frame:
-        """Identifier and content."""
-        return Frame(self.cob_id, self.entries)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +63,11 @@ class NodeWish:
     """What the layout must know of one joint.
 
     Attributes:
-        joint: name.
-        node: id.
-        torque_offset: 60B2 exists.
-        torque_target: 6071 exists.
-        velocity_target: 60FF exists.
-        external_torque: vendor object of a force sensor, None for none.
-        temperature: vendor object of a temperature, None for none.
+        torque_offset: 60B2 exists and can be mapped.
+        torque_target: 6071 likewise.
+        velocity_target: 60FF likewise.
+        external_torque: vendor object of a force sensor.
+        temperature: vendor object of a temperature.
         digital_inputs: 60FD is to be reported.
         error_code: 603F exists and can be mapped.
         interpolated: targets go to 60C1, for interpolated position mode.
@@ -106,13 +96,9 @@ class Layout:
     """All frames of a robot at one rate.
 
     Attributes:
-        cycle_hz: rate of SYNC.
         active: joints that report on every SYNC.
-        pdos: by joint name.
         sync_overflow: 1019, 0 where no SYNC counter is used.
         interval_cycles: SYNCs between two reports of a locked joint.
-        host_heartbeat_s: period of our own heartbeat.
-        drive_heartbeat_s: period of every drive's heartbeat.
         rates: of the bus; PDOs are CAN FD frames where it has a data rate.
         resend_cycles: by joint, after how many cycles a command goes out again though nothing changed.
     """
@@ -161,17 +147,9 @@ def plan_layout(
     rates: BitRates,
     pdo_bytes: int = 8,
 ) -> Layout:
-    """Decide every PDO.
+    """Decide every PDO, for joints of which the active ones report on every SYNC.
 
-    Args:
-        wishes: all joints.
-        active: names of those that report on every SYNC.
-        cycle_hz: rate.
-        sync_counter: every drive has 1019 and 18xx:06.
-        host_heartbeat_s: period of our heartbeat.
-        drive_heartbeat_s: period of the drives' heartbeats.
-        rates: of the bus.
-        pdo_bytes: how long the drives' PDOs may be.
+    ``sync_counter``: every drive has 1019 and 18xx:06; ``pdo_bytes``: how long the drives' PDOs may be.
     """
     interval = max(1, min(_MAX_TYPE, math.floor(REPORT_INTERVAL_S * cycle_hz + 1e-9)))
     slow = interval * max(1, min(_SLOW_FACTOR, _MAX_TYPE // interval))
@@ -239,34 +217,33 @@ class _Slots:
 def _pdos(
     wish: NodeWish, pdo_bytes: int, every: int, start: int, *, slow_every: int, slow_start: int
 ) -> tuple[Pdo, ...]:
-    target = od.INTERPOLATED_TARGET if wish.interpolated else od.TARGET_POSITION
-    command = [Entry.of(od.CONTROLWORD), Entry.of(target)]
-    other = [Entry.of(od.MODE)]
+    node, of = wish.node, Entry.of
+    command = [of(od.CONTROLWORD), of(od.INTERPOLATED_TARGET if wish.interpolated else od.TARGET_POSITION)]
+    other = [of(od.MODE)]
+    short_offset = wish.offset.type.bits == 16
     if wish.torque_offset:
         # Beside the position where it fits a frame, else with the mode, which goes out whenever it changes.
-        offset = Entry.of(wish.offset)
-        (command if wish.offset.type.bits == 16 else other).append(offset)
+        (command if short_offset else other).append(of(wish.offset))
     if wish.torque_target:
-        other.append(Entry.of(od.TARGET_TORQUE))
-    if wish.velocity_target and wish.offset.type.bits == 16:  # 6060, 6071, 60FF and 60B2 of 32 bits are too much
-        other.append(Entry.of(od.TARGET_VELOCITY))
-    fast = [Entry.of(od.STATUSWORD), Entry.of(od.POSITION_ACTUAL), Entry.of(od.TORQUE_ACTUAL)]
-    velocity = [Entry.of(od.VELOCITY_ACTUAL)] + ([wish.external_torque] if wish.external_torque else [])
-    display = [Entry.of(od.MODE_DISPLAY)]
-    display += ([Entry.of(od.ERROR_CODE)] if wish.error_code else []) + ([wish.temperature] if wish.temperature else [])
-    node = wish.node
-    pdos: tuple[Pdo, ...] = (
-        Pdo(False, 1, 0x200 + node, tuple(command)),
-        Pdo(False, 2, 0x300 + node, tuple(other)),
-        Pdo(True, 1, 0x180 + node, tuple(fast), every, start),
-        Pdo(True, 2, 0x280 + node, tuple(velocity), every, start),
-        Pdo(True, 3, 0x380 + node, tuple(display), slow_every, slow_start),
-    )
-    whole = Pdo(True, 1, 0x180 + node, tuple(fast + velocity), every, start)
-    if whole.frame.size <= pdo_bytes:
-        pdos = (*pdos[:2], whole, pdos[4])
-    if not wish.digital_inputs:
-        return pdos
-    # As often as a locked joint reports: an active joint's inputs go with its slow report, others with the fast ones.
-    inputs_every, inputs_start = (slow_every, slow_start) if every == 1 else (every, start)
-    return (*pdos, Pdo(True, 4, 0x480 + node, (Entry.of(od.DIGITAL_INPUTS),), inputs_every, inputs_start))
+        other.append(of(od.TARGET_TORQUE))
+    if wish.velocity_target and short_offset:  # 6060, 6071, 60FF and 60B2 of 32 bits are too much
+        other.append(of(od.TARGET_VELOCITY))
+    fast = [of(od.STATUSWORD), of(od.POSITION_ACTUAL), of(od.TORQUE_ACTUAL)]
+    velocity = [of(od.VELOCITY_ACTUAL), *([wish.external_torque] if wish.external_torque else [])]
+    display = [of(od.MODE_DISPLAY), *([of(od.ERROR_CODE)] if wish.error_code else [])]
+    display += [wish.temperature] if wish.temperature else []
+    pdos = [
+        Pdo(False, 1, Frame(0x200 + node, tuple(command))),
+        Pdo(False, 2, Frame(0x300 + node, tuple(other))),
+        Pdo(True, 1, Frame(0x180 + node, tuple(fast)), every, start),
+        Pdo(True, 2, Frame(0x280 + node, tuple(velocity)), every, start),
+        Pdo(True, 3, Frame(0x380 + node, tuple(display)), slow_every, slow_start),
+    ]
+    whole = Frame(0x180 + node, tuple(fast + velocity))
+    if whole.size <= pdo_bytes:
+        pdos[2:4] = [Pdo(True, 1, whole, every, start)]
+    if wish.digital_inputs:
+        # As often as a locked joint reports: an active joint's inputs go with its slow report, others with the fast.
+        often = (slow_every, slow_start) if every == 1 else (every, start)
+        pdos.append(Pdo(True, 4, Frame(0x480 + node, (of(od.DIGITAL_INPUTS),)), *often))
+    return tuple(pdos)

@@ -169,31 +169,87 @@ MILLI_RPM = 0xFDB44700
 """60A9: 10^-3 revolutions per minute, fine enough for friction work."""
 
 
-def pdo_cob_id(transmit: bool, number: int) -> Object:
-    """1400/1800 sub 1 of the PDO ``number`` (from 1)."""
-    return _object((0x1800 if transmit else 0x1400) + number - 1, 1, "u32", "PDO COB-ID")
+PDO_COB_ID, PDO_TYPE, RPDO_TIMEOUT, PDO_SYNC_START = 1, 2, 5, 6
+_PDO = {
+    PDO_COB_ID: ("u32", "PDO COB-ID"),
+    PDO_TYPE: ("u8", "PDO transmission type"),
+    RPDO_TIMEOUT: ("u16", "RPDO event timer, ms"),
+    PDO_SYNC_START: ("u8", "PDO SYNC start value"),
+}
 
 
-def pdo_type(transmit: bool, number: int) -> Object:
-    """1400/1800 sub 2."""
-    return _object((0x1800 if transmit else 0x1400) + number - 1, 2, "u8", "PDO transmission type")
-
-
-def rpdo_timeout_ms(number: int) -> Object:
-    """1400 sub 5: the RPDO's deadline monitoring."""
-    return _object(0x1400 + number - 1, 5, "u16", "RPDO event timer, ms")
-
-
-def pdo_sync_start(number: int) -> Object:
-    """1800 sub 6."""
-    return _object(0x1800 + number - 1, 6, "u8", "PDO SYNC start value")
-
-
-def pdo_entry_count(transmit: bool, number: int) -> Object:
-    """1600/1A00 sub 0."""
-    return _object((0x1A00 if transmit else 0x1600) + number - 1, 0, "u8", "number of mapped objects")
+def pdo(transmit: bool, number: int, sub: int) -> Object:
+    """1400/1800 of the PDO ``number`` (from 1)."""
+    return _object((0x1800 if transmit else 0x1400) + number - 1, sub, *_PDO[sub])
 
 
 def pdo_entry(transmit: bool, number: int, sub: int) -> Object:
-    """1600/1A00 sub 1..64."""
-    return _object((0x1A00 if transmit else 0x1600) + number - 1, sub, "u32", "mapped object")
+    """1600/1A00: how many entries at 0, entries from 1."""
+    kind, name = ("u32", "mapped object") if sub else ("u8", "number of mapped objects")
+    return _object((0x1A00 if transmit else 0x1600) + number - 1, sub, kind, name)
+
+
+STATUS, MODE_SHOWN, ERROR, INPUTS = "status", "mode", "error", "digital_inputs"
+"""Reported meanings beside figures."""
+FIGURES = {
+    "position": "position_rad_per_unit",
+    "velocity": "velocity_rad_s_per_unit",
+    "torque": "torque_nm_per_unit",
+    "external_torque": "external_torque_nm_per_unit",
+    "temperature": "temperature_c_per_unit",
+}
+"""Reported meanings that are multiplied by a factor, and the factor's key."""
+
+_MEANINGS = {
+    STATUSWORD.index: STATUS,
+    MODE_DISPLAY.index: MODE_SHOWN,
+    ERROR_CODE.index: ERROR,
+    DIGITAL_INPUTS.index: INPUTS,
+    POSITION_ACTUAL.index: "position",
+    VELOCITY_ACTUAL.index: "velocity",
+    TORQUE_ACTUAL.index: "torque",
+    CONTROLWORD.index: "controlword",
+    MODE.index: "target_mode",
+    TARGET_POSITION.index: "target_position",
+    INTERPOLATED_TARGET.index: "target_position",
+    TARGET_VELOCITY.index: "target_velocity",
+    TARGET_TORQUE.index: "target_torque",
+    TORQUE_OFFSET.index: "torque_offset",
+}
+_KNOWN = {*_MEANINGS.values(), *FIGURES}
+_ENTRY = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2}) ([iu][0-9]{1,2})(?: (\w+))?$", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An object and what it means to us, as robot files, frame maps and PDOs name it; "" when it is skipped."""
+
+    index: int
+    sub: int
+    type: IntegerType
+    meaning: str = ""
+
+    @staticmethod
+    def of(item: Object) -> Entry:
+        """The entry of a known object."""
+        return Entry(item.index, item.sub, item.type, _MEANINGS.get(item.index, ""))
+
+    @staticmethod
+    def parse(text: str) -> Entry:
+        """``"6064:00 i32"`` or ``"2401:00 i16 external_torque"``.
+
+        Raises:
+            ValueError: not of that form, or an unknown meaning.
+        """
+        match = _ENTRY.match(text)
+        if match is None:
+            raise ValueError(f"{text!r} is not of the form '6064:00 i32' or '2401:00 i16 external_torque'")
+        index = int(match.group(1), 16)
+        meaning = match.group(4) or _MEANINGS.get(index, "")
+        if meaning and meaning not in _KNOWN:
+            raise ValueError(f"{text!r}: unknown meaning {meaning!r}; known: {', '.join(sorted(_KNOWN))}")
+        return Entry(index, int(match.group(2), 16), IntegerType.parse(match.group(3)), meaning)
+
+    def __str__(self) -> str:
+        meaning = f" {self.meaning}" if self.meaning and self.meaning != _MEANINGS.get(self.index) else ""
+        return f"{self.index:04X}:{self.sub:02X} {self.type}{meaning}"

@@ -40,11 +40,7 @@ def standing_fault(joint: str, drive: Drive) -> Finding | None:
 
 
 def bring_back(drive: Drive, nmt: Callable[[int], None]) -> None:
-    """Out of fault or quick stop, without power.
-
-    Args:
-        drive: to bring back.
-        nmt: sends it an NMT command.
+    """Out of fault or quick stop, without power; ``nmt`` sends the drive an NMT command.
 
     Raises:
         HardwareError: it has power, does not come back after the reset of its communication, or stays in fault.

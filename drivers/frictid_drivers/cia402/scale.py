@@ -45,7 +45,6 @@ class Scale:
         velocity_rad_s: of 606C, 60FF.
         torque_nm: of 6077, 6071, 6072, 60B2.
         rated_torque_nm: what 1000 per mille are, always positive.
-        gear_ratio: as used.
     """
 
     position_rad: float
@@ -58,10 +57,12 @@ class Scale:
 def scale_of(facts: Facts, joint: JointSetup, velocity_unit: int | None) -> tuple[Scale, list[Finding]]:
     """Joint-side factors from the drive's own figures, and everything that does not fit the robot file.
 
+    Options ``position_units_per_revolution`` (of the joint), ``velocity_unit_rad_s`` (joint side) and
+    ``rated_torque_side: joint`` override what a drive says wrongly or not at all.
+
     Args:
         facts: of the drive.
-        joint: of the robot file. Options ``position_units_per_revolution`` (of the joint), ``velocity_unit_rad_s``
-            (joint side) and ``rated_torque_side: joint`` override what a drive says wrongly or not at all.
+        joint: of the robot file.
         velocity_unit: 60A9 as it is or will be set, None where the drive has none.
 
     Returns:

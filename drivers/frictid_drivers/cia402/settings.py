@@ -52,8 +52,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from frictid_drivers.cia402.entry import Entry
-from frictid_drivers.cia402.objects import Object
+from frictid_drivers.cia402.objects import Entry, Object
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.can_bus import DEFAULT_BITRATE, DEFAULT_DATA_BITRATE, FORWARDED

@@ -80,13 +80,9 @@ class Target(Enum):
 def next_controlword(state: DriveState, target: Target, *, standing: bool, may_enable: bool) -> int:
     """The controlword for the coming cycle; asked every cycle, waits for nothing.
 
-    A fault is never reset here: that takes a rising edge of bit 7 which only an explicit request sends.
-
-    Args:
-        state: as last reported.
-        target: as last requested.
-        standing: the joint does not move; power is taken away only then.
-        may_enable: drive, mode and watchdogs are as they should be; else the walk stops before power reaches the motor.
+    A fault is never reset here: that takes a rising edge of bit 7 which only an explicit request sends. Power is taken
+    away only from a joint that is ``standing``; without ``may_enable`` (drive, mode and watchdogs are as they should
+    be) the walk stops before power reaches the motor.
     """
     if state in (DriveState.FAULT, DriveState.FAULT_REACTION, DriveState.NOT_READY, DriveState.UNKNOWN):
         return DISABLE_VOLTAGE

@@ -78,22 +78,16 @@ class Axis:
     """One motor.
 
     Args:
-        dictionary: of the node.
-        plant: the joint.
         gear_ratio: motor revolutions per joint revolution, as built.
         increments_per_revolution: encoder increments per joint revolution, as built.
-        direction: +1 or -1.
         torque_step: smallest step of the reported torque, per mille.
 
     Attributes:
         now_ns: run time that the plant has reached.
-        powered: current may flow.
-        mode: 8, 9, 10, or 0 for none.
         alarm: EMCY code of what supervision found, 0 for nothing; the node clears it.
         ramping: decelerating to standstill.
         internal_limit: a set-point was cut by a limit (statusword bit 11).
         following_error: outside the window right now (statusword bit 13).
-        max_torque_per_mille: 6072h as taken over last.
         encoder_stuck: report the last position for ever (a fault to play).
         company: brings this axis and those that can only move on with it to a run time, or as far towards it as their
             commands go on unbroken; None where it is alone.

@@ -7,27 +7,31 @@ difference; this class only builds the bus, takes it exclusively and tears it do
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import can
 
-from frictid_drivers.virtual import channel, side_channel
-from frictid_drivers.virtual.arm import arm_of
+from frictid_drivers.virtual import channel
 from frictid_drivers.virtual.faults import HOST_KINDS, faults_of, missing_objects
 from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_drivers.virtual.faulty_rack import FaultyRack, leave_in_fault
 from frictid_drivers.virtual.lock_step import LockStepBus, LockStepClock
-from frictid_drivers.virtual.rack import Rack
+from frictid_drivers.virtual.objects import OBJECTS, SIZE_BYTES, key, key_text
+from frictid_drivers.virtual.rack import Rack, arm_of
 from frictid_drivers.virtual.rack_launcher import RunningRack, start_rack
 from frictid_drivers.virtual.socket_bus import SocketBus
-from frictid_hil.errors import InvalidFields, UsageError
+from frictid_hil.errors import HardwareError, InvalidFields, UsageError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import Capabilities, DriverKind, FrameSink, WallClock, unknown_options
 from frictid_hil.simulation.joint import JointModel
 
 if TYPE_CHECKING:
     import filelock
+
+
+_WRITE_S = 2.0
 
 
 class VirtualDriver:
@@ -147,7 +151,7 @@ class VirtualDriver:
     def _write(self, joint: str, index: int, subindex: int, value: int) -> None:
         if self._setup.realtime:
             with SocketBus(self._channel) as bus:
-                side_channel.write(bus, self._setup.joint(joint).address, index, subindex, value)
+                write_object(bus, self._setup.joint(joint).address, index, subindex, value)
         else:
             self._rack.servos[joint].write(index, subindex, value, self._rack.now_ns)
 
@@ -174,3 +178,31 @@ def _objects(joint: JointSetup, *, fd: bool) -> dict[str, Any]:
     if "hand" in joint.simulated:
         known |= {"external_torque_object": "2030:00 i32", "external_torque_nm_per_unit": 0.001}
     return known
+
+
+def write_object(bus: can.BusABC, node: int, index: int, subindex: int, value: int) -> None:
+    """One expedited SDO download by a second member of the bus.
+
+    What a person's hand does to a joint, or a payload on it, is no part of a robot's control; it must not take the
+    host's SDO client, nor wait for its cycle.
+
+    Raises:
+        HardwareError: refused, or no answer.
+    """
+    address = key(index, subindex)
+    size = next(
+        SIZE_BYTES[entry.kind] for record in OBJECTS if record.index == index for entry in record.entries
+        if entry.key == address
+    )  # fmt: skip
+    header = bytes([0x23 | (4 - size) << 2, index & 0xFF, index >> 8, subindex])
+    data = header + (value & 0xFFFFFFFF).to_bytes(4, "little")
+    bus.send(can.Message(arbitration_id=0x600 + node, data=data, is_extended_id=False))
+    deadline_s = time.monotonic() + _WRITE_S
+    while (left_s := deadline_s - time.monotonic()) > 0:
+        reply = bus.recv(left_s)
+        if reply is not None and reply.arbitration_id == 0x580 + node and bytes(reply.data[1:4]) == header[1:]:
+            if reply.data[0] == 0x60:
+                return
+            code = int.from_bytes(reply.data[4:8], "little")
+            raise HardwareError(f"refused with {code:08X}h", where=f"node {node}, object {key_text(address)}")
+    raise HardwareError("no answer", where=f"node {node}, object {key_text(address)}")

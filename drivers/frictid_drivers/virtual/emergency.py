@@ -37,10 +37,6 @@ def register_bits(code: int) -> int:
 class Emergency:
     """Errors of one node.
 
-    Args:
-        dictionary: 1001h, 1003h and 603Fh live there.
-        send: sends the 8 bytes of an EMCY.
-
     Attributes:
         present: error codes, oldest first.
     """

@@ -112,11 +112,9 @@ class Fault:
         at_s: when, after the first SYNC; None from the beginning.
         count: how many frames or calls.
         after: how many frames or calls pass first.
-        joints: whose.
         nodes: of these joints.
         frames: which, by name.
         cob_ids: and by identifier, where these are CANopen's.
-        code: EMCY or SDO abort code.
         quantity: object of the report.
         level: of the report, in the drive's units; bytes that are left; bit/s of the wire.
         factor: of the report, or of the drives' clocks.
@@ -156,12 +154,7 @@ ENVIRONMENT = "FRICTID_VIRTUAL_FAULTS"
 def faults_of(
     setup: RobotSetup, *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
 ) -> tuple[Fault, ...]:
-    """The faults of a robot file and of the environment.
-
-    Args:
-        setup: the robot.
-        kinds: that its simulated drives know.
-        frames: names of the frames on its wire.
+    """The faults of a robot file and of the environment: of kinds that its drives know, and frames on its wire.
 
     Raises:
         InvalidFields: what is wrong with the robot file's.
@@ -183,13 +176,7 @@ def faults_of(
 def read_faults(
     rows: Any, nodes: Mapping[str, int], *, kinds: tuple[str, ...] = KINDS, frames: tuple[str, ...] = tuple(SERVICES)
 ) -> tuple[Fault, ...]:
-    """A list of faults.
-
-    Args:
-        rows: the list under ``options.faults``; None for none.
-        nodes: node numbers of the joints that it may name.
-        kinds: that it may name.
-        frames: likewise.
+    """The list under ``options.faults``, None for none; it may name these joints (with their nodes), kinds and frames.
 
     Raises:
         InvalidFields: what is wrong, by ``options.faults.N.KEY``.

@@ -39,8 +39,6 @@ class FaultyBus(can.BusABC):
         channel: ``interface:channel`` of the good bus, or the bus itself; it is shut down together with this.
         faults: as read, or as a robot file lists them.
         now_ns: run time; the monotonic clock unless told.
-        stand_still: lets so many seconds pass.
-        arguments: of the good bus.
 
     Raises:
         can.CanInitializationError: a fault is not described as it must be.

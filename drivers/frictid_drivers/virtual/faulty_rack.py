@@ -15,12 +15,7 @@ _SWITCHED = ("mute", "reset", "emcy", "fault", "stuck_encoder", "blocked", "inte
 
 
 class FaultyRack:
-    """See ``Rack`` for what its members mean.
-
-    Args:
-        rack: the drives.
-        faults: what goes wrong.
-    """
+    """See ``Rack`` for what its members mean."""
 
     def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
         self.transmit: Transmit = lambda can_id, data: None  # no bus yet

@@ -13,7 +13,6 @@ class Consumer:
     """One node listened for.
 
     Attributes:
-        timeout_ns: longest silence.
         deadline_ns: when it counts as lost; None until it was heard.
         lost: it fell silent and has not been heard again.
     """

@@ -53,13 +53,8 @@ def servo_for(
 ) -> Servo:
     """The drive of one joint, unpowered, its brake engaged, standing at the start position.
 
-    Args:
-        robot: whose joint it is; gives seed and serial number.
-        joint: the joint.
-        plant: behind the drive, see ``plant_for``.
-        send: puts a frame on the bus.
-        missing: indices of objects that this drive does not have.
-        sync_gap_tenths: longest tolerated gap between SYNCs, in tenths of the period (2010h:01).
+    ``missing``: indices of objects that it does not have; ``sync_gap_tenths``: longest tolerated gap between SYNCs, in
+    tenths of the period (2010h:01).
     """
     model = plant.model
     gear = Fraction(joint.gear_ratio).limit_denominator(1000)

@@ -20,13 +20,7 @@ from frictid_hil.protocol.driver import FD_FRAME
 
 
 class LockStepBus(VirtualBus):
-    """The host's endpoint.
-
-    Args:
-        drives: what is on this bus.
-        channel: python-can's virtual channel.
-        arguments: of ``can.interfaces.virtual.VirtualBus``.
-    """
+    """The host's endpoint."""
 
     def __init__(self, drives: Rack | FaultyRack, channel: str = "frictid", **arguments: Any) -> None:
         arguments.setdefault("protocol", can.CanProtocol.CAN_FD)

@@ -70,8 +70,6 @@ class ObjectDictionary:
         node_id: added to the defaults that depend on it.
         overrides: defaults of this very drive (rated torque, gear, serial number).
         missing: indices that this drive does not have (to play a poorer drive).
-        records: the table.
-        manner: of the drive's family.
 
     Attributes:
         before_upload: brings values up to date.

@@ -28,12 +28,7 @@ HAND = (0x204001, 0x204002, 0x204003, 0x204004)
 
 
 def install_rules(dictionary: ObjectDictionary, powered: Callable[[], bool]) -> None:
-    """Put guards, and the effects that the dictionary has on itself, on a node's objects.
-
-    Args:
-        dictionary: of the node.
-        powered: asked: the motor has power.
-    """
+    """Put guards, and the effects that the dictionary has on itself, on a node's objects."""
     values = dictionary.values
 
     def clear_history() -> None:

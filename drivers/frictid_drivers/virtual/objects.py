@@ -68,7 +68,6 @@ class Entry:
 
     Attributes:
         access: ``ro``, ``rw``, ``wo`` or ``const``.
-        default: value after power-on.
         node_relative: the node id is added to the default.
         receive: may be mapped into an RPDO.
         transmit: may be mapped into a TPDO.

@@ -26,9 +26,6 @@ _PAUSE_S = 0.01
 class BusWire:
     """A python-can bus as the wire of the drives.
 
-    Args:
-        bus: opened.
-
     Attributes:
         heard: called for every frame of others but error frames.
         members: somebody may always be there.

@@ -50,7 +50,6 @@ class ReceivePdo:
     Attributes:
         cob_id: with ``FD_FRAME`` where it is one.
         on_sync: values count from the next SYNC on; else at once.
-        keys: objects in order; dummies have key 0.
         pending: the latest frame, not yet applied.
     """
 
@@ -67,7 +66,6 @@ class TransmitPdo:
 
     Attributes:
         cob_id: with ``FD_FRAME`` where it is one.
-        kind: transmission type.
         start: SYNC counter value that counts as the first, 0 for any.
         inhibit_ns: least time between two event-driven frames.
         event_ns: longest time between two event-driven frames, 0 for none.
@@ -100,8 +98,6 @@ class ProcessData:
     """All PDOs of one node.
 
     Args:
-        dictionary: holds the parameters and the values.
-        send: puts a frame on the bus.
         changed: called after a parameter was written.
 
     Attributes:

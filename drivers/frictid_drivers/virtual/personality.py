@@ -86,10 +86,6 @@ def known_personalities() -> dict[str, dict[str, Any]]:
 def personality_of(joint: JointSetup, folder: Path | None = None) -> Personality | None:
     """The family of a joint's drive; None for the standard servo.
 
-    Args:
-        joint: whose options ``personality`` and ``eds`` are looked at.
-        folder: of the robot file.
-
     Raises:
         InvalidFields: no such family.
         InputFileError: the EDS file cannot be read.

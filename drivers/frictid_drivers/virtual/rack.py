@@ -6,13 +6,17 @@ knows no wall clock and no threads: the same calls give the same frames, bit for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
-from frictid_drivers.virtual.arm import arm_of, couple
+from frictid_drivers.virtual.axis import Axis
 from frictid_drivers.virtual.joint_drive import plant_for, servo_for
 from frictid_drivers.virtual.pdo import NEVER_NS
 from frictid_drivers.virtual.servo import Servo
+from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.simulation.arm import ArmLoop
+from frictid_hil.simulation.arm_model import ArmModel
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 Transmit = Callable[[int, bytes], None]
 Handler = Callable[[bytes, int], None]
@@ -50,10 +54,8 @@ class Rack:
     ) -> None:
         """Build the drives of a robot file in; they have no power yet.
 
-        Args:
-            setup: the robot.
-            missing: indices of objects that drives do not have, by joint.
-            sync_gap_tenths: longest gap between SYNCs that drives tolerate, in tenths of the period.
+        ``missing``: indices of objects that drives do not have, by joint; ``sync_gap_tenths``: longest gap between
+        SYNCs that drives tolerate, in tenths of the period.
 
         Raises:
             InvalidFields: some joint's ``simulated`` mapping, or ``simulated_arm``, is wrong.
@@ -133,3 +135,35 @@ class Rack:
                 found.setdefault(can_id, []).append(handler)
         found[0x000] = [servo.receive_nmt for servo in self.servos.values()]
         return found
+
+
+def couple(model: ArmModel, plants: Sequence[ServoLoop], axes: Sequence[Axis]) -> None:
+    """Put joints that stood alone on one arm, where what one link does the others feel: their axes move on together.
+
+    Each drive still looks at its joint only when something happens to it; whoever looks first brings all to now.
+    """
+    arm = ArmLoop(model, plants)
+
+    def advance(now_ns: int) -> None:
+        end_ns = min(axis.unbroken_until_ns(now_ns) for axis in axes)
+        arm.advance((end_ns - axes[0].now_ns) * 1e-9, [axis.command_until(end_ns) for axis in axes])
+        for axis in axes:
+            axis.arrive(end_ns)
+            axis.supervise()
+
+    for axis in axes:
+        axis.company = advance
+
+
+def arm_of(setup: RobotSetup) -> ArmModel | None:
+    """The simulated arm of a robot file, None where it has none.
+
+    Raises:
+        InvalidFields: what is wrong with it, by ``simulated_arm.KEY``.
+    """
+    if not setup.simulated_arm:
+        return None
+    try:
+        return ArmModel.from_mapping(setup.simulated_arm, {joint.name: joint.dh for joint in setup.joints})
+    except InvalidFields as error:
+        raise InvalidFields([FieldProblem(("simulated_arm", *p.path), p.message) for p in error.problems]) from None

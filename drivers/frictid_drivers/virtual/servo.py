@@ -20,8 +20,7 @@ from frictid_drivers.virtual.object_dictionary import ObjectDictionary, encode
 from frictid_drivers.virtual.object_rules import COMMANDS, HAND, NETWORK, UNITS, install_rules
 from frictid_drivers.virtual.objects import OBJECTS, STANDARD, Key, Manner, Record, Value, key
 from frictid_drivers.virtual.pdo import NEVER_NS, ProcessData, ReceivePdo
-from frictid_drivers.virtual.power_stage import PowerStage
-from frictid_drivers.virtual.power_state import PowerState
+from frictid_drivers.virtual.power_stage import PowerStage, PowerState
 from frictid_drivers.virtual.sdo_server import SdoServer
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
@@ -39,17 +38,9 @@ class Servo:
     """One node.
 
     Args:
-        node_id: 1 to 127.
-        plant: the joint behind it.
-        send: puts a frame on the bus.
-        gear_ratio: motor revolutions per joint revolution, as built.
         increments_per_revolution: encoder increments per joint revolution, as built.
-        direction: +1 or -1, sign of joint motion for positive motor motion.
         torque_step: smallest step of the reported torque, per mille.
-        overrides: defaults of objects of this drive.
-        records: its objects.
         missing: indices of objects that it does not have.
-        manner: what sets its family apart.
         hold_hand: called as (held, centre_rad, amplitude_rad, frequency_hz) when the simulated hand (2040h) changes.
 
     Attributes:

@@ -61,7 +61,6 @@ class SocketBus(can.BusABC):
 
     Args:
         channel: name of the bus, or path of its socket.
-        can_filters: as for any python-can bus.
         arguments: of other interfaces (``bitrate``), of no meaning here.
 
     Raises:

@@ -73,13 +73,9 @@ class WireFaults:
             self._mapping.learn(can_id & ~FD_FRAME, data)
 
     def through(self, now_ns: int, elapsed_ns: float, can_id: int, data: bytes) -> list[Passed]:
-        """The frames that come out, each with the time at which it does.
+        """The frames that come out, each with the time at which it does, on the caller's clock.
 
-        Args:
-            now_ns: on the caller's clock.
-            elapsed_ns: since the first SYNC; -1 before it.
-            can_id: of the frame that goes in.
-            data: of the frame that goes in.
+        ``elapsed_ns`` is since the first SYNC; -1 before it.
         """
         plain = can_id & ~FD_FRAME
         if self._reports:
@@ -99,13 +95,7 @@ def _ids(fault: Fault) -> frozenset[int]:
 
 
 def spoil(state: FaultAtWork, elapsed_ns: float, frame: Passed) -> list[Passed]:
-    """What becomes of a frame that this fault concerns.
-
-    Args:
-        state: a fault of kind ``FRAME_KINDS`` or ``abort``.
-        elapsed_ns: since the first SYNC; -1 before it.
-        frame: with the time at which it comes.
-    """
+    """What becomes of a frame that this fault of kind ``FRAME_KINDS`` or ``abort`` concerns."""
     now_ns, can_id, data = frame
     fault = state.fault
     if fault.kind == "reorder" and state.held is not None:
@@ -187,11 +177,7 @@ class ReportMapping:
 
 
 class WrongFigure:
-    """One figure that drives report, gone wrong.
-
-    Args:
-        fault: of kind ``REPORT_KINDS``.
-    """
+    """One figure that drives report, gone wrong."""
 
     def __init__(self, fault: Fault) -> None:
         self.fault = fault
@@ -200,14 +186,7 @@ class WrongFigure:
         self._turn = False
 
     def applied(self, node: int, now_ns: int, elapsed_ns: float, value: float) -> float:
-        """The figure as it goes on.
-
-        Args:
-            node: that reports it.
-            now_ns: on the caller's clock.
-            elapsed_ns: since the first SYNC; -1 before it.
-            value: that it would be.
-        """
+        """The figure as a node reports it; times as in ``WireFaults.through``."""
         before = self._before.setdefault(node, deque())
         before.append((now_ns, value))
         if self._work.strikes(elapsed_ns):
@@ -250,11 +229,7 @@ class WrongFigure:
 
 
 class Injections:
-    """Frames that nobody sent, in their time: resets and warnings, for a bus whose drives know no faults.
-
-    Args:
-        faults: of kind ``reset`` and ``emcy``; others are ignored.
-    """
+    """Frames that nobody sent, in their time: resets and warnings, for a bus whose drives know no faults."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._due = sorted(
