@@ -225,7 +225,7 @@ def test_velocity_goes_with_position_where_pdos_are_long_enough():
         plan = layout(["0"], 500.0, rates, pdo_bytes=pdo_bytes)
         for pdos in plan.pdos.values():
             assert [pdo.frame.size for pdo in pdos if pdo.transmit] == sizes
-            assert len({pdo.cob_id for pdo in pdos}) == len(pdos)
+            assert len({pdo.frame.cob_id for pdo in pdos}) == len(pdos)
     assert (
         layout(["0"], 500.0, rates, pdo_bytes=64).load().average_bits < layout(["0"], 500.0, rates).load().average_bits
     )

@@ -140,23 +140,15 @@ class Drive(ABC):
         # Four bytes may be a shorter object's, from a drive that leaves the length out of its answer.
         if bits < self.quirks.typed(item).type.bits and bits in (8, 16):
             self._learn_bits(item, bits)
+        kind = self.quirks.typed(item).type
         try:
-            return self.quirks.typed(item).type.unpack(data)
+            return kind.unpack(data)
         except struct.error as error:
             raise HardwareError(
-                f"answered with {len(data)} bytes, expected a {self.quirks.typed(item).type}",
+                f"answered with {len(data)} bytes, expected a {kind}",
                 where=self.where(item.address),
                 cause="the drive's object has another type than CiA 402 gives it",
             ) from error
-
-    def asked_quickly(self, item: Object, timeout_s: float) -> int | None:
-        """Value of an object, waiting for it no longer than this.
-
-        Raises:
-            HardwareError: no answer, or refused.
-        """
-        with self.answering_within(timeout_s):
-            return self.find(item)
 
     def find_text(self, index: int) -> str:
         """A string object, "" where the drive does not have it."""
@@ -175,10 +167,7 @@ class Drive(ABC):
         return self._confirmed[key]
 
     def apply(self, writes: Iterable[Write]) -> list[str]:
-        """Bring every setting about that is not yet so, in order.
-
-        Returns:
-            What drives did not take and the run goes on without, in words.
+        """Bring every setting about that is not yet so, in order; returns what the run goes on without, in words.
 
         Raises:
             RefusedByDrive: a drive does not take what the run cannot go on without.
@@ -218,7 +207,10 @@ class Drive(ABC):
             if found is not None and (found in write.values or not (refused or cannot_map)):
                 continue
             why = self._why_not(write)
-            (lost if write.otherwise else fatal).append(f"{write.otherwise} ({why})" if write.otherwise else why)
+            if write.otherwise:
+                lost.append(f"{write.otherwise} ({why})")
+            else:
+                fatal.append(why)
         return fatal, lost
 
     def _why_not(self, write: Write) -> str:
@@ -296,14 +288,8 @@ class Drive(ABC):
             raise self._refused(item, value, what, cause) from error
 
     def _refused(self, item: Object, value: int, what: str, cause: str) -> RefusedByDrive:
-        return RefusedByDrive(
-            what,
-            item,
-            value,
-            where=self.where(item.address),
-            cause=cause,
-            next_step="see the drive's manual on this object; nothing has moved",
-        )
+        next_step = "see the drive's manual on this object; nothing has moved"
+        return RefusedByDrive(what, item, value, where=self.where(item.address), cause=cause, next_step=next_step)
 
     def forget(self, *items: Object) -> None:
         """These were changed by other means than SDO; with none given, all may have been (the drive was reset)."""

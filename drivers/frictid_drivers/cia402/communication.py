@@ -82,9 +82,8 @@ def pdo_writes(drive: Drive, layout: Layout, joint: str) -> list[Write]:
     """Mapping and transmission of every PDO; those that are not used are made invalid first."""
     used = {(pdo.transmit, pdo.number) for pdo in layout.pdos[joint]}
     writes = []
-    for transmit, number in _ALL:
-        cob_id = od.pdo(transmit, number, od.PDO_COB_ID)
-        present = drive.known(cob_id) if (transmit, number) not in used else None
+    for cob_id in (od.pdo(*which, od.PDO_COB_ID) for which in _ALL if which not in used):
+        present = drive.known(cob_id)
         if present is not None and not present & _NOT_VALID:
             writes.append(Write(cob_id, present | _NOT_VALID, mask=_COB_ID_MASK))
     for pdo in layout.pdos[joint]:

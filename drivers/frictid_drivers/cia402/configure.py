@@ -96,10 +96,7 @@ def velocity_unit_writes(drive: Drive) -> list[Write]:
     a thousand times as long (``dependent_writes``).
     """
     told = drive.known(od.VELOCITY_UNIT)
-    before = None if told is None else velocity_unit_rad_s(told)
-    after = velocity_unit_rad_s(od.MILLI_RPM)
-    assert after is not None  # it is an angle per time
-    if told is None or before is None or told == od.MILLI_RPM:
+    if told is None or told == od.MILLI_RPM or velocity_unit_rad_s(told) is None:
         return []
     return [Write(od.VELOCITY_UNIT, od.MILLI_RPM, "velocity stays in the drive's own, coarser unit")]
 
@@ -127,8 +124,7 @@ def interpolation_writes(drive: Drive, cycle_hz: float) -> list[Write]:
     """60C2 for a rate, only where it differs: in the drive's own power of ten, else in ms, else as exact as can be."""
     if not drive.has(od.INTERPOLATION_VALUE):
         return []
-    present = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
-    if abs(present * cycle_hz - 1.0) < 1e-9:
+    if abs(_present_period_s(drive) * cycle_hz - 1.0) < 1e-9:
         return []
     value, index = interpolation_period(drive, cycle_hz)
     said = "the interpolation time stays as it is"
@@ -144,10 +140,10 @@ def interpolation_period(drive: Drive, cycle_hz: float) -> tuple[int, int]:
     own = drive.known(od.INTERPOLATION_INDEX)
     closest = (math.inf, 1, -3)
     for index in (-3,) if own is None else (-3, own, -4, -5, -6, -2, -1):
-        value = min(255, max(1, round(10.0**-index / cycle_hz)))
-        off = abs(_period_s(value, index) * cycle_hz - 1.0)
         if index != own and drive.quirks.refusal(od.INTERPOLATION_INDEX, index):
             continue
+        value = min(255, max(1, round(10.0**-index / cycle_hz)))
+        off = abs(_period_s(value, index) * cycle_hz - 1.0)
         if off < _PERIOD_TOLERANCE:
             return value, index
         closest = min(closest, (off, value, index))
@@ -162,10 +158,8 @@ def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> N
     """
     if not drive.has(od.INTERPOLATION_VALUE):
         return
-    if any("interpolation time" in one for one in lost):
-        found = _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
-    else:
-        found = _period_s(*interpolation_period(drive, cycle_hz))
+    as_it_is = any("interpolation time" in one for one in lost)
+    found = _present_period_s(drive) if as_it_is else _period_s(*interpolation_period(drive, cycle_hz))
     if abs(found * cycle_hz - 1.0) > _MOST_PERIOD_OFF:
         raise HardwareError(
             f"the drive interpolates over {found * 1e3:g} ms (60C2), the cycle is {1e3 / cycle_hz:g} ms",
@@ -177,39 +171,35 @@ def refuse_other_period(drive: Drive, cycle_hz: float, lost: Iterable[str]) -> N
         )
 
 
+def _present_period_s(drive: Drive) -> float:
+    return _period_s(drive.known(od.INTERPOLATION_VALUE), drive.known(od.INTERPOLATION_INDEX))
+
+
 def _period_s(value: int | None, index: int | None) -> float:
     return 0.0 if value is None else value * 10.0 ** (-3 if index is None else index)
 
 
 def reaction_writes(drive: Drive, settings: BusSettings) -> list[Write]:
     """What the drive does when the host is lost, and how it stops quickly: 6007, 605A."""
-    writes = []
-    if drive.has(od.ABORT_CONNECTION):
-        other = 5 - settings.abort_option
-        writes.append(
-            Write(
-                od.ABORT_CONNECTION, settings.abort_option, "the drive does not stop when the host is lost", (other, 1)
-            )
-        )
-    if drive.has(od.QUICK_STOP_OPTION):
-        own = tuple(option for option in (6, 5, 7, 2, 1) if option != settings.quick_stop_option)
-        writes.append(
-            Write(od.QUICK_STOP_OPTION, settings.quick_stop_option, "how it stops quickly cannot be set", own)
-        )
-    return writes
+    abort, stop = settings.abort_option, settings.quick_stop_option
+    others = tuple(option for option in (6, 5, 7, 2, 1) if option != stop)
+    writes = [
+        Write(od.ABORT_CONNECTION, abort, "the drive does not stop when the host is lost", (5 - abort, 1)),
+        Write(od.QUICK_STOP_OPTION, stop, "how it stops quickly cannot be set", others),
+    ]
+    return [write for write in writes if drive.has(write.item)]
 
 
 def window_writes(drive: Drive, settings: JointSettings, position_rad_per_unit: float, *, active: bool) -> list[Write]:
     """Following-error window, tight where the joint stands locked: 6065, 6066."""
     window_rad = settings.following_window_rad if active else settings.locked_window_rad
-    writes = []
-    if drive.has(od.FOLLOWING_WINDOW):
-        units = max(1, round(window_rad / abs(position_rad_per_unit)))
-        writes.append(Write(od.FOLLOWING_WINDOW, units, "only the host watches the following error"))
-    if drive.has(od.FOLLOWING_TIMEOUT_MS):
-        said = "the drive's own time for a following error stays"
-        writes.append(Write(od.FOLLOWING_TIMEOUT_MS, settings.following_timeout_ms, said, (0,)))
-    return writes
+    units = max(1, round(window_rad / abs(position_rad_per_unit)))
+    said = "the drive's own time for a following error stays"
+    writes = [
+        Write(od.FOLLOWING_WINDOW, units, "only the host watches the following error"),
+        Write(od.FOLLOWING_TIMEOUT_MS, settings.following_timeout_ms, said, (0,)),
+    ]
+    return [write for write in writes if drive.has(write.item)]
 
 
 def limit_writes(
@@ -222,10 +212,8 @@ def limit_writes(
 ) -> tuple[list[Write], list[str]]:
     """The drive's own limits: 6072 in per mille, 607D in position units (which of them is lower depends on direction).
 
-    A limit that is tighter in the drive than asked for stays, unless the robot file says that it may be loosened.
-
-    Returns:
-        The writes, and what stays tighter, in words.
+    A limit that is tighter in the drive than asked for stays, unless the robot file says that it may be loosened; what
+    stays so is returned in words beside the writes.
 
     Raises:
         HardwareError: the limits are no span of whole units.

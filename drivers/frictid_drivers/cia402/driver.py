@@ -147,15 +147,12 @@ class Cia402Driver:
         """Everything that can be said without moving or writing."""
         fleet = self._reached()
         cycle_hz = plan.cycle_hz if plan is not None else self.setup.cycle_hz
-        stretches = self._alone()
-        if plan is not None and plan.joints:
-            stretches = [[entry.joint for entry in stretch] for stretch in plan.stretches]
+        moving = plan.stretches if plan is not None else ()
+        stretches = [[entry.joint for entry in stretch] for stretch in moving] or self._alone()
         # The fullest of all stretches: joints differ in what they report.
         active = max(stretches, key=lambda names: fleet.load(names, cycle_hz).average_percent)
         layout = fleet.layout(active, cycle_hz)
-        findings = [inspection.bus_finding(layout.load(), fleet.highest_rate_hz(active))]
-        if not fleet.sync_counter:
-            findings.append(inspection.no_sync_counter(fleet.facts))
+        findings = inspection.bus_findings(layout.load(), fleet.highest_rate_hz(active), fleet.facts)
         for joint in self.setup.joints:
             entry = next((one for one in plan.joints if one.joint == joint.name), None) if plan else None
             findings += inspection.joint_findings(joint, fleet, layout, self._settings, entry)
@@ -163,8 +160,7 @@ class Cia402Driver:
 
     def faults(self) -> list[Finding]:
         """What keeps drives from running again (``driver.Resettable``)."""
-        drives = self._reached().drives
-        return [fault for name, drive in drives.items() if (fault := reentry.standing_fault(name, drive)) is not None]
+        return [fault for drive in self._reached().drives.values() if (fault := reentry.standing_fault(drive))]
 
     def reset_faults(self) -> None:
         """Bring them back, without power: reset of communication, then of the fault.
@@ -173,8 +169,8 @@ class Cia402Driver:
             HardwareError: a drive has power, does not come back, or stays in fault.
         """
         fleet = self._reached()
-        for name, drive in fleet.drives.items():
-            if reentry.standing_fault(name, drive) is not None:
+        for drive in fleet.drives.values():
+            if reentry.standing_fault(drive) is not None:
                 reentry.bring_back(drive, partial(fleet.nmt_to, drive.node_id))
 
     # -- configuring --------------------------------------------------------------------------------------------
@@ -371,7 +367,9 @@ class Cia402Driver:
         for name in doubtful:
             status = None
             with contextlib.suppress(*_WIRE_ERRORS):
-                status = self._reached().drives[name].asked_quickly(od.STATUSWORD, _LAST_LOOK_S)
+                drive = self._reached().drives[name]
+                with drive.answering_within(_LAST_LOOK_S):
+                    status = drive.find(od.STATUSWORD)
             if status is None or drive_state(status) not in _OFF:
                 powered.append(name)
         return tuple(powered)

@@ -186,11 +186,7 @@ class Fleet:
             return layout, FrameMap(frames, SYNC_COB_ID, window_ns, self._settings.host_node)
 
     def foreseen(self, joint: JointSetup, layout: Layout) -> tuple[list[Finding], list[str], list[str]]:
-        """What configuring this joint will meet, by reading alone.
-
-        Returns:
-            Findings of its scale; what will end the run; what it will go on without.
-        """
+        """What configuring a joint will meet, by reading alone: findings of its scale, what ends the run, what is lost."""
         drive, facts, settings = self.drives[joint.name], self.facts[joint.name], self._joint_settings[joint.name]
         units = configure.velocity_unit_writes(drive)
         unit = facts.velocity_unit
@@ -234,8 +230,7 @@ class Fleet:
     def restore(self, but_not: Collection[str]) -> None:
         """Put back what this run changed, drive by drive; one that no longer answers is left alone.
 
-        Args:
-            but_not: joints that may still have power: their drives go on watching over us.
+        The drives of joints that may still have power (``but_not``) go on watching over us.
         """
         for name, drive in self.drives.items():
             if name not in but_not:

@@ -151,8 +151,7 @@ class _Reader:
         self._known_keys((), mapping, {"schema", "sync_cob_id", "window_ns", "host_node", "joints"})
         if mapping.get("schema") != SCHEMA:
             self._problem(("schema",), f"expected {SCHEMA}, found {mapping.get('schema')!r}")
-        sync = mapping.get("sync_cob_id", 0x80)
-        if sync is not None:
+        if (sync := mapping.get("sync_cob_id", 0x80)) is not None:
             sync = self._integer(("sync_cob_id",), sync, 0, 0x7FF)
         window_ns = self._integer(("window_ns",), mapping.get("window_ns", 0), 0, 2**63)
         host_node = self._integer(("host_node",), mapping.get("host_node", 0), 0, 127)

@@ -71,27 +71,21 @@ def identity(joint: JointSetup, drive: Drive, facts: Facts, settings: JointSetti
     )
 
 
-def bus_finding(load: BusLoad, highest_hz: float) -> Finding:
-    """Does the layout fit the wire?"""
+def bus_findings(load: BusLoad, highest_hz: float, facts: Mapping[str, Facts]) -> list[Finding]:
+    """Does the layout fit the wire, and can the reports of locked joints be spread?"""
+    subject, findings = "bus load", []
     if load.fits:
-        return Finding(Severity.OK, "bus load", f"{load}; up to {highest_hz:g} Hz would fit")
-    return Finding(
-        Severity.ERROR,
-        "bus load",
-        f"{load}: more than 80 % on average or 100 % in one cycle",
-        f"use a rate of at most {highest_hz:g} Hz (`calibrate --rate`, or `cycle_hz` in the robot file)",
-    )
-
-
-def no_sync_counter(facts: Mapping[str, Facts]) -> Finding:
-    """Reports of locked joints cannot be spread."""
+        findings.append(Finding(Severity.OK, subject, f"{load}; up to {highest_hz:g} Hz would fit"))
+    else:
+        said = f"{load}: more than 80 % on average or 100 % in one cycle"
+        rate = f"use a rate of at most {highest_hz:g} Hz (`calibrate --rate`, or `cycle_hz` in the robot file)"
+        findings.append(Finding(_ERROR, subject, said, rate))
     lacking = [joint for joint, fact in facts.items() if not fact.sync_counter]
-    return Finding(
-        Severity.WARNING,
-        "bus load",
-        f"no SYNC counter (1019, 18xx:06) on joint {', '.join(lacking)}: all locked joints answer the same SYNC",
-        "the rate that fits the bus is lower for it; newer firmware may have the SYNC counter",
-    )
+    if lacking:
+        said = f"no SYNC counter (1019, 18xx:06) on joint {', '.join(lacking)}: all locked joints answer the same SYNC"
+        newer = "the rate that fits the bus is lower for it; newer firmware may have the SYNC counter"
+        findings.append(Finding(_WARNING, subject, said, newer))
+    return findings
 
 
 def joint_findings(

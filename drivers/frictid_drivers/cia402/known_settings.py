@@ -56,12 +56,8 @@ KNOWN_SETTINGS: dict[tuple[int, int], tuple[Setting, ...]] = {
 
 def read_settings(drive: Drive, vendor: int, product: int) -> dict[Setting, int]:
     """Values of all known settings that this drive has; empty for an unknown vendor."""
-    values = {}
-    for setting in KNOWN_SETTINGS.get((vendor, product), ()):
-        value = drive.find(setting.object)
-        if value is not None:
-            values[setting] = value
-    return values
+    known = KNOWN_SETTINGS.get((vendor, product), ())
+    return {setting: value for setting in known if (value := drive.find(setting.object)) is not None}
 
 
 def timing_of(settings: dict[Setting, int], cycle_s: float) -> Timing | None:
@@ -70,19 +66,17 @@ def timing_of(settings: dict[Setting, int], cycle_s: float) -> Timing | None:
     The torque is that which was applied during the cycle before SYNC, on average half a cycle earlier; a first-order
     low-pass delays by its time constant.
     """
-    filters = {Effect.VELOCITY_FILTER_US: 0.0, Effect.TORQUE_FILTER_US: 0.0}
-    known = False
-    for setting, value in settings.items():
-        if setting.effect in filters:
-            known = True
-            filters[setting.effect] += value * 1e-6
-    if not known:
+    velocity_s, torque_s = (
+        [value * 1e-6 for setting, value in settings.items() if setting.effect is effect]
+        for effect in (Effect.VELOCITY_FILTER_US, Effect.TORQUE_FILTER_US)
+    )
+    if not velocity_s and not torque_s:
         return None
     return Timing(
         position_delay_s=0.0,
-        velocity_delay_s=filters[Effect.VELOCITY_FILTER_US],
-        torque_delay_s=cycle_s / 2 + filters[Effect.TORQUE_FILTER_US],
-        torque_lag_s=filters[Effect.TORQUE_FILTER_US],
+        velocity_delay_s=sum(velocity_s, 0.0),
+        torque_delay_s=cycle_s / 2 + sum(torque_s, 0.0),
+        torque_lag_s=sum(torque_s, 0.0),
         uncertainty_s=0.0002,
         source="drive",
     )

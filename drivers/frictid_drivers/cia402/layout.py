@@ -42,10 +42,9 @@ _MAX_TYPE = 240
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO as it shall be configured.
+    """One PDO as it shall be configured: a TPDO of the drive (``transmit``) or an RPDO, numbered from 1.
 
     Attributes:
-        transmit: a TPDO of the drive, else an RPDO.
         frame: its COB-ID is that of the predefined connection set.
         every: transmission type: sent or applied on every so many SYNCs.
         start: SYNC counter value of the first one, 0 for none.
@@ -98,7 +97,6 @@ class Layout:
     Attributes:
         active: joints that report on every SYNC.
         sync_overflow: 1019, 0 where no SYNC counter is used.
-        interval_cycles: SYNCs between two reports of a locked joint.
         rates: of the bus; PDOs are CAN FD frames where it has a data rate.
         resend_cycles: by joint, after how many cycles a command goes out again though nothing changed.
     """
@@ -107,7 +105,6 @@ class Layout:
     active: tuple[str, ...]
     pdos: dict[str, tuple[Pdo, ...]]
     sync_overflow: int
-    interval_cycles: int
     host_heartbeat_s: float
     drive_heartbeat_s: float
     rates: BitRates
@@ -159,20 +156,18 @@ def plan_layout(
     pdos: dict[str, tuple[Pdo, ...]] = {}
     for wish in wishes:
         fast_start, slow_start = starts[wish.joint]
+        often, seldom = (interval, fast_start), (slow, slow_start)
         if not wish.decimates:
-            pdos[wish.joint] = _pdos(wish, pdo_bytes, 1, 0, slow_every=1, slow_start=0)
+            often = seldom = (1, 0)
         elif wish.joint in active:
             # The same SYNCs as when it is locked, more often: no other joint's start value has to change.
-            slow_start = (slow_start - 1) % interval + 1 if interval > 1 and slow_start else 0
-            pdos[wish.joint] = _pdos(wish, pdo_bytes, 1, 0, slow_every=interval, slow_start=slow_start)
-        else:
-            pdos[wish.joint] = _pdos(wish, pdo_bytes, interval, fast_start, slow_every=slow, slow_start=slow_start)
+            often, seldom = (1, 0), (interval, (slow_start - 1) % interval + 1 if interval > 1 and slow_start else 0)
+        pdos[wish.joint] = _pdos(wish, pdo_bytes, often, seldom)
     return Layout(
         cycle_hz=cycle_hz,
         active=tuple(joint for joint in pdos if joint in active),
         pdos=pdos,
         sync_overflow=slow if sync_counter and slow > 1 else 0,
-        interval_cycles=interval,
         host_heartbeat_s=host_heartbeat_s,
         drive_heartbeat_s=drive_heartbeat_s,
         rates=rates,
@@ -190,7 +185,7 @@ def _starts(
     fd = rates.data is not None
     fast_starts = {}
     for wish in wishes:
-        pdos = _pdos(wish, pdo_bytes, 1, 0, slow_every=1, slow_start=0)
+        pdos = _pdos(wish, pdo_bytes, (1, 0), (1, 0))
         fast = [SyncFrame(pdo.frame.size, fd=fd) for pdo in pdos if pdo.transmit and pdo.number < 3]
         bits = sum(frame.bits(rates).worst for frame in fast)
         fast_starts[wish.joint] = slots.take(interval, bits) if interval > 1 else 0
@@ -214,9 +209,8 @@ class _Slots:
         return start + 1
 
 
-def _pdos(
-    wish: NodeWish, pdo_bytes: int, every: int, start: int, *, slow_every: int, slow_start: int
-) -> tuple[Pdo, ...]:
+def _pdos(wish: NodeWish, pdo_bytes: int, often: tuple[int, int], seldom: tuple[int, int]) -> tuple[Pdo, ...]:
+    """With transmission type and start value of the reports that come often, and of those that come seldom."""
     node, of = wish.node, Entry.of
     command = [of(od.CONTROLWORD), of(od.INTERPOLATED_TARGET if wish.interpolated else od.TARGET_POSITION)]
     other = [of(od.MODE)]
@@ -235,15 +229,15 @@ def _pdos(
     pdos = [
         Pdo(False, 1, Frame(0x200 + node, tuple(command))),
         Pdo(False, 2, Frame(0x300 + node, tuple(other))),
-        Pdo(True, 1, Frame(0x180 + node, tuple(fast)), every, start),
-        Pdo(True, 2, Frame(0x280 + node, tuple(velocity)), every, start),
-        Pdo(True, 3, Frame(0x380 + node, tuple(display)), slow_every, slow_start),
+        Pdo(True, 1, Frame(0x180 + node, tuple(fast)), *often),
+        Pdo(True, 2, Frame(0x280 + node, tuple(velocity)), *often),
+        Pdo(True, 3, Frame(0x380 + node, tuple(display)), *seldom),
     ]
     whole = Frame(0x180 + node, tuple(fast + velocity))
     if whole.size <= pdo_bytes:
-        pdos[2:4] = [Pdo(True, 1, whole, every, start)]
+        pdos[2:4] = [Pdo(True, 1, whole, *often)]
     if wish.digital_inputs:
         # As often as a locked joint reports: an active joint's inputs go with its slow report, others with the fast.
-        often = (slow_every, slow_start) if every == 1 else (every, start)
-        pdos.append(Pdo(True, 4, Frame(0x480 + node, (of(od.DIGITAL_INPUTS),)), *often))
+        inputs = Frame(0x480 + node, (of(od.DIGITAL_INPUTS),))
+        pdos.append(Pdo(True, 4, inputs, *(seldom if often[0] == 1 else often)))
     return tuple(pdos)

@@ -29,11 +29,6 @@ from frictid_hil.protocol.driver import FD_FRAME, FrameSink
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
-def logged_id(message: can.Message) -> int:
-    """The identifier as a ``FrameSink`` takes it."""
-    return message.arbitration_id | FD_FRAME if message.is_fd else message.arbitration_id
-
-
 _SDO_BYTES = 8
 
 
@@ -72,16 +67,14 @@ class Wire(canopen.Network):
         if message is None:
             return False
         if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
-            self._tell(logged_id(message), message.data, False)
+            self._tell(message.arbitration_id | FD_FRAME * message.is_fd, message.data, False)
             self.dispatch(message.arbitration_id, message.data, message.timestamp)
         return True
 
     def dispatch(self, can_id: int, data: bytearray, timestamp: float) -> None:
         """Hand a frame to canopen; what canopen cannot digest (a short EMCY) must not end the reception."""
-        try:
+        with contextlib.suppress(Exception):  # canopen's callbacks raise whatever struct or its own parsing does
             self.notify(can_id, data, timestamp)
-        except Exception:  # canopen's callbacks raise whatever struct or its own parsing does
-            return
 
     def drain(self) -> None:
         """Hand over everything that has already arrived."""
@@ -228,8 +221,6 @@ class HeartbeatTimer:
 
     def _run(self) -> None:
         while not self._stop.wait(self._period_s):
-            try:
+            # A full buffer or a bus-off passes; the drives' watchdogs are the judge of how long is too long.
+            with contextlib.suppress(HardwareError):
                 self._send()
-            except HardwareError:
-                # A full buffer or a bus-off passes; the drives' watchdogs are the judge of how long is too long.
-                continue

@@ -46,7 +46,10 @@ SCHEMA = "frictid.quirks/1"
 SHIPPED = Path(__file__).with_name("quirks.yaml")
 _SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
 _UNSIGNED = {0x01: 1, 0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
-"""CiA 301 data types and their bits."""
+_INTEGERS = {
+    code: IntegerType(signed, bits) for signed, of in ((True, _SIGNED), (False, _UNSIGNED)) for code, bits in of.items()
+}
+"""CiA 301 data types."""
 
 Address = tuple[int, int]
 
@@ -172,11 +175,8 @@ def _entry(path: Path, number: int, plain: Any) -> tuple[dict[str, int], Quirks]
             if key in values and not float(values[key]) > 0.0:
                 raise ValueError(f"{key}: expected a number above 0")
         unit = values.get("velocity_unit")
-        if not (
-            unit is None
-            or unit in ("position", "tenth position", "rpm")
-            or (isinstance(unit, int | float) and unit > 0)
-        ):
+        positive = isinstance(unit, int | float) and unit > 0
+        if not positive and unit not in (None, "position", "tenth position", "rpm"):
             raise ValueError("velocity_unit: expected position, tenth position, rpm, or rad/s")
     except (TypeError, ValueError, AttributeError) as error:
         raise InputFileError(f"cannot be used: {error}", where=where) from error
@@ -249,10 +249,7 @@ def variables_of(dictionary: canopen.ObjectDictionary) -> list[ODVariable]:
 
 def integer_type(variable: ODVariable) -> IntegerType | None:
     """The type of a whole number; None for all else."""
-    kind = variable.data_type
-    if kind in _SIGNED:
-        return IntegerType(True, _SIGNED[kind])
-    return IntegerType(False, _UNSIGNED[kind]) if kind in _UNSIGNED else None
+    return _INTEGERS.get(variable.data_type)
 
 
 def _text_of(path: Path) -> io.StringIO:

@@ -23,7 +23,7 @@ _LEAVE_S = 2.0
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
-def standing_fault(joint: str, drive: Drive) -> Finding | None:
+def standing_fault(drive: Drive) -> Finding | None:
     """What keeps a drive from running again; None where nothing does. Reads only."""
     status = drive.read(od.STATUSWORD)
     state = drive_state(status)
@@ -33,7 +33,7 @@ def standing_fault(joint: str, drive: Drive) -> Finding | None:
     what = "stands in quick stop" if state is DriveState.QUICK_STOP_ACTIVE else "is in fault"
     return Finding(
         Severity.ERROR,
-        f"joint {joint}",
+        f"joint {drive.joint}",
         f"{what}: {told_error(error) if error else 'no error code'} (statusword {status:#06x})",
         "find and clear its cause before it is reset",
     )

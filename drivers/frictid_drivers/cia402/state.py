@@ -50,17 +50,13 @@ def _said_by(bits: int) -> DriveState:
 _STATES = tuple(_said_by(bits) for bits in range(_RELEVANT + 1))
 
 _JOINT_STATES = {
-    DriveState.NOT_READY: JointState.DISABLED,
-    DriveState.SWITCH_ON_DISABLED: JointState.DISABLED,
-    DriveState.READY: JointState.DISABLED,
-    DriveState.SWITCHED_ON: JointState.DISABLED,
     DriveState.ENABLED: JointState.ENABLED,
     DriveState.QUICK_STOP_ACTIVE: JointState.STOPPING,
     DriveState.FAULT_REACTION: JointState.FAULT,
     DriveState.FAULT: JointState.FAULT,
     DriveState.UNKNOWN: JointState.UNKNOWN,
 }
-JOINT_STATES = tuple(_JOINT_STATES[state] for state in _STATES)
+JOINT_STATES = tuple(_JOINT_STATES.get(state, JointState.DISABLED) for state in _STATES)
 """What the runner calls the state, by ``statusword & 0x6F``."""
 
 
@@ -77,6 +73,15 @@ class Target(Enum):
     STOPPED = "stopped"
 
 
+_ROAD = {
+    DriveState.SWITCH_ON_DISABLED: SHUTDOWN,
+    DriveState.READY: SWITCH_ON,
+    DriveState.SWITCHED_ON: ENABLE,
+    DriveState.ENABLED: ENABLE,
+}
+"""To power, and there."""
+
+
 def next_controlword(state: DriveState, target: Target, *, standing: bool, may_enable: bool) -> int:
     """The controlword for the coming cycle; asked every cycle, waits for nothing.
 
@@ -87,19 +92,11 @@ def next_controlword(state: DriveState, target: Target, *, standing: bool, may_e
     if state in (DriveState.FAULT, DriveState.FAULT_REACTION, DriveState.NOT_READY, DriveState.UNKNOWN):
         return DISABLE_VOLTAGE
     if target is Target.ENABLED:
-        if state is DriveState.SWITCH_ON_DISABLED:
-            return SHUTDOWN
-        if state is DriveState.READY:
-            return SWITCH_ON
-        if state is DriveState.SWITCHED_ON:
-            return ENABLE if may_enable else SWITCH_ON
-        if state is DriveState.ENABLED:
-            return ENABLE
-        return DISABLE_VOLTAGE if standing else QUICK_STOP
-    if state is DriveState.ENABLED:
-        return SWITCH_ON if standing and target is Target.DISABLED else QUICK_STOP
-    if state is DriveState.QUICK_STOP_ACTIVE:
-        return DISABLE_VOLTAGE if standing and target is Target.DISABLED else QUICK_STOP
-    if state is DriveState.SWITCHED_ON:
-        return SHUTDOWN
-    return DISABLE_VOLTAGE
+        if state is DriveState.QUICK_STOP_ACTIVE:
+            return DISABLE_VOLTAGE if standing else QUICK_STOP
+        return SWITCH_ON if state is DriveState.SWITCHED_ON and not may_enable else _ROAD[state]
+    if state in (DriveState.ENABLED, DriveState.QUICK_STOP_ACTIVE):
+        if target is Target.STOPPED or not standing:
+            return QUICK_STOP
+        return SWITCH_ON if state is DriveState.ENABLED else DISABLE_VOLTAGE
+    return SHUTDOWN if state is DriveState.SWITCHED_ON else DISABLE_VOLTAGE

@@ -178,8 +178,7 @@ class Axis:
         """Follow the host's set-points again, starting from here and at rest."""
         self._ramp = None
         self._stopped = False
-        self._clear_set_points(self._plant.measured_position_rad)
-        self._use_mode()
+        self._start_from_here()
 
     def set_mode(self, mode: int) -> None:
         """Change the mode displayed in 6061h; commands start from where the joint is."""
@@ -187,10 +186,10 @@ class Axis:
             self.mode = mode
             # While a stop is under way or held, the new mode waits for ``resume``.
             if not self._stopped:
-                self._clear_set_points(self._plant.measured_position_rad)
-                self._use_mode()
+                self._start_from_here()
 
-    def _use_mode(self) -> None:
+    def _start_from_here(self) -> None:
+        self._clear_set_points(self._plant.measured_position_rad)
         # Without a mode the joint is held where it is. Passing through torque mode makes the position loop let go of
         # its old target.
         self._plant.set_mode(CST)
@@ -199,11 +198,7 @@ class Axis:
     def _clear_set_points(self, position_rad: float) -> None:
         self._position_rad = self._from_rad = self._to_rad = position_rad
         self._from_ns = self._to_ns = self.now_ns
-        self._velocity_rad_s = 0.0
-        self._demand_rad_s = 0.0
-        self._demand_rad_s2 = 0.0
-        self._torque_nm = 0.0
-        self._offset_nm = 0.0
+        self._velocity_rad_s = self._demand_rad_s = self._demand_rad_s2 = self._torque_nm = self._offset_nm = 0.0
 
     # -- set-points ----------------------------------------------------------------------------------------------------
 
@@ -416,9 +411,7 @@ class Axis:
         self._latched_ns = self.now_ns
         if not self.encoder_stuck:
             values[_K6064] = self._position_units()
-            values[_K606C] = _clipped(plant.velocity_rad_s / self._rad_s_per_unit, _I32)
-        else:
-            values[_K606C] = 0
+        values[_K606C] = 0 if self.encoder_stuck else _clipped(plant.velocity_rad_s / self._rad_s_per_unit, _I32)
         step = self._torque_step
         values[_K6077] = _clipped(torque_nm / (self._nm_per_mille * step), _I16 // step) * step
         values[_K6074] = _clipped((self._torque_nm + self._offset_nm) / self._nm_per_mille, _I16)
@@ -427,11 +420,6 @@ class Axis:
         values[_K60F4] = _clipped(demand - values[_K6064], _I32)
         values[_K2030] = _clipped(plant.external_torque_nm * 1000.0, _I32)
         values[_K2031] = _clipped(plant.temperature_c * 10.0, _I16)
-
-    @property
-    def saturated(self) -> bool:
-        """The inner loop ran into its torque limit."""
-        return self._plant.saturated
 
     @property
     def at_rest(self) -> bool:

@@ -140,9 +140,10 @@ class VirtualDriver:
             )
         self._write(joint, 0x2040, 1, 0)
         if grip:
-            figures = (round(centre_rad * 1e6), round(amplitude_rad * 1e6), round(frequency_hz * 1e3), 1)
-            for subindex, value in zip((2, 3, 4, 1), figures, strict=True):
-                self._write(joint, 0x2040, subindex, value)
+            self._write(joint, 0x2040, 2, round(centre_rad * 1e6))
+            self._write(joint, 0x2040, 3, round(amplitude_rad * 1e6))
+            self._write(joint, 0x2040, 4, round(frequency_hz * 1e3))
+            self._write(joint, 0x2040, 1, 1)
 
     def mount_payload(self, joint: str, mounted: bool) -> None:
         """Put the payload of the robot file on a joint, or take it off."""

@@ -22,12 +22,7 @@ _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 
 
 def eds_text(records: Sequence[Record] = OBJECTS, absent: Collection[Key] = ()) -> str:
-    """The whole file.
-
-    Args:
-        records: of the drive.
-        absent: entries that it lacks.
-    """
+    """The whole file for a drive's objects, without the entries that it lacks."""
     records = [
         replace(record, entries=entries)
         for record in records

@@ -32,11 +32,8 @@ class HeartbeatWatch:
     def configure(self, entries: Iterable[int]) -> None:
         """Take over the entries of 1016h; one that stays the same keeps its state."""
         known = {(consumer.node, consumer.timeout_ns): consumer for consumer in self.consumers}
-        self.consumers = []
-        for entry in entries:
-            node, timeout_ns = entry >> 16 & 0x7F, (entry & 0xFFFF) * _MS
-            if node and timeout_ns:
-                self.consumers.append(known.get((node, timeout_ns)) or Consumer(node, timeout_ns))
+        wanted = [(entry >> 16 & 0x7F, (entry & 0xFFFF) * _MS) for entry in entries]
+        self.consumers = [known.get(one) or Consumer(*one) for one in wanted if all(one)]
 
     @property
     def any_lost(self) -> bool:
@@ -50,10 +47,8 @@ class HeartbeatWatch:
 
     def newly_lost(self, now_ns: int) -> list[int]:
         """Nodes whose time has run out; each is told once."""
-        found = []
-        for consumer in self.consumers:
-            if consumer.deadline_ns is not None and now_ns >= consumer.deadline_ns:
-                consumer.deadline_ns = None
-                consumer.lost = True
-                found.append(consumer.node)
-        return found
+        late = [one for one in self.consumers if one.deadline_ns is not None and now_ns >= one.deadline_ns]
+        for consumer in late:
+            consumer.deadline_ns = None
+            consumer.lost = True
+        return [consumer.node for consumer in late]

@@ -72,12 +72,9 @@ class BusWire:
 
 
 def serve(setup: RobotSetup, *, announce: Callable[[str], None], stop: Callable[[], bool] = lambda: False) -> None:
-    """Run until told to stop.
+    """Run until ``stop``, asked many times a second, says so; ``announce`` is told the bus once the drives are on it.
 
-    Args:
-        setup: the robot whose drives these are; its ``bus`` and ``options`` say where, and what goes wrong.
-        announce: told the bus once the drives are on it.
-        stop: asked many times a second.
+    The robot's ``bus`` and ``options`` say where these drives are, and what goes wrong.
 
     Raises:
         InvalidFields: the simulated joints or faults of the robot file are wrong.

@@ -45,7 +45,7 @@ LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074
 
 @dataclass(slots=True)
 class ReceivePdo:
-    """A valid RPDO, compiled.
+    """A valid RPDO, compiled; dummies have key 0.
 
     Attributes:
         cob_id: with ``FD_FRAME`` where it is one.

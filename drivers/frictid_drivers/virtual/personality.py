@@ -84,7 +84,7 @@ def known_personalities() -> dict[str, dict[str, Any]]:
 
 
 def personality_of(joint: JointSetup, folder: Path | None = None) -> Personality | None:
-    """The family of a joint's drive; None for the standard servo.
+    """The family that a joint's options ``personality`` or ``eds`` (from the robot file's folder) name; None: standard.
 
     Raises:
         InvalidFields: no such family.

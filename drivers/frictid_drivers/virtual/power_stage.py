@@ -304,9 +304,9 @@ class PowerStage:
         """Transition 15; in other states warnings are forgotten."""
         if self.state is PowerState.FAULT_REACTION:
             return
-        if self.state is PowerState.FAULT and emergency.HEARTBEAT_LOST in self._errors.present:
-            return  # as with many makers: the connection comes first (NMT reset communication), then the fault
         if self.state is PowerState.FAULT:
+            if emergency.HEARTBEAT_LOST in self._errors.present:
+                return  # as with many makers: the connection comes first (NMT reset communication), then the fault
             self.state = PowerState.SWITCH_ON_DISABLED
         missing = self._host_missing()
         for code in self._errors.present:
@@ -357,13 +357,10 @@ class PowerStage:
         if remote:
             word |= 0x0200
         if self.state is PowerState.ENABLED:
-            mode = axis.mode
-            if self._halted:
-                word |= 0x0400 if not axis.ramping else 0
-            elif mode and not axis.ramping:
-                word |= 0x1000
-            if axis.internal_limit or axis.saturated:
+            if not axis.ramping and (self._halted or axis.mode):
+                word |= 0x0400 if self._halted else 0x1000
+            if axis.internal_limit or self._plant.saturated:
                 word |= 0x0800
-            if mode == CSP and axis.following_error:
+            if axis.mode == CSP and axis.following_error:
                 word |= 0x2000
         return word

@@ -124,11 +124,7 @@ class RackProcess:
         return wall_ns
 
     def run(self, over: Callable[[int, bool], bool]) -> None:
-        """Serve until told that it is over, many times a second.
-
-        Args:
-            over: asked with the wall clock in ns, and whether the robot stands still with nobody connected.
-        """
+        """Serve until it is ``over``: asked with the wall clock in ns, and whether the robot rests unobserved."""
         self._drives.power_on()
         leave_in_fault(self._rack, self._faults)
         while True:

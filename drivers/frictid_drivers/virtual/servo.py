@@ -70,7 +70,7 @@ class Servo:
         self._values = cast("dict[Key, int]", self.dictionary.values)
         self._plant = plant
         self._send = send
-        self._hold_hand = hold_hand
+        self._hold_hand = hold_hand or (lambda held, centre_rad, amplitude_rad, frequency_hz: None)
         self._now_ns = 0
         self.axis = Axis(
             self.dictionary,
@@ -230,7 +230,7 @@ class Servo:
             self._connection_lost(emergency.HEARTBEAT_LOST, node)
         if now_ns >= self._sync_deadline_ns():
             self._sync_lost()
-        if self.axis.powered and now_ns - self.axis.now_ns >= self._tick_ns():
+        if now_ns >= self._tick_due_ns():
             self.power.run_to(now_ns)
             self.power.changed = self.power.changed or self.process_data.live
         if self.power.changed or now_ns >= self.process_data.next_timer_ns:
@@ -239,8 +239,11 @@ class Servo:
         else:
             self._schedule()
 
-    def _tick_ns(self) -> int:
-        return _RAMP_TICK_NS if self.axis.ramping else _SUPERVISION_NS
+    def _tick_due_ns(self) -> int:
+        """When the powered motor is looked at next."""
+        if not self.axis.powered:
+            return NEVER_NS
+        return self.axis.now_ns + (_RAMP_TICK_NS if self.axis.ramping else _SUPERVISION_NS)
 
     def _sync_deadline_ns(self) -> int:
         if (
@@ -255,10 +258,8 @@ class Servo:
         return self._last_sync_ns + self._sync_window_ns + 1
 
     def _schedule(self) -> None:
-        due = [self._heartbeat_ns, self._sync_deadline_ns(), self.process_data.next_timer_ns, *self._watch.deadlines_ns]
-        if self.axis.powered:
-            due.append(self.axis.now_ns + self._tick_ns())
-        self.next_event_ns = max(min(due), self._now_ns + 1)
+        timers_ns = (self._heartbeat_ns, self._sync_deadline_ns(), self._tick_due_ns(), self.process_data.next_timer_ns)
+        self.next_event_ns = max(min(*timers_ns, *self._watch.deadlines_ns), self._now_ns + 1)
         self.wake(self.next_event_ns)
 
     def _arrive(self, now_ns: int) -> None:
@@ -407,9 +408,8 @@ class Servo:
         self._heartbeat_ns = self._now_ns + period_ns if period_ns else NEVER_NS
 
     def _hand_changed(self) -> None:
-        if self._hold_hand is not None:
-            grip, centre, amplitude, frequency = (self._values[key(0x2040, sub)] for sub in (1, 2, 3, 4))
-            self._hold_hand(bool(grip), centre * 1e-6, amplitude * 1e-6, frequency * 1e-3)
+        grip, centre, amplitude, frequency = (self._values[key(0x2040, sub)] for sub in (1, 2, 3, 4))
+        self._hold_hand(bool(grip), centre * 1e-6, amplitude * 1e-6, frequency * 1e-3)
 
     def _payload_changed(self) -> None:
         self._plant.mount_payload(bool(self._values[key(0x2041)]))
