@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 
 from frictid_drivers.cia402.frame_map import Frame, FrameMap, JointFrames
 from frictid_drivers.cia402.objects import ERROR, FIGURES, INPUTS, INTERPOLATED, MODE_SHOWN, STATUS, IntegerType
@@ -115,25 +115,20 @@ class _Report:
         )
 
 
+@dataclass(slots=True, eq=False)
 class _Joint:
     """What is known of one joint."""
 
-    __slots__ = (
-        "cyclic", "emergency", "feedback", "heartbeat_ns", "inputs", "position_at", "restarted", "taken_cycle", "told",
-        "untold",
-    )  # fmt: skip
-
-    def __init__(self, frames: JointFrames) -> None:
-        self.feedback = Feedback()
-        self.cyclic: tuple[_Report, ...] = ()
-        self.inputs: _Report | None = None
-        self.position_at: tuple[_Report, int] | None = None
-        self.taken_cycle = -1
-        self.heartbeat_ns: int | None = None
-        self.restarted = False
-        self.told = 0
-        self.emergency = 0
-        self.untold = 0
+    feedback: Feedback = field(default_factory=Feedback)
+    cyclic: tuple[_Report, ...] = ()
+    inputs: _Report | None = None
+    position_at: tuple[_Report, int] | None = None
+    taken_cycle: int = -1
+    heartbeat_ns: int | None = None
+    restarted: bool = False
+    told: int = 0
+    emergency: int = 0
+    untold: int = 0
 
     def judge(self) -> None:
         """What is wrong now: an emergency that was not taken back, or 603F in the state of fault.
@@ -162,7 +157,7 @@ class Decoder:
         self._emergencies: dict[int, _Joint] = {}
         self._heartbeats: dict[int, _Joint] = {}
         for frames in frame_map.joints:
-            joint = _Joint(frames)
+            joint = _Joint()
             self._joints.append(joint)
             self._emergencies[EMCY_BASE + frames.node] = joint
             self._heartbeats[HEARTBEAT_BASE + frames.node] = joint
@@ -191,8 +186,8 @@ class Decoder:
             joint.heartbeat_ns = None
             joint.restarted = False
             joint.told = joint.emergency = joint.untold = 0
-            for field in fields(Feedback):
-                setattr(joint.feedback, field.name, getattr(blank, field.name))
+            for one in fields(Feedback):
+                setattr(joint.feedback, one.name, getattr(blank, one.name))
 
     def begin(self, t_ns: int) -> None:
         """A row begins: SYNC at ``t_ns``."""

@@ -186,7 +186,7 @@ class Fleet:
             return layout, FrameMap(frames, SYNC_COB_ID, window_ns, self._settings.host_node)
 
     def foreseen(self, joint: JointSetup, layout: Layout) -> tuple[list[Finding], list[str], list[str]]:
-        """What configuring a joint will meet, by reading alone: findings of its scale, what ends the run, what is lost."""
+        """What configuring will meet, by reading alone: findings of the scale, what ends the run, what is lost."""
         drive, facts, settings = self.drives[joint.name], self.facts[joint.name], self._joint_settings[joint.name]
         units = configure.velocity_unit_writes(drive)
         unit = facts.velocity_unit

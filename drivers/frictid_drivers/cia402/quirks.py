@@ -249,7 +249,7 @@ def variables_of(dictionary: canopen.ObjectDictionary) -> list[ODVariable]:
 
 def integer_type(variable: ODVariable) -> IntegerType | None:
     """The type of a whole number; None for all else."""
-    return _INTEGERS.get(variable.data_type)
+    return _INTEGERS.get(variable.data_type or 0)
 
 
 def _text_of(path: Path) -> io.StringIO:
