@@ -231,8 +231,8 @@ def highest_rates_hz() -> None:
     for wire in wires:
         for joints, together in ((("0",), False), (NAMES[:3], True), (NAMES, True)):
             planned = plan_calibration(CalibrateOptions(ROBOT, joints=joints, together=together))
-            options = {**planned.setup.options, **wire}
-            setup = replace(planned.setup, bus="virtual:bench-rates", options=options)
+            options = {**planned.order.setup.options, **wire}
+            setup = replace(planned.order.setup, bus="virtual:bench-rates", options=options)
             driver = load_driver("virtual")(setup)  # type: ignore[call-arg]  # protocols carry no constructor
             driver.open(lambda *_: None)
             try:

@@ -14,8 +14,7 @@ import pytest
 import typer
 
 from frictid_drivers.virtual import channel
-from frictid_hil.cli.output import Output
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli.output import Output, folding
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
 from frictid_hil.files import part_of_path, write_whole
 from frictid_hil.jobs import dashboard

@@ -133,12 +133,12 @@ def test_an_arm_that_leaves_the_box_is_stopped(tmp_path: Path) -> None:
     planned = plan_calibration(
         CalibrateOptions(boxed(tmp_path, "[-0.4, 0.4]"), bus="virtual:test-box", joints=("0",), cycles=2)
     )
-    assert planned.setup.workspace is not None
-    narrow = replace(planned.setup.workspace, box_m=((-0.2, 0.9), (-0.1, 0.4), (0.0, 1.2)))
+    assert planned.order.setup.workspace is not None
+    narrow = replace(planned.order.setup.workspace, box_m=((-0.2, 0.9), (-0.1, 0.4), (0.0, 1.2)))
     with pytest.raises(SafetyAbort, match=r"y = -0.06\d m is \d+ mm below its bound of -0.060 m, with joints 0 at -\d"):
         run_plan(
             "virtual",
-            replace(planned.setup, workspace=narrow),
+            replace(planned.order.setup, workspace=narrow),
             planned.plan,
             Nothing(),
             notify=lambda _: None,

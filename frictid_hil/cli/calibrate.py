@@ -9,30 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
-from frictid_hil.cli.options import (
-    AmplitudeOption,
-    BusOption,
-    CyclesOption,
-    DryRunOption,
-    ForceOption,
-    JointOption,
-    LiveAtOption,
-    LiveOption,
-    MethodOption,
-    NotifyOption,
-    OutOption,
-    ProfileArgument,
-    RatioOption,
-    RealtimeOption,
-    ResumeOption,
-    RobotOption,
-    SeedOption,
-    VelocityOption,
-    YesOption,
-    one_of,
-    quantity,
-    robot_files,
-)
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.linear_axis import rotary_names
@@ -55,16 +33,16 @@ def _show_findings(output: Output, result: Result) -> None:
 @verb(app, "check", _show_findings)
 def check(
     output: Output,
-    robot: RobotOption,
-    bus: BusOption = None,
+    robot: opt.Robot,
+    bus: opt.Bus = None,
     dry: Annotated[bool, typer.Option("--dry", help="Check the robot file and its plan alone; open no bus.")] = False,
     latency: Annotated[
         float,
-        typer.Option(
+        option(
             "--latency",
-            metavar="TIME",
-            parser=quantity("duration"),
-            help="Also measure for so long, e.g. 60s, which rate this computer can hold.",
+            "TIME",
+            "Also measure for so long, e.g. 60s, which rate this computer can hold.",
+            parser=opt.quantity("duration"),
         ),
     ] = "0s",  # type: ignore[assignment]  # typer parses it
 ) -> Result:
@@ -83,8 +61,8 @@ def _show_reset(output: Output, result: Result) -> None:
 @verb(app, "reset", _show_reset)
 def reset(
     output: Output,
-    robot: RobotOption,
-    bus: BusOption = None,
+    robot: opt.Robot,
+    bus: opt.Bus = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before the reset.")] = False,
 ) -> Result:
     """Bring drives back that a fault or a cut-off run left standing: shows what it was, asks, resets. No power."""
@@ -140,11 +118,11 @@ def _row(joint: dict[str, Any]) -> tuple[str | Text, ...]:
 
 ProgramOption = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--program",
-        metavar="PROGRAM",
-        autocompletion=one_of("thorough", "standard", "quick"),
-        help="thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
+        "PROGRAM",
+        "thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
+        complete=opt.one_of("thorough", "standard", "quick"),
     ),
 ]
 TogetherOption = Annotated[
@@ -169,27 +147,27 @@ RateOption = Annotated[
 @verb(app, "calibrate", _show_joints)
 def calibrate(
     output: Output,
-    robot: RobotOption = "",
-    joints: JointOption = None,
-    amplitude_rad: AmplitudeOption = None,
-    velocity_rad_s: VelocityOption = None,
-    cycles: CyclesOption = None,
-    ratio: RatioOption = None,
-    method: MethodOption = None,
+    robot: opt.Robot = "",
+    joints: opt.Joint = None,
+    amplitude_rad: opt.Amplitude = None,
+    velocity_rad_s: opt.Velocity = None,
+    cycles: opt.Cycles = None,
+    ratio: opt.Ratio = None,
+    method: opt.Method = None,
     program: ProgramOption = None,
     together: TogetherOption = None,
     measure_skew: MeasureSkewOption = None,
     rate_hz: RateOption = None,
-    bus: BusOption = None,
-    dry_run: DryRunOption = False,
-    realtime: RealtimeOption = None,
-    seed: SeedOption = 0,
-    resume: ResumeOption = None,
-    live: LiveOption = False,
-    live_at: LiveAtOption = None,
-    out: OutOption = None,
-    notify: NotifyOption = None,
-    yes: YesOption = False,
+    bus: opt.Bus = None,
+    dry_run: opt.DryRun = False,
+    realtime: opt.Realtime = None,
+    seed: opt.Seed = 0,
+    resume: opt.Resume = None,
+    live: opt.Live = False,
+    live_at: opt.LiveAt = None,
+    out: opt.Out = None,
+    notify: opt.Notify = None,
+    yes: opt.Yes = False,
 ) -> Result | Told:
     """Identify the friction of every joint, one at a time or all --together, and write a friction profile."""
     from frictid_hil.cli.progress import shown_plan, watching
@@ -198,7 +176,8 @@ def calibrate(
 
     options = output.options(CalibrateOptions, seed=seed or None)
     if dry_run:
-        return shown_plan(output, plan_calibration(options))
+        planned = plan_calibration(options)
+        return shown_plan(output, planned.plan, planned.order.setup)
     with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
         return job(options, watcher)
 
@@ -207,30 +186,23 @@ def calibrate(
 def identify(
     output: Output,
     logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG...", help="Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them."),
+        list[Path], argument("LOG...", "Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them.")
     ],
     robot: Annotated[
-        str | None,
-        typer.Option(
-            "--robot", "-r", metavar="FILE", help="Robot file (limits, gear, timing).", autocompletion=robot_files
-        ),
+        str | None, option("--robot -r", "FILE", "Robot file (limits, gear, timing).", complete=opt.robot_files)
     ] = None,
-    joints: JointOption = None,
-    amplitude_rad: AmplitudeOption = None,
-    velocity_rad_s: VelocityOption = None,
-    cycles: CyclesOption = None,
-    ratio: RatioOption = None,
-    method: MethodOption = "aligned",
-    columns: Annotated[
-        str | None, typer.Option("--columns", metavar="FILE", help="Column map of a foreign file (emps.yaml).")
-    ] = None,
+    joints: opt.Joint = None,
+    amplitude_rad: opt.Amplitude = None,
+    velocity_rad_s: opt.Velocity = None,
+    cycles: opt.Cycles = None,
+    ratio: opt.Ratio = None,
+    method: opt.Method = "aligned",
+    columns: Annotated[str | None, option("--columns", "FILE", "Column map of a foreign file (emps.yaml).")] = None,
     executor: Annotated[
-        str | None,
-        typer.Option("--executor", metavar="WHERE", help="processes:N, or dask://host:port, for many recordings."),
+        str | None, option("--executor", "WHERE", "processes:N, or dask://host:port, for many recordings.")
     ] = None,
-    out: OutOption = None,
-    force: ForceOption = False,
+    out: opt.Out = None,
+    force: opt.Force = False,
 ) -> Result:
     """Identify friction from recorded data, by the same mathematics as a live run."""
     from frictid_hil.jobs.identify import IdentifyOptions
@@ -254,16 +226,11 @@ def _show_distances(output: Output, result: Result) -> None:
 @verb(app, "compare", _show_distances)
 def compare(
     output: Output,
-    profile: ProfileArgument,
-    other: Annotated[Path | None, typer.Argument(metavar="[OTHER]", help="Reference profile.")] = None,
+    profile: opt.Profile,
+    other: Annotated[Path | None, argument("[OTHER]", "Reference profile.")] = None,
     truth: Annotated[
         str | None,
-        typer.Option(
-            "--truth",
-            metavar="FILE",
-            autocompletion=robot_files,
-            help="Robot file whose simulated joints are the reference.",
-        ),
+        option("--truth", "FILE", "Robot file whose simulated joints are the reference.", complete=opt.robot_files),
     ] = None,
 ) -> Result:
     """Distance between two profiles, equation (15), or between a profile and the simulated joints' own curves."""

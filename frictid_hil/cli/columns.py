@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.options import ForceOption
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import Output, Result, verb
 
 app = typer.Typer()
@@ -33,14 +34,10 @@ def _show(output: Output, result: Result) -> None:
 @verb(app, "columns", _show)
 def columns(
     output: Output,
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log in whatever form: CSV, bag, MCAP, parquet, ...")],
-    known: Annotated[
-        str | None, typer.Option("--columns", metavar="FILE", help="Try this column map instead of drafting one.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write the draft to this file.")
-    ] = None,
-    force: ForceOption = False,
+    log: Annotated[Path, argument("LOG", "A log in whatever form: CSV, bag, MCAP, parquet, ...")],
+    known: Annotated[str | None, option("--columns", "FILE", "Try this column map instead of drafting one.")] = None,
+    out: Annotated[Path | None, option("--out", "FILE.yaml", "Write the draft to this file.")] = None,
+    force: opt.Force = False,
 ) -> Result:
     """Look at a log: what its columns are, in what units, what is odd; drafts the column map for --columns."""
     from frictid_hil.jobs.columns import columns as job

@@ -6,22 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from frictid_hil.cli.options import (
-    BusOption,
-    DryRunOption,
-    LiveAtOption,
-    LiveOption,
-    OneJointOption,
-    OutOption,
-    RealtimeOption,
-    RobotOption,
-    SeedOption,
-    StoreOption,
-    YesOption,
-    one_of,
-    profiles,
-    quantity,
-)
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import option
 from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.mode import Mode
@@ -39,77 +25,60 @@ def _drive_mode(name: str) -> Mode:
 
 
 def _duration(text: str) -> float:
-    return 0.0 if text.strip() == "0" else quantity("duration")(text)
+    return 0.0 if text.strip() == "0" else opt.quantity("duration")(text)
 
 
 TaskOption = Annotated[
     str,
-    typer.Option(
+    option(
         "--task",
-        metavar="TASK",
-        autocompletion=one_of("hand", "track"),
-        help="hand (a person guides the joint), track (a triangle under a weak PD).",
+        "TASK",
+        "hand (a person guides the joint), track (a triangle under a weak PD).",
+        complete=opt.one_of("hand", "track"),
     ),
 ]
 ProfileOption = Annotated[
     str,
-    typer.Option(
-        "--profile",
-        "-p",
-        metavar="PROFILE",
-        autocompletion=profiles,
-        help="Profile, run folder, or id of the store. Default: the robot's active profile.",
+    option(
+        "--profile -p",
+        "PROFILE",
+        "Profile, run folder, or id of the store. Default: the robot's active profile.",
+        complete=opt.profiles,
     ),
 ]
 ModeOption = Annotated[
     str | None,
-    typer.Option(
-        "--mode",
-        metavar="MODES",
-        help="nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task.",
-    ),
+    option("--mode", "MODES", "nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task."),
 ]
 SettingOption = Annotated[
     str,
-    typer.Option(
-        "--setting",
-        metavar="SETTING",
-        autocompletion=one_of("ours", "paper"),
-        help="ours, or paper (R = 0.9, K = 10000 N m/rad).",
+    option(
+        "--setting", "SETTING", "ours, or paper (R = 0.9, K = 10000 N m/rad).", complete=opt.one_of("ours", "paper")
     ),
 ]
 StiffnessOption = Annotated[
-    float | None, typer.Option("--stiffness", metavar="K", parser=quantity("stiffness"), help="K, e.g. 8000Nm/rad.")
+    float | None, option("--stiffness", "K", "K, e.g. 8000Nm/rad.", parser=opt.quantity("stiffness"))
 ]
 ViscosityOption = Annotated[
-    float | None,
-    typer.Option(
-        "--viscosity", metavar="B_C", help="B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0
-    ),
+    float | None, option("--viscosity", "B_C", "B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0)
 ]
 SpeedOption = Annotated[
-    float | None,
-    typer.Option("--speed", metavar="SPEED", parser=quantity("angular velocity"), help="Peak speed of the task."),
+    float | None, option("--speed", "SPEED", "Peak speed of the task.", parser=opt.quantity("angular velocity"))
 ]
 DurationOption = Annotated[
     float | None,
-    typer.Option(
-        "--duration",
-        metavar="TIME",
-        parser=_duration,
-        help="Of each mode, 10s unless told; 0 runs until interrupted.",
-    ),
+    option("--duration", "TIME", "Of each mode, 10s unless told; 0 runs until interrupted.", parser=_duration),
 ]
 CentreOption = Annotated[
-    float | None, typer.Option("--centre", metavar="ANGLE", parser=quantity("angle"), help="Middle of the travel.")
+    float | None, option("--centre", "ANGLE", "Middle of the travel.", parser=opt.quantity("angle"))
 ]
 DriveModeOption = Annotated[
     str,
-    typer.Option(
+    option(
         "--drive-mode",
-        metavar="MODE",
-        autocompletion=one_of("torque", "position", "velocity"),
-        help="torque; position or velocity with the torque as offset (60B2).",
+        "MODE",
+        "torque; position or velocity with the torque as offset (60B2).",
+        complete=opt.one_of("torque", "position", "velocity"),
     ),
 ]
 
@@ -150,13 +119,13 @@ def _number(figures: dict[str, Any], key: str, unit: str, scale: float) -> str:
 @verb(app, "compensate", _show)
 def compensate(
     output: Output,
-    robot: RobotOption,
-    joint: OneJointOption,
+    robot: opt.Robot,
+    joint: opt.OneJoint,
     task: TaskOption,
     profile: ProfileOption = "active",
     mode: ModeOption = None,
     setting: SettingOption = "ours",
-    ratio: Annotated[float | None, typer.Option("--compensation-ratio", metavar="R", help="R, below 1.")] = None,
+    ratio: Annotated[float | None, option("--compensation-ratio", "R", "R, below 1.")] = None,
     stiffness_nm_per_rad: StiffnessOption = None,
     viscous_nm_s_per_rad: ViscosityOption = None,
     speed_rad_s: SpeedOption = None,
@@ -164,15 +133,15 @@ def compensate(
     centre_rad: CentreOption = None,
     drive_mode: DriveModeOption = "torque",
     force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
-    dry_run: DryRunOption = False,
-    bus: BusOption = None,
-    realtime: RealtimeOption = None,
-    seed: SeedOption = 0,
-    live: LiveOption = False,
-    live_at: LiveAtOption = None,
-    out: OutOption = None,
-    store: StoreOption = None,
-    yes: YesOption = False,
+    dry_run: opt.DryRun = False,
+    bus: opt.Bus = None,
+    realtime: opt.Realtime = None,
+    seed: opt.Seed = 0,
+    live: opt.Live = False,
+    live_at: opt.LiveAt = None,
+    out: opt.Out = None,
+    store: opt.Store = None,
+    yes: opt.Yes = False,
 ) -> Result | Told:
     """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
     from frictid_hil.cli.progress import shown_plan, watching
@@ -184,6 +153,7 @@ def compensate(
     wanted = output.options(Wanted, modes=modes, drive_mode=_drive_mode(drive_mode))
     options = output.options(CompensateOptions, wanted=wanted)
     if dry_run:
-        return shown_plan(output, plan_compensation(options))
+        planned = plan_compensation(options)
+        return shown_plan(output, planned.plan, planned.setup)
     with watching(output, yes=yes, live=live, live_at=live_at) as watcher:
         return job(options, watcher, live=watcher.note)

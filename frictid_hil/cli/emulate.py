@@ -7,7 +7,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from frictid_hil.cli.options import robot_files
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import option
 from frictid_hil.cli.output import Output, verb
 from frictid_hil.errors import UsageError
 
@@ -19,27 +20,19 @@ def motoman(
     output: Output,
     pty: Annotated[bool, typer.Option("--pty", help="On a pseudo terminal, whose name is printed first.")] = False,
     robot: Annotated[
-        str,
-        typer.Option(
-            "--robot",
-            "-r",
-            metavar="FILE",
-            autocompletion=robot_files,
-            help="Robot file whose joints stand behind it.",
-        ),
+        str, option("--robot -r", "FILE", "Robot file whose joints stand behind it.", complete=opt.robot_files)
     ] = "hp3j-serial.yaml",
     link: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--link",
-            metavar="NAME",
+            "NAME",
+            "A name of your own for the port, under which it comes back after a fault that took it away.",
             dir_okay=False,
-            help="A name of your own for the port, under which it comes back after a fault that took it away.",
         ),
     ] = None,
     fault: Annotated[
-        list[str] | None,
-        typer.Option("--fault", metavar="FAULT", help="What shall go wrong, in the emulator's words; repeat."),
+        list[str] | None, option("--fault", "FAULT", "What shall go wrong, in the emulator's words; repeat.")
     ] = None,
 ) -> NoReturn:
     """A serial MOTOMAN-style controller with six simulated joints; runs until Ctrl-C."""
@@ -55,13 +48,9 @@ def motoman(
 @verb(app, "cia402", schema="emulate")
 def cia402(
     output: Output,
-    bus: Annotated[
-        str,
-        typer.Option("--bus", metavar="BUS", help="interface:channel of python-can, e.g. socketcan:vcan0."),
-    ],
+    bus: Annotated[str, option("--bus", "BUS", "interface:channel of python-can, e.g. socketcan:vcan0.")],
     robot: Annotated[
-        str,
-        typer.Option("--robot", "-r", metavar="FILE", autocompletion=robot_files, help="Robot file of these drives."),
+        str, option("--robot -r", "FILE", "Robot file of these drives.", complete=opt.robot_files)
     ] = "hp3j.yaml",
 ) -> NoReturn:
     """The CiA-402 drives of a robot file on a CAN bus, for any host; runs until Ctrl-C."""

@@ -7,16 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from frictid_hil.cli import options as opt
 from frictid_hil.cli.model_words import model_logs, print_arm
-from frictid_hil.cli.options import (
-    BusOption,
-    ForceOption,
-    RealtimeOption,
-    ResumeOption,
-    RobotOption,
-    SeedOption,
-    YesOption,
-)
+from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import UsageError
 
@@ -26,120 +19,87 @@ app = typer.Typer(
 
 
 LogsArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="SET | LOG...", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
-    ),
+    list[Path], argument("SET | LOG...", "Folder with nominal.yaml and its logs; or recordings that lie anywhere.")
 ]
-ReportFolderOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder for the report page.")]
-ColumnsOption = Annotated[
-    str | None, typer.Option("--columns", metavar="FILE", help="Column map of a foreign logger (emps.yaml).")
-]
-JointNameOption = Annotated[
-    str | None, typer.Option("--joint", "-j", metavar="JOINT", help="The joint, where logs or profile hold several.")
-]
+ReportFolderOption = Annotated[Path | None, option("--out", "FOLDER", "Folder for the report page.")]
+ColumnsOption = Annotated[str | None, option("--columns", "FILE", "Column map of a foreign logger (emps.yaml).")]
+JointNameOption = Annotated[str | None, option("--joint -j", "JOINT", "The joint, where logs or profile hold several.")]
 
 
 DiagnoseLogsArgument = Annotated[
     list[Path] | None,
-    typer.Argument(
-        metavar="[SET | LOG...]", help="Folder with nominal.yaml and its logs; or recordings that lie anywhere."
-    ),
+    argument("[SET | LOG...]", "Folder with nominal.yaml and its logs; or recordings that lie anywhere."),
 ]
 ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", metavar="FILE", help="Your own robot model, MJCF or URDF: every joint is diagnosed."),
+    Path | None, option("--model", "FILE", "Your own robot model, MJCF or URDF: every joint is diagnosed.")
 ]
-MoreLogsOption = Annotated[
-    list[Path] | None, typer.Option("--log", metavar="LOG", help="A recording; as those without an option.")
-]
-NominalOption = Annotated[
-    Path | None, typer.Option("--nominal", metavar="FILE", help="What the simulator believes (nominal.yaml).")
-]
-ProfileOption = Annotated[
-    Path | None, typer.Option("--profile", metavar="PROFILE", help="Friction profile that the simulator believes.")
-]
+MoreLogsOption = Annotated[list[Path] | None, option("--log", "LOG", "A recording; as those without an option.")]
+NominalOption = Annotated[Path | None, option("--nominal", "FILE", "What the simulator believes (nominal.yaml).")]
+ProfileOption = Annotated[Path | None, option("--profile", "PROFILE", "Friction profile that the simulator believes.")]
 JointOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--joint",
-        "-j",
-        metavar="JOINT",
-        help="The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
+    option(
+        "--joint -j",
+        "JOINT",
+        "The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
     ),
 ]
 HoldOption = Annotated[
-    list[str] | None,
-    typer.Option("--hold", metavar="JOINT=20deg", help="Where a joint of the model stood that no log has."),
+    list[str] | None, option("--hold", "JOINT=20deg", "Where a joint of the model stood that no log has.")
 ]
 ToleranceOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
         "--tolerance",
-        metavar="NUMBER=SIGMA",
-        help="One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
+        "NUMBER=SIGMA",
+        "One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
     ),
 ]
 ExecutorOption = Annotated[
-    str | None,
-    typer.Option("--executor", metavar="WHERE", help="processes:N, or dask://host:port, for the joints of a model."),
+    str | None, option("--executor", "WHERE", "processes:N, or dask://host:port, for the joints of a model.")
 ]
 ValidationOption = Annotated[
-    list[str] | None,
-    typer.Option("--validation", metavar="LOG", help="Log to judge on, by name; unless told, what was recorded last."),
+    list[str] | None, option("--validation", "LOG", "Log to judge on, by name; unless told, what was recorded last.")
 ]
 SplitOption = Annotated[
-    str,
-    typer.Option(
-        "--split", metavar="HOW", help="Judge on the end of every log, 30% or 20s of it; or on whole logs: log."
-    ),
+    str, option("--split", "HOW", "Judge on the end of every log, 30% or 20s of it; or on whole logs: log.")
 ]
 NegligibleOption = Annotated[
     float | None,
-    typer.Option(
+    option(
         "--negligible",
-        metavar="PERCENT",
+        "PERCENT",
+        "Gap that means nothing to you, in percent of the friction level; 5 unless told.",
         min=0.0,
         max=100.0,
-        help="Gap that means nothing to you, in percent of the friction level; 5 unless told.",
     ),
 ]
 WriteModelOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
         "--write-model",
-        metavar="FILE",
-        help="Write the improved joint as a robot file; with --model, your own file with the causes added.",
+        "FILE",
+        "Write the improved joint as a robot file; with --model, your own file with the causes added.",
     ),
 ]
 MujocoOption = Annotated[
     Path | None,
-    typer.Option(
-        "--export-mujoco",
-        metavar="FILE.xml",
-        help="Export the improved joint to MuJoCo, and FILE.py with its callback.",
-    ),
+    option("--export-mujoco", "FILE.xml", "Export the improved joint to MuJoCo, and FILE.py with its callback."),
 ]
 ExportOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
         "--export",
-        metavar="TARGET=FILE",
-        help="Also write the joints of a model: isaaclab, mjlab (.py), newton (.usda), ros2 (.yaml), bam, samples "
+        "TARGET=FILE",
+        "Also write the joints of a model: isaaclab, mjlab (.py), newton (.usda), ros2 (.yaml), bam, samples "
         "(.json), c (.h).",
     ),
 ]
 StageOption = Annotated[
     Path | None,
-    typer.Option(
-        "--stage",
-        metavar="FILE",
-        help="Your USD stage, over whose joints --export newton is laid; without it a new one.",
-    ),
+    option("--stage", "FILE", "Your USD stage, over whose joints --export newton is laid; without it a new one."),
 ]
-RandomiseOption = Annotated[
-    int, typer.Option("--randomise", metavar="N", min=0, help="Posterior samples to draw for --export.")
-]
+RandomiseOption = Annotated[int, option("--randomise", "N", "Posterior samples to draw for --export.", min=0)]
 ApplyOption = Annotated[
     bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
 ]
@@ -205,7 +165,7 @@ def diagnose(
     randomise: RandomiseOption = 0,
     apply: ApplyOption = False,
     out: ReportFolderOption = None,
-    force: ForceOption = False,
+    force: opt.Force = False,
 ) -> Result:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
     from frictid_hil.jobs.gap.export_targets import Wanted
@@ -243,8 +203,8 @@ def draft(
     logs: LogsArgument,
     columns: ColumnsOption = None,
     joint: JointNameOption = None,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write.")] = Path("nominal.yaml"),
-    force: ForceOption = False,
+    out: Annotated[Path, option("--out", "FILE", "The file to write.")] = Path("nominal.yaml"),
+    force: opt.Force = False,
 ) -> Result:
     """Draft a first nominal.yaml, with tolerances, from recordings where nothing is believed yet."""
     from frictid_hil.jobs.gap.logs import Source
@@ -269,15 +229,11 @@ def _show_fleet(output: Output, result: Result) -> None:
 @verb(app, "fleet", _show_fleet, schema="gap_fleet")
 def fleet(
     output: Output,
-    results: Annotated[
-        list[Path], typer.Argument(metavar="RESULT...", help="What `gap diagnose --json` printed, one file a robot.")
-    ],
-    randomise: Annotated[int, typer.Option("--randomise", metavar="N", min=0, help="Robots to draw into --out.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="File for the robots drawn (.json).")
-    ] = None,
-    seed: SeedOption = 1,
-    force: ForceOption = False,
+    results: Annotated[list[Path], argument("RESULT...", "What `gap diagnose --json` printed, one file a robot.")],
+    randomise: Annotated[int, option("--randomise", "N", "Robots to draw into --out.", min=0)] = 0,
+    out: Annotated[Path | None, option("--out", "FILE", "File for the robots drawn (.json).")] = None,
+    seed: opt.Seed = 1,
+    force: opt.Force = False,
 ) -> Result:
     """Tell what varies between robots of one kind from what is not known of them."""
     from frictid_hil.jobs.gap_fleet import fleet as job
@@ -299,19 +255,15 @@ def _show_check(output: Output, result: Result) -> None:
 @verb(app, "check", _show_check, schema="gap_check")
 def check(
     output: Output,
-    cases: Annotated[int, typer.Option("--cases", metavar="N", min=1, help="Joints to draw.")] = 40,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the draw.")] = 1,
-    world: Annotated[
-        str, typer.Option("--world", metavar="NAMES", help="narrow, wide, zoo, or several with commas.")
-    ] = "narrow",
-    processes: Annotated[int, typer.Option("--processes", metavar="N", min=1, help="Parallel processes.")] = 2,
+    cases: Annotated[int, option("--cases", "N", "Joints to draw.", min=1)] = 40,
+    seed: Annotated[int, option("--seed", "N", "Seed of the draw.")] = 1,
+    world: Annotated[str, option("--world", "NAMES", "narrow, wide, zoo, or several with commas.")] = "narrow",
+    processes: Annotated[int, option("--processes", "N", "Parallel processes.", min=1)] = 2,
     leave_one_out: Annotated[
         bool, typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn.")
     ] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to keep cases, answers and scores in.")
-    ] = None,
-    force: ForceOption = False,
+    out: Annotated[Path | None, option("--out", "FOLDER", "Folder to keep cases, answers and scores in.")] = None,
+    force: opt.Force = False,
 ) -> Result:
     """Draw joints whose truth is sealed, diagnose them, open the seal, score the answers."""
     from frictid_hil.jobs.gap_check import run_gap_check
@@ -321,15 +273,13 @@ def check(
     return run_gap_check(cases, seed, out, processes, worlds=worlds, **more)
 
 
-PlanOption = Annotated[
-    Path | None, typer.Option("--plan", metavar="FILE", help="Record just what an ambiguous diagnosis asked for.")
-]
+PlanOption = Annotated[Path | None, option("--plan", "FILE", "Record just what an ambiguous diagnosis asked for.")]
 UntilDecidedOption = Annotated[
     float | None,
-    typer.Option(
+    option(
         "--until-decided",
-        metavar="SECONDS",
-        help="Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
+        "SECONDS",
+        "Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
     ),
 ]
 PayloadOption = Annotated[
@@ -341,8 +291,7 @@ PayloadOption = Annotated[
     ),
 ]
 RecordedOption = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="Make a set of what this run has recorded; nothing moves."),
+    Path | None, option("--from", "RUN", "Make a set of what this run has recorded; nothing moves.")
 ]
 
 
@@ -357,20 +306,20 @@ def _show_recording(output: Output, result: Result) -> None:
 @verb(app, "record", _show_recording, schema="gap_record")
 def record(
     output: Output,
-    robot: RobotOption = "",
-    joint: Annotated[str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint to record.")] = "",
-    bus: BusOption = None,
+    robot: opt.Robot = "",
+    joint: Annotated[str, option("--joint -j", "JOINT", "The joint to record.")] = "",
+    bus: opt.Bus = None,
     short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
     plan: PlanOption = None,
     until_decided: UntilDecidedOption = None,
     profile: ProfileOption = None,
     payload: PayloadOption = None,
-    realtime: RealtimeOption = None,
-    seed: SeedOption = 0,
-    resume: ResumeOption = None,
+    realtime: opt.Realtime = None,
+    seed: opt.Seed = 0,
+    resume: opt.Resume = None,
     recorded: RecordedOption = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder of the experiment set.")] = None,
-    yes: YesOption = False,
+    out: Annotated[Path | None, option("--out", "FOLDER", "Folder of the experiment set.")] = None,
+    yes: opt.Yes = False,
 ) -> Told:
     """Run the diagnostic experiments on the bus and write an experiment set."""
     from frictid_hil.cli.progress import watching

@@ -7,20 +7,9 @@ from typing import Annotated
 
 import typer
 
-from frictid_hil.cli.options import (
-    BusOption,
-    LiveAtOption,
-    LiveOption,
-    NotifyOption,
-    OutOption,
-    RealtimeOption,
-    RobotOption,
-    SeedOption,
-    StoreOption,
-    quantity,
-)
-from frictid_hil.cli.output import Output, Result, verb
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import option
+from frictid_hil.cli.output import Output, Result, folding, verb
 
 app = typer.Typer()
 
@@ -52,15 +41,15 @@ def _with_unit(value: float | None, unit: str, digits: int = 1) -> str:
 @verb(app, "recalibrate", _show_night)
 def recalibrate(
     output: Output,
-    robot: RobotOption,
-    bus: BusOption = None,
-    store: StoreOption = None,
-    realtime: RealtimeOption = None,
-    seed: SeedOption = 0,
-    notify: NotifyOption = None,
-    live: LiveOption = False,
-    live_at: LiveAtOption = None,
-    out: OutOption = None,
+    robot: opt.Robot,
+    bus: opt.Bus = None,
+    store: opt.Store = None,
+    realtime: opt.Realtime = None,
+    seed: opt.Seed = 0,
+    notify: opt.Notify = None,
+    live: opt.Live = False,
+    live_at: opt.LiveAt = None,
+    out: opt.Out = None,
 ) -> Result:
     """Calibrate with nobody watching; promote or refuse by the robot file's policy. Never asks."""
     from frictid_hil.cli.progress import watching
@@ -84,23 +73,18 @@ def _show_units(output: Output, result: Result) -> None:
 @verb(app, "schedule", _show_units)
 def schedule(
     output: Output,
-    robot: RobotOption,
-    on_calendar: Annotated[
-        str, typer.Option("--on-calendar", metavar="WHEN", help='When, e.g. "Mon..Fri 02:30" (man systemd.time).')
-    ],
-    bus: BusOption = None,
+    robot: opt.Robot,
+    on_calendar: Annotated[str, option("--on-calendar", "WHEN", 'When, e.g. "Mon..Fri 02:30" (man systemd.time).')],
+    bus: opt.Bus = None,
     system: Annotated[
         bool, typer.Option("--system/--user", help="For the whole machine, or for this person alone.")
     ] = False,
-    user: Annotated[
-        str, typer.Option("--account", metavar="NAME", help="Account that a system service runs as.")
-    ] = "frictid",
-    command: NotifyOption = None,
+    user: Annotated[str, option("--account", "NAME", "Account that a system service runs as.")] = "frictid",
+    command: opt.Notify = None,
     time_limit_s: Annotated[
-        float,
-        typer.Option("--time-limit", metavar="TIME", parser=quantity("duration"), help="A longer night is stopped."),
+        float, option("--time-limit", "TIME", "A longer night is stopped.", parser=opt.quantity("duration"))
     ] = "4h",  # type: ignore[assignment]  # typer parses it
-    out: OutOption = None,
+    out: opt.Out = None,
 ) -> Result:
     """Write and verify the systemd service and timer for `recalibrate`; print a cron line as well."""
     from frictid_hil.jobs.schedule import ScheduleOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -22,31 +22,19 @@ _ROOM_FOR_BARS = 100
 """Columns of a terminal; on a narrower one the torque is a figure without its bar."""
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """What a row says of the newest rows of a joint; "" where it is not measured.
+def figures_of(rows: Rows, max_torque_nm: float | None) -> dict[str, str]:
+    """What is told of some rows of one joint: largest error and torque, newest temperature; "" where not measured.
 
-    Attributes:
-        error: largest following error among them.
-        torque: highest torque among them as a bar of its limit, with its value.
-        temperature: of the newest.
+    There is no bar of the torque where its limit is None.
     """
-
-    error: str = ""
-    torque: str = ""
-    temperature: str = ""
-
-
-def figures_of(rows: Rows, max_torque_nm: float | None) -> Figures:
-    """Figures of some rows of one joint (``ring.SAMPLE_ROW``); no bar of the torque where its limit is None."""
     error_rad = _largest(rows["position_command_rad"] - rows["position_rad"])
     torque_nm = _largest(rows["torque_nm"])
     temperature_c = float(rows["temperature_c"][-1])
-    return Figures(
-        f"{degrees(error_rad):.3f} deg" if math.isfinite(error_rad) else "",
-        torque_bar(torque_nm, max_torque_nm) if math.isfinite(torque_nm) else "",
-        f"{temperature_c:.1f} C" if math.isfinite(temperature_c) else "",
-    )
+    return {
+        "error": f"{degrees(error_rad):.3f} deg" if math.isfinite(error_rad) else "",
+        "torque": torque_bar(torque_nm, max_torque_nm) if math.isfinite(torque_nm) else "",
+        "temperature": f"{temperature_c:.1f} C" if math.isfinite(temperature_c) else "",
+    }
 
 
 def torque_bar(torque_nm: float, max_torque_nm: float | None) -> str:
@@ -84,12 +72,8 @@ class Lateness:
 class JointView:
     """The rows of one run.
 
-    Args:
-        console: a terminal.
-        setup: names, torque limits.
-        period_s: of a cycle; infinite where the controller cycles by itself and sends its recording afterwards.
-        planned: how long each stretch of the plan takes, s, by its name (a joint's, or of several that move together).
-        members: the joints of each stretch.
+    Stretches are named by their joint, or joints that move together. The period of a cycle is infinite where the
+    controller cycles by itself and sends its recording afterwards.
     """
 
     def __init__(
@@ -152,15 +136,10 @@ class JointView:
                 continue
             late = self._lateness[name].take(mine["t_ns"])
             if drawn:
-                figures = figures_of(mine, self._setup.joint(name).max_torque_nm if self._bars else None)
-                self._progress.update(
-                    self._tasks[name],
-                    completed=completed_s,
-                    error=figures.error,
-                    torque=figures.torque,
-                    temperature=figures.temperature,
-                    late=f"{late} late",
+                figures: dict[str, Any] = figures_of(
+                    mine, self._setup.joint(name).max_torque_nm if self._bars else None
                 )
+                self._progress.update(self._tasks[name], completed=completed_s, late=f"{late} late", **figures)
         if drawn:
             self._drawn_at = now
 

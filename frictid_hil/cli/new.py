@@ -9,7 +9,8 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from frictid_hil.cli.options import ForceOption, quantity
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import Output, Result, Told, verb
 from frictid_hil.errors import Interrupted, UsageError
 
@@ -33,7 +34,7 @@ def _travel(text: str) -> tuple[float, float]:
     low, dots, high = text.partition("..")
     if not dots:
         raise typer.BadParameter(f"expected LOW..HIGH such as -90deg..90deg, found {text!r}")
-    parse = quantity("angle")
+    parse = opt.quantity("angle")
     return parse(low), parse(high)
 
 
@@ -70,31 +71,21 @@ def _asked(question: str, option: str, parse: Callable[[str], _Value], *, asks: 
 
 
 JointOption = Annotated[
-    list[Any] | None,
-    typer.Option("--joint", "-j", metavar="NAME=ADDRESS", parser=_named, help="A joint and its address; repeat."),
+    list[Any] | None, option("--joint -j", "NAME=ADDRESS", "A joint and its address; repeat.", parser=_named)
 ]
-BusOption = Annotated[
-    str | None, typer.Option("--bus", metavar="BUS", parser=_bus, help="interface:channel, e.g. socketcan:can0.")
-]
-TravelOption = Annotated[
-    Any,
-    typer.Option("--travel", metavar="LOW..HIGH", parser=_travel, help="Travel of the joints: -90deg..90deg."),
-]
+BusOption = Annotated[str | None, option("--bus", "BUS", "interface:channel, e.g. socketcan:can0.", parser=_bus)]
+TravelOption = Annotated[Any, option("--travel", "LOW..HIGH", "Travel of the joints: -90deg..90deg.", parser=_travel)]
 MaxVelocityOption = Annotated[
-    float | None,
-    typer.Option("--max-velocity", metavar="SPEED", parser=quantity("angular velocity"), help="E.g. 115deg/s."),
+    float | None, option("--max-velocity", "SPEED", "E.g. 115deg/s.", parser=opt.quantity("angular velocity"))
 ]
 MaxTorqueOption = Annotated[
-    float | None,
-    typer.Option("--max-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint, e.g. 60Nm."),
+    float | None, option("--max-torque", "TORQUE", "At the joint, e.g. 60Nm.", parser=opt.quantity("torque"))
 ]
 GearRatioOption = Annotated[
-    float | None,
-    typer.Option("--gear-ratio", metavar="RATIO", parser=_ratio, help="Motor revolutions per joint revolution."),
+    float | None, option("--gear-ratio", "RATIO", "Motor revolutions per joint revolution.", parser=_ratio)
 ]
 RatedTorqueOption = Annotated[
-    float | None,
-    typer.Option("--rated-torque", metavar="TORQUE", parser=quantity("torque"), help="At the joint: motor x gear."),
+    float | None, option("--rated-torque", "TORQUE", "At the joint: motor x gear.", parser=opt.quantity("torque"))
 ]
 
 
@@ -106,10 +97,10 @@ def _show_robot(output: Output, _result: Result) -> None:
 @verb(app, "robot", _show_robot, schema="new_robot")
 def robot(
     output: Output,
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="Robot file to write; the robot is named after it.")],
+    path: Annotated[Path, argument("FILE", "Robot file to write; the robot is named after it.")],
     joint: JointOption = None,
     bus: BusOption = None,
-    driver: Annotated[str, typer.Option("--driver", metavar="DRIVER", help="Driver of the bus.")] = "cia402",
+    driver: Annotated[str, option("--driver", "DRIVER", "Driver of the bus.")] = "cia402",
     travel: TravelOption = None,
     max_velocity: MaxVelocityOption = None,
     max_torque: MaxTorqueOption = None,
@@ -119,7 +110,7 @@ def robot(
     read: Annotated[bool, typer.Option("--read", help="Ask the drives for gear and rated torque; nothing moves.")] = (
         False
     ),
-    force: ForceOption = False,
+    force: opt.Force = False,
 ) -> Told:
     """A robot file for your robot. On a terminal it asks for what you did not give; one answer holds for all joints."""
     from frictid_hil.files import refuse_overwriting
@@ -133,12 +124,14 @@ def robot(
     names = answer(joint or None, "joints and their addresses (shoulder=1 elbow=2)", "--joint", _all_named)
     spot = answer(bus, "bus (socketcan:can0)", "--bus", _bus)
     range_rad = answer(travel, "travel of the joints (-90deg..90deg)", "--travel", _travel)
-    speed = answer(max_velocity, "highest speed of a joint (115deg/s)", "--max-velocity", quantity("angular velocity"))
-    torque = answer(max_torque, "highest torque at a joint (60Nm)", "--max-torque", quantity("torque"))
+    speed = answer(
+        max_velocity, "highest speed of a joint (115deg/s)", "--max-velocity", opt.quantity("angular velocity")
+    )
+    torque = answer(max_torque, "highest torque at a joint (60Nm)", "--max-torque", opt.quantity("torque"))
     ratio, rated = gear_ratio, rated_torque
     if not read:
         ratio = answer(ratio, "motor revolutions per joint revolution (100)", "--gear-ratio", _ratio)
-        rated = answer(rated, "rated torque at a joint: motor x gear (24Nm)", "--rated-torque", quantity("torque"))
+        rated = answer(rated, "rated torque at a joint: motor x gear (24Nm)", "--rated-torque", opt.quantity("torque"))
     joints = [JointAnswers(name, address, range_rad, speed, torque, ratio, rated) for name, address in names]
     return new_robot(path, driver=driver, bus=spot, joints=joints, cycle_hz=cycle_hz, read=read, force=force)
 
@@ -152,7 +145,7 @@ def _show_driver(output: Output, result: Result) -> None:
 @verb(app, "driver", _show_driver, schema="new_driver")
 def driver(
     output: Output,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the driver, as robot files will have it.")],
+    name: Annotated[str, argument("NAME", "Name of the driver, as robot files will have it.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; frictid-NAME here if not given.")] = None,
 ) -> Result:
     """A driver of your own for CAN devices: a package that runs, with a fake device, a robot file and its tests."""

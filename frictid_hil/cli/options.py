@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from frictid_hil.errors import UsageError
 from frictid_hil.units import parse_quantity
+
+
+def option(names: str, metavar: str, help: str, complete: Callable[..., list[str]] | None = None, **more: Any) -> Any:
+    """An option that takes a value, such as ``option("--robot -r", "FILE", "Robot file.")``."""
+    return typer.Option(*names.split(), metavar=metavar, help=help, autocompletion=complete, **more)
+
+
+def argument(metavar: str, help: str, complete: Callable[..., list[str]] | None = None, **more: Any) -> Any:
+    """What is given by its place."""
+    return typer.Argument(metavar=metavar, help=help, autocompletion=complete, **more)
 
 
 def quantity(dimension: str) -> Callable[[str], float]:
@@ -70,103 +80,62 @@ def profiles(incomplete: str) -> list[str]:
     return sorted(name for name in known | near | {"active"} if name.startswith(incomplete))
 
 
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
-OutOption = Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Folder to write to.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
-ResumeOption = Annotated[
-    Path | None,
-    typer.Option("--resume", metavar="RUN", help="Go on with this run: its robot and options, what it still lacks."),
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
+Out = Annotated[Path | None, option("--out", "FOLDER", "Folder to write to.")]
+Force = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
+Resume = Annotated[
+    Path | None, option("--resume", "RUN", "Go on with this run: its robot and options, what it still lacks.")
 ]
-NotifyOption = Annotated[
+Notify = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--notify",
-        metavar="CMD",
-        help="Command that is given the JSON on its standard input, however it ended; a shell needs `sh -c '...'`.",
+        "CMD",
+        "Command that is given the JSON on its standard input, however it ended; a shell needs `sh -c '...'`.",
     ),
 ]
 
-RobotOption = Annotated[
-    str,
-    typer.Option(
-        "--robot",
-        "-r",
-        metavar="FILE",
-        help="Robot file, by path or by name (hp3j.yaml).",
-        autocompletion=robot_files,
-    ),
+Robot = Annotated[
+    str, option("--robot -r", "FILE", "Robot file, by path or by name (hp3j.yaml).", complete=robot_files)
 ]
-BusOption = Annotated[
+Bus = Annotated[
     str | None,
-    typer.Option(
-        "--bus",
-        metavar="BUS",
-        help="interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0).",
-    ),
+    option("--bus", "BUS", "interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0)."),
 ]
-RealtimeOption = Annotated[bool | None, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
-SeedOption = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the virtual robot's noise.")]
+Realtime = Annotated[bool | None, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
+Seed = Annotated[int, option("--seed", "N", "Seed of the virtual robot's noise.")]
 
-OneJointOption = Annotated[
-    str, typer.Option("--joint", "-j", metavar="JOINT", help="The joint.", autocompletion=joints)
-]
-JointOption = Annotated[
+OneJoint = Annotated[str, option("--joint -j", "JOINT", "The joint.", complete=joints)]
+Joint = Annotated[
     list[str] | None,
-    typer.Option(
-        "--joint",
-        "-j",
-        metavar="JOINT",
-        help="Only this joint; repeat for several. Default: all.",
-        autocompletion=joints,
-    ),
+    option("--joint -j", "JOINT", "Only this joint; repeat for several. Default: all.", complete=joints),
 ]
-AmplitudeOption = Annotated[
-    float | None,
-    typer.Option(
-        "--amplitude",
-        "-A",
-        metavar="ANGLE",
-        parser=quantity("angle"),
-        help="Peak-to-peak travel A, e.g. 20deg.",
-    ),
+Amplitude = Annotated[
+    float | None, option("--amplitude -A", "ANGLE", "Peak-to-peak travel A, e.g. 20deg.", parser=quantity("angle"))
 ]
-VelocityOption = Annotated[
-    float | None,
-    typer.Option(
-        "--velocity",
-        "-V",
-        metavar="SPEED",
-        parser=quantity("angular velocity"),
-        help="Peak speed V, e.g. 115deg/s.",
-    ),
+Velocity = Annotated[
+    float | None, option("--velocity -V", "SPEED", "Peak speed V, e.g. 115deg/s.", parser=quantity("angular velocity"))
 ]
-CyclesOption = Annotated[int | None, typer.Option("--cycles", "-N", metavar="N", min=2, help="Number of cycles N.")]
-RatioOption = Annotated[
-    float | None, typer.Option("--ratio", "-c", metavar="C", min=0.0, max=0.999, help="Window ratio c.")
-]
-MethodOption = Annotated[
+Cycles = Annotated[int | None, option("--cycles -N", "N", "Number of cycles N.", min=2)]
+Ratio = Annotated[float | None, option("--ratio -c", "C", "Window ratio c.", min=0.0, max=0.999)]
+Method = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--method",
-        metavar="METHOD",
-        autocompletion=one_of("function-a", "aligned", "least-squares"),
-        help="function-a (as published), aligned or least-squares; else that of the programme or of the profile.",
+        "METHOD",
+        "function-a (as published), aligned or least-squares; else that of the programme or of the profile.",
+        complete=one_of("function-a", "aligned", "least-squares"),
     ),
 ]
 
-ProfileArgument = Annotated[
-    Path,
-    typer.Argument(metavar="PROFILE", help="Profile, or a run folder that holds one.", autocompletion=profiles),
-]
-LiveOption = Annotated[
+Profile = Annotated[Path, argument("PROFILE", "Profile, or a run folder that holds one.", complete=profiles)]
+Live = Annotated[
     bool, typer.Option("--live", help="Stream samples over Foxglove WebSocket to this computer (127.0.0.1:8765).")
 ]
-LiveAtOption = Annotated[
-    str | None,
-    typer.Option("--live-at", metavar="HOST:PORT", help="As --live, on this address; 0.0.0.0:8765 for everybody."),
+LiveAt = Annotated[
+    str | None, option("--live-at", "HOST:PORT", "As --live, on this address; 0.0.0.0:8765 for everybody.")
 ]
-StoreOption = Annotated[
-    Path | None,
-    typer.Option("--store", metavar="FOLDER", help="Folder of the profile store; default: the user's data folder."),
+Store = Annotated[
+    Path | None, option("--store", "FOLDER", "Folder of the profile store; default: the user's data folder.")
 ]

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from inspect import Parameter
@@ -20,9 +20,9 @@ from typing import Annotated, Any, NoReturn, Protocol, TypeVar
 
 import typer
 from rich.console import Console, RenderableType
+from rich.table import Column, Table
 from rich.text import Text
 
-from frictid_hil.cli.tables import folding
 from frictid_hil.errors import Defect, FrictidError, Interrupted
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
@@ -54,6 +54,12 @@ def _noted(console: Console) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
+def folding(*headings: str, whole: Collection[str] = (), title: str | None = None) -> Table:
+    """A table that a narrow terminal folds and never cuts; columns named in ``whole`` are narrowed last, not folded."""
+    columns = (Column(heading, overflow="fold", no_wrap=heading in whole) for heading in headings)
+    return Table(*columns, title=title)
+
+
 class Told(Protocol):
     """A typed result."""
 
@@ -64,13 +70,9 @@ class Told(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """How this call was asked to speak.
+    """How this call was asked to speak, and every other option and argument that it was given, by name.
 
-    Attributes:
-        as_json: one object on stdout.
-        quiet: no progress.
-        given: every other option and argument of the verb, by name. The command of ``notify`` is given the same JSON
-            on its standard input, whatever the ending.
+    The command of ``notify`` is given the JSON on its standard input, whatever the ending.
     """
 
     as_json: bool = False
@@ -147,13 +149,7 @@ class Output:
     def run(
         self, verb: str, job: Callable[[], Result | Told], show: Callable[[Output, Result], None] | None = None
     ) -> NoReturn:
-        """Call a job, print its result, leave with its exit code.
-
-        Args:
-            verb: names the schema (``frictid.<verb>/1``).
-            job: returns a typed result, or a mapping with ``outcome``; may raise ``FrictidError``.
-            show: prints the result for a person, where more than a plan was asked for.
-        """
+        """Call a job, print its result, leave with its exit code; ``verb`` names the schema (``frictid.<verb>/1``)."""
         try:
             with _noted(self.err):
                 done = job()
@@ -243,11 +239,7 @@ def verb(
 ) -> Callable[[Verb], Verb]:
     """Make a verb of a function that is given an ``Output`` and the verb's own options, and returns its result.
 
-    Args:
-        app: group that it belongs to.
-        name: as typed.
-        show: prints the result for a person.
-        schema: of the JSON, where it is not the name.
+    ``show`` prints the result for a person; the JSON's schema is named after the verb unless told.
     """
 
     def add(function: Verb) -> Verb:

@@ -8,21 +8,18 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from frictid_hil.cli.options import ForceOption, ProfileArgument, StoreOption, profiles, robots
-from frictid_hil.cli.output import READING, Output, Result, verb
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import argument, option
+from frictid_hil.cli.output import READING, Output, Result, folding, verb
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
-RobotArgument = Annotated[str, typer.Argument(metavar="ROBOT", help="Name of the robot.", autocompletion=robots)]
+RobotArgument = Annotated[str, argument("ROBOT", "Name of the robot.", complete=opt.robots)]
 RobotName = Annotated[
-    str | None,
-    typer.Option(
-        "--robot", "-r", metavar="ROBOT", help="Name of the robot whose store is meant by ids.", autocompletion=robots
-    ),
+    str | None, option("--robot -r", "ROBOT", "Name of the robot whose store is meant by ids.", complete=opt.robots)
 ]
 
-ReasonOption = Annotated[str, typer.Option("--reason", metavar="TEXT", help="For the history.")]
+ReasonOption = Annotated[str, option("--reason", "TEXT", "For the history.")]
 
 _SHOWN = 50
 """Profiles, promotions and nights in a table that a person reads."""
@@ -61,7 +58,7 @@ def _timing(joint: Result) -> str:
 
 
 @verb(app, "show", _show_profile, schema="profile_show")
-def show(output: Output, profile: ProfileArgument) -> Result:
+def show(output: Output, profile: opt.Profile) -> Result:
     """Print a profile as a person reads it."""
     from frictid_hil.jobs.profiles import show as job
 
@@ -77,12 +74,10 @@ def _show_export(output: Output, result: Result) -> None:
 @verb(app, "export", _show_export, schema="profile_export")
 def export(
     output: Output,
-    profile: ProfileArgument,
-    to: Annotated[
-        str, typer.Option("--to", metavar="TARGET", help="table (20 points, CSV), ros2 (YAML) or i2rt (YAML).")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write.")],
-    force: ForceOption = False,
+    profile: opt.Profile,
+    to: Annotated[str, option("--to", "TARGET", "table (20 points, CSV), ros2 (YAML) or i2rt (YAML).")],
+    out: Annotated[Path, option("--out", "FILE", "File to write.")],
+    force: opt.Force = False,
 ) -> Result:
     """Write a profile in the form of the place where it shall act, and say what is lost."""
     from frictid_hil.jobs.profile_export import export as job
@@ -113,15 +108,11 @@ def diff(
     output: Output,
     older: Annotated[
         str,
-        typer.Argument(
-            metavar="PROFILE",
-            help="Profile, run folder; or with --robot an id, `active`, `baseline`.",
-            autocompletion=profiles,
-        ),
+        argument("PROFILE", "Profile, run folder; or with --robot an id, `active`, `baseline`.", complete=opt.profiles),
     ],
-    newer: Annotated[str, typer.Argument(metavar="PROFILE", help="The same.", autocompletion=profiles)],
+    newer: Annotated[str, argument("PROFILE", "The same.", complete=opt.profiles)],
     robot: RobotName = None,
-    store: StoreOption = None,
+    store: opt.Store = None,
 ) -> Result:
     """How two profiles differ: distance (15), F_0, overlap of intervals, temperature, and what else changed."""
     from frictid_hil.jobs.profiles import diff as job
@@ -139,16 +130,13 @@ def _show_active(output: Output, result: Result) -> None:
 def promote(
     output: Output,
     profile: Annotated[
-        str,
-        typer.Argument(
-            metavar="PROFILE", help="Profile, run folder; or with --robot an id of the store.", autocompletion=profiles
-        ),
+        str, argument("PROFILE", "Profile, run folder; or with --robot an id of the store.", complete=opt.profiles)
     ],
     robot: RobotName = None,
     reason: ReasonOption = "",
     baseline: Annotated[bool, typer.Option("--baseline", help="Measure drift from it from now on.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Although a quality gate failed.")] = False,
-    store: StoreOption = None,
+    store: opt.Store = None,
 ) -> Result:
     """Make a profile the active one of its robot; joints that it lacks stay, and one command goes back."""
     from frictid_hil.jobs.profiles import promote as job
@@ -158,7 +146,7 @@ def promote(
 
 
 @verb(app, "rollback", _show_active, schema="profile_rollback")
-def rollback(output: Output, robot: RobotArgument, reason: ReasonOption = "", store: StoreOption = None) -> Result:
+def rollback(output: Output, robot: RobotArgument, reason: ReasonOption = "", store: opt.Store = None) -> Result:
     """Make the profile active again that was so before the present one."""
     from frictid_hil.jobs.profiles import rollback as job
 
@@ -214,15 +202,12 @@ def history(
     output: Output,
     robot: RobotArgument,
     last: Annotated[
-        int | None,
-        typer.Option(
-            "--last", metavar="N", min=0, help="Only so many, 0 for all. Default: 50 in a table, all with --json."
-        ),
+        int | None, option("--last", "N", "Only so many, 0 for all. Default: 50 in a table, all with --json.", min=0)
     ] = None,
-    store: StoreOption = None,
+    store: opt.Store = None,
 ) -> Result:
     """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
-    from frictid_hil.jobs.history import history as job
+    from frictid_hil.jobs.profiles import history as job
     from frictid_hil.profiles.store import ProfileStore
 
     shown = last if last is not None else 0 if output.as_json else _SHOWN

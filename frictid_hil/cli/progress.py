@@ -7,14 +7,12 @@ import math
 import sys
 import termios
 from collections.abc import Callable, Iterator
-from typing import Protocol
 
 import typer
 from rich.console import Console
 
 from frictid_hil.cli.joint_view import JointView
-from frictid_hil.cli.output import Output, Result
-from frictid_hil.cli.tables import folding
+from frictid_hil.cli.output import Output, Result, folding
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.live import DEFAULT_ADDRESS
 from frictid_hil.jobs.live import live as live_watcher
@@ -28,42 +26,20 @@ from frictid_hil.runner.stop_signals import handling_signals
 from frictid_hil.units import degrees, format_duration
 
 
-class Planned(Protocol):
-    """What a job that moves has planned and not yet begun."""
-
-    @property
-    def plan(self) -> Plan:
-        """Within every limit."""
-        ...
-
-    @property
-    def setup(self) -> RobotSetup:
-        """The robot as its driver knows it."""
-        ...
-
-
-def shown_plan(output: Output, planned: Planned) -> Result:
+def shown_plan(output: Output, plan: Plan, setup: RobotSetup) -> Result:
     """What ``--dry-run`` tells; no bus is opened."""
-    print_plan(output.out, planned.plan, planned.setup)
-    return {"outcome": "ok", "dry_run": True, "plan": described(planned.plan)}
+    print_plan(output.out, plan, setup)
+    return {"outcome": "ok", "dry_run": True, "plan": described(plan)}
 
 
 def print_plan(console: Console, plan: Plan, setup: RobotSetup) -> None:
     """Whether it is real, joint order, travel, peaks, limits, locked joints, duration, as a technician reads them."""
     how = ", all joints together" if plan.together else ""
     console.print(_which(setup), style="bold", soft_wrap=True)
-    table = folding(
-        *(
-            "joint",
-            "travel (limits), deg",
-            "speed of limit, deg/s",
-            "torque of limit, N m",
-            "time",
-            "others locked, deg",
-        ),
-        whole=("joint",),
-        title=f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}",
-    )
+    limited = ("travel (limits), deg", "speed of limit, deg/s", "torque of limit, N m")
+    headings = ("joint", *limited, "time", "others locked, deg")
+    title = f"Plan for {plan.robot}: {format_duration(plan.duration_s)} at {plan.cycle_hz:g} Hz{how}"
+    table = folding(*headings, whole=("joint",), title=title)
     for entry in plan.joints:
         joint = setup.joint(entry.joint)
         locked = " ".join(f"{name}:{degrees(at):.0f}" for name, at in entry.locked.items())

@@ -7,19 +7,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from frictid_hil.cli.options import (
-    AmplitudeOption,
-    CyclesOption,
-    ForceOption,
-    JointOption,
-    MethodOption,
-    OutOption,
-    RatioOption,
-    RobotOption,
-    StoreOption,
-    VelocityOption,
-    robots,
-)
+from frictid_hil.cli import options as opt
+from frictid_hil.cli.options import argument, option
 from frictid_hil.cli.output import READING, Output, Result, verb
 from frictid_hil.units import degrees
 
@@ -35,18 +24,17 @@ def _show_pages(output: Output, result: Result) -> None:
 @verb(app, "report", _show_pages)
 def report(
     output: Output,
-    run: Annotated[Path | None, typer.Argument(metavar="[RUN]", help="Run folder.")] = None,
+    run: Annotated[Path | None, argument("[RUN]", "Run folder.")] = None,
     robot: Annotated[
         str | None,
-        typer.Option(
-            "--robot",
-            "-r",
-            metavar="ROBOT",
-            autocompletion=robots,
-            help="The page of a robot with its history: its name in the store, or its file.",
+        option(
+            "--robot -r",
+            "ROBOT",
+            "The page of a robot with its history: its name in the store, or its file.",
+            complete=opt.robots,
         ),
     ] = None,
-    store: StoreOption = None,
+    store: opt.Store = None,
 ) -> Result:
     """Write the self-contained HTML page of a run, or the index page of a robot."""
     from frictid_hil.jobs.report import report as job
@@ -57,10 +45,10 @@ def report(
 @verb(app, "dashboard")
 def dashboard(
     output: Output,
-    runs: Annotated[
-        Path, typer.Option("--runs", metavar="DIR", file_okay=False, help="Folder under which runs are looked for.")
-    ] = Path("runs"),
-    store: StoreOption = None,
+    runs: Annotated[Path, option("--runs", "DIR", "Folder under which runs are looked for.", file_okay=False)] = Path(
+        "runs"
+    ),
+    store: opt.Store = None,
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of 127.0.0.1 to listen on.")] = 8642,
 ) -> NoReturn:
     """Show robots, runs and a run as it moves, in a browser on this computer; it reads only. Runs until Ctrl-C."""
@@ -71,20 +59,13 @@ def dashboard(
     raise typer.Exit(0)
 
 
-FramesOption = Annotated[
-    Path | None,
-    typer.Option("--frames", metavar="FILE", help="Mapping file of a foreign log: which frame is what."),
-]
-EdsOption = Annotated[
-    Path | None, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of the drives of a foreign log.")
-]
+FramesOption = Annotated[Path | None, option("--frames", "FILE", "Mapping file of a foreign log: which frame is what.")]
+EdsOption = Annotated[Path | None, option("--eds", "FILE", "EDS or DCF file of the drives of a foreign log.")]
 ProfileOption = Annotated[
-    Path | None,
-    typer.Option("--profile", metavar="PROFILE", help="Profile to compare with; default: the run's own."),
+    Path | None, option("--profile", "PROFILE", "Profile to compare with; default: the run's own.")
 ]
 EchoOption = Annotated[
-    str | None,
-    typer.Option("--echo", metavar="BUS", help="interface:channel of a bus on which every frame is sent again."),
+    str | None, option("--echo", "BUS", "interface:channel of a bus on which every frame is sent again.")
 ]
 SimulateOption = Annotated[
     bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
@@ -131,24 +112,22 @@ def _verdict(joint: Result) -> str:
 @verb(app, "replay", _show_replay)
 def replay(
     output: Output,
-    source: Annotated[
-        Path, typer.Argument(metavar="RUN_OR_LOG", help="Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")
-    ],
-    robot: RobotOption,
-    joints: JointOption = None,
+    source: Annotated[Path, argument("RUN_OR_LOG", "Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")],
+    robot: opt.Robot,
+    joints: opt.Joint = None,
     frames: FramesOption = None,
     eds: EdsOption = None,
     profile: ProfileOption = None,
-    amplitude: AmplitudeOption = None,
-    velocity: VelocityOption = None,
-    cycles: CyclesOption = None,
-    ratio: RatioOption = None,
-    method: MethodOption = None,
+    amplitude: opt.Amplitude = None,
+    velocity: opt.Velocity = None,
+    cycles: opt.Cycles = None,
+    ratio: opt.Ratio = None,
+    method: opt.Method = None,
     paced: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
     echo: EchoOption = None,
     simulation: SimulateOption = True,
-    out: OutOption = None,
-    force: ForceOption = False,
+    out: opt.Out = None,
+    force: opt.Force = False,
 ) -> Result:
     """Play a recording back: the same profile to the last bit, and measured beside simulated motion."""
     from frictid_hil.jobs.plans import given_procedure

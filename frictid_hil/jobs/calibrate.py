@@ -97,11 +97,6 @@ class Planned:
     options: CalibrateOptions
     kept: Mapping[str, tuple[JointProfile, dict[str, Any]]]
 
-    @property
-    def setup(self) -> RobotSetup:
-        """The robot as its driver knows it."""
-        return self.order.setup
-
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
@@ -230,7 +225,7 @@ class _Measured:
         try:
             profile = identify_joint(
                 self._run.folder.samples(moved),
-                self._planned.setup.joint(name),
+                self._planned.order.setup.joint(name),
                 method=self._planned.method,
                 late_cycles=moved.late_cycles + moved.missed_cycles,
                 company=self._company(moved),
@@ -274,7 +269,7 @@ class _Measured:
         return [self._run.folder.samples(replace(moved, joint=other)) for other in others]
 
     def _provenance(self) -> Provenance:
-        order, setup, folder = self._planned.order, self._planned.setup, self._run.folder
+        order, setup, folder = self._planned.order, self._planned.order.setup, self._run.folder
         return Provenance.now(
             robot_file=order.robot.path.name,
             config_sha256=order.robot.digest,
@@ -289,11 +284,7 @@ class _Measured:
 
 
 def _refuse_without_watchdog(preflight: Preflight) -> None:
-    """Refuse, where nobody is present, a drive that does not stop by itself when this computer fails.
-
-    Raises:
-        UsageError: these drives do not.
-    """
+    """Refuse, where nobody is present, a drive that does not stop by itself when this computer fails."""
     if not preflight.capabilities.drive_watchdog:
         raise UsageError(
             "these drives have no watchdog of their own; they would go on if this computer died with nobody there",
@@ -303,11 +294,7 @@ def _refuse_without_watchdog(preflight: Preflight) -> None:
 
 
 def _estimated_by(options: CalibrateOptions) -> tuple[Programme, str]:
-    """The programme and the estimator.
-
-    Raises:
-        UsageError: there is no such estimator, or the programme has cycles of its own.
-    """
+    """The programme and the estimator."""
     chosen = programme(options.program or "thorough")
     method = options.method or chosen.method
     if method not in METHODS:
@@ -318,11 +305,7 @@ def _estimated_by(options: CalibrateOptions) -> tuple[Programme, str]:
 
 
 def _setup(robot: Robot, options: CalibrateOptions) -> RobotSetup:
-    """The robot as its driver is told it.
-
-    Raises:
-        UsageError: the robot has no such joint.
-    """
+    """The robot as its driver is told it."""
     setup = robot.to_setup(options.bus, realtime=bool(options.realtime), seed=options.seed or 0)
     if options.rate_hz is not None:
         setup = replace(setup, cycle_hz=options.rate_hz)

@@ -15,9 +15,9 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import Interrupted, UsageError
 from frictid_hil.jobs.compensation.companions import Hand, Live, LiveFigures
 from frictid_hil.jobs.compensation.figures import mode_run
-from frictid_hil.jobs.compensation.plan import compensation_plan
+from frictid_hil.jobs.compensation.plan import Asked, compensation_plan
 from frictid_hil.jobs.compensation.profile_fit import doubts_of_drive, doubts_of_file, refuse
-from frictid_hil.jobs.compensation.result import Asked, CompensationResult, Progress, result_of
+from frictid_hil.jobs.compensation.result import CompensationResult, Progress, result_of
 from frictid_hil.jobs.compensation.wanted import MODES, Wanted
 from frictid_hil.jobs.plans import expected_of
 from frictid_hil.jobs.profiles import named_profile
@@ -81,9 +81,10 @@ def plan_compensation(options: CompensateOptions) -> Asked:
         # Measured together with the friction; it takes the place of a stated one.
         setup = setup.with_joint(joint.name, loop_stiffness_nm_per_rad=measured)
     forced = [f"forced in spite of: {doubt}" for doubt in doubts]
-    planned = compensation_plan(robot, setup, joint.name, entry, wanted, Rehearsals(robot, options.bus), forced)
-    refuse_beyond_limits(planned.plan, setup, expected_of(robot))
-    return Asked(robot, setup, joint.name, profile_path, entry, wanted, planned)
+    rehearsals = Rehearsals(robot, options.bus)
+    asked = compensation_plan(robot, setup, joint.name, profile_path, entry, wanted, rehearsals, forced)
+    refuse_beyond_limits(asked.plan, setup, expected_of(robot))
+    return asked
 
 
 def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None = None) -> CompensationResult:
@@ -101,7 +102,7 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
     asked = plan_compensation(options)
     order = Order(VERB, asked.robot, asked.setup, options.bus, {"profile": str(asked.profile)}, options.out)
     progress = Progress()
-    hand = Hand(asked.joint, asked.planned, asked.wanted, watcher)
+    hand = Hand(asked, watcher)
 
     def doubt(preflight: Preflight) -> None:
         doubts = doubts_of_drive(asked.entry, preflight.identities[asked.joint])

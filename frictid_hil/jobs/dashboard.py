@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
-from frictid_hil.jobs.history import NIGHT_PAGE, page_of
+from frictid_hil.jobs.report import NIGHT_PAGE, page_of
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap_reader import read_mcap
 from frictid_hil.recording.samples import Samples

@@ -52,12 +52,6 @@ _LOG.addHandler(logging.NullHandler())
 class FoxgloveServer:
     """Listens from the start; announces channels and sends messages from any thread, without waiting for viewers.
 
-    Args:
-        name: shown by the viewers.
-        host: address to listen on.
-        port: 0 for any.
-        refused: called in the server's thread with the origin of each page that was turned away.
-
     Attributes:
         port: that it listens on.
 

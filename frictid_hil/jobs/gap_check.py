@@ -28,15 +28,8 @@ def run_gap_check(
 ) -> dict[str, Any]:
     """Draw joints whose effect is sealed, diagnose them in processes of their own, open the seal, score.
 
-    Args:
-        cases: how many joints of each world; twenty bring every kind, 200 every effect five times.
-        seed: of everything drawn.
-        out: folder that keeps commitment, cases, answers, truth, ``result.json`` and ``gap-check.md``.
-        worlds: to draw from.
-        processes: at once; one per processor core unless given.
-        leave_one_out: also take each joint's own effect out of the library and diagnose again.
-        force: write over the result and the page of an earlier check, and drop the answers of an unfinished one.
-        progress: given a line now and then.
+    See ``frictid-hil gap check --help``. Twenty cases bring every kind, 200 every effect five times. With ``force`` the
+    answers of an unfinished check are dropped; ``progress`` is given a line now and then.
 
     Returns:
         What ``--json`` prints of a single world: ``outcome``, ``world``, ``seed``, ``cases``, ``truth_sha256``,
@@ -82,9 +75,6 @@ def _claim(folder: Path, asked: tuple[str, int, int], *, force: bool) -> None:
     """Note in the folder which check it belongs to.
 
     The note is a digest: seed and world are not to be read beside the cases.
-
-    Raises:
-        UsageError: another check has answers there, unless ``force``.
     """
     digest = hashlib.sha256(json.dumps([*asked, code_digest()]).encode()).hexdigest()
     note, answers = folder / "check.sha256", folder / "answers.jsonl"

@@ -27,11 +27,7 @@ DECIDED = 0.95
 class Decided:
     """The result of recording until the cause is decided.
 
-    Attributes:
-        recorded: the last recording; its set holds all experiments.
-        experiments: of all recordings, in the order in which they ran; ``duration_s`` is theirs.
-        diagnosis: of the whole set; None where nothing was recorded.
-        why: why nothing more was recorded.
+    ``diagnosis`` is of the whole set of the last recording; None where nothing was recorded. ``why`` nothing more was.
     """
 
     recorded: Recorded

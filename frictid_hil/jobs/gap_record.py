@@ -272,11 +272,7 @@ def _unloaded(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
 
 
 def _why_no_payload(options: GapRecordOptions, belief: Belief, *, simulated: bool) -> str | None:
-    """Why nothing is recorded with the payload; None where it is.
-
-    Raises:
-        UsageError: it was asked for, and its inertia and weight are nowhere told.
-    """
+    """Why nothing is recorded with the payload; None where it is."""
     if not belief.payload:
         if options.payload:
             raise UsageError(
@@ -458,11 +454,7 @@ class _Recording:
             self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
 
     def _ready_for(self, plan: Plan) -> bool:
-        """Ask for the payload where a person has to mount it; without a yes its experiments are left out.
-
-        Raises:
-            UsageError: there are no others.
-        """
+        """Ask for the payload where a person has to mount it; without a yes its experiments are left out."""
         if self._planned.order.setup.simulated or not self._planned.loaded[self._session]:
             return True
         for note in plan.notes:

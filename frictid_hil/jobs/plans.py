@@ -176,11 +176,7 @@ def calibration_plan(
 
 
 def _refuse_different_timing(procedures: Mapping[str, Procedure]) -> None:
-    """Refuse joints that would not reverse together, because their coupling would not cancel between the directions.
-
-    Raises:
-        UsageError: a joint whose cycles last otherwise than the first one's.
-    """
+    """Refuse joints that would not reverse together, because their coupling would not cancel between the directions."""
     first, reference = next(iter(procedures.items()))
     for name, procedure in procedures.items():
         same = procedure.cycles == reference.cycles and procedure.shares == reference.shares

@@ -12,6 +12,7 @@ from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profi
 from frictid_hil.errors import GateFailed, ProfileMismatch, UsageError
 from frictid_hil.plan.linear_axis import linear_names
 from frictid_hil.profiles.drift import differences, drift
+from frictid_hil.profiles.promotions import Promotion
 from frictid_hil.profiles.store import ProfileStore
 
 
@@ -82,15 +83,11 @@ def promote(
         UsageError: no such profile.
     """
     profile, place = named_profile(named, robot, store)
-    bad = {
-        joint: [gate.name for gate in one.gates if not gate.passed]
-        for joint, one in profile.joints.items()
-        if any(not gate.passed for gate in one.gates)
-    }
+    failed = {joint: [gate.name for gate in one.gates if not gate.passed] for joint, one in profile.joints.items()}
+    bad = [f"joint {joint}: {', '.join(gates)}" for joint, gates in failed.items() if gates]
     if bad and not force:
-        failed = "; ".join(f"joint {joint}: {', '.join(gates)}" for joint, gates in bad.items())
         raise GateFailed(
-            f"quality gates failed: {failed}",
+            f"quality gates failed: {'; '.join(bad)}",
             where=str(place),
             next_step="measure again; or promote with --force, knowing why",
         )
@@ -103,11 +100,7 @@ def promote(
     if baseline:
         kept.pin_baseline(profile.robot, identity, by=_person(), reason=reason)
     return {
-        "outcome": "ok",
-        "robot": profile.robot,
-        "active": str(kept.path(profile.robot, promotion.id).resolve()),
-        "id": promotion.id,
-        "before": before.id if before else None,
+        **_in_force(kept, profile.robot, promotion.id, before),
         "joints_kept": [name for name in whole.joints if name not in profile.joints],
         "baseline": kept.baseline(profile.robot),
     }
@@ -122,13 +115,70 @@ def rollback(robot: str, *, store: Path | None = None, reason: str = "") -> dict
     kept = ProfileStore(store)
     before = kept.active(robot)
     line = kept.rollback(robot, by=_person(), reason=reason)
+    return _in_force(kept, robot, line.id, before)
+
+
+def _in_force(kept: ProfileStore, robot: str, identity: str, before: Promotion | None) -> dict[str, Any]:
     return {
         "outcome": "ok",
         "robot": robot,
-        "active": str(kept.path(robot, line.id).resolve()),
-        "id": line.id,
+        "active": str(kept.path(robot, identity).resolve()),
+        "id": identity,
         "before": before.id if before else None,
     }
+
+
+_JOINT = ("temperature_c", "distance_percent", "gates_failed")
+_PROMOTION = ("action", "id", "utc", "by", "reason")
+_NIGHT = ("utc", "outcome", "promoted", "drifted", "reason", "next_step", "run")
+"""What is told of each, by its own names."""
+
+
+def history(store: ProfileStore, robot: str, *, last: int | None = None) -> dict[str, Any]:
+    """Profiles, promotions and recalibrations of a robot, oldest first.
+
+    With ``last``, only so many of each.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    profiles, promotions = store.history(robot, last), store.promotions(robot, last)
+    nights = store.attempts(robot, last)
+    if not profiles and not nights:
+        raise unknown_robot(store, robot)
+    active, baseline = store.active(robot), store.baseline(robot)
+    return {
+        "outcome": "ok",
+        "robot": robot,
+        "active": active.id if active else None,
+        "baseline": baseline,
+        "profiles_kept": store.count(robot),
+        "profiles": [
+            {
+                "id": stored.id,
+                "created_utc": stored.created_utc,
+                "active": active is not None and stored.id == active.id,
+                "joints": {
+                    name: {"coulomb_n" if joint.prismatic else "coulomb_nm": joint.coulomb_nm}
+                    | {key: getattr(joint, key) for key in _JOINT}
+                    for name, joint in stored.joints.items()
+                },
+            }
+            for stored in profiles
+        ],
+        "promotions": [{key: getattr(one, key) for key in _PROMOTION} for one in promotions],
+        "recalibrations": [{key: getattr(one, key) for key in _NIGHT} for one in nights],
+    }
+
+
+def unknown_robot(store: ProfileStore, robot: str) -> UsageError:
+    """The error where the store knows nothing of a robot."""
+    robots = ", ".join(store.robots()) or "none"
+    return UsageError(
+        f"the store knows no robot named {robot!r}; it has {robots}",
+        where=str(store.root),
+        next_step="promote a profile with `frictid-hil profile promote RUN`",
+    )
 
 
 def named_profile(text: str, robot: str | None, store: Path | None) -> tuple[FrictionProfile, Path]:

@@ -27,7 +27,7 @@ from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
 from frictid_hil.files import made_folder
 from frictid_hil.jobs.calibrate import Calibrated, CalibrateOptions, calibrate
-from frictid_hil.jobs.history import write_index_page
+from frictid_hil.jobs.report import NIGHT_PAGE, write_index_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.linear_axis import rotary_name
 from frictid_hil.profiles.judgement import Verdict, judge
@@ -112,11 +112,7 @@ def _night(options: RecalibrateOptions, robot: Robot, store: ProfileStore, watch
 
 
 def _permission(robot: Robot, bus: str | None) -> Interlock | None:
-    """The interlock to watch; None for a simulated robot without one.
-
-    Raises:
-        UsageError: a real robot may not be moved with nobody asked.
-    """
+    """The interlock to watch; None for a simulated robot without one."""
     unattended = robot.policy.unattended
     if unattended is None:
         if robot.kind(bus).simulated:
@@ -198,7 +194,7 @@ def _write_page(
     # The verdict stands whether or not its page can be written.
     with contextlib.suppress(FrictidError):
         page = recalibration_page(result, robot.policy, newer, active, baseline, store.trends(robot.name))
-        result["recalibration_report"] = str(write_page(page, Path(result["run"]) / "recalibration.html").resolve())
+        result["recalibration_report"] = str(write_page(page, Path(result["run"]) / NIGHT_PAGE).resolve())
 
 
 # -- alone, and ending in order -------------------------------------------------------------------------------------
@@ -206,11 +202,7 @@ def _write_page(
 
 @contextlib.contextmanager
 def _alone(store: ProfileStore, robot: Robot) -> Iterator[None]:
-    """One recalibration of a robot at a time; the lock dies with its process.
-
-    Raises:
-        HardwareBusy: another one is at work.
-    """
+    """One recalibration of a robot at a time; the lock dies with its process."""
     folder = store.root / robot.name
     made_folder(folder, UsageError)
     lock = filelock.FileLock(folder / ".recalibrate.lock")

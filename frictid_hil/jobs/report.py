@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,17 @@ from typing import Any
 from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, UsageError
-from frictid_hil.jobs.history import write_index_page
+from frictid_hil.jobs.profiles import unknown_robot
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 from frictid_hil.report.calibration import calibration_page
-from frictid_hil.report.pages import write_page
+from frictid_hil.report.index import index_page
+from frictid_hil.report.pages import Page, write_page
 from frictid_hil.runs.folder import load_manifest
+
+NIGHT_PAGE = "recalibration.html"
+"""In the run folder of a recalibration."""
 
 
 def report(
@@ -51,8 +56,8 @@ def report(
             next_step="look at manifest.json for how it ended; `frictid-hil identify` reads its samples",
         )
     result = {"outcome": "ok", "report": str(page.resolve())}
-    if (run / "recalibration.html").exists():
-        result["recalibration_report"] = str((run / "recalibration.html").resolve())
+    if (run / NIGHT_PAGE).exists():
+        result["recalibration_report"] = str((run / NIGHT_PAGE).resolve())
     return result
 
 
@@ -93,3 +98,34 @@ def _active_then(manifest: dict[str, Any]) -> FrictionProfile | None:
     with contextlib.suppress(FrictidError):
         return load_profile(manifest["active_profile"]) if manifest.get("active_profile") else None
     return None
+
+
+def write_index_page(store: ProfileStore, robot: str) -> Path:
+    """The index page of a robot, in its folder of the store.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    path = store.root / robot / "index.html"
+    folder = path.parent.resolve()
+    page = page_of(store, robot, lambda run: Path(os.path.relpath(run / NIGHT_PAGE, folder)).as_posix())
+    return write_page(page, path)
+
+
+def page_of(store: ProfileStore, robot: str, address: Callable[[Path], str]) -> Page:
+    """The index page of a robot.
+
+    ``address`` is of the page of a night, by its run folder; "" where it cannot be reached.
+
+    Raises:
+        UsageError: nothing is known of such a robot.
+    """
+    trends, nights = store.trends(robot), store.attempts(robot)
+    if not trends and not nights:
+        raise unknown_robot(store, robot)
+    with_page = {
+        one.utc: Path(one.run).resolve() for one in nights if one.run and (Path(one.run) / NIGHT_PAGE).exists()
+    }
+    addresses = {utc: found for utc, run in with_page.items() if (found := address(run))}
+    active, baseline = store.active(robot), store.baseline(robot)
+    return index_page(robot, trends, store.promotions(robot), nights, active, baseline, addresses)

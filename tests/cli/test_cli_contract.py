@@ -68,7 +68,7 @@ def test_a_plan_says_first_whether_a_real_robot_moves(bus: str, told: str) -> No
     options = CalibrateOptions("hp3j", bus=bus, joints=("5",))
     planned = plan_calibration(options)
     console = Console(record=True, width=150)
-    print_plan(console, planned.plan, planned.setup)
+    print_plan(console, planned.plan, planned.order.setup)
     assert console.export_text().startswith(told)
 
 
@@ -80,7 +80,7 @@ def test_a_plan_tells_each_joints_limits_and_which_of_them_another_file_states(t
     )
     planned = plan_calibration(CalibrateOptions(str(site)))
     console = Console(record=True, width=200)
-    print_plan(console, planned.plan, planned.setup)
+    print_plan(console, planned.plan, planned.order.setup)
     told = console.export_text()
     assert [entry.joint for entry in planned.plan.joints] == ["4", "5"]
     assert "of 9.0" in told and "of 28.5" in told

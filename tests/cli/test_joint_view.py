@@ -49,11 +49,11 @@ def test_figures_are_the_worst_of_the_rows_and_blank_where_nothing_was_measured(
     rows["position_rad"][1] -= math.radians(0.25)
     rows["torque_nm"][2] = math.nan
     figures = figures_of(rows, max_torque_nm=10.0)
-    assert figures.error == "0.250 deg"
-    assert figures.torque == "█████·····   5.0 N m"
-    assert figures.temperature == "36.5 C"
+    assert figures["error"] == "0.250 deg"
+    assert figures["torque"] == "█████·····   5.0 N m"
+    assert figures["temperature"] == "36.5 C"
     rows["temperature_c"] = rows["torque_nm"] = rows["position_command_rad"] = math.nan
-    assert figures_of(rows, 10.0) == type(figures)()
+    assert figures_of(rows, 10.0) == {"error": "", "torque": "", "temperature": ""}
 
 
 @pytest.mark.parametrize(("torque_nm", "cells"), [(0.0, 0), (10.0, 10), (25.0, 10)])

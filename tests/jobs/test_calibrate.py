@@ -174,7 +174,7 @@ def test_a_continued_run_needs_its_folder_alone_and_moves_as_it_began(
     whole = tmp_path / "run"
     shutil.copytree(run, whole)
     planned = plan_calibration(CalibrateOptions(resume=whole))
-    assert [entry.joint for entry in planned.plan.joints] == ["5"] and planned.setup.seed == 7
+    assert [entry.joint for entry in planned.plan.joints] == ["5"] and planned.order.setup.seed == 7
     result = calibrate(CalibrateOptions(resume=whole), Silent())
     assert list(result.joints) == ["4", "5"] and result.profile is not None
     used = [joint.procedure for joint in result.profile.joints.values() if joint.procedure is not None]

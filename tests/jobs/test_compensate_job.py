@@ -175,7 +175,7 @@ def test_a_joint_that_yields_gradually_is_given_such_a_spring_by_our_setting_onl
     for found, setting, expected in ((profile, "ours", False), (other, "ours", True), (other, "paper", False)):
         laws = plan_compensation(
             CompensateOptions(str(robot), found, JOINT, Wanted("track", ("mop",), setting=setting))
-        ).planned.laws
+        ).laws
         assert laws["mop"].friction is not None and laws["mop"].friction.gradual is expected
 
 

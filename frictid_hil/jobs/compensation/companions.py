@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from frictid_hil.jobs.compensation.plan import CompensationPlan
+from frictid_hil.jobs.compensation.plan import Asked
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.setup import RobotSetup
@@ -39,17 +39,17 @@ Live = Callable[[str], None]
 class Hand:
     """The simulated person, following the phases; on a real robot the person reads what to do."""
 
-    def __init__(self, joint: str, planned: CompensationPlan, wanted: Wanted, watcher: Watcher) -> None:
-        self._joint = joint
-        self._centre_rad = planned.centre_rad
-        names = {motion.name for motion in planned.plan.joints[0].motions}
+    def __init__(self, asked: Asked, watcher: Watcher) -> None:
+        self._joint = asked.joint
+        self._centre_rad = asked.centre_rad
+        names = {motion.name for motion in asked.plan.joints[0].motions}
         # A person who does not rest lets go at the end of the swing.
         self._last = {
             name if (rest := name.replace("hand ", "rest ")) not in names else rest
             for name in names
             if name[:5] == "hand "
         }
-        self._wanted = wanted
+        self._wanted = asked.wanted
         self._watcher = watcher
         self._driver: GuidedBySimulation | None = None
 

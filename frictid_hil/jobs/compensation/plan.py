@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -37,15 +38,24 @@ _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class CompensationPlan:
-    """A plan of a compensation, with the laws by mode and the figures that it was made from.
+class Asked:
+    """A compensation of a joint, decided before a bus is opened: its plan, and the laws by mode that it was made from.
 
-    R is lowest where gravity is known least within the task's travel; None without compensation.
+    Attributes:
+        entry: the joint's in the profile.
+        lowest_ratio: R where gravity is known least, within the task's travel; None without compensation.
+        warnings: what speaks against it and is done all the same.
     """
 
+    robot: Robot
+    setup: RobotSetup
+    joint: str
+    profile: Path
+    entry: JointProfile
+    wanted: Wanted
     plan: Plan
     centre_rad: float
-    laws: dict[str, ControlLaw]
+    laws: Mapping[str, ControlLaw]
     lowest_ratio: float | None
     warnings: tuple[str, ...]
 
@@ -54,11 +64,12 @@ def compensation_plan(
     robot: Robot,
     setup: RobotSetup,
     name: str,
+    profile: Path,
     entry: JointProfile,
     wanted: Wanted,
     rehearsals: Rehearsals,
     forced: Sequence[str],
-) -> CompensationPlan:
+) -> Asked:
     """The plan of one joint; a travel that was never seen on this robot is rehearsed first.
 
     ``forced`` are warnings of what is done in spite of doubts.
@@ -93,7 +104,8 @@ def compensation_plan(
         )
     notes += [*warnings, *inherited_notes(robot, [name]), *care_notes(robot, setup), *forced]
     plan = Plan(robot.name, setup.cycle_hz, (moved,), tuple(notes))
-    return CompensationPlan(plan, centre_rad, laws, lowest_ratio, (*warnings, *forced))
+    told = (*warnings, *forced)
+    return Asked(robot, setup, name, profile, entry, wanted, plan, centre_rad, laws, lowest_ratio, told)
 
 
 def _ratio(laws: Mapping[str, ControlLaw]) -> float:

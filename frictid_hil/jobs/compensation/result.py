@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from frictid_hil.config.profile import JointProfile
-from frictid_hil.config.robot import Robot
 from frictid_hil.errors import FrictidError
 from frictid_hil.jobs.compensation.figures import (
     DOMINATED_PERCENT,
@@ -19,13 +17,11 @@ from frictid_hil.jobs.compensation.figures import (
     following_lag_s,
     friction_dominates,
 )
-from frictid_hil.jobs.compensation.plan import CompensationPlan
+from frictid_hil.jobs.compensation.plan import Asked
 from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
-from frictid_hil.plan.plan import Plan
-from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.samples import Mark
 from frictid_hil.report.compensation import compensation_page
 from frictid_hil.report.pages import write_page
@@ -35,24 +31,6 @@ from frictid_hil.runs.life import Ended, Run
 
 _LATE_PERCENT = 50.0
 """Of the tracking error, from which on the lag of a drive's own loop is told."""
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A compensation of a joint, decided before a bus is opened; ``entry`` is the joint's in the profile."""
-
-    robot: Robot
-    setup: RobotSetup
-    joint: str
-    profile: Path
-    entry: JointProfile
-    wanted: Wanted
-    planned: CompensationPlan
-
-    @property
-    def plan(self) -> Plan:
-        """The plan that ran."""
-        return self.planned.plan
 
 
 @dataclass(slots=True)
@@ -83,13 +61,13 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
     wanted, moved = asked.wanted, progress.run
     inertia, source = _inertia(asked)
     found = figures(progress.runs, wanted.task, inertia, _floors(asked, inertia))
-    friction = next((law.friction for law in asked.planned.laws.values() if law.friction is not None), None)
+    friction = next((law.friction for law in asked.laws.values() if law.friction is not None), None)
     told: dict[str, Any] = {
         "joint": asked.joint,
         "task": wanted.task,
         "setting": wanted.setting,
         "compensation_ratio": friction.ratio if friction else None,
-        "compensation_ratio_lowest": asked.planned.lowest_ratio,
+        "compensation_ratio_lowest": asked.lowest_ratio,
         "stiffness_nm_per_rad": friction.stiffness_nm_per_rad if friction else None,
         "inertia_kg_m2": inertia,
         "inertia_source": source,
@@ -97,7 +75,7 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
         "rate_hz": moved.rate_hz if moved else None,
         "late_cycles": moved.late_cycles if moved else None,
         "missed_cycles": moved.missed_cycles if moved else None,
-        "warnings": list(asked.planned.warnings),
+        "warnings": list(asked.warnings),
         "profile": str(asked.profile.resolve()),
         "modes": {
             **{mode: figure.values() for mode, figure in found.items()},

@@ -48,16 +48,7 @@ def _row(
     size: Mapping[str, float],
     lost: str,
 ) -> dict[str, Any]:
-    """One exported file, as JSON.
-
-    Args:
-        target: what it is for.
-        where: where it ran.
-        before: RMS of the torque error by joint, N m, of the user's model.
-        after: with the export.
-        size: RMS of the measured torque by joint, N m; percent is of it, the RMS over joints.
-        lost: what the target cannot hold.
-    """
+    """One exported file, as JSON: RMS of the torque error and of the measured torque by joint, N m; percent of it."""
     joints = {name: {"before_nm": before[name], "after_nm": after[name]} for name in after}
     told = {"target": target, "where": where, "lost": lost, "joints": joints}
     shares = (np.array([off[name] / size[name] for name in after]) for off in (before, after))

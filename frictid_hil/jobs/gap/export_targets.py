@@ -28,11 +28,8 @@ _SIGMAS = 2.0 * 1.96
 class Wanted:
     """What to write beside the model.
 
-    Attributes:
-        files: path by target, see ``targets.TARGETS``.
-        samples: of the posterior, how many; 0 draws none.
-        seed: of the draw.
-        stage: USD of the user's, over whose joints ``newton`` is laid; None writes a stage of its own.
+    Paths are by target, see ``targets.TARGETS``; ``samples`` of the posterior are drawn; ``newton`` is laid over the
+    joints of ``stage``, and writes a stage of its own without.
     """
 
     files: Mapping[str, Path]

@@ -42,15 +42,9 @@ INERTIA_POSTURES = 40
 class ModelLogs:
     """What is asked: a model, recordings, and what the model does not say.
 
-    Attributes:
-        model: MJCF or URDF, by path or the name of one that is shipped.
-        joints: to diagnose; ``NAME`` or ``NAME=NAME_IN_LOG``; all that model and logs share unless told.
-        held: place in rad (m) of joints that the logs do not have.
-        tolerances: one-sigma by ``NUMBER`` or ``JOINT:NUMBER``.
-        validation: names of logs to judge on.
-        split: how logs are parted into those that are fitted and those that are judged on; see ``parted``.
-        nominal: a ``nominal.yaml`` whose sections (controller, drive, encoder, ...) say more than the model does, or
-            better; of all joints that are diagnosed.
+    See ``frictid-hil gap diagnose --help``. Names of joints are ``NAME`` or ``NAME=NAME_IN_LOG``; ``held`` is the place
+    in rad (m) of joints that no log has; ``tolerances`` are one-sigma by ``NUMBER`` or ``JOINT:NUMBER``; the sections
+    of ``nominal`` (controller, drive, encoder, ...) say more than the model does, or better, of all joints.
     """
 
     model: Path

@@ -25,6 +25,7 @@ from frictid_hil.config.profile import (
 from frictid_hil.config.profile import Estimate as Figure
 from frictid_hil.errors import IdentificationError, UsageError
 from frictid_hil.friction import quality
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.estimate import Estimate as Estimated
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
@@ -165,14 +166,14 @@ def _from_cycles(
     if loop is not None:
         notes.append(f"its own position loop is a spring of {loop:.3g} N m/rad at this gain")
     apart = "all joints moved together" if recording.coupled else "inertia and gravity could not be separated"
+    warmth = samples.temperature_c
     rigid: dict[str, Any] = {name: _figure(getattr(body, name) if body else None, apart) for name in _BODY}
-    return JointProfile(
-        method=result.method,
-        prismatic=samples.prismatic,
-        velocity_rad_s=curve.velocity_rad_s,
-        torque_nm=curve.torque_nm,
-        torque_interval_nm=_interval(curve.torque_nm, result.half_width_nm),
-        coulomb_nm=_figure(result.coulomb_nm),
+    return _entry(
+        samples,
+        result.method,
+        curve,
+        result.half_width_nm,
+        result.coulomb_nm,
         presliding_stiffness_nm_per_rad=stiffness,
         presliding_level_nm=level,
         presliding_yields=yields,
@@ -181,10 +182,9 @@ def _from_cycles(
         backward=_pair_list(-result.pairs.velocity_minus_rad_s, result.pairs.torque_minus_nm),
         published=_pair_list(published.velocity_rad_s, published.torque_nm) if published else None,
         ripple=Ripple.of_table(result.ripple.period_rad, result.ripple.torque_nm) if result.ripple else None,
-        torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=result.time_skew.used_s if result.time_skew else skew.torque_delay_s - skew.position_delay_s,
         time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
-        temperature_c=_mean_temperature_c(samples),
+        temperature_c=None if warmth is None else round(float(np.nanmean(warmth)), 2),
         procedure=ProcedureUsed(
             **{key: getattr(procedure, key) for key in _PROCEDURE_KEYS},
             shares=procedure.shares or None,
@@ -239,11 +239,6 @@ def _quality(recording: CycleRecording, result: Estimated, notes: Sequence[str])
     }
 
 
-def _mean_temperature_c(samples: Samples) -> float | None:
-    measured = samples.temperature_c
-    return None if measured is None else round(float(np.nanmean(measured)), 2)
-
-
 def _from_plateaus(samples: Samples) -> JointProfile:
     assert samples.torque_nm is not None  # by the caller
     skew = declared_skew(samples)
@@ -255,21 +250,19 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         torque_delay_s=skew.torque_delay_s - skew.position_delay_s,
         where=f"joint {samples.joint}",
     )
-    pairs, curve, half = found.pairs, found.curve, found.half_width_nm
+    pairs, half = found.pairs, found.half_width_nm
     notes = [*_damage(samples), "no sine cycles: windows are stretches of constant speed, both ways"]
     known = bool(np.all(np.isfinite(half)))
     if not known:
         notes.append("no interval could be formed: every speed was held at one place only, and once")
-    return JointProfile(
-        method="plateaus",
-        prismatic=samples.prismatic,
-        velocity_rad_s=curve.velocity_rad_s,
-        torque_nm=curve.torque_nm,
-        torque_interval_nm=_interval(curve.torque_nm, half) if known else None,
-        coulomb_nm=_figure(found.coulomb_nm),
+    return _entry(
+        samples,
+        "plateaus",
+        found.curve,
+        half if known else None,
+        found.coulomb_nm,
         forward=_pair_list(pairs.velocity_rad_s, pairs.torque_plus_nm),
         backward=_pair_list(-pairs.velocity_minus_rad_s, pairs.torque_minus_nm),
-        torque_source=str(samples.meta.get("torque_source", "")),
         time_skew_s=skew.torque_delay_s - skew.position_delay_s,
         quality={"notes": notes},
     )
@@ -294,14 +287,12 @@ def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
     body: dict[str, Any] = {
         name: _figure(getattr(found, name), found.untold.get(name, "a linear axis")) for name in _BODY
     }
-    return JointProfile(
-        method="least-squares",
-        prismatic=samples.prismatic,
-        velocity_rad_s=found.curve.velocity_rad_s,
-        torque_nm=found.curve.torque_nm,
-        torque_interval_nm=_interval(found.curve.torque_nm, found.half_width_nm),
-        coulomb_nm=_figure(found.coulomb_nm),
-        torque_source=str(samples.meta.get("torque_source", "")),
+    return _entry(
+        samples,
+        "least-squares",
+        found.curve,
+        found.half_width_nm,
+        found.coulomb_nm,
         time_skew_s=delay_s,
         quality={
             "residual_rms_nm": found.residual_rms_nm,
@@ -319,8 +310,23 @@ def _damage(samples: Samples) -> list[str]:
     return [*said, *samples.meta.get("told", ()), *samples.meta.get("doubts", ())]
 
 
-def _interval(torque_nm: tuple[float, ...], half_width_nm: Array) -> tuple[tuple[float, float], ...]:
-    return tuple((f - h, f + h) for f, h in zip(torque_nm, half_width_nm.tolist(), strict=True))
+def _entry(
+    samples: Samples, method: str, curve: FrictionCurve, half_nm: Array | None, coulomb: Measured, **more: Any
+) -> JointProfile:
+    """What every way of identifying finds, and more."""
+    interval = None
+    if half_nm is not None:
+        interval = tuple((f - h, f + h) for f, h in zip(curve.torque_nm, half_nm.tolist(), strict=True))
+    return JointProfile(
+        method=method,
+        prismatic=samples.prismatic,
+        velocity_rad_s=curve.velocity_rad_s,
+        torque_nm=curve.torque_nm,
+        torque_interval_nm=interval,
+        coulomb_nm=_figure(coulomb),
+        torque_source=str(samples.meta.get("torque_source", "")),
+        **more,
+    )
 
 
 def _recording(
