@@ -30,7 +30,7 @@ from frictid_hil.friction.metrics import CurveDistance, curve_distance, curve_me
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate, plan_calibration
 from frictid_hil.jobs.compare import true_curve
-from frictid_hil.jobs.identification.declared import declared_skew
+from frictid_hil.jobs.identification.cycles import declared_skew
 from frictid_hil.jobs.identification.joint_profile import identify_joint, procedure_of
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.protocol.driver import load_driver

@@ -14,7 +14,7 @@ import numpy as np
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.metrics import plain_rms, ratio_interval, rms_by_part
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.jobs.identification.declared import declared_skew
+from frictid_hil.jobs.identification.cycles import declared_skew
 from frictid_hil.plan.control import Compensated
 from frictid_hil.recording.samples import Mark, Samples
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Literal
 
 import numpy as np
@@ -34,13 +34,11 @@ from frictid_hil.friction.loop_stiffness import loop_stiffness
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
 from frictid_hil.friction.presliding import least_stiffness, presliding
-from frictid_hil.friction.recording import CycleRecording, Repeat
+from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Array, Procedure
-from frictid_hil.jobs.identification.companions import with_companions
-from frictid_hil.jobs.identification.declared import declared_skew
-from frictid_hil.jobs.identification.path_time import gaps_ns, path_time
-from frictid_hil.jobs.identification.skew_stretch import wanted_note, with_shaking
+from frictid_hil.jobs.identification.cycles import cycle_recording, declared_skew, told_of
+from frictid_hil.jobs.identification.skew_stretch import wanted_note
 from frictid_hil.plan.linear_axis import linear_names
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import POSITION_GAIN
@@ -150,7 +148,7 @@ def _from_cycles(
     together: tuple[str, ...] = (),
     company: Sequence[Samples] = (),
 ) -> JointProfile:
-    samples, recording, notes = _prepared(samples, procedure, start_s, joint, late_cycles, together, company)
+    samples, recording, notes = cycle_recording(samples, procedure, start_s, joint, late_cycles, together, company)
     result = estimate(recording, method)
     limits = {} if joint is None else joint.gates
     if limits:
@@ -200,34 +198,6 @@ def _judged(gates: Sequence[Gate]) -> tuple[JudgedGate, ...]:
     return tuple(JudgedGate(name=gate.name, passed=gate.passed, message=gate.reason) for gate in gates)
 
 
-def _prepared(
-    samples: Samples,
-    procedure: Procedure,
-    start_s: float,
-    joint: JointSetup | None,
-    late_cycles: int,
-    together: tuple[str, ...],
-    company: Sequence[Samples],
-) -> tuple[Samples, CycleRecording, list[str]]:
-    """Samples on the time of the path, what the estimator is given of them, and what is to be said of both."""
-    notes = _damage(samples)
-    path = path_time(samples, procedure, round(start_s * 1e9))
-    if path is not None:
-        samples, *company = (path.applied(one) for one in (samples, *company))
-        notes.append(path.said)
-    recording = _recording(samples, procedure, start_s, joint, late_cycles)
-    if path is not None:
-        recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
-    recording = with_shaking(recording, samples)
-    if len(together) > 1:
-        recording = replace(recording, coupled=True)
-        try:
-            recording = with_companions(recording, samples, company, start_s)
-        except IdentificationError as problem:
-            notes.append(problem.what)
-    return samples, recording, notes
-
-
 def _quality(recording: CycleRecording, result: Estimated, notes: Sequence[str]) -> dict[str, Any]:
     return {
         **{name: float(value) for name, value in result.figures.items()},
@@ -251,7 +221,7 @@ def _from_plateaus(samples: Samples) -> JointProfile:
         where=f"joint {samples.joint}",
     )
     pairs, half = found.pairs, found.half_width_nm
-    notes = [*_damage(samples), "no sine cycles: windows are stretches of constant speed, both ways"]
+    notes = [*told_of(samples), "no sine cycles: windows are stretches of constant speed, both ways"]
     known = bool(np.all(np.isfinite(half)))
     if not known:
         notes.append("no interval could be formed: every speed was held at one place only, and once")
@@ -297,17 +267,11 @@ def _from_free_motion(samples: Samples, notes: list[str]) -> JointProfile:
         quality={
             "residual_rms_nm": found.residual_rms_nm,
             "torque_rms_nm": found.torque_rms_nm,
-            "notes": [*_damage(samples), *notes],
+            "notes": [*told_of(samples), *notes],
         },
         gates=_judged(found.gates),
         **body,
     )
-
-
-def _damage(samples: Samples) -> list[str]:
-    damage = samples.meta.get("damage")
-    said = [f"the recording is damaged, what is left of it was used: {damage}"] if damage else []
-    return [*said, *samples.meta.get("told", ()), *samples.meta.get("doubts", ())]
 
 
 def _entry(
@@ -327,72 +291,6 @@ def _entry(
         torque_source=str(samples.meta.get("torque_source", "")),
         **more,
     )
-
-
-def _recording(
-    samples: Samples, procedure: Procedure, start_s: float, joint: JointSetup | None, late_cycles: int
-) -> CycleRecording:
-    kept = samples.select(_around_cycles(samples, procedure, start_s))
-    assert kept.torque_nm is not None  # by the caller
-    drift, cycles = samples.marked("drift"), samples.marked("cycles")
-    quantum = samples.meta.get("torque_resolution_nm")
-    return CycleRecording(
-        time_s=kept.time_s - start_s,
-        position_rad=kept.position_rad,
-        torque_nm=kept.torque_nm,
-        procedure=procedure,
-        velocity_rad_s=kept.velocity_rad_s,
-        command_rad=kept.position_command_rad,
-        skew=declared_skew(samples),
-        gear_ratio=joint.gear_ratio if joint else math.nan,
-        prismatic=samples.prismatic,
-        torque_limit_nm=joint.max_torque_nm if joint else math.inf,
-        limited_share=float(cycles[0].details.get("limited_share", 0.0)) if cycles else 0.0,
-        torque_quantum_nm=float(quantum) if quantum else 0.0,
-        repeat=_repeat(drift[0], procedure, start_s) if drift else None,
-        late_cycles=late_cycles,
-        stops_s=gaps_ns(kept) * 1e-9 - start_s,
-        expected_inertia=joint.expected_inertia_kg_m2 if joint else 0.0,
-        elsewhere=_elsewhere(samples),
-        where=f"joint {samples.joint}",
-    )
-
-
-def _elsewhere(samples: Samples) -> tuple[tuple[str, Array, Array], ...]:
-    """Stretches besides the cycles that go both ways: the rehearsal, and the way there with the way back."""
-    found = []
-    for names in (("rehearsal",), ("move", "return")):
-        parts = [samples.during(mark) for name in names for mark in samples.marked(name)]
-        parts = [part for part in parts if len(part) > 2]
-        if not parts:
-            continue
-        velocity = [
-            np.gradient(part.position_rad, part.time_s) if part.velocity_rad_s is None else part.velocity_rad_s
-            for part in parts
-        ]
-        torque = [part.torque_nm for part in parts if part.torque_nm is not None]
-        found.append((" and ".join(names), np.concatenate(velocity), np.concatenate(torque)))
-    return tuple(found)
-
-
-def _repeat(drift: Mark, procedure: Procedure, start_s: float) -> Repeat:
-    """Which cycle was run again: the one whose peak speed the mark carries."""
-    off = np.abs(procedure.peak_velocities_rad_s - float(drift.details["peak_velocity_rad_s"]))
-    return Repeat(int(np.argmin(off)) + 1, drift.start_ns * 1e-9 - start_s)
-
-
-def _around_cycles(samples: Samples, procedure: Procedure, start_s: float) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """From the hold before the cycles to the end of the repeated cycle; half a second around where no marks tell."""
-    first_s, last_s = start_s - 0.5, start_s + procedure.duration_s + 0.5
-    holds = [mark for mark in samples.marked("hold") if mark.end_ns * 1e-9 <= start_s + 1e-6]
-    if holds:
-        first_s = holds[-1].start_ns * 1e-9
-    drift = samples.marked("drift")
-    if drift:
-        last_s = drift[0].end_ns * 1e-9
-    time_s = samples.time_s
-    inside: np.ndarray[Any, np.dtype[np.bool_]] = (time_s >= first_s) & (time_s < last_s)
-    return inside
 
 
 def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
