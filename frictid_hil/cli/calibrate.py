@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.text import Text
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import Output, Result, Told, verb
+from frictid_hil.cli.output import Output, Result, Told, takes, verb
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees, format_duration
@@ -31,20 +31,21 @@ def _show_findings(output: Output, result: Result) -> None:
 
 
 @verb(app, "check", _show_findings)
+@takes(
+    dry=typer.Option("--dry", help="Check the robot file and its plan alone; open no bus."),
+    latency=option(
+        "--latency",
+        "TIME",
+        "Also measure for so long, e.g. 60s, which rate this computer can hold.",
+        parser=opt.quantity("duration"),
+    ),
+)
 def check(
     output: Output,
-    robot: opt.Robot,
-    bus: opt.Bus = None,
-    dry: Annotated[bool, typer.Option("--dry", help="Check the robot file and its plan alone; open no bus.")] = False,
-    latency: Annotated[
-        float,
-        option(
-            "--latency",
-            "TIME",
-            "Also measure for so long, e.g. 60s, which rate this computer can hold.",
-            parser=opt.quantity("duration"),
-        ),
-    ] = "0s",  # type: ignore[assignment]  # typer parses it
+    robot: str,
+    bus: str | None = None,
+    dry: bool = False,
+    latency: float = "0s",  # type: ignore[assignment]  # typer parses it
 ) -> Result:
     """Look at bus, drives, modes, limits and bus load. Reads only; nothing moves, nothing is written."""
     from frictid_hil.jobs.check import check as job
@@ -59,12 +60,8 @@ def _show_reset(output: Output, result: Result) -> None:
 
 
 @verb(app, "reset", _show_reset)
-def reset(
-    output: Output,
-    robot: opt.Robot,
-    bus: opt.Bus = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before the reset.")] = False,
-) -> Result:
+@takes(yes=typer.Option("--yes", "-y", help="Skip the question before the reset."))
+def reset(output: Output, robot: str, bus: str | None = None, yes: bool = False) -> Result:
     """Bring drives back that a fault or a cut-off run left standing: shows what it was, asks, resets. No power."""
     from frictid_hil.cli.progress import answer
     from frictid_hil.jobs.reset import reset as job
@@ -116,58 +113,48 @@ def _row(joint: dict[str, Any]) -> tuple[str | Text, ...]:
     )
 
 
-ProgramOption = Annotated[
-    str | None,
-    option(
+@verb(app, "calibrate", _show_joints)
+@takes(
+    program=option(
         "--program",
         "PROGRAM",
         "thorough (N speeds, aligned; unless told), standard (3 speeds), quick (2): least squares.",
         complete=opt.one_of("thorough", "standard", "quick"),
     ),
-]
-TogetherOption = Annotated[
-    bool | None,
-    typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
-]
-MeasureSkewOption = Annotated[
-    bool | None,
-    typer.Option(
+    together=typer.Option("--together", help="All joints at once, in phase; the cell must allow it."),
+    measure_skew=typer.Option(
         "--measure-skew/--declared-skew",
         help="Each joint also shakes for 8 s, which measures how late its torque is. Default: the robot file's "
         "`procedure: measure_skew`, else the declared timing.",
         show_default=False,
     ),
-]
-RateOption = Annotated[
-    float | None,
-    typer.Option("--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."),
-]
-
-
-@verb(app, "calibrate", _show_joints)
+    rate_hz=typer.Option(
+        "--rate", min=1.0, help="Set-points per second instead of the robot file's cycle_hz, e.g. 250."
+    ),
+)
 def calibrate(
     output: Output,
-    robot: opt.Robot = "",
-    joints: opt.Joint = None,
-    amplitude_rad: opt.Amplitude = None,
-    velocity_rad_s: opt.Velocity = None,
-    cycles: opt.Cycles = None,
-    ratio: opt.Ratio = None,
-    method: opt.Method = None,
-    program: ProgramOption = None,
-    together: TogetherOption = None,
-    measure_skew: MeasureSkewOption = None,
-    rate_hz: RateOption = None,
-    bus: opt.Bus = None,
-    dry_run: opt.DryRun = False,
-    realtime: opt.Realtime = None,
-    seed: opt.Seed = 0,
-    resume: opt.Resume = None,
-    live: opt.Live = False,
-    live_at: opt.LiveAt = None,
-    out: opt.Out = None,
-    notify: opt.Notify = None,
-    yes: opt.Yes = False,
+    robot: str = "",
+    joints: list[str] | None = None,
+    amplitude_rad: float | None = None,
+    velocity_rad_s: float | None = None,
+    cycles: int | None = None,
+    ratio: float | None = None,
+    method: str | None = None,
+    program: str | None = None,
+    together: bool | None = None,
+    measure_skew: bool | None = None,
+    rate_hz: float | None = None,
+    bus: str | None = None,
+    dry_run: bool = False,
+    realtime: bool | None = None,
+    seed: int = 0,
+    resume: Path | None = None,
+    live: bool = False,
+    live_at: str | None = None,
+    out: Path | None = None,
+    notify: str | None = None,
+    yes: bool = False,
 ) -> Result | Told:
     """Identify the friction of every joint, one at a time or all --together, and write a friction profile."""
     from frictid_hil.cli.progress import shown_plan, watching
@@ -183,26 +170,26 @@ def calibrate(
 
 
 @verb(app, "identify", _show_joints)
+@takes(
+    logs=argument("LOG...", "Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them."),
+    robot=option("--robot -r", "FILE", "Robot file (limits, gear, timing).", complete=opt.robot_files),
+    columns=option("--columns", "FILE", "Column map of a foreign file (emps.yaml)."),
+    executor=option("--executor", "WHERE", "processes:N, or dask://host:port, for many recordings."),
+)
 def identify(
     output: Output,
-    logs: Annotated[
-        list[Path], argument("LOG...", "Run folders, MCAP, CSV, .mat or bus logs; folders and globs of them.")
-    ],
-    robot: Annotated[
-        str | None, option("--robot -r", "FILE", "Robot file (limits, gear, timing).", complete=opt.robot_files)
-    ] = None,
-    joints: opt.Joint = None,
-    amplitude_rad: opt.Amplitude = None,
-    velocity_rad_s: opt.Velocity = None,
-    cycles: opt.Cycles = None,
-    ratio: opt.Ratio = None,
-    method: opt.Method = "aligned",
-    columns: Annotated[str | None, option("--columns", "FILE", "Column map of a foreign file (emps.yaml).")] = None,
-    executor: Annotated[
-        str | None, option("--executor", "WHERE", "processes:N, or dask://host:port, for many recordings.")
-    ] = None,
-    out: opt.Out = None,
-    force: opt.Force = False,
+    logs: list[Path],
+    robot: str | None = None,
+    joints: list[str] | None = None,
+    amplitude_rad: float | None = None,
+    velocity_rad_s: float | None = None,
+    cycles: int | None = None,
+    ratio: float | None = None,
+    method: str | None = "aligned",
+    columns: str | None = None,
+    executor: str | None = None,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Result:
     """Identify friction from recorded data, by the same mathematics as a live run."""
     from frictid_hil.jobs.identify import IdentifyOptions
@@ -224,15 +211,11 @@ def _show_distances(output: Output, result: Result) -> None:
 
 
 @verb(app, "compare", _show_distances)
-def compare(
-    output: Output,
-    profile: opt.Profile,
-    other: Annotated[Path | None, argument("[OTHER]", "Reference profile.")] = None,
-    truth: Annotated[
-        str | None,
-        option("--truth", "FILE", "Robot file whose simulated joints are the reference.", complete=opt.robot_files),
-    ] = None,
-) -> Result:
+@takes(
+    other=argument("[OTHER]", "Reference profile."),
+    truth=option("--truth", "FILE", "Robot file whose simulated joints are the reference.", complete=opt.robot_files),
+)
+def compare(output: Output, profile: Path, other: Path | None = None, truth: str | None = None) -> Result:
     """Distance between two profiles, equation (15), or between a profile and the simulated joints' own curves."""
     from frictid_hil.jobs.compare import compare as job
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import Output, Result, verb
+from frictid_hil.cli.output import Output, Result, takes, verb
 
 app = typer.Typer()
 
@@ -32,12 +30,17 @@ def _show(output: Output, result: Result) -> None:
 
 
 @verb(app, "columns", _show)
+@takes(
+    log=argument("LOG", "A log in whatever form: CSV, bag, MCAP, parquet, ..."),
+    known=option("--columns", "FILE", "Try this column map instead of drafting one."),
+    out=option("--out", "FILE.yaml", "Write the draft to this file."),
+)
 def columns(
     output: Output,
-    log: Annotated[Path, argument("LOG", "A log in whatever form: CSV, bag, MCAP, parquet, ...")],
-    known: Annotated[str | None, option("--columns", "FILE", "Try this column map instead of drafting one.")] = None,
-    out: Annotated[Path | None, option("--out", "FILE.yaml", "Write the draft to this file.")] = None,
-    force: opt.Force = False,
+    log: Path,
+    known: str | None = None,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Result:
     """Look at a log: what its columns are, in what units, what is odd; drafts the column map for --columns."""
     from frictid_hil.jobs.columns import columns as job

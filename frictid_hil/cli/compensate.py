@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Any
 
 import typer
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import option
-from frictid_hil.cli.output import Output, Result, Told, verb
+from frictid_hil.cli.output import Output, Result, Told, takes, verb
 from frictid_hil.errors import UsageError
 from frictid_hil.plan.mode import Mode
 from frictid_hil.units import degrees
@@ -26,61 +27,6 @@ def _drive_mode(name: str) -> Mode:
 
 def _duration(text: str) -> float:
     return 0.0 if text.strip() == "0" else opt.quantity("duration")(text)
-
-
-TaskOption = Annotated[
-    str,
-    option(
-        "--task",
-        "TASK",
-        "hand (a person guides the joint), track (a triangle under a weak PD).",
-        complete=opt.one_of("hand", "track"),
-    ),
-]
-ProfileOption = Annotated[
-    str,
-    option(
-        "--profile -p",
-        "PROFILE",
-        "Profile, run folder, or id of the store. Default: the robot's active profile.",
-        complete=opt.profiles,
-    ),
-]
-ModeOption = Annotated[
-    str | None,
-    option("--mode", "MODES", "nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task."),
-]
-SettingOption = Annotated[
-    str,
-    option(
-        "--setting", "SETTING", "ours, or paper (R = 0.9, K = 10000 N m/rad).", complete=opt.one_of("ours", "paper")
-    ),
-]
-StiffnessOption = Annotated[
-    float | None, option("--stiffness", "K", "K, e.g. 8000Nm/rad.", parser=opt.quantity("stiffness"))
-]
-ViscosityOption = Annotated[
-    float | None, option("--viscosity", "B_C", "B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0)
-]
-SpeedOption = Annotated[
-    float | None, option("--speed", "SPEED", "Peak speed of the task.", parser=opt.quantity("angular velocity"))
-]
-DurationOption = Annotated[
-    float | None,
-    option("--duration", "TIME", "Of each mode, 10s unless told; 0 runs until interrupted.", parser=_duration),
-]
-CentreOption = Annotated[
-    float | None, option("--centre", "ANGLE", "Middle of the travel.", parser=opt.quantity("angle"))
-]
-DriveModeOption = Annotated[
-    str,
-    option(
-        "--drive-mode",
-        "MODE",
-        "torque; position or velocity with the torque as offset (60B2).",
-        complete=opt.one_of("torque", "position", "velocity"),
-    ),
-]
 
 
 _HAND: dict[str, tuple[str, str, float]] = {
@@ -117,31 +63,66 @@ def _number(figures: dict[str, Any], key: str, unit: str, scale: float) -> str:
 
 
 @verb(app, "compensate", _show)
+@takes(
+    task=option(
+        "--task",
+        "TASK",
+        "hand (a person guides the joint), track (a triangle under a weak PD).",
+        complete=opt.one_of("hand", "track"),
+    ),
+    profile=option(
+        "--profile -p",
+        "PROFILE",
+        "Profile, run folder, or id of the store. Default: the robot's active profile.",
+        complete=opt.profiles,
+    ),
+    mode=option("--mode", "MODES", "nc, mo, mol, mop, mop-reference, joined by commas. Default: all of the task."),
+    setting=option(
+        "--setting", "SETTING", "ours, or paper (R = 0.9, K = 10000 N m/rad).", complete=opt.one_of("ours", "paper")
+    ),
+    ratio=option("--compensation-ratio", "R", "R, below 1."),
+    stiffness_nm_per_rad=option("--stiffness", "K", "K, e.g. 8000Nm/rad.", parser=opt.quantity("stiffness")),
+    viscous_nm_s_per_rad=option(
+        "--viscosity", "B_C", "B_c of mol in N m s/rad, instead of the least-squares one.", min=0.0
+    ),
+    speed_rad_s=option("--speed", "SPEED", "Peak speed of the task.", parser=opt.quantity("angular velocity")),
+    duration_s=option(
+        "--duration", "TIME", "Of each mode, 10s unless told; 0 runs until interrupted.", parser=_duration
+    ),
+    centre_rad=option("--centre", "ANGLE", "Middle of the travel.", parser=opt.quantity("angle")),
+    drive_mode=option(
+        "--drive-mode",
+        "MODE",
+        "torque; position or velocity with the torque as offset (60B2).",
+        complete=opt.one_of("torque", "position", "velocity"),
+    ),
+    force=typer.Option("--force", help="Use a profile that does not fit, under supervision."),
+)
 def compensate(
     output: Output,
-    robot: opt.Robot,
-    joint: opt.OneJoint,
-    task: TaskOption,
-    profile: ProfileOption = "active",
-    mode: ModeOption = None,
-    setting: SettingOption = "ours",
-    ratio: Annotated[float | None, option("--compensation-ratio", "R", "R, below 1.")] = None,
-    stiffness_nm_per_rad: StiffnessOption = None,
-    viscous_nm_s_per_rad: ViscosityOption = None,
-    speed_rad_s: SpeedOption = None,
-    duration_s: DurationOption = None,
-    centre_rad: CentreOption = None,
-    drive_mode: DriveModeOption = "torque",
-    force: Annotated[bool, typer.Option("--force", help="Use a profile that does not fit, under supervision.")] = False,
-    dry_run: opt.DryRun = False,
-    bus: opt.Bus = None,
-    realtime: opt.Realtime = None,
-    seed: opt.Seed = 0,
-    live: opt.Live = False,
-    live_at: opt.LiveAt = None,
-    out: opt.Out = None,
-    store: opt.Store = None,
-    yes: opt.Yes = False,
+    robot: str,
+    joint: str,
+    task: str,
+    profile: str = "active",
+    mode: str | None = None,
+    setting: str = "ours",
+    ratio: float | None = None,
+    stiffness_nm_per_rad: float | None = None,
+    viscous_nm_s_per_rad: float | None = None,
+    speed_rad_s: float | None = None,
+    duration_s: float | None = None,
+    centre_rad: float | None = None,
+    drive_mode: str = "torque",
+    force: bool = False,
+    dry_run: bool = False,
+    bus: str | None = None,
+    realtime: bool | None = None,
+    seed: int = 0,
+    live: bool = False,
+    live_at: str | None = None,
+    out: Path | None = None,
+    store: Path | None = None,
+    yes: bool = False,
 ) -> Result | Told:
     """Compensate a joint's friction with an identified profile, in one mode or several, and compare them."""
     from frictid_hil.cli.progress import shown_plan, watching

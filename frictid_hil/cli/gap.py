@@ -2,107 +2,172 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from frictid_hil.cli import options as opt
-from frictid_hil.cli.model_words import model_logs, print_arm
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import Output, Result, Told, verb
+from frictid_hil.cli.output import Output, Result, Told, takes, verb
 from frictid_hil.errors import UsageError
+from frictid_hil.units import parse_quantity
+
+if TYPE_CHECKING:
+    from frictid_hil.jobs.gap.from_model import ModelLogs
+
+
+def model_logs(output: Output, logs: Sequence[Path]) -> ModelLogs:
+    """The options as one value.
+
+    Raises:
+        UsageError: one that cannot be read, or that does not go with a model.
+    """
+    from frictid_hil.jobs.gap.from_model import ModelLogs
+
+    given = output.given
+    for name, value in (("--profile", given["profile"]), ("--export-mujoco", given["mujoco"])):
+        if value is not None:
+            raise UsageError(
+                f"{name} does not go with --model",
+                next_step="the model brings its own friction; --write-model writes the improved model",
+            )
+    held = dict(_held(word) for word in given["hold"] or ())
+    tolerances = dict(_tolerance(word) for word in given["tolerance"] or ())
+    return output.options(ModelLogs, logs=logs, joints=given["joint"], held=held, tolerances=tolerances)
+
+
+def _held(word: str) -> tuple[str, float]:
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise UsageError(f"--hold {word}: no place is given", next_step="write it as --hold elbow=20deg")
+    length = value.strip().endswith("m")
+    return name, parse_quantity(value, "length" if length else "angle")
+
+
+def _tolerance(word: str) -> tuple[str, float | str]:
+    name, equals, value = word.partition("=")
+    if value in ("data_sheet", "cad", "profile"):
+        return name, value
+    try:
+        share = float(value.removesuffix("%")) * (0.01 if value.endswith("%") else 1.0)
+    except ValueError:
+        share = -1.0
+    if not equals or not share >= 0.0:
+        raise UsageError(
+            f"--tolerance {word} is no one-sigma", next_step="write it as --tolerance inertia_kg_m2=5% (or =cad)"
+        )
+    return name, share
+
+
+def print_arm(output: Output, result: Result) -> None:
+    """Joints as rows, then the arm."""
+    rows = []
+    for name, joint in result["joints"].items():
+        causes = joint["causes"]
+        gap = [joint["gap"][state]["inverse_nm"] for state in ("before", "after", "noise_floor")]
+        words = ("effect", "{}"), ("confidence", "{:.2f}")
+        told = (", ".join(form.format(cause[key]) for cause in causes) for key, form in words)
+        unit = _units(joint)[0]
+        rows.append((name, joint["verdict"], *told, *("-" if v is None else f"{v:.3g} {unit}" for v in gap)))
+    headings = ("joint", "verdict", "cause", "confidence", "gap before", "after", "noise floor")
+    output.table(headings, rows, ("joint",))
+    output.say(result["summary"])
+    _print_arm_cause(output, result)
+    _print_closed_loop(output, result)
+    _print_written(output, result)
+    for line, names in _same_lines(result["joints"]).items():
+        who = "all joints" if len(names) == len(result["joints"]) > 1 else ", ".join(names)
+        output.say(f"{who}: {line}")
+    for name in result["still"]:
+        output.out.print(f"{name}: stands still in every log, so nothing can be said of it")
+    for name, place in result["held"].items():
+        output.out.print(f"{name}: held at {place:.4g}")
+
+
+def _print_arm_cause(output: Output, result: Result) -> None:
+    """What belongs to no single joint, and how much these motions can tell."""
+    arm = result["arm"]
+    if arm is None:
+        return
+    if cause := arm["cause"]:
+        for name, value in cause["parameters"].items():
+            low, high = value["interval_95"]
+            output.out.print(f"  {name} = {value['value']:.4g} ({low:.4g} .. {high:.4g})")
+    base = arm["base_parameters"]
+    output.out.print(
+        f"the motions tell {base['rank']} combinations of {base['of']} inertial parameters apart (condition "
+        f"{base['condition']:.0f})",
+    )
+
+
+def _print_closed_loop(output: Output, result: Result) -> None:
+    """The user's simulator before and after."""
+    from frictid_hil.jobs.gap.nearer import left_out_words
+
+    loop = result["closed_loop"]
+    if "reason" in loop:
+        output.say(f"closed loop of your model: {loop['reason']}")
+        return
+    rows = []
+    for name, before in loop["before"].items():
+        states = (before, loop["after"][name])
+        torque, length = _units(result["joints"].get(name, {}))
+        torques = ["-" if s["torque_nm"] is None else f"{s['torque_nm']:.3g} {torque}" for s in states]
+        rows.append((name, *torques, *(f"{1e3 * s['position_rad']:.3g} m{length}" for s in states)))
+    output.table(("your model in MuJoCo", "torque before", "after", "position before", "after"), rows)
+    for line in left_out_words(loop):
+        output.say(line)
+
+
+def _print_written(output: Output, result: Result) -> None:
+    """What was written where, and how near every file comes to the machine: one row a file and engine."""
+    from frictid_hil.jobs.gap.export_figures import rows_of
+
+    joints = result.get("export", {}).get("joints", {})
+    for name, joint in joints.items():
+        off = joint["torque_difference_percent"]
+        how = (
+            "chosen by the positions that were fitted"
+            if off is None
+            else f"{off:.2f} % of torque from our simulation on withheld motion"
+        )
+        output.out.print(f"{name}: the export is {how}")
+        for effect, where in joint["placed"].items():
+            output.say(f"  {effect}: {where}")
+        for effect, why in joint["lost"].items():
+            output.say(f"  lost of {effect}: {why}")
+    for remark in {remark for joint in joints.values() for remark in joint["remarks"]}:
+        output.say(remark)
+    output.tell(result, "model")
+    for target, told in result.get("targets", {}).items():
+        output.say(f"{target}: {', '.join(told['files'])}")
+    if rows := rows_of(result):
+        headings = ("export", "where it ran", "torque error before", "after", "what is lost")
+        output.table(headings, rows, ("export",))
+        output.say("torque error: of the measured torque of the changed joints, on motion that was not fitted")
+    output.tell(result, "report")
+    if result.get("model_refused"):
+        output.say(f"no model was written: {result['model_refused']}")
+
+
+def _units(joint: Mapping[str, Any]) -> tuple[str, str]:
+    """(of torque or force, of position)."""
+    return ("N", "m") if joint.get("prismatic") else ("N m", "rad")
+
+
+def _same_lines(joints: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What is asked and what could not be concluded, each line once, with the joints that it is about."""
+    found: dict[str, list[str]] = {}
+    for name, joint in joints.items():
+        for line in (*joint["asked"], *(f"{subject}: {why}" for subject, why in joint["reasons"].items())):
+            found.setdefault(line, []).append(name)
+    return found
+
 
 app = typer.Typer(
     help="Where the simulator differs from the machine, why, and how far it closes.", no_args_is_help=True
 )
-
-
-LogsArgument = Annotated[
-    list[Path], argument("SET | LOG...", "Folder with nominal.yaml and its logs; or recordings that lie anywhere.")
-]
-ReportFolderOption = Annotated[Path | None, option("--out", "FOLDER", "Folder for the report page.")]
-ColumnsOption = Annotated[str | None, option("--columns", "FILE", "Column map of a foreign logger (emps.yaml).")]
-JointNameOption = Annotated[str | None, option("--joint -j", "JOINT", "The joint, where logs or profile hold several.")]
-
-
-DiagnoseLogsArgument = Annotated[
-    list[Path] | None,
-    argument("[SET | LOG...]", "Folder with nominal.yaml and its logs; or recordings that lie anywhere."),
-]
-ModelOption = Annotated[
-    Path | None, option("--model", "FILE", "Your own robot model, MJCF or URDF: every joint is diagnosed.")
-]
-MoreLogsOption = Annotated[list[Path] | None, option("--log", "LOG", "A recording; as those without an option.")]
-NominalOption = Annotated[Path | None, option("--nominal", "FILE", "What the simulator believes (nominal.yaml).")]
-ProfileOption = Annotated[Path | None, option("--profile", "PROFILE", "Friction profile that the simulator believes.")]
-JointOption = Annotated[
-    list[str] | None,
-    option(
-        "--joint -j",
-        "JOINT",
-        "The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
-    ),
-]
-HoldOption = Annotated[
-    list[str] | None, option("--hold", "JOINT=20deg", "Where a joint of the model stood that no log has.")
-]
-ToleranceOption = Annotated[
-    list[str] | None,
-    option(
-        "--tolerance",
-        "NUMBER=SIGMA",
-        "One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
-    ),
-]
-ExecutorOption = Annotated[
-    str | None, option("--executor", "WHERE", "processes:N, or dask://host:port, for the joints of a model.")
-]
-ValidationOption = Annotated[
-    list[str] | None, option("--validation", "LOG", "Log to judge on, by name; unless told, what was recorded last.")
-]
-SplitOption = Annotated[
-    str, option("--split", "HOW", "Judge on the end of every log, 30% or 20s of it; or on whole logs: log.")
-]
-NegligibleOption = Annotated[
-    float | None,
-    option(
-        "--negligible",
-        "PERCENT",
-        "Gap that means nothing to you, in percent of the friction level; 5 unless told.",
-        min=0.0,
-        max=100.0,
-    ),
-]
-WriteModelOption = Annotated[
-    Path | None,
-    option(
-        "--write-model",
-        "FILE",
-        "Write the improved joint as a robot file; with --model, your own file with the causes added.",
-    ),
-]
-MujocoOption = Annotated[
-    Path | None,
-    option("--export-mujoco", "FILE.xml", "Export the improved joint to MuJoCo, and FILE.py with its callback."),
-]
-ExportOption = Annotated[
-    list[str] | None,
-    option(
-        "--export",
-        "TARGET=FILE",
-        "Also write the joints of a model: isaaclab, mjlab (.py), newton (.usda), ros2 (.yaml), bam, samples "
-        "(.json), c (.h).",
-    ),
-]
-StageOption = Annotated[
-    Path | None,
-    option("--stage", "FILE", "Your USD stage, over whose joints --export newton is laid; without it a new one."),
-]
-RandomiseOption = Annotated[int, option("--randomise", "N", "Posterior samples to draw for --export.", min=0)]
-ApplyOption = Annotated[
-    bool, typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown.")
-]
 
 
 def _show_diagnosis(output: Output, result: Result) -> None:
@@ -143,29 +208,74 @@ def _cause(cause: Result) -> tuple[str, ...]:
 
 
 @verb(app, "diagnose", _show_diagnosis, schema="gap_diagnose")
+@takes(
+    logs=argument("[SET | LOG...]", "Folder with nominal.yaml and its logs; or recordings that lie anywhere."),
+    model=option("--model", "FILE", "Your own robot model, MJCF or URDF: every joint is diagnosed."),
+    more_logs=option("--log", "LOG", "A recording; as those without an option."),
+    columns=option("--columns", "FILE", "Column map of a foreign logger (emps.yaml)."),
+    nominal=option("--nominal", "FILE", "What the simulator believes (nominal.yaml)."),
+    profile=option("--profile", "PROFILE", "Friction profile that the simulator believes."),
+    joint=option(
+        "--joint -j",
+        "JOINT",
+        "The joint, where logs or profile hold several; of a model several times, or NAME=NAME_IN_LOG.",
+    ),
+    hold=option("--hold", "JOINT=20deg", "Where a joint of the model stood that no log has."),
+    tolerance=option(
+        "--tolerance",
+        "NUMBER=SIGMA",
+        "One-sigma of a number of the model, relative or data_sheet, cad, profile; JOINT:NUMBER=... for one.",
+    ),
+    executor=option("--executor", "WHERE", "processes:N, or dask://host:port, for the joints of a model."),
+    validation=option("--validation", "LOG", "Log to judge on, by name; unless told, what was recorded last."),
+    split=option("--split", "HOW", "Judge on the end of every log, 30% or 20s of it; or on whole logs: log."),
+    negligible=option(
+        "--negligible",
+        "PERCENT",
+        "Gap that means nothing to you, in percent of the friction level; 5 unless told.",
+        min=0.0,
+        max=100.0,
+    ),
+    write_model=option(
+        "--write-model",
+        "FILE",
+        "Write the improved joint as a robot file; with --model, your own file with the causes added.",
+    ),
+    mujoco=option("--export-mujoco", "FILE.xml", "Export the improved joint to MuJoCo, and FILE.py with its callback."),
+    export=option(
+        "--export",
+        "TARGET=FILE",
+        "Also write the joints of a model: isaaclab, mjlab (.py), newton (.usda), ros2 (.yaml), bam, samples "
+        "(.json), c (.h).",
+    ),
+    stage=option("--stage", "FILE", "Your USD stage, over whose joints --export newton is laid; without it a new one."),
+    randomise=option("--randomise", "N", "Posterior samples to draw for --export.", min=0),
+    apply=typer.Option("--apply", help="Write the best candidate even where the verdict is ambiguous or unknown."),
+    out=option("--out", "FOLDER", "Folder for the report page."),
+)
 def diagnose(
     output: Output,
-    logs: DiagnoseLogsArgument = None,
-    model: ModelOption = None,
-    more_logs: MoreLogsOption = None,
-    columns: ColumnsOption = None,
-    nominal: NominalOption = None,
-    profile: ProfileOption = None,
-    joint: JointOption = None,
-    hold: HoldOption = None,
-    tolerance: ToleranceOption = None,
-    executor: ExecutorOption = None,
-    validation: ValidationOption = None,
-    split: SplitOption = "",
-    negligible: NegligibleOption = None,
-    write_model: WriteModelOption = None,
-    mujoco: MujocoOption = None,
-    export: ExportOption = None,
-    stage: StageOption = None,
-    randomise: RandomiseOption = 0,
-    apply: ApplyOption = False,
-    out: ReportFolderOption = None,
-    force: opt.Force = False,
+    logs: list[Path] | None = None,
+    model: Path | None = None,
+    more_logs: list[Path] | None = None,
+    columns: str | None = None,
+    nominal: Path | None = None,
+    profile: Path | None = None,
+    joint: list[str] | None = None,
+    hold: list[str] | None = None,
+    tolerance: list[str] | None = None,
+    executor: str | None = None,
+    validation: list[str] | None = None,
+    split: str = "",
+    negligible: float | None = None,
+    write_model: Path | None = None,
+    mujoco: Path | None = None,
+    export: list[str] | None = None,
+    stage: Path | None = None,
+    randomise: int = 0,
+    apply: bool = False,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Result:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
     from frictid_hil.jobs.gap.export_targets import Wanted
@@ -198,13 +308,19 @@ def _show_draft(output: Output, result: Result) -> None:
 
 
 @verb(app, "draft", _show_draft, schema="gap_draft")
+@takes(
+    logs=argument("SET | LOG...", "Folder with nominal.yaml and its logs; or recordings that lie anywhere."),
+    columns=option("--columns", "FILE", "Column map of a foreign logger (emps.yaml)."),
+    joint=option("--joint -j", "JOINT", "The joint, where logs or profile hold several."),
+    out=option("--out", "FILE", "The file to write."),
+)
 def draft(
     output: Output,
-    logs: LogsArgument,
-    columns: ColumnsOption = None,
-    joint: JointNameOption = None,
-    out: Annotated[Path, option("--out", "FILE", "The file to write.")] = Path("nominal.yaml"),
-    force: opt.Force = False,
+    logs: list[Path],
+    columns: str | None = None,
+    joint: str | None = None,
+    out: Path = Path("nominal.yaml"),
+    force: bool = False,
 ) -> Result:
     """Draft a first nominal.yaml, with tolerances, from recordings where nothing is believed yet."""
     from frictid_hil.jobs.gap.logs import Source
@@ -227,13 +343,18 @@ def _show_fleet(output: Output, result: Result) -> None:
 
 
 @verb(app, "fleet", _show_fleet, schema="gap_fleet")
+@takes(
+    results=argument("RESULT...", "What `gap diagnose --json` printed, one file a robot."),
+    randomise=option("--randomise", "N", "Robots to draw into --out.", min=0),
+    out=option("--out", "FILE", "File for the robots drawn (.json)."),
+)
 def fleet(
     output: Output,
-    results: Annotated[list[Path], argument("RESULT...", "What `gap diagnose --json` printed, one file a robot.")],
-    randomise: Annotated[int, option("--randomise", "N", "Robots to draw into --out.", min=0)] = 0,
-    out: Annotated[Path | None, option("--out", "FILE", "File for the robots drawn (.json).")] = None,
-    seed: opt.Seed = 1,
-    force: opt.Force = False,
+    results: list[Path],
+    randomise: int = 0,
+    out: Path | None = None,
+    seed: int = 1,
+    force: bool = False,
 ) -> Result:
     """Tell what varies between robots of one kind from what is not known of them."""
     from frictid_hil.jobs.gap_fleet import fleet as job
@@ -253,17 +374,23 @@ def _show_check(output: Output, result: Result) -> None:
 
 
 @verb(app, "check", _show_check, schema="gap_check")
+@takes(
+    cases=option("--cases", "N", "Joints to draw.", min=1),
+    seed=option("--seed", "N", "Seed of the draw."),
+    world=option("--world", "NAMES", "narrow, wide, zoo, or several with commas."),
+    processes=option("--processes", "N", "Parallel processes.", min=1),
+    leave_one_out=typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn."),
+    out=option("--out", "FOLDER", "Folder to keep cases, answers and scores in."),
+)
 def check(
     output: Output,
-    cases: Annotated[int, option("--cases", "N", "Joints to draw.", min=1)] = 40,
-    seed: Annotated[int, option("--seed", "N", "Seed of the draw.")] = 1,
-    world: Annotated[str, option("--world", "NAMES", "narrow, wide, zoo, or several with commas.")] = "narrow",
-    processes: Annotated[int, option("--processes", "N", "Parallel processes.", min=1)] = 2,
-    leave_one_out: Annotated[
-        bool, typer.Option("--leave-one-effect-out", help="Also hold out each effect from the library in turn.")
-    ] = False,
-    out: Annotated[Path | None, option("--out", "FOLDER", "Folder to keep cases, answers and scores in.")] = None,
-    force: opt.Force = False,
+    cases: int = 40,
+    seed: int = 1,
+    world: str = "narrow",
+    processes: int = 2,
+    leave_one_out: bool = False,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Result:
     """Draw joints whose truth is sealed, diagnose them, open the seal, score the answers."""
     from frictid_hil.jobs.gap_check import run_gap_check
@@ -271,28 +398,6 @@ def check(
     worlds = [name.strip() for name in world.split(",") if name.strip()]
     more: dict[str, Any] = {"leave_one_out": leave_one_out, "force": force, "progress": output.err.print}
     return run_gap_check(cases, seed, out, processes, worlds=worlds, **more)
-
-
-PlanOption = Annotated[Path | None, option("--plan", "FILE", "Record just what an ambiguous diagnosis asked for.")]
-UntilDecidedOption = Annotated[
-    float | None,
-    option(
-        "--until-decided",
-        "SECONDS",
-        "Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
-    ),
-]
-PayloadOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--payload/--no-payload",
-        help="Payload steps too; you are asked to mount it. A simulated robot mounts its own.",
-        show_default=False,
-    ),
-]
-RecordedOption = Annotated[
-    Path | None, option("--from", "RUN", "Make a set of what this run has recorded; nothing moves.")
-]
 
 
 def _show_recording(output: Output, result: Result) -> None:
@@ -304,22 +409,40 @@ def _show_recording(output: Output, result: Result) -> None:
 
 
 @verb(app, "record", _show_recording, schema="gap_record")
+@takes(
+    joint=option("--joint -j", "JOINT", "The joint to record."),
+    short=typer.Option("--short", help="The short set: about a minute of motion."),
+    plan=option("--plan", "FILE", "Record just what an ambiguous diagnosis asked for."),
+    until_decided=option(
+        "--until-decided",
+        "SECONDS",
+        "Diagnose after each recording and add what tells most, for so many seconds of motion at most.",
+    ),
+    profile=option("--profile", "PROFILE", "Friction profile that the simulator believes."),
+    payload=typer.Option(
+        "--payload/--no-payload",
+        help="Payload steps too; you are asked to mount it. A simulated robot mounts its own.",
+        show_default=False,
+    ),
+    recorded=option("--from", "RUN", "Make a set of what this run has recorded; nothing moves."),
+    out=option("--out", "FOLDER", "Folder of the experiment set."),
+)
 def record(
     output: Output,
-    robot: opt.Robot = "",
-    joint: Annotated[str, option("--joint -j", "JOINT", "The joint to record.")] = "",
-    bus: opt.Bus = None,
-    short: Annotated[bool, typer.Option("--short", help="The short set: about a minute of motion.")] = False,
-    plan: PlanOption = None,
-    until_decided: UntilDecidedOption = None,
-    profile: ProfileOption = None,
-    payload: PayloadOption = None,
-    realtime: opt.Realtime = None,
-    seed: opt.Seed = 0,
-    resume: opt.Resume = None,
-    recorded: RecordedOption = None,
-    out: Annotated[Path | None, option("--out", "FOLDER", "Folder of the experiment set.")] = None,
-    yes: opt.Yes = False,
+    robot: str = "",
+    joint: str = "",
+    bus: str | None = None,
+    short: bool = False,
+    plan: Path | None = None,
+    until_decided: float | None = None,
+    profile: Path | None = None,
+    payload: bool | None = None,
+    realtime: bool | None = None,
+    seed: int = 0,
+    resume: Path | None = None,
+    recorded: Path | None = None,
+    out: Path | None = None,
+    yes: bool = False,
 ) -> Told:
     """Run the diagnostic experiments on the bus and write an experiment set."""
     from frictid_hil.cli.progress import watching

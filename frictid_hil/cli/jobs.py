@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from pathlib import Path
 
 import typer
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import option
-from frictid_hil.cli.output import Output, Result, folding, verb
+from frictid_hil.cli.output import Output, Result, folding, takes, verb
 
 app = typer.Typer()
 
@@ -41,15 +41,15 @@ def _with_unit(value: float | None, unit: str, digits: int = 1) -> str:
 @verb(app, "recalibrate", _show_night)
 def recalibrate(
     output: Output,
-    robot: opt.Robot,
-    bus: opt.Bus = None,
-    store: opt.Store = None,
-    realtime: opt.Realtime = None,
-    seed: opt.Seed = 0,
-    notify: opt.Notify = None,
-    live: opt.Live = False,
-    live_at: opt.LiveAt = None,
-    out: opt.Out = None,
+    robot: str,
+    bus: str | None = None,
+    store: Path | None = None,
+    realtime: bool | None = None,
+    seed: int = 0,
+    notify: str | None = None,
+    live: bool = False,
+    live_at: str | None = None,
+    out: Path | None = None,
 ) -> Result:
     """Calibrate with nobody watching; promote or refuse by the robot file's policy. Never asks."""
     from frictid_hil.cli.progress import watching
@@ -71,20 +71,23 @@ def _show_units(output: Output, result: Result) -> None:
 
 
 @verb(app, "schedule", _show_units)
+@takes(
+    on_calendar=option("--on-calendar", "WHEN", 'When, e.g. "Mon..Fri 02:30" (man systemd.time).'),
+    system=typer.Option("--system/--user", help="For the whole machine, or for this person alone."),
+    user=option("--account", "NAME", "Account that a system service runs as."),
+    command=opt.SHARED["notify"],
+    time_limit_s=option("--time-limit", "TIME", "A longer night is stopped.", parser=opt.quantity("duration")),
+)
 def schedule(
     output: Output,
-    robot: opt.Robot,
-    on_calendar: Annotated[str, option("--on-calendar", "WHEN", 'When, e.g. "Mon..Fri 02:30" (man systemd.time).')],
-    bus: opt.Bus = None,
-    system: Annotated[
-        bool, typer.Option("--system/--user", help="For the whole machine, or for this person alone.")
-    ] = False,
-    user: Annotated[str, option("--account", "NAME", "Account that a system service runs as.")] = "frictid",
-    command: opt.Notify = None,
-    time_limit_s: Annotated[
-        float, option("--time-limit", "TIME", "A longer night is stopped.", parser=opt.quantity("duration"))
-    ] = "4h",  # type: ignore[assignment]  # typer parses it
-    out: opt.Out = None,
+    robot: str,
+    on_calendar: str,
+    bus: str | None = None,
+    system: bool = False,
+    user: str = "frictid",
+    command: str | None = None,
+    time_limit_s: float = "4h",  # type: ignore[assignment]  # typer parses it
+    out: Path | None = None,
 ) -> Result:
     """Write and verify the systemd service and timer for `recalibrate`; print a cron line as well."""
     from frictid_hil.jobs.schedule import ScheduleOptions

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
 import typer
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import Output, Result, Told, verb
+from frictid_hil.cli.output import Output, Result, Told, takes, verb
 from frictid_hil.errors import Interrupted, UsageError
 
 _Value = TypeVar("_Value")
@@ -70,47 +70,39 @@ def _asked(question: str, option: str, parse: Callable[[str], _Value], *, asks: 
     return answer
 
 
-JointOption = Annotated[
-    list[Any] | None, option("--joint -j", "NAME=ADDRESS", "A joint and its address; repeat.", parser=_named)
-]
-BusOption = Annotated[str | None, option("--bus", "BUS", "interface:channel, e.g. socketcan:can0.", parser=_bus)]
-TravelOption = Annotated[Any, option("--travel", "LOW..HIGH", "Travel of the joints: -90deg..90deg.", parser=_travel)]
-MaxVelocityOption = Annotated[
-    float | None, option("--max-velocity", "SPEED", "E.g. 115deg/s.", parser=opt.quantity("angular velocity"))
-]
-MaxTorqueOption = Annotated[
-    float | None, option("--max-torque", "TORQUE", "At the joint, e.g. 60Nm.", parser=opt.quantity("torque"))
-]
-GearRatioOption = Annotated[
-    float | None, option("--gear-ratio", "RATIO", "Motor revolutions per joint revolution.", parser=_ratio)
-]
-RatedTorqueOption = Annotated[
-    float | None, option("--rated-torque", "TORQUE", "At the joint: motor x gear.", parser=opt.quantity("torque"))
-]
-
-
 def _show_robot(output: Output, _result: Result) -> None:
     path = output.given["path"]
     output.say(f"{path}: look at every line, then `frictid-hil check --robot {path} --dry`")
 
 
 @verb(app, "robot", _show_robot, schema="new_robot")
+@takes(
+    path=argument("FILE", "Robot file to write; the robot is named after it."),
+    joint=option("--joint -j", "NAME=ADDRESS", "A joint and its address; repeat.", parser=_named),
+    bus=option("--bus", "BUS", "interface:channel, e.g. socketcan:can0.", parser=_bus),
+    driver=option("--driver", "DRIVER", "Driver of the bus."),
+    travel=option("--travel", "LOW..HIGH", "Travel of the joints: -90deg..90deg.", parser=_travel),
+    max_velocity=option("--max-velocity", "SPEED", "E.g. 115deg/s.", parser=opt.quantity("angular velocity")),
+    max_torque=option("--max-torque", "TORQUE", "At the joint, e.g. 60Nm.", parser=opt.quantity("torque")),
+    gear_ratio=option("--gear-ratio", "RATIO", "Motor revolutions per joint revolution.", parser=_ratio),
+    rated_torque=option("--rated-torque", "TORQUE", "At the joint: motor x gear.", parser=opt.quantity("torque")),
+    cycle_hz=typer.Option("--rate", min=1.0, help="Set-points per second."),
+    read=typer.Option("--read", help="Ask the drives for gear and rated torque; nothing moves."),
+)
 def robot(
     output: Output,
-    path: Annotated[Path, argument("FILE", "Robot file to write; the robot is named after it.")],
-    joint: JointOption = None,
-    bus: BusOption = None,
-    driver: Annotated[str, option("--driver", "DRIVER", "Driver of the bus.")] = "cia402",
-    travel: TravelOption = None,
-    max_velocity: MaxVelocityOption = None,
-    max_torque: MaxTorqueOption = None,
-    gear_ratio: GearRatioOption = None,
-    rated_torque: RatedTorqueOption = None,
-    cycle_hz: Annotated[float, typer.Option("--rate", min=1.0, help="Set-points per second.")] = 1000.0,
-    read: Annotated[bool, typer.Option("--read", help="Ask the drives for gear and rated torque; nothing moves.")] = (
-        False
-    ),
-    force: opt.Force = False,
+    path: Path,
+    joint: list[Any] | None = None,
+    bus: str | None = None,
+    driver: str = "cia402",
+    travel: Any = None,
+    max_velocity: float | None = None,
+    max_torque: float | None = None,
+    gear_ratio: float | None = None,
+    rated_torque: float | None = None,
+    cycle_hz: float = 1000.0,
+    read: bool = (False),
+    force: bool = False,
 ) -> Told:
     """A robot file for your robot. On a terminal it asks for what you did not give; one answer holds for all joints."""
     from frictid_hil.files import refuse_overwriting
@@ -143,11 +135,11 @@ def _show_driver(output: Output, result: Result) -> None:
 
 
 @verb(app, "driver", _show_driver, schema="new_driver")
-def driver(
-    output: Output,
-    name: Annotated[str, argument("NAME", "Name of the driver, as robot files will have it.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; frictid-NAME here if not given.")] = None,
-) -> Result:
+@takes(
+    name=argument("NAME", "Name of the driver, as robot files will have it."),
+    out=typer.Option("--out", help="Folder to write; frictid-NAME here if not given."),
+)
+def driver(output: Output, name: str, out: Path | None = None) -> Result:
     """A driver of your own for CAN devices: a package that runs, with a fake device, a robot file and its tests."""
     from frictid_hil.jobs.new_driver import new_driver
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -80,62 +80,42 @@ def profiles(incomplete: str) -> list[str]:
     return sorted(name for name in known | near | {"active"} if name.startswith(incomplete))
 
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan; open no bus.")]
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the question before motion, never the checks.")]
-Out = Annotated[Path | None, option("--out", "FOLDER", "Folder to write to.")]
-Force = Annotated[bool, typer.Option("--force", help="Write over files that are there.")]
-Resume = Annotated[
-    Path | None, option("--resume", "RUN", "Go on with this run: its robot and options, what it still lacks.")
-]
-Notify = Annotated[
-    str | None,
-    option(
+SHARED: dict[str, Any] = {
+    "as_json": typer.Option("--json", help="Exactly one JSON object on stdout."),
+    "quiet": typer.Option("--quiet", "-q", help="No progress; the result and errors alone."),
+    "dry_run": typer.Option("--dry-run", help="Print the plan; open no bus."),
+    "yes": typer.Option("--yes", "-y", help="Skip the question before motion, never the checks."),
+    "out": option("--out", "FOLDER", "Folder to write to."),
+    "force": typer.Option("--force", help="Write over files that are there."),
+    "resume": option("--resume", "RUN", "Go on with this run: its robot and options, what it still lacks."),
+    "notify": option(
         "--notify",
         "CMD",
         "Command that is given the JSON on its standard input, however it ended; a shell needs `sh -c '...'`.",
     ),
-]
-
-Robot = Annotated[
-    str, option("--robot -r", "FILE", "Robot file, by path or by name (hp3j.yaml).", complete=robot_files)
-]
-Bus = Annotated[
-    str | None,
-    option("--bus", "BUS", "interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0)."),
-]
-Realtime = Annotated[bool | None, typer.Option("--realtime", help="Run the virtual robot on the wall clock.")]
-Seed = Annotated[int, option("--seed", "N", "Seed of the virtual robot's noise.")]
-
-OneJoint = Annotated[str, option("--joint -j", "JOINT", "The joint.", complete=joints)]
-Joint = Annotated[
-    list[str] | None,
-    option("--joint -j", "JOINT", "Only this joint; repeat for several. Default: all.", complete=joints),
-]
-Amplitude = Annotated[
-    float | None, option("--amplitude -A", "ANGLE", "Peak-to-peak travel A, e.g. 20deg.", parser=quantity("angle"))
-]
-Velocity = Annotated[
-    float | None, option("--velocity -V", "SPEED", "Peak speed V, e.g. 115deg/s.", parser=quantity("angular velocity"))
-]
-Cycles = Annotated[int | None, option("--cycles -N", "N", "Number of cycles N.", min=2)]
-Ratio = Annotated[float | None, option("--ratio -c", "C", "Window ratio c.", min=0.0, max=0.999)]
-Method = Annotated[
-    str | None,
-    option(
+    "robot": option("--robot -r", "FILE", "Robot file, by path or by name (hp3j.yaml).", complete=robot_files),
+    "bus": option(
+        "--bus", "BUS", "interface:channel instead of the robot file's (socketcan:can0, serial:/dev/ttyUSB0)."
+    ),
+    "realtime": typer.Option("--realtime", help="Run the virtual robot on the wall clock."),
+    "seed": option("--seed", "N", "Seed of the virtual robot's noise."),
+    "joint": option("--joint -j", "JOINT", "The joint.", complete=joints),
+    "joints": option("--joint -j", "JOINT", "Only this joint; repeat for several. Default: all.", complete=joints),
+    "amplitude_rad": option("--amplitude -A", "ANGLE", "Peak-to-peak travel A, e.g. 20deg.", parser=quantity("angle")),
+    "velocity_rad_s": option(
+        "--velocity -V", "SPEED", "Peak speed V, e.g. 115deg/s.", parser=quantity("angular velocity")
+    ),
+    "cycles": option("--cycles -N", "N", "Number of cycles N.", min=2),
+    "ratio": option("--ratio -c", "C", "Window ratio c.", min=0.0, max=0.999),
+    "method": option(
         "--method",
         "METHOD",
         "function-a (as published), aligned or least-squares; else that of the programme or of the profile.",
         complete=one_of("function-a", "aligned", "least-squares"),
     ),
-]
-
-Profile = Annotated[Path, argument("PROFILE", "Profile, or a run folder that holds one.", complete=profiles)]
-Live = Annotated[
-    bool, typer.Option("--live", help="Stream samples over Foxglove WebSocket to this computer (127.0.0.1:8765).")
-]
-LiveAt = Annotated[
-    str | None, option("--live-at", "HOST:PORT", "As --live, on this address; 0.0.0.0:8765 for everybody.")
-]
-Store = Annotated[
-    Path | None, option("--store", "FOLDER", "Folder of the profile store; default: the user's data folder.")
-]
+    "profile": argument("PROFILE", "Profile, or a run folder that holds one.", complete=profiles),
+    "live": typer.Option("--live", help="Stream samples over Foxglove WebSocket to this computer (127.0.0.1:8765)."),
+    "live_at": option("--live-at", "HOST:PORT", "As --live, on this address; 0.0.0.0:8765 for everybody."),
+    "store": option("--store", "FOLDER", "Folder of the profile store; default: the user's data folder."),
+}
+"""Options that several verbs share, by the name of their parameter."""

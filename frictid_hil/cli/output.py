@@ -23,6 +23,7 @@ from rich.console import Console, RenderableType
 from rich.table import Column, Table
 from rich.text import Text
 
+from frictid_hil.cli.options import SHARED
 from frictid_hil.errors import Defect, FrictidError, Interrupted
 
 EXIT_OF_OUTCOME = {"ok": 0, "refused": 2, "aborted": 1, "gate_failed": 5, "interrupted": 130}
@@ -225,17 +226,21 @@ class Output:
             console.print(f"  next step: {error['next_step']}")
 
 
-_COMMON = {
-    "as_json": Annotated[bool, typer.Option("--json", help="Exactly one JSON object on stdout.")],
-    "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="No progress; the result and errors alone.")],
-}
-"""Options of every verb."""
-
 Verb = TypeVar("Verb", bound=Callable[..., Result | Told])
 
 
+def takes(**own: Any) -> Callable[[Verb], Verb]:
+    """The options and arguments that a verb does not share with others, by the name of their parameter."""
+
+    def add(function: Verb) -> Verb:
+        vars(function)["takes"] = own
+        return function
+
+    return add
+
+
 def verb(
-    app: typer.Typer, name: str, show: Callable[[Output, Result], None] | None = None, *, schema: str = ""
+    app: typer.Typer, name: str, show: Callable[[Output, Result], None] | None = None, schema: str = ""
 ) -> Callable[[Verb], Verb]:
     """Make a verb of a function that is given an ``Output`` and the verb's own options, and returns its result.
 
@@ -243,14 +248,21 @@ def verb(
     """
 
     def add(function: Verb) -> Verb:
-        _, *own = inspect.signature(function, eval_str=True).parameters.values()
-        common = [Parameter(n, Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in _COMMON.items()]
+        _, *taken = inspect.signature(function, eval_str=True).parameters.values()
+        options = {**SHARED, **vars(function).get("takes", {})}
+        parameters = [
+            one.replace(kind=Parameter.KEYWORD_ONLY, annotation=Annotated[one.annotation, options[one.name]])
+            for one in taken
+        ]
+        parameters += [
+            Parameter(n, Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, options[n]])
+            for n in ("as_json", "quiet")
+        ]
 
         def call(*, as_json: bool, quiet: bool, **given: Any) -> None:
             output = Output(as_json, quiet, given)
             output.run(schema or name, lambda: function(output, **given), show)
 
-        parameters = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in own] + common
         vars(call)["__signature__"] = inspect.Signature(parameters)
         app.command(name, help=inspect.getdoc(function))(call)
         return function

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.text import Text
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import READING, Output, Result, folding, verb
+from frictid_hil.cli.output import READING, Output, Result, folding, takes, verb
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
-
-RobotArgument = Annotated[str, argument("ROBOT", "Name of the robot.", complete=opt.robots)]
-RobotName = Annotated[
-    str | None, option("--robot -r", "ROBOT", "Name of the robot whose store is meant by ids.", complete=opt.robots)
-]
-
-ReasonOption = Annotated[str, option("--reason", "TEXT", "For the history.")]
 
 _SHOWN = 50
 """Profiles, promotions and nights in a table that a person reads."""
@@ -58,7 +50,7 @@ def _timing(joint: Result) -> str:
 
 
 @verb(app, "show", _show_profile, schema="profile_show")
-def show(output: Output, profile: opt.Profile) -> Result:
+def show(output: Output, profile: Path) -> Result:
     """Print a profile as a person reads it."""
     from frictid_hil.jobs.profiles import show as job
 
@@ -72,13 +64,11 @@ def _show_export(output: Output, result: Result) -> None:
 
 
 @verb(app, "export", _show_export, schema="profile_export")
-def export(
-    output: Output,
-    profile: opt.Profile,
-    to: Annotated[str, option("--to", "TARGET", "table (20 points, CSV), ros2 (YAML) or i2rt (YAML).")],
-    out: Annotated[Path, option("--out", "FILE", "File to write.")],
-    force: opt.Force = False,
-) -> Result:
+@takes(
+    to=option("--to", "TARGET", "table (20 points, CSV), ros2 (YAML) or i2rt (YAML)."),
+    out=option("--out", "FILE", "File to write."),
+)
+def export(output: Output, profile: Path, to: str, out: Path, force: bool = False) -> Result:
     """Write a profile in the form of the place where it shall act, and say what is lost."""
     from frictid_hil.jobs.profile_export import export as job
 
@@ -104,16 +94,14 @@ def _show_diff(output: Output, result: Result) -> None:
 
 
 @verb(app, "diff", _show_diff, schema="profile_diff")
-def diff(
-    output: Output,
-    older: Annotated[
-        str,
-        argument("PROFILE", "Profile, run folder; or with --robot an id, `active`, `baseline`.", complete=opt.profiles),
-    ],
-    newer: Annotated[str, argument("PROFILE", "The same.", complete=opt.profiles)],
-    robot: RobotName = None,
-    store: opt.Store = None,
-) -> Result:
+@takes(
+    older=argument(
+        "PROFILE", "Profile, run folder; or with --robot an id, `active`, `baseline`.", complete=opt.profiles
+    ),
+    newer=argument("PROFILE", "The same.", complete=opt.profiles),
+    robot=option("--robot -r", "ROBOT", "Name of the robot whose store is meant by ids.", complete=opt.robots),
+)
+def diff(output: Output, older: str, newer: str, robot: str | None = None, store: Path | None = None) -> Result:
     """How two profiles differ: distance (15), F_0, overlap of intervals, temperature, and what else changed."""
     from frictid_hil.jobs.profiles import diff as job
 
@@ -127,16 +115,21 @@ def _show_active(output: Output, result: Result) -> None:
 
 
 @verb(app, "promote", _show_active, schema="profile_promote")
+@takes(
+    profile=argument("PROFILE", "Profile, run folder; or with --robot an id of the store.", complete=opt.profiles),
+    robot=option("--robot -r", "ROBOT", "Name of the robot whose store is meant by ids.", complete=opt.robots),
+    reason=option("--reason", "TEXT", "For the history."),
+    baseline=typer.Option("--baseline", help="Measure drift from it from now on."),
+    force=typer.Option("--force", help="Although a quality gate failed."),
+)
 def promote(
     output: Output,
-    profile: Annotated[
-        str, argument("PROFILE", "Profile, run folder; or with --robot an id of the store.", complete=opt.profiles)
-    ],
-    robot: RobotName = None,
-    reason: ReasonOption = "",
-    baseline: Annotated[bool, typer.Option("--baseline", help="Measure drift from it from now on.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Although a quality gate failed.")] = False,
-    store: opt.Store = None,
+    profile: str,
+    robot: str | None = None,
+    reason: str = "",
+    baseline: bool = False,
+    force: bool = False,
+    store: Path | None = None,
 ) -> Result:
     """Make a profile the active one of its robot; joints that it lacks stay, and one command goes back."""
     from frictid_hil.jobs.profiles import promote as job
@@ -146,7 +139,11 @@ def promote(
 
 
 @verb(app, "rollback", _show_active, schema="profile_rollback")
-def rollback(output: Output, robot: RobotArgument, reason: ReasonOption = "", store: opt.Store = None) -> Result:
+@takes(
+    robot=argument("ROBOT", "Name of the robot.", complete=opt.robots),
+    reason=option("--reason", "TEXT", "For the history."),
+)
+def rollback(output: Output, robot: str, reason: str = "", store: Path | None = None) -> Result:
     """Make the profile active again that was so before the present one."""
     from frictid_hil.jobs.profiles import rollback as job
 
@@ -198,14 +195,11 @@ def _signed(value: float | None) -> str:
 
 
 @verb(app, "history", _show_history, schema="profile_history")
-def history(
-    output: Output,
-    robot: RobotArgument,
-    last: Annotated[
-        int | None, option("--last", "N", "Only so many, 0 for all. Default: 50 in a table, all with --json.", min=0)
-    ] = None,
-    store: opt.Store = None,
-) -> Result:
+@takes(
+    robot=argument("ROBOT", "Name of the robot.", complete=opt.robots),
+    last=option("--last", "N", "Only so many, 0 for all. Default: 50 in a table, all with --json.", min=0),
+)
+def history(output: Output, robot: str, last: int | None = None, store: Path | None = None) -> Result:
     """Every profile of a robot, with F_0, distance from the baseline and temperature of every joint."""
     from frictid_hil.jobs.profiles import history as job
     from frictid_hil.profiles.store import ProfileStore

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import NoReturn
 
 import typer
 
 from frictid_hil.cli import options as opt
 from frictid_hil.cli.options import argument, option
-from frictid_hil.cli.output import READING, Output, Result, verb
+from frictid_hil.cli.output import READING, Output, Result, takes, verb
 from frictid_hil.units import degrees
 
 app = typer.Typer()
@@ -22,20 +22,16 @@ def _show_pages(output: Output, result: Result) -> None:
 
 
 @verb(app, "report", _show_pages)
-def report(
-    output: Output,
-    run: Annotated[Path | None, argument("[RUN]", "Run folder.")] = None,
-    robot: Annotated[
-        str | None,
-        option(
-            "--robot -r",
-            "ROBOT",
-            "The page of a robot with its history: its name in the store, or its file.",
-            complete=opt.robots,
-        ),
-    ] = None,
-    store: opt.Store = None,
-) -> Result:
+@takes(
+    run=argument("[RUN]", "Run folder."),
+    robot=option(
+        "--robot -r",
+        "ROBOT",
+        "The page of a robot with its history: its name in the store, or its file.",
+        complete=opt.robots,
+    ),
+)
+def report(output: Output, run: Path | None = None, robot: str | None = None, store: Path | None = None) -> Result:
     """Write the self-contained HTML page of a run, or the index page of a robot."""
     from frictid_hil.jobs.report import report as job
 
@@ -43,33 +39,17 @@ def report(
 
 
 @verb(app, "dashboard")
-def dashboard(
-    output: Output,
-    runs: Annotated[Path, option("--runs", "DIR", "Folder under which runs are looked for.", file_okay=False)] = Path(
-        "runs"
-    ),
-    store: opt.Store = None,
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of 127.0.0.1 to listen on.")] = 8642,
-) -> NoReturn:
+@takes(
+    runs=option("--runs", "DIR", "Folder under which runs are looked for.", file_okay=False),
+    port=typer.Option("--port", min=1, max=65535, help="Port of 127.0.0.1 to listen on."),
+)
+def dashboard(output: Output, runs: Path = Path("runs"), store: Path | None = None, port: int = 8642) -> NoReturn:
     """Show robots, runs and a run as it moves, in a browser on this computer; it reads only. Runs until Ctrl-C."""
     from frictid_hil.jobs.dashboard import serve
     from frictid_hil.profiles.store import ProfileStore
 
     serve(runs, ProfileStore(store), port, output.announce("dashboard", "address", "dashboard"))
     raise typer.Exit(0)
-
-
-FramesOption = Annotated[Path | None, option("--frames", "FILE", "Mapping file of a foreign log: which frame is what.")]
-EdsOption = Annotated[Path | None, option("--eds", "FILE", "EDS or DCF file of the drives of a foreign log.")]
-ProfileOption = Annotated[
-    Path | None, option("--profile", "PROFILE", "Profile to compare with; default: the run's own.")
-]
-EchoOption = Annotated[
-    str | None, option("--echo", "BUS", "interface:channel of a bus on which every frame is sent again.")
-]
-SimulateOption = Annotated[
-    bool, typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too.")
-]
 
 
 def _show_replay(output: Output, result: Result) -> None:
@@ -110,24 +90,35 @@ def _verdict(joint: Result) -> str:
 
 
 @verb(app, "replay", _show_replay)
+@takes(
+    source=argument("RUN_OR_LOG", "Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV."),
+    frames=option("--frames", "FILE", "Mapping file of a foreign log: which frame is what."),
+    eds=option("--eds", "FILE", "EDS or DCF file of the drives of a foreign log."),
+    profile=option("--profile", "PROFILE", "Profile to compare with; default: the run's own."),
+    amplitude=opt.SHARED["amplitude_rad"],
+    velocity=opt.SHARED["velocity_rad_s"],
+    paced=typer.Option("--realtime", help="Play at recorded speed."),
+    echo=option("--echo", "BUS", "interface:channel of a bus on which every frame is sent again."),
+    simulation=typer.Option("--simulate/--no-simulate", help="Stream the set-points to the simulated joints, too."),
+)
 def replay(
     output: Output,
-    source: Annotated[Path, argument("RUN_OR_LOG", "Run folder, bus log (BLF, ASC, candump, TRC), MCAP or CSV.")],
-    robot: opt.Robot,
-    joints: opt.Joint = None,
-    frames: FramesOption = None,
-    eds: EdsOption = None,
-    profile: ProfileOption = None,
-    amplitude: opt.Amplitude = None,
-    velocity: opt.Velocity = None,
-    cycles: opt.Cycles = None,
-    ratio: opt.Ratio = None,
-    method: opt.Method = None,
-    paced: Annotated[bool, typer.Option("--realtime", help="Play at recorded speed.")] = False,
-    echo: EchoOption = None,
-    simulation: SimulateOption = True,
-    out: opt.Out = None,
-    force: opt.Force = False,
+    source: Path,
+    robot: str,
+    joints: list[str] | None = None,
+    frames: Path | None = None,
+    eds: Path | None = None,
+    profile: Path | None = None,
+    amplitude: float | None = None,
+    velocity: float | None = None,
+    cycles: int | None = None,
+    ratio: float | None = None,
+    method: str | None = None,
+    paced: bool = False,
+    echo: str | None = None,
+    simulation: bool = True,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Result:
     """Play a recording back: the same profile to the last bit, and measured beside simulated motion."""
     from frictid_hil.jobs.plans import given_procedure

@@ -31,7 +31,7 @@ from frictid_hil.gap.experiments import (
     names_of_plan,
 )
 from frictid_hil.jobs.gap.belief import Belief, belief_of, read_back
-from frictid_hil.jobs.gap.set import existing_set, write_set
+from frictid_hil.jobs.gap.logs import existing_set, write_set
 from frictid_hil.jobs.plans import APPROACH_RAD_S, care_notes, expected_of
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.limits import refuse_beyond_limits

@@ -17,11 +17,10 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError, GateFailed, InputFileError, UsageError
 from frictid_hil.files import made_folders, refuse_overwriting
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.bus_logs import Account, is_log, logs_of, samples_in
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.jobs.identification.joint_profile import failed_result, identify_joint, joint_result
 from frictid_hil.jobs.plans import given_procedure
-from frictid_hil.jobs.replaying.bus_logs import is_log, logs_of
-from frictid_hil.jobs.replaying.decoded_log import Account, samples_in
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.parquet import is_lerobot
 from frictid_hil.recording.read import READABLE, read

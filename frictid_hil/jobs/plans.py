@@ -125,11 +125,11 @@ def inherited_notes(robot: Robot, joints: Sequence[str]) -> list[str]:
     ]
 
 
-def slow_reversal(start_rad: float, *, repeats: int = 2) -> Corners:
-    """Slow small triangles that load the gear's presliding one way, then the other."""
+def slow_reversal(start_rad: float) -> Corners:
+    """Two slow small triangles that load the gear's presliding one way, then the other."""
     leg_s = _REVERSAL_TRAVEL_RAD / _REVERSAL_SPEED_RAD_S
-    corners = [start_rad + (_REVERSAL_TRAVEL_RAD if k % 2 else 0.0) for k in range(2 * repeats + 1)]
-    return Corners("reversal", tuple(k * leg_s for k in range(2 * repeats + 1)), tuple(corners))
+    there = start_rad + _REVERSAL_TRAVEL_RAD
+    return Corners("reversal", tuple(k * leg_s for k in range(5)), (start_rad, there, start_rad, there, start_rad))
 
 
 def calibration_plan(

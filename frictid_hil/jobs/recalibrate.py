@@ -21,7 +21,6 @@ from typing import Any, NoReturn
 import filelock
 
 from frictid_hil.config.policy import Policy
-from frictid_hil.config.profile import FrictionProfile
 from frictid_hil.config.provenance import utc_now
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import Defect, FrictidError, GateFailed, HardwareBusy, Interrupted, UsageError
@@ -167,7 +166,10 @@ def _concluded(options: RecalibrateOptions, robot: Robot, store: ProfileStore, m
             _apply(verdict, result, store, robot.name, identity)
             if verdict.drifted and not result["exit_code"] and robot.policy.on_drift == "alarm":
                 result["exit_code"] = DRIFTED
-        _write_page(result, robot, store, newer, active, baseline)
+        # The verdict stands whether or not its page can be written.
+        with contextlib.suppress(FrictidError):
+            page = recalibration_page(result, robot.policy, newer, active, baseline, store.trends(robot.name))
+            result["recalibration_report"] = str(write_page(page, Path(result["run"]) / NIGHT_PAGE).resolve())
     current = store.active(robot.name)
     result["active"] = str(store.path(robot.name, current.id).resolve()) if current else None
     return result
@@ -181,20 +183,6 @@ def _apply(verdict: Verdict, result: dict[str, Any], store: ProfileStore, robot:
     elif verdict.refused:
         refused = GateFailed(verdict.reason, where=f"{robot}, profile {identity}", next_step=verdict.next_step)
         result |= {"outcome": refused.outcome, "exit_code": refused.exit_code, "error": refused.to_json()}
-
-
-def _write_page(
-    result: dict[str, Any],
-    robot: Robot,
-    store: ProfileStore,
-    newer: FrictionProfile,
-    active: FrictionProfile | None,
-    baseline: FrictionProfile | None,
-) -> None:
-    # The verdict stands whether or not its page can be written.
-    with contextlib.suppress(FrictidError):
-        page = recalibration_page(result, robot.policy, newer, active, baseline, store.trends(robot.name))
-        result["recalibration_report"] = str(write_page(page, Path(result["run"]) / NIGHT_PAGE).resolve())
 
 
 # -- alone, and ending in order -------------------------------------------------------------------------------------

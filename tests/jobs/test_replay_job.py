@@ -21,9 +21,9 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.errors import ConfigError, InputFileError, UsageError
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.bus_logs import lost_rows
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.replay import ReplayOptions, replay
-from frictid_hil.jobs.replaying.decoded_log import lost_rows
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.recording.bus_log import BusLogWriter, read_frames
 from frictid_hil.recording.playback import LogBus, logged

@@ -43,8 +43,8 @@ def cycle_recording(
     start_s: float,
     joint: JointSetup | None,
     late_cycles: int,
-    together: tuple[str, ...],
-    company: Sequence[Samples],
+    together: tuple[str, ...] = (),
+    company: Sequence[Samples] = (),
 ) -> tuple[Samples, CycleRecording, list[str]]:
     """Samples on the time of the path, what the estimator is given of them, and what is to be said of both.
 

@@ -85,11 +85,12 @@ def identify_joint(
         together = tuple(map(str, marks[0].details.get("together", ())))
         known = {other.joint: other for other in company if other.joint != samples.joint}
         others = [known[name] for name in together if name in known]
-        return _from_cycles(samples, used, marks[0].start_ns * 1e-9, joint, method, late_cycles, together, others)
+        found = cycle_recording(samples, used, marks[0].start_ns * 1e-9, joint, late_cycles, together, others)
+        return _from_cycles(*found, joint, method, together)
     if procedure is not None:
         path = samples.position_rad if samples.position_command_rad is None else samples.position_command_rad
         start_s = cycles_start_s(samples.time_s, path, procedure, where=f"joint {samples.joint}")
-        return _from_cycles(samples, procedure, start_s, joint, method, late_cycles)
+        return _from_cycles(*cycle_recording(samples, procedure, start_s, joint, late_cycles), joint, method)
     if method == "least-squares":
         return _from_free_motion(samples, [])
     if samples.marks:
@@ -140,15 +141,12 @@ def failed_result(why: str) -> dict[str, Any]:
 
 def _from_cycles(
     samples: Samples,
-    procedure: Procedure,
-    start_s: float,
+    recording: CycleRecording,
+    notes: list[str],
     joint: JointSetup | None,
     method: str,
-    late_cycles: int,
     together: tuple[str, ...] = (),
-    company: Sequence[Samples] = (),
 ) -> JointProfile:
-    samples, recording, notes = cycle_recording(samples, procedure, start_s, joint, late_cycles, together, company)
     result = estimate(recording, method)
     limits = {} if joint is None else joint.gates
     if limits:
@@ -184,8 +182,8 @@ def _from_cycles(
         time_skew=None if result.time_skew is None else TimeSkew(**asdict(result.time_skew)),
         temperature_c=None if warmth is None else round(float(np.nanmean(warmth)), 2),
         procedure=ProcedureUsed(
-            **{key: getattr(procedure, key) for key in _PROCEDURE_KEYS},
-            shares=procedure.shares or None,
+            **{key: getattr(recording.procedure, key) for key in _PROCEDURE_KEYS},
+            shares=recording.procedure.shares or None,
             together=together or None,
         ),
         drive=_drive(samples.meta),

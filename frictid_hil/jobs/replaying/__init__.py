@@ -1,1 +1,0 @@
-"""Bus logs played back."""
