@@ -99,7 +99,7 @@ class TerminalWatcher:
         self._view: JointView | None = None
         self._period_s = math.inf
         self._make_view: Callable[[], JointView] | None = None
-        self._done_s: dict[str, float] = {}
+        self._done_s = 0.0
         self._phase = ""
         self._phase_s = 0.0
         self._joint = ""
@@ -146,8 +146,8 @@ class TerminalWatcher:
             self._start_phase(event)
         elif isinstance(event, JobProgress):
             self._show_job(event)
-        elif isinstance(event, JointRun):
-            self._finish(event)
+        elif isinstance(event, JointRun) and self._view is not None:
+            self._view.done(event.joint, event.late_cycles + event.missed_cycles)
         elif isinstance(event, Warned):
             self.note(f"warning: {event.message}")
 
@@ -159,8 +159,7 @@ class TerminalWatcher:
         if self._stretch_began_s is None:
             self._stretch_began_s = float(rows["t_ns"][0]) * 1e-9
         # Run time goes on from joint to joint; a planned phase is never shown further than its end.
-        done_s = self._done_s.get(self._joint, 0.0)
-        self._view.rows(rows, min(now_s - self._stretch_began_s, done_s + self._phase_s))
+        self._view.rows(rows, min(now_s - self._stretch_began_s, self._done_s + self._phase_s))
 
     def joint(self, joint: str, summary: str, ok: bool) -> None:
         """A line per finished joint."""
@@ -182,10 +181,10 @@ class TerminalWatcher:
             return
         if event.joint != self._joint:
             self._joint = event.joint
-            self._done_s[event.joint] = 0.0
+            self._done_s = 0.0
             self._stretch_began_s = None
         else:
-            self._done_s[event.joint] = self._done_s.get(event.joint, 0.0) + self._phase_s
+            self._done_s += self._phase_s
         self._phase_s = event.duration_s
         self._phase = event.phase
         if not self._console.is_terminal:
@@ -195,24 +194,19 @@ class TerminalWatcher:
         if self._view is None and self._make_view is not None:
             self._view = self._make_view()
         if self._view is not None:
-            self._view.phase(event.joint, event.phase, self._done_s[event.joint])
+            self._view.phase(event.joint, event.phase, self._done_s)
 
     def _show_job(self, event: JobProgress) -> None:
         """A job moves the bar; the transfer of its recording shows its own share."""
         if self._silent:
             return
         if self._view is not None:
-            done_s = self._done_s[event.joint]
             if event.stage == "motion":
-                self._view.phase(event.joint, self._phase, done_s + event.share * self._phase_s)
+                self._view.phase(event.joint, self._phase, self._done_s + event.share * self._phase_s)
             else:
-                self._view.phase(event.joint, f"{event.stage} {event.share:.0%}", done_s)
+                self._view.phase(event.joint, f"{event.stage} {event.share:.0%}", self._done_s)
         elif event.stage == "transfer" and event.share >= 1.0:
             self._console.print(f"joint {event.joint}: recording fetched")
-
-    def _finish(self, event: JointRun) -> None:
-        if self._view is not None:
-            self._view.done(event.joint, event.late_cycles + event.missed_cycles)
 
 
 @contextlib.contextmanager

@@ -35,7 +35,6 @@ from frictid_hil.plan.plan import Plan
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.protocol.driver import planned_quantum_s
-from frictid_hil.recording.samples import Samples
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.events import JointRun, Preflight
 from frictid_hil.runner.interlock import Interlock
@@ -221,14 +220,15 @@ class _Measured:
             "late_cycles": moved.late_cycles,
             "missed_cycles": moved.missed_cycles,
         }
-        name = moved.joint
+        name, plan = moved.joint, self._planned.plan
+        others = [entry.joint for entry in plan.joints if plan.together and entry.joint != name]
         try:
             profile = identify_joint(
                 self._run.folder.samples(moved),
                 self._planned.order.setup.joint(name),
                 method=self._planned.method,
                 late_cycles=moved.late_cycles + moved.missed_cycles,
-                company=self._company(moved),
+                company=[self._run.folder.samples(replace(moved, joint=other)) for other in others],
             )
         except IdentificationError as error:
             self._results[name] = {**result, **failed_result(str(error)), "coulomb_nm": None}
@@ -261,12 +261,6 @@ class _Measured:
         if profile is not None:
             report = write_run_page(folder.path, profile, folder.manifest)
         return Calibrated(ended, joints, profile, profile_file, report)
-
-    def _company(self, moved: JointRun) -> list[Samples]:
-        """Samples of the joints that moved together with this one."""
-        plan = self._planned.plan
-        others = [entry.joint for entry in plan.joints if plan.together and entry.joint != moved.joint]
-        return [self._run.folder.samples(replace(moved, joint=other)) for other in others]
 
     def _provenance(self) -> Provenance:
         order, setup, folder = self._planned.order, self._planned.order.setup, self._run.folder

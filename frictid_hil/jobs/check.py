@@ -41,8 +41,11 @@ def check(robot_name: str, *, bus: str | None = None, latency_s: float = 0.0, dr
             identities = driver.identify()
         finally:
             driver.close()
-    measured = _measured(latency_s) if latency_s else None
-    if measured is not None:
+    measured = None
+    if latency_s:
+        # In a process of its own, as the cyclic loop is, because what makes it punctual cannot be undone.
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            measured = pool.apply(measure_latency, (latency_s,))
         findings.extend(_told(measured, setup.cycle_hz))
     ok = all(finding.severity is not Severity.ERROR for finding in findings)
     return {
@@ -90,12 +93,6 @@ def _planned(robot: Robot, setup: RobotSetup) -> tuple[Plan, list[Finding]]:
         if name not in expected
     ]
     return plan, [judged, *unknown]
-
-
-def _measured(latency_s: float) -> Latency:
-    """Measure in a process of its own, as the cyclic loop is, because what makes it punctual cannot be undone."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(measure_latency, (latency_s,))
 
 
 def _told(found: Latency, cycle_hz: float) -> list[Finding]:

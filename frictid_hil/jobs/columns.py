@@ -28,7 +28,9 @@ def columns(log: Path, *, columns: str | None = None, out: Path | None = None, f
         ``columns`` of the file, ``joints`` as they are read now, ``findings``, and ``map`` (text) where one is drafted.
     """
     known = load_columns(columns) if columns else None
-    table = None if _reads_itself(log) else open_table(log, known.topic if known else None)
+    run = log.is_dir() and any(log.glob("samples*.mcap"))
+    ours = run or (log.suffix.lower() == ".mcap" and is_ours(log) is True)
+    table = None if ours else open_table(log, known.topic if known else None)
     result: dict[str, Any] = {"outcome": "ok", "log": str(log.resolve()), "columns": list(table.names) if table else []}
     if known is not None or table is None or table.standard is not None:
         joints = read(log, known)
@@ -49,10 +51,6 @@ def columns(log: Path, *, columns: str | None = None, out: Path | None = None, f
 
 
 _TITLE = "# Drafted by `frictid-hil columns`; correct what is wrong, then use it with --columns.\n"
-
-
-def _reads_itself(log: Path) -> bool:
-    return (log.is_dir() and any(log.glob("samples*.mcap"))) or (log.suffix.lower() == ".mcap" and is_ours(log) is True)
 
 
 def _told(joints: list[Samples]) -> dict[str, Any]:

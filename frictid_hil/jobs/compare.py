@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, JointProfile, load_profile, profile_file
+from frictid_hil.config.profile import JointProfile, load_profile, profile_file
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import ProfileMismatch, UsageError
 from frictid_hil.friction.curve import FrictionCurve
@@ -38,7 +38,11 @@ def compare(profile_path: Path, other_path: Path | None, truth: str | None) -> d
     profile = load_profile(profile_file(profile_path))
     if truth is not None:
         robot = load_robot(truth)
-        references = _true_curves(robot, profile)
+        references = {
+            name: true_curve(robot, name, _upper_velocity(joint))
+            for name, joint in profile.joints.items()
+            if name in robot.file.joints and robot.file.joints[name].simulated
+        }
         named = f"truth of {truth}"
         other_robot = robot.name != profile.robot
         warnings = [f"they are of different robots: {profile.robot} and {robot.name}"] if other_robot else []
@@ -82,14 +86,6 @@ def true_curve(robot: Robot, name: str, velocity_rad_s: float) -> FrictionCurve:
         model = JointModel.of(robot.file.joints[name], name)
     speeds = np.linspace(0.0, velocity_rad_s, _TRUTH_POINTS + 1)[1:]
     return FrictionCurve.through(speeds, true_curve_nm(model, speeds), where=f"truth of joint {name}")
-
-
-def _true_curves(robot: Robot, profile: FrictionProfile) -> dict[str, FrictionCurve]:
-    return {
-        name: true_curve(robot, name, _upper_velocity(joint))
-        for name, joint in profile.joints.items()
-        if name in robot.file.joints and robot.file.joints[name].simulated
-    }
 
 
 def _upper_velocity(joint: JointProfile) -> float:

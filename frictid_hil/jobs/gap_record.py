@@ -59,7 +59,6 @@ class GapRecordOptions:
         payload: a person is there to mount the payload when asked; None: on a simulated robot only, which mounts its
             own.
         centre_rad: middle of all travels; None: middle of the joint's procedure.
-        travel_rad: of the small sines; None: the joint's procedure's.
         seed: of simulated noise and of the validation moves.
         out: folder of the set; what a plan file asks for is added to the set of the same joint that is there.
     """
@@ -73,7 +72,6 @@ class GapRecordOptions:
     profile: Path | None = None
     payload: bool | None = None
     centre_rad: float | None = None
-    travel_rad: float | None = None
     realtime: bool = False
     seed: int = 0
     out: Path | None = None
@@ -252,7 +250,7 @@ def envelope_of(robot: Robot, joint: JointSetup, options: GapRecordOptions) -> E
         joint.position_max_rad,
         joint.max_velocity_rad_s,
         centre_rad=middle if options.centre_rad is None else options.centre_rad,
-        travel_rad=options.travel_rad or procedure.amplitude_rad,
+        travel_rad=procedure.amplitude_rad,
         velocity_rad_s=procedure.velocity_rad_s,
     )
 
@@ -400,7 +398,10 @@ class _Recording:
                     break
                 error = refused
             if error is not None:
-                self._keep_whole_experiments()
+                half = self._run.so_far(self._planned.joint.name)
+                if half is not None:
+                    # What was finished of a stretch before it was ended early.
+                    self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
                 return error
         return None
 
@@ -446,12 +447,6 @@ class _Recording:
         self._session += 1
         if self._planned.order.setup.lock_step and self._session < len(self._planned.loaded):
             self._mount()
-
-    def _keep_whole_experiments(self) -> None:
-        """Keep the experiments of a stretch that were finished before it was ended early."""
-        half = self._run.so_far(self._planned.joint.name)
-        if half is not None:
-            self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
 
     def _ready_for(self, plan: Plan) -> bool:
         """Ask for the payload where a person has to mount it; without a yes its experiments are left out."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.config.profile import JointProfile, load_profile, profile_file
+from frictid_hil.config.profile import load_profile, profile_file
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
 from frictid_hil.files import refuse_overwriting, write_whole
@@ -35,19 +35,17 @@ def export(profile: Path, target: str, out: Path, *, force: bool = False) -> dic
     if target not in _TARGETS:
         raise UsageError(f"no target {target!r}", where="--to", next_step=f"one of {', '.join(_TARGETS)}")
     refuse_overwriting([out], force=force)
-    joints = {name: (joint, _curve(name, joint)) for name, joint in load_profile(profile_file(profile)).joints.items()}
+    loaded = load_profile(profile_file(profile))
+    pairs = {n: (np.array(one.velocity_rad_s), np.array(one.torque_nm)) for n, one in loaded.joints.items()}
+    joints = {name: FrictionCurve.through(*pair, where=f"joint {name}") for name, pair in pairs.items()}
     text, read_back, lost = _TARGETS[target](joints)
     write_whole(out, text)
-    worst = max(_off(curve, read_back[name]) for name, (_, curve) in joints.items())
+    worst = max(_off(curve, read_back[name]) for name, curve in joints.items())
     return {"outcome": "ok", "written": str(out.resolve()), "lost": lost, "worst_percent": 100.0 * worst}
 
 
-Joints = Mapping[str, tuple[JointProfile, FrictionCurve]]
+Joints = Mapping[str, FrictionCurve]
 Torque = Callable[[Any], Any]
-
-
-def _curve(name: str, joint: JointProfile) -> FrictionCurve:
-    return FrictionCurve.through(np.array(joint.velocity_rad_s), np.array(joint.torque_nm), where=f"joint {name}")
 
 
 def _off(curve: FrictionCurve, written: Torque) -> float:
@@ -59,7 +57,7 @@ def _table(joints: Joints) -> tuple[str, dict[str, Torque], str]:
     """Speed and torque in ten rows for each direction, for drives that interpolate between rows."""
     rows = ["joint,velocity_rad_s,torque_nm"]
     back: dict[str, Torque] = {}
-    for name, (_, curve) in joints.items():
+    for name, curve in joints.items():
         low, high = curve.measured_range_rad_s
         speed = np.geomspace(low, high, POINTS // 2)
         torque = curve.torque(speed)
@@ -79,7 +77,7 @@ def _line(curve: FrictionCurve) -> tuple[float, float]:
 
 def _ros2(joints: Joints) -> tuple[str, dict[str, Torque], str]:
     """Parameters of a node: level and slope by joint."""
-    lines = {name: _line(curve) for name, (_, curve) in joints.items()}
+    lines = {name: _line(curve) for name, curve in joints.items()}
     parameters = {
         "joints": list(lines),
         "friction": {
@@ -95,10 +93,8 @@ def _ros2(joints: Joints) -> tuple[str, dict[str, Torque], str]:
 
 def _i2rt(joints: Joints) -> tuple[str, dict[str, Torque], str]:
     """One level by joint, in the order of the arm, times the sign of speed."""
-    means = {}
-    for name, (_, curve) in joints.items():
-        speed = np.linspace(*curve.measured_range_rad_s, 200)
-        means[name] = (float(np.mean(curve.torque(speed))), 0.0)
+    speeds = {name: np.linspace(*curve.measured_range_rad_s, 200) for name, curve in joints.items()}
+    means = {name: (float(np.mean(joints[name].torque(speed))), 0.0) for name, speed in speeds.items()}
     text = dump({"coulomb_friction": [round(level, 6) for level, _ in means.values()]})
     return text, _straight(means), "everything but one level: friction that depends on speed, and presliding"
 

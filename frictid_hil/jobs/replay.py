@@ -63,51 +63,152 @@ def replay(options: ReplayOptions, note: Callable[[str], None] = lambda _: None)
         UsageError: nothing says which frame is what, options contradict each other, or a file would be overwritten.
         InputFileError: the recording is unreadable or unusable.
     """
-    robot = load_robot(options.robot)
-    robot.check_joints(options.joints)
-    if options.out is not None:
-        refuse_overwriting([options.out / "profile.yaml", *options.out.glob("simulated-*.csv")], force=options.force)
-    account = Account()
-    late: dict[str, int] = {}
-    if is_log(options.source):
-        recordings, late = _decoded(options, robot, account, note)
-    else:
-        recordings = [one for one in read(options.source) if not options.joints or one.joint in options.joints]
-    unknown_joints = [one.joint for one in recordings if one.joint not in robot.file.joints]
-    if unknown_joints or not recordings:
-        raise InputFileError(
-            f"joints {', '.join(unknown_joints)} are not in {robot.path.name}" if unknown_joints else "no joint moved",
-            where=str(options.source),
+    return _Replay(options, note).result()
+
+
+_Identified = tuple[JointProfile | None, dict[str, Any]]
+"""The profile of a joint, None where there is no curve, and its entry in the result."""
+
+
+class _Replay:
+    def __init__(self, options: ReplayOptions, note: Callable[[str], None]) -> None:
+        self._options = options
+        self._note = note
+        self._robot = load_robot(options.robot)
+        self._account = Account()
+        self._late: dict[str, int] = {}
+
+    def result(self) -> dict[str, Any]:
+        """The JSON of the verb."""
+        options, robot = self._options, self._robot
+        robot.check_joints(options.joints)
+        if out := options.out:
+            refuse_overwriting([out / "profile.yaml", *out.glob("simulated-*.csv")], force=options.force)
+        if is_log(options.source):
+            recordings = self._decoded()
+        else:
+            recordings = [one for one in read(options.source) if not options.joints or one.joint in options.joints]
+        unknown = [one.joint for one in recordings if one.joint not in robot.file.joints]
+        if unknown or not recordings:
+            raise InputFileError(
+                f"joints {', '.join(unknown)} are not in {robot.path.name}" if unknown else "no joint moved",
+                where=str(options.source),
+            )
+        reference, setup = _reference(options), robot.to_setup()
+        told = {one.joint: self._identified(one, recordings, setup, reference) for one in recordings}
+        result = self._told(told, reference)
+        if options.simulation:
+            result |= self._simulated(recordings, result["joints"])
+        return result
+
+    def _decoded(self) -> list[Samples]:
+        """Samples of every joint that moved; the late cycles that the live run counted are noted."""
+        options = self._options
+        logs = logs_of(options.source, given_map(options.frames, options.eds, self._robot))
+        told_s = -math.inf
+
+        def at(time_s: float) -> None:
+            nonlocal told_s
+            if options.paced and time_s >= told_s + 1.0:
+                told_s = time_s
+                self._note(f"{time_s:.0f} s")
+
+        with _echo(options.echo) as echo:
+            paced: dict[str, Any] = {"paced": options.paced, "echo": echo, "at": at}
+            samples = samples_in(logs, self._robot.name, self._account, joints=options.joints, **paced)
+        self._late = {motion.joint: motion.late_cycles for log in logs for motion in log.motions}
+        return [samples[name] for name in dict.fromkeys([*self._robot.joint_names, *samples]) if name in samples]
+
+    def _identified(
+        self, samples: Samples, recordings: list[Samples], setup: RobotSetup, reference: FrictionProfile | None
+    ) -> _Identified:
+        name = samples.joint
+        known = reference.joints.get(name) if reference else None
+        told = {"identical": None, "difference_percent": None, "lost_rows": self._account.lost_rows.get(name)}
+        try:
+            profile = identify_joint(
+                samples,
+                setup.joint(name),
+                method=self._options.method or (known.method if known else "aligned"),
+                procedure=None if samples.marks else self._options.procedure,
+                late_cycles=self._late.get(name, 0),
+                company=recordings,
+            )
+        except IdentificationError as error:
+            return None, {**failed_result(str(error)), **told}
+        gate = self._account.gate(name)
+        gates = profile.gates if gate is None else (*profile.gates, gate)
+        profile = profile.model_copy(update={"gates": gates, "drive": profile.drive if known is None else known.drive})
+        result = {**joint_result(profile), **told}
+        if known is not None:
+            distance = curve_distance(profile.curve(), known.curve(), known.velocity_rad_s[-1])
+            result |= {"identical": profile.values() == known.values(), "difference_percent": distance.e_percent}
+        return profile, result
+
+    def _told(self, told: Mapping[str, _Identified], reference: FrictionProfile | None) -> dict[str, Any]:
+        options = self._options
+        joints = {name: joint for name, (_, joint) in told.items()}
+        compared = None
+        if reference is not None:
+            wanted = set(options.joints or reference.joints) & set(reference.joints)
+            compared = all(joints.get(name, {}).get("identical") is True for name in wanted)
+        bad = {name: joint["remarks"] for name, joint in joints.items() if joint["outcome"] != "ok"}
+        result: dict[str, Any] = {
+            "outcome": "gate_failed" if bad else "ok",
+            "robot": self._robot.name,
+            "source": str(options.source.resolve()),
+            "identical": compared,
+            "position_rms_rad": None,
+            "torque_rms_nm": None,
+            "log": asdict(self._account) if self._account.frames else None,
+            "profile": self._write({name: one for name, (one, _) in told.items() if one is not None}),
+            "joints": joints,
+        }
+        if bad:
+            result["error"] = GateFailed(
+                "; ".join(f"joint {name}: {'; '.join(remarks)}" for name, remarks in bad.items()),
+                where=str(options.source),
+                next_step="results of the other joints stand",
+            ).to_json()
+        return result
+
+    def _write(self, profiles: dict[str, JointProfile]) -> str | None:
+        out, source = self._options.out, self._options.source
+        if out is None or not profiles:
+            return None
+        out.mkdir(parents=True, exist_ok=True)
+        logs = sorted(source.glob("bus*.blf")) if source.is_dir() else [source]
+        provenance = Provenance.now(
+            robot_file=self._robot.path.name,
+            config_sha256=self._robot.digest,
+            run=str(source.resolve()),
+            log_sha256={log.name: file_sha256(log) for log in logs},
+            notes=["identified from a replay"],
         )
-    reference = _reference(options)
-    setup = robot.to_setup()
-    told = {one.joint: _identified(one, recordings, setup, options, reference, account, late) for one in recordings}
-    result = _result(options, robot, told, reference, account)
-    if options.simulation:
-        result |= _simulated(options, robot, recordings, result["joints"], note)
-    return result
+        path = out / "profile.yaml"
+        FrictionProfile(robot=self._robot.name, joints=profiles, provenance=provenance).save(path)
+        return str(path.resolve())
 
-
-# -- decoding -------------------------------------------------------------------------------------------------------
-
-
-def _decoded(
-    options: ReplayOptions, robot: Robot, account: Account, note: Callable[[str], None]
-) -> tuple[list[Samples], dict[str, int]]:
-    """Samples of every joint that moved, and the late cycles that the live run counted."""
-    logs = logs_of(options.source, given_map(options.frames, options.eds, robot))
-    told_s = -math.inf
-
-    def at(time_s: float) -> None:
-        nonlocal told_s
-        if options.paced and time_s >= told_s + 1.0:
-            told_s = time_s
-            note(f"{time_s:.0f} s")
-
-    with _echo(options.echo) as echo:
-        samples = samples_in(logs, robot.name, account, joints=options.joints, paced=options.paced, echo=echo, at=at)
-    late = {motion.joint: motion.late_cycles for log in logs for motion in log.motions}
-    return [samples[name] for name in dict.fromkeys([*robot.joint_names, *samples]) if name in samples], late
+    def _simulated(self, recordings: list[Samples], joints: dict[str, dict[str, Any]]) -> dict[str, Any]:
+        """Root mean squares over all joints that the robot file can simulate; per joint beside them."""
+        squares: dict[str, list[tuple[float, int]]] = {"position_rms_rad": [], "torque_rms_nm": []}
+        files = []
+        for samples in recordings:
+            if not self._robot.file.joints[samples.joint].simulated:
+                joints[samples.joint]["simulation"] = "the robot file has no `simulated` for this joint"
+                continue
+            simulated = simulate(self._robot, samples)
+            if simulated.note:
+                self._note(f"joint {samples.joint}: {simulated.note}")
+            for key in squares:
+                value = getattr(simulated, key)
+                joints[samples.joint][key] = value
+                if value is not None:
+                    squares[key].append((value**2, len(samples)))
+            if out := self._options.out:
+                out.mkdir(parents=True, exist_ok=True)
+                files.append(str(simulated.write_csv(out / f"simulated-{samples.joint}.csv").resolve()))
+        return {**{key: _pooled(values) for key, values in squares.items()}, "simulated": files}
 
 
 @contextlib.contextmanager
@@ -127,139 +228,12 @@ def _echo(named: str | None) -> Iterator[can.BusABC | None]:
         yield bus
 
 
-# -- identifying and comparing --------------------------------------------------------------------------------------
-
-
 def _reference(options: ReplayOptions) -> FrictionProfile | None:
     if options.profile is not None:
         return load_profile(profile_file(options.profile))
     folder = options.source if options.source.is_dir() else options.source.parent
     own = folder / "profile.yaml"
     return load_profile(own) if (folder / "manifest.json").exists() and own.exists() else None
-
-
-_Identified = tuple[JointProfile | None, dict[str, Any]]
-"""The profile of a joint, None where there is no curve, and its entry in the result."""
-
-
-def _identified(
-    samples: Samples,
-    recordings: list[Samples],
-    setup: RobotSetup,
-    options: ReplayOptions,
-    reference: FrictionProfile | None,
-    account: Account,
-    late: Mapping[str, int],
-) -> _Identified:
-    name = samples.joint
-    known = reference.joints.get(name) if reference else None
-    told = {"identical": None, "difference_percent": None, "lost_rows": account.lost_rows.get(name)}
-    try:
-        profile = identify_joint(
-            samples,
-            setup.joint(name),
-            method=options.method or (known.method if known else "aligned"),
-            procedure=None if samples.marks else options.procedure,
-            late_cycles=late.get(name, 0),
-            company=recordings,
-        )
-    except IdentificationError as error:
-        return None, {**failed_result(str(error)), **told}
-    gate = account.gate(name)
-    gates = profile.gates if gate is None else (*profile.gates, gate)
-    profile = profile.model_copy(update={"gates": gates, "drive": profile.drive if known is None else known.drive})
-    result = {**joint_result(profile), **told}
-    if known is not None:
-        result["identical"] = profile.values() == known.values()
-        result["difference_percent"] = curve_distance(
-            profile.curve(), known.curve(), known.velocity_rad_s[-1]
-        ).e_percent
-    return profile, result
-
-
-def _result(
-    options: ReplayOptions,
-    robot: Robot,
-    told: Mapping[str, _Identified],
-    reference: FrictionProfile | None,
-    account: Account,
-) -> dict[str, Any]:
-    joints = {name: joint for name, (_, joint) in told.items()}
-    compared = None
-    if reference is not None:
-        wanted = set(options.joints or reference.joints) & set(reference.joints)
-        compared = all(joints.get(name, {}).get("identical") is True for name in wanted)
-    bad = {name: joint["remarks"] for name, joint in joints.items() if joint["outcome"] != "ok"}
-    result: dict[str, Any] = {
-        "outcome": "gate_failed" if bad else "ok",
-        "robot": robot.name,
-        "source": str(options.source.resolve()),
-        "identical": compared,
-        "position_rms_rad": None,
-        "torque_rms_nm": None,
-        "log": asdict(account) if account.frames else None,
-        "profile": _write(options, robot, {name: one for name, (one, _) in told.items() if one is not None}),
-        "joints": joints,
-    }
-    if bad:
-        result["error"] = GateFailed(
-            "; ".join(f"joint {name}: {'; '.join(remarks)}" for name, remarks in bad.items()),
-            where=str(options.source),
-            next_step="results of the other joints stand",
-        ).to_json()
-    return result
-
-
-def _write(options: ReplayOptions, robot: Robot, profiles: Mapping[str, JointProfile]) -> str | None:
-    if options.out is None or not profiles:
-        return None
-    options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "profile.yaml"
-    logs = sorted(options.source.glob("bus*.blf")) if options.source.is_dir() else [options.source]
-    FrictionProfile(
-        robot=robot.name,
-        joints=dict(profiles),
-        provenance=Provenance.now(
-            robot_file=robot.path.name,
-            config_sha256=robot.digest,
-            run=str(options.source.resolve()),
-            log_sha256={log.name: file_sha256(log) for log in logs},
-            notes=["identified from a replay"],
-        ),
-    ).save(path)
-    return str(path.resolve())
-
-
-# -- simulating -----------------------------------------------------------------------------------------------------
-
-
-def _simulated(
-    options: ReplayOptions,
-    robot: Robot,
-    recordings: list[Samples],
-    joints: dict[str, dict[str, Any]],
-    note: Callable[[str], None],
-) -> dict[str, Any]:
-    """Root mean squares over all joints that the robot file can simulate; per joint beside them."""
-    squares: dict[str, list[tuple[float, int]]] = {"position_rms_rad": [], "torque_rms_nm": []}
-    files = []
-    for samples in recordings:
-        if not robot.file.joints[samples.joint].simulated:
-            joints[samples.joint]["simulation"] = "the robot file has no `simulated` for this joint"
-            continue
-        simulated = simulate(robot, samples)
-        if simulated.note:
-            note(f"joint {samples.joint}: {simulated.note}")
-        for key in squares:
-            value = getattr(simulated, key)
-            joints[samples.joint][key] = value
-            if value is not None:
-                squares[key].append((value**2, len(samples)))
-        if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
-            files.append(str(simulated.write_csv(options.out / f"simulated-{samples.joint}.csv").resolve()))
-    together: dict[str, Any] = {key: _pooled(values) for key, values in squares.items()}
-    return {**together, "simulated": files}
 
 
 def _pooled(values: list[tuple[float, int]]) -> float | None:

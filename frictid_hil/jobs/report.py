@@ -43,7 +43,8 @@ def report(
     if (run is None) == (robot is None):
         raise UsageError("name one: the folder of a run, or a robot with --robot")
     if robot is not None:
-        page = write_index_page(ProfileStore(store, told), _name_of(robot))
+        named = load_robot(robot).name if Path(robot).suffix in (".yaml", ".yml") else robot
+        page = write_index_page(ProfileStore(store, told), named)
         return {"outcome": "ok", "report": str(page.resolve())}
     assert run is not None  # by the check above
     manifest = load_manifest(run)
@@ -71,33 +72,19 @@ def whole_profile(run: Path) -> FrictionProfile:
     return profile.model_copy(update={"joints": joints})
 
 
-def _name_of(robot: str) -> str:
-    """The name in a robot file, given by its path; else the word itself is the name."""
-    return load_robot(robot).name if Path(robot).suffix in (".yaml", ".yml") else robot
-
-
 def write_run_page(run: Path, profile: FrictionProfile, manifest: dict[str, Any]) -> Path:
     """The page of a run whose profile and manifest are at hand."""
     samples: dict[str, Samples] = {}
     # A page without loops is better than none; the recording's own defect is told by `identify`.
     with contextlib.suppress(FrictidError):
         samples = {one.joint: one for one in read(run) if one.marks}
-    error = manifest.get("error") or {}
-    page = calibration_page(
-        profile,
-        samples,
-        outcome=str(manifest.get("outcome") or "interrupted"),
-        error=str(error.get("what", "")),
-        previous=_active_then(manifest),
-    )
-    return write_page(page, run / "report.html")
-
-
-def _active_then(manifest: dict[str, Any]) -> FrictionProfile | None:
-    """The profile that was in force when the run ended, where it is still at hand."""
+    previous = None
+    # What was in force when the run ended, where it is still at hand.
     with contextlib.suppress(FrictidError):
-        return load_profile(manifest["active_profile"]) if manifest.get("active_profile") else None
-    return None
+        previous = load_profile(manifest["active_profile"]) if manifest.get("active_profile") else None
+    outcome, error = str(manifest.get("outcome") or "interrupted"), manifest.get("error") or {}
+    page = calibration_page(profile, samples, outcome=outcome, error=str(error.get("what", "")), previous=previous)
+    return write_page(page, run / "report.html")
 
 
 def write_index_page(store: ProfileStore, robot: str) -> Path:

@@ -66,12 +66,8 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
             where=str(robot.path),
             next_step="add policy.unattended to the robot file first",
         )
-    if options.system and options.out is None and not _account_exists(options.user):
-        raise UsageError(
-            f"there is no account {options.user!r} on this computer",
-            next_step=f"make it: `sudo useradd --system --groups dialout {options.user}`; or give --account, or --out "
-            "for units of another computer",
-        )
+    if options.system and options.out is None:
+        _refuse_without_account(options.user)
     elapses = next_elapse(options.on_calendar)
     name = f"frictid-hil-{robot.name}"
     units = {f"{name}.service": _service(options, robot), f"{name}.timer": _timer(options, robot)}
@@ -95,12 +91,15 @@ def schedule(options: ScheduleOptions) -> dict[str, Any]:
     }
 
 
-def _account_exists(name: str) -> bool:
+def _refuse_without_account(name: str) -> None:
     try:
         pwd.getpwnam(name)
     except KeyError:
-        return False
-    return True
+        raise UsageError(
+            f"there is no account {name!r} on this computer",
+            next_step=f"make it: `sudo useradd --system --groups dialout {name}`; or give --account, or --out "
+            "for units of another computer",
+        ) from None
 
 
 def _enable(options: ScheduleOptions, paths: list[Path]) -> str:

@@ -83,7 +83,9 @@ def friction_settings(
     """
     presliding = entry.presliding_stiffness_nm_per_rad.value
     ours = wanted.setting == "ours"
-    ratio = wanted.ratio if wanted.ratio is not None else _our_ratio(entry) if ours else PAPER_RATIO
+    # R of our setting is lower where the encoder hides presliding.
+    usual = PAPER_RATIO if not ours else COARSE_RATIO if entry.presliding_yields == "unseen" else OUR_RATIO
+    ratio = usual if wanted.ratio is None else wanted.ratio
     stiffness = wanted.stiffness_nm_per_rad
     if stiffness is None and not ours:
         stiffness = PAPER_STIFFNESS_NM_PER_RAD
@@ -117,11 +119,6 @@ def friction_settings(
         if sentence not in warnings:
             warnings.append(sentence)
     return settings
-
-
-def _our_ratio(entry: JointProfile) -> float:
-    """Return R of our setting; it is lower where the encoder hides presliding."""
-    return COARSE_RATIO if entry.presliding_yields == "unseen" else OUR_RATIO
 
 
 def calibrated_centre_rad(entry: JointProfile, joint: JointSetup) -> float:

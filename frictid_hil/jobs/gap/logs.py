@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -278,7 +278,8 @@ def write_set(
     for experiment, samples in logs:
         # Also a log that no list names: whoever put it there did not ask for another in its place.
         taken = {str(entry["name"]) for entry in listed} | {path.stem for path in folder.glob("*.csv")}
-        name = _unused(experiment.name, taken)
+        names = itertools.chain([experiment.name], (f"{experiment.name}_{k}" for k in itertools.count(2)))
+        name = next(candidate for candidate in names if candidate not in taken)
         write_csv(folder / f"{name}.csv", samples)
         listed.append(
             {
@@ -300,8 +301,3 @@ def write_set(
         **belief.sections,
     }
     write_whole(folder / "nominal.yaml", dump({**document, "experiments": listed}))
-
-
-def _unused(name: str, taken: Set[str]) -> str:
-    names = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(2)))
-    return next(candidate for candidate in names if candidate not in taken)

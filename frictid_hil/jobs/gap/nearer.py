@@ -26,7 +26,8 @@ def nearer_only(arm: ArmSet, made: Mapping[str, Export]) -> tuple[dict[str, Expo
     left_out: dict[str, Any] = {}
     while True:
         told = closed_loop_gap(arm, natives(kept))
-        farther = {name: left for name, left in told.get("left_percent", {}).items() if not _nearer(left)}
+        left = told.get("left_percent", {})
+        farther = {n: one for n, one in left.items() if not one["interval_95"] or one["interval_95"][1] >= 100.0}
         if not farther:
             return kept, {**told, "left_out": left_out}
         # One by one: a joint that is far off pulls at its neighbours.
@@ -57,10 +58,6 @@ def left_out_words(told: Mapping[str, Any]) -> list[str]:
             f"were not fitted, so {instead} is written"
         )
     return words
-
-
-def _nearer(left: Mapping[str, Any]) -> bool:
-    return left["interval_95"] is not None and left["interval_95"][1] < 100.0
 
 
 def _another(arm: ArmSet, made: Mapping[str, Export], name: str) -> Export | None:

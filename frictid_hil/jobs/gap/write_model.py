@@ -250,7 +250,9 @@ def write_model(arm: ArmSet, made: Mapping[str, Export], out: Path, *, force: bo
         )
     files = edited_files(arm.robot, changes, out)
     if arm.robot.urdf:
-        files[out.with_suffix(".effects.yaml")] = _sidecar(made).encode()
+        # A URDF cannot hold most effects: they stand beside it, as a robot file has them under `simulated`.
+        effects = dump({name: {"effects": export.model.effects} for name, export in made.items()})
+        files[out.with_suffix(".effects.yaml")] = effects.encode()
     refuse_overwriting(files, force=force)
     for path, content in files.items():
         write_whole(path, content)
@@ -281,8 +283,3 @@ def _account(export: Export, *, urdf: bool) -> dict[str, Any]:
         "torque_difference_percent": 100.0 * export.off[export.form] if export.off else None,
         "tried_percent": {form: 100.0 * off for form, off in export.off.items()},
     }
-
-
-def _sidecar(made: Mapping[str, Export]) -> str:
-    """All effects of the joints, as a robot file has them under ``simulated``; a URDF cannot hold most."""
-    return dump({name: {"effects": export.model.effects} for name, export in made.items()})
