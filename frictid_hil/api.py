@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from frictid_hil.config.profile import FrictionProfile, JointProfile
+from frictid_hil.config.profile import FrictionProfile, JointProfile, profile_file
 from frictid_hil.config.profile import load_profile as _load_profile
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import UsageError
@@ -115,8 +115,7 @@ def load_profile(path: str | Path) -> FrictionProfile:
     Raises:
         ConfigError: unreadable or wrong; every problem with file:line:column.
     """
-    place = Path(path)
-    return _load_profile(place / "profile.yaml" if place.is_dir() else place)
+    return _load_profile(profile_file(Path(path)))
 
 
 def diagnose(*paths: str | Path, nominal: str | Path | None = None, **options: Any) -> Diagnosis:

@@ -103,7 +103,7 @@ def _print_arm_cause(output: Output, result: Result) -> None:
 
 def _print_closed_loop(output: Output, result: Result) -> None:
     """The user's simulator before and after."""
-    from frictid_hil.jobs.gap.nearer import left_out_words
+    from frictid_hil.jobs.gap.write_model import left_out_words
 
     loop = result["closed_loop"]
     if "reason" in loop:

@@ -113,7 +113,7 @@ def compensate(options: CompensateOptions, watcher: Watcher, live: Live | None =
         _refuse_mode(asked.wanted.drive_mode, preflight)
 
     with Run(order, watcher) as run:
-        figures = LiveFigures(asked.setup, asked.joint, asked.wanted, live)
+        figures = LiveFigures(asked.joint, live)
 
         def noticed(event: Event) -> None:
             hand.follow(event)

@@ -16,8 +16,7 @@ from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
-from frictid_hil.jobs.gap.write_model import Export, exports, likely, natives
+from frictid_hil.jobs.gap.write_model import Export, exports, left_out_words, likely, natives, nearer_only
 from frictid_hil.jobs.gap.write_model import write_model as write_changed
 from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.report.arm import arm_page
@@ -115,7 +114,7 @@ def _written(
             why = "no change brings your model nearer to the recordings that were not fitted"
         return {"model": None, "model_refused": why}
     told = write_changed(arm, made, write, force=force)
-    figures = figures_of_model(arm, Withheld(arm, made), natives(made), loop)
+    figures = figures_of_model(Withheld(arm, made), natives(made), loop)
     return {"model": told["model"], "export": {**told, "figures": figures}}
 
 

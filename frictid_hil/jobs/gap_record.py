@@ -110,31 +110,6 @@ class Recorded:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class _Planned:
-    """A recording, decided before a bus is opened.
-
-    Attributes:
-        belief: of the simulator.
-        experiments: all that belong to the set.
-        plans: of those that are still to be recorded, without the payload and with it.
-        loaded: for each plan, whether the payload is mounted.
-        logs: recorded by the run that is continued.
-        skipped: left out, with reasons.
-        earlier: the set that is added to.
-    """
-
-    order: Order
-    joint: JointSetup
-    belief: Belief
-    experiments: tuple[Experiment, ...]
-    plans: tuple[Plan, ...]
-    loaded: tuple[bool, ...]
-    logs: Mapping[str, Samples]
-    skipped: Mapping[str, str]
-    earlier: Mapping[str, Any] | None
-
-
 def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) -> Recorded:
     """Record diagnostic experiments: plan, check, ask, run, and write the set.
 
@@ -148,11 +123,9 @@ def record(options: GapRecordOptions, watcher: Watcher, *, move: bool = True) ->
         Its ending and the set. A safety abort or an interruption after motion began is an ending; experiments finished
         before it are in the set.
     """
-    planned = _planned(options, move=move)
-    with Run(planned.order, watcher) as run:
-        recording = _Recording(planned, run, watcher)
-        error = recording.everything()
-        return recording.concluded(error)
+    recording = _Recording(options, watcher, move=move)
+    with Run(recording.order, watcher) as run:
+        return recording.concluded(run, recording.everything(run))
 
 
 def recordable(options: GapRecordOptions) -> dict[str, float]:
@@ -177,55 +150,6 @@ def _situation(options: GapRecordOptions) -> tuple[Robot, RobotSetup, JointSetup
     name = options.profile.name if options.profile else ""
     belief = belief_of(joint, profile, profile_name=name, simulated_drive=simulated)
     return robot, setup, joint, belief, _why_no_payload(options, belief, simulated=simulated)
-
-
-def _planned(options: GapRecordOptions, *, move: bool) -> _Planned:
-    if options.resume is not None and not move and not options.robot:
-        options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
-    options = restored(options, (VERB,))
-    robot, setup, joint, belief, without = _situation(options)
-    envelope = envelope_of(robot, joint, options)
-    names = manifest_of(options.resume, robot)["options"]["names"] if options.resume else _names(options, envelope)
-    asked = chosen(names, envelope, seed=options.seed)
-    experiments = asked if without is None else _unloaded(asked)
-    skipped = {e.name: without for e in asked if without is not None and e.name not in {x.name for x in experiments}}
-    if not experiments:
-        raise UsageError(f"all experiments asked for need the payload: {without}", where=options.robot)
-    earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
-    asked_for = options.plan is not None or options.experiments or options.resume is not None
-    if earlier is not None and not asked_for:
-        raise UsageError(
-            "holds an experiment set already",
-            where=str(options.out),
-            next_step="choose another --out, or add what a diagnosis asked for with --plan",
-        )
-    logs = recorded_logs(options.resume, joint.name, experiments) if options.resume else {}
-    missing = [e for e in experiments if e.name not in logs] if move else []
-    plans = _plans(robot, setup, joint, missing, belief, Rehearsals(robot, setup.bus))
-    for plan, expected in plans:
-        refuse_beyond_limits(plan, setup, expected)
-    written = {"out": str(options.out.resolve())} if options.out else {}
-    order = Order(
-        VERB,
-        robot,
-        setup,
-        options.bus,
-        {**kept_options(options), **written, "names": list(names)},
-        resume=options.resume,
-        outputs=(options.out,) if options.out else (),
-        continued_by="frictid-hil gap record --resume",
-    )
-    return _Planned(
-        order,
-        joint,
-        belief,
-        experiments,
-        tuple(plan for plan, _ in plans),
-        tuple(loaded for loaded in (False, True) if any(e.payload == loaded for e in missing)),
-        logs,
-        skipped,
-        earlier,
-    )
 
 
 def recorded_logs(run: Path, joint: str, experiments: Sequence[Experiment]) -> dict[str, Samples]:
@@ -366,30 +290,66 @@ class _Recording:
     two stretches of cyclic traffic. Everybody else is asked again before the plan with the payload.
     """
 
-    def __init__(self, planned: _Planned, run: Run, watcher: Watcher) -> None:
-        self._planned = planned
-        self._run = run
+    def __init__(self, options: GapRecordOptions, watcher: Watcher, *, move: bool) -> None:
         self._watcher = watcher
         self._session = 0
         self._driver: Driver | None = None
-        self._logs = dict(planned.logs)
         self._unloaded = ""
         """Why no recording with the payload was made although it was planned."""
+        if options.resume is not None and not move and not options.robot:
+            options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
+        options = restored(options, (VERB,))
+        robot, setup, joint, belief, without = _situation(options)
+        self._joint, self._belief = joint, belief
+        envelope = envelope_of(robot, joint, options)
+        names = manifest_of(options.resume, robot)["options"]["names"] if options.resume else _names(options, envelope)
+        asked = chosen(names, envelope, seed=options.seed)
+        self._experiments = experiments = asked if without is None else _unloaded(asked)
+        kept = {e.name for e in experiments}
+        self._skipped = {e.name: without for e in asked if without is not None and e.name not in kept}
+        if not experiments:
+            raise UsageError(f"all experiments asked for need the payload: {without}", where=options.robot)
+        self._earlier = existing_set(options.out, robot.name, joint.name) if options.out else None
+        asked_for = options.plan is not None or options.experiments or options.resume is not None
+        if self._earlier is not None and not asked_for:
+            raise UsageError(
+                "holds an experiment set already",
+                where=str(options.out),
+                next_step="choose another --out, or add what a diagnosis asked for with --plan",
+            )
+        self._logs = recorded_logs(options.resume, joint.name, experiments) if options.resume else {}
+        missing = [e for e in experiments if e.name not in self._logs] if move else []
+        plans = _plans(robot, setup, joint, missing, belief, Rehearsals(robot, setup.bus))
+        for plan, expected in plans:
+            refuse_beyond_limits(plan, setup, expected)
+        self._plans = [plan for plan, _ in plans]
+        self._loaded = [loaded for loaded in (False, True) if any(e.payload == loaded for e in missing)]
+        written = {"out": str(options.out.resolve())} if options.out else {}
+        self.order = Order(
+            VERB,
+            robot,
+            setup,
+            options.bus,
+            {**kept_options(options), **written, "names": list(names)},
+            resume=options.resume,
+            outputs=(options.out,) if options.out else (),
+            continued_by="frictid-hil gap record --resume",
+        )
 
-    def everything(self) -> FrictidError | None:
+    def everything(self, run: Run) -> FrictidError | None:
         """Run all plans; returns what ended them early.
 
         Raises:
             FrictidError: before anything could move.
         """
-        plans = self._planned.plans
+        self._run, plans = run, self._plans
         if not plans:
-            self._run.reopen()
-        for plan in [_joined(plans)] if plans and self._planned.order.setup.lock_step else plans:
+            run.reopen()
+        for plan in [_joined(plans)] if plans and self.order.setup.lock_step else plans:
             try:
                 if not self._ready_for(plan):
                     break
-                error = self._run.move(plan, each=self._keep, asked=self._mount, prepare=self._remember)
+                error = run.move(plan, each=self._keep, asked=self._mount, prepare=self._remember)
             except FrictidError as refused:
                 if not self._session:
                     raise
@@ -398,65 +358,62 @@ class _Recording:
                     break
                 error = refused
             if error is not None:
-                half = self._run.so_far(self._planned.joint.name)
+                half = run.so_far(self._joint.name)
                 if half is not None:
                     # What was finished of a stretch before it was ended early.
-                    self._logs.update(_cut(self._run.folder.samples(half), self._planned.experiments))
+                    self._logs.update(_cut(self._run.folder.samples(half), self._experiments))
                 return error
         return None
 
-    def concluded(self, error: FrictidError | None) -> Recorded:
+    def concluded(self, run: Run, error: FrictidError | None) -> Recorded:
         """Write the set, and return how the run ended."""
-        planned, folder = self._planned, self._run.folder
-        experiments = {e.name: e for payload in (False, True) for e in planned.experiments if e.payload == payload}
+        experiments = {e.name: e for payload in (False, True) for e in self._experiments if e.payload == payload}
         done = [e for name, e in experiments.items() if name in self._logs]
-        skipped = dict(planned.skipped)
+        skipped = dict(self._skipped)
         if self._unloaded:
             skipped |= {name: self._unloaded for name, e in experiments.items() if e.payload and name not in self._logs}
         for name, why in skipped.items():
             self._watcher.note(f"{name} was left out: {why}")
         place: Path | None = None
         if done:
-            place = planned.order.outputs[0] if planned.order.outputs else folder.path / "set"
+            place = self.order.outputs[0] if self.order.outputs else run.folder.path / "set"
             self._write(place, done)
         return Recorded(
-            self._run.end(error),
-            planned.joint.name,
+            run.end(error),
+            self._joint.name,
             place,
             tuple(e.name for e in done),
             skipped,
             sum(e.duration_s for e in done),
-            planned.belief.sources,
+            self._belief.sources,
         )
 
     def _write(self, place: Path, done: Sequence[Experiment]) -> None:
         """The experiments that this run has not put into the set yet."""
-        planned, manifest = self._planned, self._run.folder.manifest
-        joint, robot = planned.joint.name, planned.order.robot.name
-        belief = dataclasses.replace(
-            planned.belief, sections=read_back(planned.belief.sections, manifest["identities"].get(joint, {}))
-        )
-        earlier = planned.earlier or (existing_set(place, robot, joint) if planned.order.resume else None)
+        manifest, joint, robot = self._run.folder.manifest, self._joint.name, self.order.robot.name
+        sections = read_back(self._belief.sections, manifest["identities"].get(joint, {}))
+        belief = dataclasses.replace(self._belief, sections=sections)
+        earlier = self._earlier or (existing_set(place, robot, joint) if self.order.resume else None)
         before = manifest.get("in_set", {}).get(str(place.resolve()), []) if earlier else []
         fresh = [(e, self._logs[e.name]) for e in done if e.name not in before]
         write_set(place, robot, joint, belief, fresh, earlier=earlier)
         manifest.setdefault("in_set", {})[str(place.resolve())] = [e.name for e in done]
 
     def _keep(self, moved: JointRun) -> None:
-        self._logs.update(_cut(self._run.folder.samples(moved), self._planned.experiments))
+        self._logs.update(_cut(self._run.folder.samples(moved), self._experiments))
         self._session += 1
-        if self._planned.order.setup.lock_step and self._session < len(self._planned.loaded):
+        if self.order.setup.lock_step and self._session < len(self._loaded):
             self._mount()
 
     def _ready_for(self, plan: Plan) -> bool:
         """Ask for the payload where a person has to mount it; without a yes its experiments are left out."""
-        if self._planned.order.setup.simulated or not self._planned.loaded[self._session]:
+        if self.order.setup.simulated or not self._loaded[self._session]:
             return True
         for note in plan.notes:
             if not self._watcher.ask(f"{note[:1].upper()}{note[1:]}. Is it mounted?"):
                 self._unloaded = "nobody mounted the payload"
                 if not self._session:
-                    raise UsageError(f"{self._unloaded}; nothing has moved", where=str(self._planned.order.robot.path))
+                    raise UsageError(f"{self._unloaded}; nothing has moved", where=str(self.order.robot.path))
                 return False
         return True
 
@@ -467,7 +424,7 @@ class _Recording:
         """Put the payload on a simulated joint, or take it off; a real one has been prepared by the person."""
         mount: Callable[[str, bool], None] | None = getattr(self._driver, "mount_payload", None)
         if mount is not None:
-            mount(self._planned.joint.name, self._planned.loaded[self._session])
+            mount(self._joint.name, self._loaded[self._session])
 
 
 def _joined(plans: Sequence[Plan]) -> Plan:

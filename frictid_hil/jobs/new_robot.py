@@ -70,8 +70,9 @@ def new_robot(
         HardwareError: the bus or a drive cannot be reached.
     """
     refuse_overwriting([path], force=force)
-    found = _read(path.stem, driver, bus, joints, cycle_hz) if read else {joint.name: {} for joint in joints}
-    text = _text(path.stem, driver, bus, joints, cycle_hz, found)
+    setup = RobotSetup(path.stem, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))
+    found = _read(driver, setup) if read else {joint.name: {} for joint in joints}
+    text = _text(driver, setup, joints, found)
     draft = path.with_name(f".{path.name}.draft")
     try:
         write_whole(draft, text)
@@ -82,11 +83,8 @@ def new_robot(
     return NewRobot(path, found)
 
 
-def _read(
-    name: str, driver: str, bus: str, joints: Sequence[JointAnswers], cycle_hz: float
-) -> dict[str, dict[str, float]]:
+def _read(driver: str, setup: RobotSetup) -> dict[str, dict[str, float]]:
     """Ask each drive for its gear ratio and its rated torque."""
-    setup = RobotSetup(name, bus, cycle_hz, tuple(_provisional(joint) for joint in joints))
     drives = new_driver(driver, setup)
     try:
         drives.open()
@@ -122,12 +120,7 @@ def _provisional(joint: JointAnswers) -> JointSetup:
 
 
 def _text(
-    name: str,
-    driver: str,
-    bus: str,
-    joints: Sequence[JointAnswers],
-    cycle_hz: float,
-    found: Mapping[str, Mapping[str, float]],
+    driver: str, setup: RobotSetup, joints: Sequence[JointAnswers], found: Mapping[str, Mapping[str, float]]
 ) -> str:
     """The file: what was answered, what was read, and what is still to be looked at."""
     travel = min(high - low for low, high in (joint.travel_rad for joint in joints))
@@ -136,10 +129,10 @@ def _text(
     lines = [
         "# Written by `frictid-hil new robot`. Look at every line before the robot moves.",
         "schema: frictid.robot/1",
-        f"name: {name}",
+        f"name: {setup.name}",
         f"driver: {driver}",
-        f"bus: {bus}",
-        f"cycle_hz: {cycle_hz:g}",
+        f"bus: {setup.bus}",
+        f"cycle_hz: {setup.cycle_hz:g}",
         "procedure:",
         f"  amplitude_rad: {_degrees(amplitude)}   # travel of a cycle, peak-to-peak",
         f"  velocity_rad_s: {_degrees(0.5 * speed, '/s')}   # peak speed of the last cycle; half of the lowest limit",

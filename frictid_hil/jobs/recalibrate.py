@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -76,12 +76,13 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
     try:
         with _terminable(), _alone(store, robot):
             result = _night(options, robot, store, watcher)
-    except FrictidError as error:
-        error.next_step = error.next_step or _UNTOLD
-        _note_failure(store, robot, began_utc, error)
-        raise
     except Exception as error:
-        _note_failure(store, robot, began_utc, Defect.of(error))
+        told = error if isinstance(error, FrictidError) else Defect.of(error)
+        told.next_step = told.next_step or _UNTOLD
+        failure = Attempt(began_utc, told.outcome, told.exit_code, reason=str(told), next_step=told.next_step)
+        # The error itself is what must be told; a disk that is full cannot hold the line as well.
+        with contextlib.suppress(FrictidError):
+            store.note_attempt(robot.name, failure)
         raise
     store.note_attempt(robot.name, _attempt(began_utc, result, robot.policy))
     # The history is on the disk; a page that cannot be written must not turn a good night into a bad one.
@@ -91,23 +92,10 @@ def recalibrate(options: RecalibrateOptions, watcher: Watcher) -> dict[str, Any]
 
 
 def _night(options: RecalibrateOptions, robot: Robot, store: ProfileStore, watcher: Watcher) -> dict[str, Any]:
-    policy = robot.policy
-    interlock = _permission(robot, options.bus)
-    measured = calibrate(
-        CalibrateOptions(
-            robot=options.robot,
-            bus=options.bus,
-            realtime=options.realtime,
-            seed=options.seed,
-            out=options.out,
-            verb=VERB,
-            warm_up=None if policy.warm_up.fixed_s == 0.0 else policy.warm_up,
-            interlock=interlock,
-            store=options.store,
-        ),
-        watcher,
-    )
-    return _concluded(options, robot, store, measured)
+    interlock, warm_up = _permission(robot, options.bus), robot.policy.warm_up
+    warmed = None if warm_up.fixed_s == 0.0 else warm_up
+    asked = CalibrateOptions(**asdict(options), verb=VERB, warm_up=warmed, interlock=interlock)
+    return _concluded(options, robot, store, calibrate(asked, watcher))
 
 
 def _permission(robot: Robot, bus: str | None) -> Interlock | None:
@@ -225,21 +213,9 @@ def _terminable() -> Iterator[None]:
 def _attempt(began_utc: str, result: dict[str, Any], policy: Policy) -> Attempt:
     return Attempt(
         utc=began_utc,
-        outcome=result["outcome"],
-        exit_code=result["exit_code"],
-        promoted=result["promoted"],
         profile=result["stored"] or "",
         drift_percent={name: figures["distance_percent"] for name, figures in result["drift"].items()},
         drift_limit_percent=policy.drift_limit_percent,
         drifted=tuple(result["drifted"]),
-        reason=result["reason"],
-        next_step=result["next_step"],
-        run=result["run"],
+        **{key: result[key] for key in ("outcome", "exit_code", "promoted", "reason", "next_step", "run")},
     )
-
-
-def _note_failure(store: ProfileStore, robot: Robot, began_utc: str, error: FrictidError) -> None:
-    attempt = Attempt(began_utc, error.outcome, error.exit_code, reason=str(error), next_step=error.next_step)
-    # The error itself is what must be told; a disk that is full cannot hold the line as well.
-    with contextlib.suppress(FrictidError):
-        store.note_attempt(robot.name, attempt)

@@ -189,7 +189,7 @@ def test_r_falls_where_gravity_is_uncertain_and_the_plan_says_so(robot: Path, pr
     planned = {}
     for found, setting in ((profile, "ours"), (doubtful, "ours"), (doubtful, "paper")):
         wanted = Wanted("hand", ("nc", "mop"), setting=setting)
-        planned[found.stem, setting] = plan_compensation(CompensateOptions(str(robot), found, JOINT, wanted)).planned
+        planned[found.stem, setting] = plan_compensation(CompensateOptions(str(robot), found, JOINT, wanted))
     law = planned["doubtful", "ours"].laws["mop"]
     assert law.friction_share(centre_rad) == 1.0
     spread_rad = math.radians(10.0) / math.sqrt(2.0)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.jobs.compensation.figures import ModeRun, figures, friction_dominates
+from frictid_hil.jobs.compensation.figures import ModeRun, figures, friction_dominates, tracking_floor_rad
 from frictid_hil.jobs.compensation.plan import triangle
-from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
 from frictid_hil.plan.control import PositionGains
 
 INERTIA, STEP = 0.5, 1e-3

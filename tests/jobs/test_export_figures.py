@@ -65,7 +65,7 @@ def test_a_model_that_cannot_be_run_is_judged_by_what_stands_in_it(arm: ArmSet) 
     made = {"lift": export_of(arm, arm.joints["lift"], {"friction_level_error": {"error_share": 0.5}}, None)}
     told = closed_loop_gap(arm, natives(made))
     assert "no position commands" in told["reason"]
-    (row,) = figures_of_model(arm, Withheld(arm, made), natives(made), told)
+    (row,) = figures_of_model(Withheld(arm, made), natives(made), told)
     assert row["target"] == "mjcf" and "MuJoCo reads" in row["where"]
     assert row["before_percent"] > 5.0 and row["after_percent"] < 0.2 * row["before_percent"]
 
@@ -97,6 +97,6 @@ def test_an_engine_that_fails_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatc
     np.savetxt(tmp_path / "walk.csv", table, delimiter=",", header=header, comments="")
     arm = sets_from_model(ModelLogs(tmp_path / "arm.xml", [tmp_path / "walk.csv"]))
     monkeypatch.setattr("frictid_hil.jobs.gap.export_figures.installed", lambda: {"engine 1.0": broken})
-    here, there = figures_of_model(arm, Withheld(arm, ["lift"]), {}, closed_loop_gap(arm, {}))
+    here, there = figures_of_model(Withheld(arm, ["lift"]), {}, closed_loop_gap(arm, {}))
     assert here["after_percent"] == pytest.approx(here["before_percent"])
     assert there["refused"] == "RuntimeError: no such kernel" and there["where"] == "engine 1.0"

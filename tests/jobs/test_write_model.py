@@ -17,8 +17,7 @@ pytest.importorskip("mujoco", minversion="4.0")
 
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
-from frictid_hil.jobs.gap.nearer import left_out_words, nearer_only
-from frictid_hil.jobs.gap.write_model import applied, exports, natives, write_model
+from frictid_hil.jobs.gap.write_model import applied, exports, left_out_words, natives, nearer_only, write_model
 from frictid_hil.simulation.robot_model import RobotModel
 
 LIFT = {"error_share": 0.5}

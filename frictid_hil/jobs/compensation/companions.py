@@ -8,9 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from frictid_hil.jobs.compensation.plan import Asked
-from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.jobs.watch import Watcher
-from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.events import Event, Marked, PhaseStarted
@@ -86,9 +84,8 @@ class Hand:
 class LiveFigures:
     """Keeps rows as the keeper does, forgets them, and tells what they say."""
 
-    def __init__(self, setup: RobotSetup, joint: str, wanted: Wanted, live: Live | None) -> None:
+    def __init__(self, joint: str, live: Live | None) -> None:
         self._joint = joint
-        self._wanted = wanted
         self._live = live
         self._sums = np.zeros(3)
         self._recent: list[Rows] = []

@@ -11,11 +11,14 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
+from frictid_hil.friction.compensation import Compensation, CompensationSettings
+from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.metrics import plain_rms, ratio_interval, rms_by_part
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.jobs.identification.cycles import declared_skew
-from frictid_hil.plan.control import Compensated
+from frictid_hil.plan.control import Compensated, PositionGains
+from frictid_hil.plan.plan import Motion
 from frictid_hil.recording.samples import Mark, Samples
 
 DOMINATED_PERCENT = 85.0
@@ -60,7 +63,7 @@ class ModeFigures:
         reduction_inertia_removed_percent: of the one with inertia removed.
         tracking_rms_rad: E_s of (28).
         ceiling_percent: reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without
-            any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor``).
+            any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor_rad``).
         inertial_rms_nm: of inertia times acceleration.
         velocity_error_rms_rad_s: of the path's speed less the measured one; None by hand.
         interval_95: of the task's own measure, from cycle to cycle; None where there is one cycle.
@@ -234,3 +237,48 @@ def _reduction(value: float | None, base: float | None) -> float | None:
     if value is None or not base:
         return None
     return 100.0 * (1.0 - value / base)
+
+
+_STEP_S = 2e-4
+_AT_ONCE_NM_PER_RAD = 1e7
+"""A spring that slips at once."""
+
+
+def tracking_floor_rad(
+    path: Motion,
+    gains: PositionGains,
+    inertia_kg_m2: float,
+    curve: FrictionCurve,
+    *,
+    first_s: float,
+    follows_reference: bool,
+) -> float:
+    """E_s of (28) of the ideal joint along a path from rest; what comes before ``first_s`` is not counted.
+
+    A triangle turns at once, and a weak PD takes its time to turn an inertia; no friction compensation can take that
+    away. Two ideal joints tell how long::
+
+        measured velocity     no friction at all            I a = k_p (p_d - p) + k_d (v_d - v)
+        reference velocity    friction given back exactly   I a = k_p (p_d - p) + k_d (v_d - v) + phi(v_d) - phi(v)
+
+    The second, with ``follows_reference``, turns faster: while it still moves the old way, friction and its
+    compensation both push it the new way.
+    """
+    times_s = np.arange(0.0, path.duration_s, _STEP_S)
+    references = path.position_rad(times_s)
+    velocities = np.gradient(references, _STEP_S).tolist()
+    exact = CompensationSettings.of(curve, "mop", stiffness_nm_per_rad=_AT_ONCE_NM_PER_RAD, ratio=1.0)
+    taken, given = Compensation(exact, _STEP_S).step, Compensation(exact, _STEP_S).step
+    kp, kd = gains.stiffness_nm_per_rad, gains.damping_nm_s_per_rad
+    position, velocity = float(references[0]), 0.0
+    errors = []
+    for reference, reference_velocity in zip(references.tolist(), velocities, strict=True):
+        error = reference - position
+        errors.append(error)
+        torque = kp * error + kd * (reference_velocity - velocity)
+        if follows_reference:
+            torque += given(0.0, 0.0, reference_velocity) - taken(velocity * _STEP_S, velocity)
+        velocity += torque / inertia_kg_m2 * _STEP_S
+        position += velocity * _STEP_S
+    counted = np.array(errors)[times_s >= first_s]
+    return plain_rms(counted)

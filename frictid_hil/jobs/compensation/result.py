@@ -16,9 +16,9 @@ from frictid_hil.jobs.compensation.figures import (
     figures,
     following_lag_s,
     friction_dominates,
+    tracking_floor_rad,
 )
 from frictid_hil.jobs.compensation.plan import Asked
-from frictid_hil.jobs.compensation.tracking_floor import tracking_floor_rad
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
@@ -72,9 +72,7 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
         "inertia_kg_m2": inertia,
         "inertia_source": source,
         "seed": asked.setup.seed if wanted.simulated else None,
-        "rate_hz": moved.rate_hz if moved else None,
-        "late_cycles": moved.late_cycles if moved else None,
-        "missed_cycles": moved.missed_cycles if moved else None,
+        **{key: getattr(moved, key, None) for key in ("rate_hz", "late_cycles", "missed_cycles")},
         "warnings": list(asked.warnings),
         "profile": str(asked.profile.resolve()),
         "modes": {
@@ -93,10 +91,7 @@ def result_of(asked: Asked, run: Run, progress: Progress, error: FrictidError | 
         wanted.task,
         progress.runs,
         told["modes"],
-        facts={
-            "robot": "SIMULATED" if wanted.simulated else "REAL",
-            **_facts({**told, "run": str(ended.run.resolve())}),
-        },
+        facts=_facts({**told, "run": str(ended.run.resolve())}, "SIMULATED" if wanted.simulated else "REAL"),
         remarks=told["remarks"],
         outcome=ended.outcome,
         error=error.what if error else "",
@@ -179,10 +174,11 @@ def _service_figures(wanted: Wanted, service: Mark | None) -> dict[str, Any]:
     }
 
 
-def _facts(result: dict[str, Any]) -> dict[str, str]:
+def _facts(result: dict[str, Any], robot: str) -> dict[str, str]:
     """Describe how the joint was compensated, for the page."""
     inertia, rate = result["inertia_kg_m2"], result["rate_hz"]
     facts = {
+        "robot": robot,
         "setting": str(result["setting"]),
         "compensation ratio": f"{_shown(result['compensation_ratio'])}, at its lowest "
         f"{_shown(result['compensation_ratio_lowest'])}",

@@ -40,32 +40,16 @@ _PERCENT = ("before_percent", "after_percent")
 _ITSELF = "our own evaluation of the file, not run there"
 
 
-def _row(
-    target: str,
-    where: str,
-    before: Mapping[str, float],
-    after: Mapping[str, float],
-    size: Mapping[str, float],
-    lost: str,
-) -> dict[str, Any]:
-    """One exported file, as JSON: RMS of the torque error and of the measured torque by joint, N m; percent of it."""
-    joints = {name: {"before_nm": before[name], "after_nm": after[name]} for name in after}
-    told = {"target": target, "where": where, "lost": lost, "joints": joints}
-    shares = (np.array([off[name] / size[name] for name in after]) for off in (before, after))
-    return {**told, **dict(zip(_PERCENT, (100.0 * plain_rms(share) for share in shares), strict=True))}
-
-
 class Withheld:
     """The last motion that was not fitted, and what the machine gave there beyond what the bodies need.
 
     Attributes:
-        motion: the motion.
         joints: whose torque error counts.
         size: RMS of their measured torque, N m.
     """
 
     def __init__(self, arm: ArmSet, changed: Iterable[str]) -> None:
-        self._arm = arm
+        self.arm = arm
         self.motion = withheld(arm)[-1].beginning(LAW_S)
         self.joints = tuple(changed) or arm.recorded
         self._smooth = low_pass(self.motion.time_s)
@@ -89,16 +73,25 @@ class Withheld:
         found = {}
         edge = slice(*np.searchsorted(self.motion.time_s, self.motion.time_s[[0, -1]] + [EDGE_S, -EDGE_S]))
         for name in self.joints:
-            law, believed = laws[name], self._arm.robot.joint(name)
+            law, believed = laws[name], self.arm.robot.joint(name)
             torque = (friction_nm or {}).get(name, law.torque_nm(self.velocity[name], self._slip[name]))
             if law.armature_kg_m2 is not None:
                 torque = torque + (law.armature_kg_m2 - believed.armature_kg_m2) * self._acceleration[name]
             found[name] = plain_rms((self._left[name] - self._smooth(torque))[edge])
         return found
 
+    def row(
+        self, target: str, where: str, before: Mapping[str, float], after: Mapping[str, float], lost: str
+    ) -> dict[str, Any]:
+        """One exported file, as JSON: RMS of the torque error by joint, N m, and in percent of the measured torque."""
+        joints = {name: {"before_nm": before[name], "after_nm": after[name]} for name in after}
+        told = {"target": target, "where": where, "lost": lost, "joints": joints}
+        shares = (np.array([off[name] / self.size[name] for name in after]) for off in (before, after))
+        return {**told, **dict(zip(_PERCENT, (100.0 * plain_rms(share) for share in shares), strict=True))}
+
     def before(self) -> dict[str, float]:
         """The same with the friction of the user's model."""
-        believed = {name: self._arm.robot.joint(name) for name in self.joints}
+        believed = {name: self.arm.robot.joint(name) for name in self.joints}
         return self.off({name: Law(b.dry_nm, *b.stribeck, b.damping) for name, b in believed.items()})
 
 
@@ -112,13 +105,11 @@ def rows_of(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def figure_of_target(
-    arm: ArmSet, motion: Withheld, target: str, texts: Mapping[str, str], lost: str
-) -> list[dict[str, Any]]:
-    """Rows of a target's files, see ``_row``; none where the logs have no torque."""
+def figure_of_target(motion: Withheld, target: str, texts: Mapping[str, str], lost: str) -> list[dict[str, Any]]:
+    """Rows of a target's files, see ``Withheld.row``; none where the logs have no torque."""
     if not motion.known:
         return []
-    before, laws = motion.before(), laws_of(target, texts, arm.joints)
+    before, laws = motion.before(), laws_of(target, texts, motion.arm.joints)
     if not laws or not set(motion.joints) <= set(laws[0]):
         return []
     where, friction = _ITSELF, None
@@ -128,12 +119,10 @@ def figure_of_target(
         where = "compiled and run here"
     every = [motion.off(one, friction) for one in laws]
     after = {name: float(np.median([off[name] for off in every])) for name in motion.joints}
-    return [_row(target, where, before, after, motion.size, lost)]
+    return [motion.row(target, where, before, after, lost)]
 
 
-def figures_of_model(
-    arm: ArmSet, motion: Withheld, natives: Mapping[str, Native], told: Mapping[str, Any]
-) -> list[dict[str, Any]]:
+def figures_of_model(motion: Withheld, natives: Mapping[str, Native], told: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Rows of the user's improved model: in MuJoCo, and for a short while in the other engines that are installed.
 
     Where it cannot run in closed loop, its friction is read back from the edited file.
@@ -141,10 +130,11 @@ def figures_of_model(
     if not motion.known:
         return []
     if "reason" in told:
-        return [_row_as_read(arm, motion, natives)]
+        return [_row_as_read(motion, natives)]
     before, after = ({n: told[when][n]["torque_nm"] for n in motion.joints} for when in ("before", "after"))
     here = f"MuJoCo {mujoco_library().__version__}, closed loop"
-    rows = [_row("mjcf", here, before, after, motion.size, "told with each joint")]
+    rows = [motion.row("mjcf", here, before, after, "told with each joint")]
+    arm = motion.arm
     improved = compiled_with(arm.robot, natives)
     short = motion.motion.beginning(SLOW_FROM_S + SLOW_S)
     begin = int(np.searchsorted(short.time_s, short.time_s[0] + SLOW_FROM_S))
@@ -155,25 +145,23 @@ def figures_of_model(
             rows.append({"target": "mjcf", "where": name, "refused": f"{type(error).__name__}: {error}"[:300]})
             continue
         where, torque = f"{name}, closed loop, {SLOW_S:g} s", reported(arm, natives) * ran
-        off = _short_off(arm, motion, short, begin, torque)
-        rows.append(_row("mjcf", where, *off, motion.size, "as above"))
+        off = _short_off(motion, short, begin, torque)
+        rows.append(motion.row("mjcf", where, *off, "as above"))
     return rows
 
 
-def _row_as_read(arm: ArmSet, motion: Withheld, natives: Mapping[str, Native]) -> dict[str, Any]:
-    robot = arm.robot
+def _row_as_read(motion: Withheld, natives: Mapping[str, Native]) -> dict[str, Any]:
+    robot = motion.arm.robot
     improved = RobotModel(robot.path, compiled_with(robot, natives), urdf=robot.urdf)
     joints = {name: improved.joint(name) for name in motion.joints}
     laws = {name: Law(b.dry_nm, *b.stribeck, b.damping, b.armature_kg_m2) for name, b in joints.items()}
     target, where = "urdf" if robot.urdf else "mjcf", "our own evaluation of the friction that MuJoCo reads from it"
-    return _row(target, where, motion.before(), motion.off(laws), motion.size, "told with each joint")
+    return motion.row(target, where, motion.before(), motion.off(laws), "told with each joint")
 
 
-def figure_in_newton(
-    arm: ArmSet, motion: Withheld, stage: Path, natives: Mapping[str, Native], lost: str
-) -> list[dict[str, Any]]:
+def figure_in_newton(motion: Withheld, stage: Path, natives: Mapping[str, Native], lost: str) -> list[dict[str, Any]]:
     """The row of a stage in Newton itself, where it is installed and the whole arm can be driven."""
-    name = newton()
+    name, arm = newton(), motion.arm
     if name is None or not motion.known or why_no_closed_loop(arm, [motion.motion]):
         return []
     short, step_s = motion.motion.beginning(ENGINE_S), float(arm.robot.compiled.opt.timestep)
@@ -185,15 +173,13 @@ def figure_in_newton(
     except Exception as error:  # as above
         return [{"target": "newton", "where": name, "refused": f"{type(error).__name__}: {error}"[:300]}]
     begin = int(np.searchsorted(time, time[0] + EDGE_S))
-    off = _short_off(arm, motion, short, begin, reported(arm, natives) * ran)
-    return [_row("newton", where, *off, motion.size, lost)]
+    off = _short_off(motion, short, begin, reported(arm, natives) * ran)
+    return [motion.row("newton", where, *off, lost)]
 
 
-def _short_off(
-    arm: ArmSet, motion: Withheld, short: Motion, begin: int, torque: Array
-) -> tuple[dict[str, float], dict[str, float]]:
+def _short_off(motion: Withheld, short: Motion, begin: int, torque: Array) -> tuple[dict[str, float], dict[str, float]]:
     """RMS of the torque error by joint from row ``begin`` on: user's model in MuJoCo, and ``torque`` (n, k)."""
-    smooth = low_pass(short.time_s)
+    smooth, arm = low_pass(short.time_s), motion.arm
     nominal = replayed(arm.robot.compiled, *driven(arm, short)).torque_nm
     before, after = {}, {}
     for name in motion.joints:

@@ -114,9 +114,9 @@ def write_targets(
     for target, files in texts.items():
         places = {name: {e: place_of(target, e) for e in one.model.effects} for name, one in made.items()}
         lost = _lost_words(target, places)
-        figures = figure_of_target(arm, motion, target, {p.name: text for p, text in files.items()}, lost)
+        figures = figure_of_target(motion, target, {p.name: text for p, text in files.items()}, lost)
         if target == "newton":
-            figures = figure_in_newton(arm, motion, wanted.files[target], natives(made), lost) or figures
+            figures = figure_in_newton(motion, wanted.files[target], natives(made), lost) or figures
         paths = [str(path.resolve()) for path in files]
         told[target] = {"files": paths, "effects": places, "lost": lost, "figures": figures}
     return told
