@@ -152,8 +152,6 @@ class Account:
     """What a log holds besides rows, and what it lacks.
 
     Attributes:
-        frames: in the log.
-        rows: cycles decoded.
         unknown: frames that nothing describes, by name.
         services: frames around the cycles, by name.
         repeated: reports that came twice in a row.
@@ -287,16 +285,10 @@ def samples_in(
     echo: can.BusABC | None = None,
     at: Callable[[float], None] = lambda _: None,
 ) -> dict[str, Samples]:
-    """The samples of every joint that moved during some logs, by joint; of the last one in which it did.
+    """The samples of every joint that moved during the logs of one run, by joint; of the last one in which it did.
 
-    Args:
-        logs: of one run, in order.
-        robot: name, for the samples' meta.
-        account: counts are added to it.
-        joints: only these; all when empty.
-        paced: at recorded speed.
-        echo: bus on which every frame is sent again.
-        at: told the time since the start of a log, s, as rows come.
+    Only ``joints``, or all when empty. Counts are added to ``account``; every frame is sent again on ``echo``; ``at``
+    is told the time since the start of a log, s, as rows come.
 
     Raises:
         InputFileError: a log is unreadable, or no report could be decoded.

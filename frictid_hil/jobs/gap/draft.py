@@ -18,7 +18,7 @@ from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.residuals import LowPass, slip_state, uniform
 
 SLIP_RAD = 2e-4
-"""Travel in which the slip spring yields, where nobody measured it."""
+"""Travel in which the slip spring yields, and friction builds up, where nobody measured it."""
 SPEEDS = 8
 """Points of the drafted friction curve."""
 SHORT_RAD = 0.3

@@ -16,9 +16,10 @@ import numpy as np
 
 from frictid_hil.friction.metrics import plain_rms
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.gap.residuals import slip_state
 from frictid_hil.jobs.gap.closed_loop import driven, low_pass, reported, why_no_closed_loop, withheld
+from frictid_hil.jobs.gap.draft import SLIP_RAD
 from frictid_hil.jobs.gap.from_model import ArmSet, Motion
-from frictid_hil.jobs.gap.write_model import PRESLIDING_RAD
 from frictid_hil.simulation.model_edit import compiled_with
 from frictid_hil.simulation.model_replay import replayed
 from frictid_hil.simulation.native import Native
@@ -65,7 +66,7 @@ class Withheld:
         columns = {name: arm.recorded.index(name) for name in self.joints}
         self._left = {name: self._smooth(measured[name] - bodies[:, k]) for name, k in columns.items()}
         self.velocity = {name: self._smooth(moved[1][:, k]) for name, k in columns.items()}
-        self._slip = {name: _slip(moved[0][:, k], _travel(arm, name)) for name, k in columns.items()}
+        self._slip = {name: slip_state(moved[0][:, k], 1.0 / _travel(arm, name)) for name, k in columns.items()}
         self._acceleration = {name: self._smooth(moved[2][:, k]) for name, k in columns.items()}
 
     def off(self, laws: Mapping[str, Law], friction_nm: Mapping[str, Array] | None = None) -> dict[str, float]:
@@ -193,12 +194,4 @@ def _travel(arm: ArmSet, name: str) -> float:
     """Travel over which a joint's friction builds up, as the user's model has it, rad."""
     believed = arm.robot.joint(name)
     stiffness = believed.presliding_nm_per_rad
-    return believed.dry_nm / stiffness if stiffness and believed.dry_nm > 0.0 else PRESLIDING_RAD
-
-
-def _slip(position_rad: Array, travel_rad: float) -> Array:
-    """How much of the level of friction has built up along a motion, -1..1, from a relaxed start."""
-    slip = np.zeros_like(position_rad)
-    for k, moved in enumerate(np.diff(position_rad) / travel_rad, 1):
-        slip[k] = min(1.0, max(-1.0, slip[k - 1] + moved))
-    return slip
+    return believed.dry_nm / stiffness if stiffness and believed.dry_nm > 0.0 else SLIP_RAD

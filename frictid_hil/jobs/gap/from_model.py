@@ -63,8 +63,6 @@ class JointSet:
     """One joint, ready to be diagnosed.
 
     Attributes:
-        believed: what the file says.
-        experiments: its set.
         document: the same belief as a ``nominal.yaml`` would say it.
         drafted: numbers taken from the logs because the file has none, by name.
         asked: what nobody said, with what it costs and how to say it.

@@ -39,13 +39,9 @@ class Source:
     from time: the last log, or the last third of a single one, is judged on.
 
     Attributes:
-        paths: one folder, or logs.
-        columns: column map of a foreign logger, by path or name.
         nominal: what the simulator believes; a set's own ``nominal.yaml`` unless told. It need not list the logs.
         profile: friction profile or run folder, whose numbers overrule it.
-        joint: its name in recordings and profile that hold several.
-        validation: names of logs (file names without ending) to judge on.
-        split: see ``parted``.
+        validation: names of logs (file names without ending) to judge on; ``split`` see ``parted``.
     """
 
     paths: Sequence[Path]
@@ -103,12 +99,8 @@ def parted(
 ) -> list[tuple[str, str, NDArray[np.bool_], bool]]:
     """Divide the recordings into those that are fitted and those that the result is judged on.
 
-    Unless told: the last third of one log, else the last logs that make up a quarter or more.
-
-    Args:
-        logs: names and samples.
-        validation: names of the logs to judge on.
-        split: ``log`` parts by whole logs; ``30%`` or ``20s`` by time, the end of every log being judged on.
+    Unless told: the last third of one log, else the last logs that make up a quarter or more. ``split`` is ``log`` for
+    whole logs; ``30%`` or ``20s`` by time, the end of every log being judged on.
 
     Raises:
         UsageError: two logs of one name, a name that no log has, or a split that cannot be read or leaves nothing.

@@ -17,6 +17,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.diagnose import UNDECIDED
 from frictid_hil.gap.diagnosis import Cause, Diagnosis
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap, fitted, gap_of, why_no_closed_loop
+from frictid_hil.jobs.gap.draft import SLIP_RAD
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, postures
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, ServoGains
@@ -26,8 +27,6 @@ from frictid_hil.simulation.native_check import in_posture, torque_difference
 
 CHECKED_S = 10.0
 """Length of the withheld motion along which an export is compared with our own simulation."""
-PRESLIDING_RAD = 2e-4
-"""Travel in which friction builds up, where nobody says it."""
 _FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9]))
 
 
@@ -152,7 +151,7 @@ def joint_model(
         friction=curve,
         presliding_stiffness_nm_per_rad=presliding_nm_per_rad
         or nominal.presliding_stiffness_nm_per_rad
-        or curve.coulomb_nm / PRESLIDING_RAD,
+        or curve.coulomb_nm / SLIP_RAD,
         encoder=Encoder("motor", 0.0),
         drive=Drive(rated, limit, 0.0, 0.0, 0.0),
         servo=ServoGains(0.0, 0.0, 0.0),

@@ -25,7 +25,6 @@ class Programme:
     """A choice of speeds and of the estimator that goes with them.
 
     Attributes:
-        name: as typed.
         shares: peak speeds as shares of V; empty for the N equally spaced ones of the robot file.
         method: estimator unless one is asked for.
         error_percent: error over the curve's measured range, worst joint and seed of the simulated hp3j, rigid or
