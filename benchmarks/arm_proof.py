@@ -22,7 +22,7 @@ from arm_in_mujoco import JOINTS, Machine, write_case
 
 from frictid_hil.jobs.gap.from_model import ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import exports, nearer_only
-from frictid_hil.jobs.gap_diagnose_arm import diagnosed
+from frictid_hil.jobs.gap_diagnose import diagnosed
 
 DRY_NM = {"pan": 9.0, "lift": 9.0, "elbow": 6.0, "wrist_1": 1.8, "wrist_2": 1.8, "wrist_3": 1.8}
 EFFECTS = {

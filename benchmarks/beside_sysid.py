@@ -22,7 +22,7 @@ from arm_in_mujoco import JOINTS, STEP_S, Machine, write_case
 from frictid_hil.jobs.gap.closed_loop import gap_of
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, Motion, sets_from_model
 from frictid_hil.jobs.gap.write_model import exports, natives, nearer_only
-from frictid_hil.jobs.gap_diagnose_arm import diagnosed
+from frictid_hil.jobs.gap_diagnose import diagnosed
 from frictid_hil.simulation.model_edit import compiled_with
 from frictid_hil.simulation.robot_model import relax
 

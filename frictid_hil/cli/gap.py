@@ -281,7 +281,7 @@ def diagnose(
     from frictid_hil.jobs.gap.export_targets import Wanted
     from frictid_hil.jobs.gap.logs import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
-    from frictid_hil.jobs.gap_diagnose_arm import diagnose_arm
+    from frictid_hil.jobs.gap_diagnose import diagnose_arm
 
     every = [*(logs or ()), *(more_logs or ())]
     to_write: dict[str, Any] = {"write_model": write_model, "apply": apply, "out": out, "force": force}

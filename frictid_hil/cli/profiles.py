@@ -70,7 +70,7 @@ def _show_export(output: Output, result: Result) -> None:
 )
 def export(output: Output, profile: Path, to: str, out: Path, force: bool = False) -> Result:
     """Write a profile in the form of the place where it shall act, and say what is lost."""
-    from frictid_hil.jobs.profile_export import export as job
+    from frictid_hil.jobs.profiles import export as job
 
     return job(profile, to, out, force=force)
 

@@ -12,7 +12,7 @@ import yaml
 from frictid_hil.config.profile import load_profile
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.curve import FrictionCurve
-from frictid_hil.jobs.profile_export import export
+from frictid_hil.jobs.profiles import export
 
 PROFILE = Path(__file__).parents[1] / "config" / "golden" / "profile-1.yaml"
 
