@@ -122,7 +122,7 @@ def _print_closed_loop(output: Output, result: Result) -> None:
 
 def _print_written(output: Output, result: Result) -> None:
     """What was written where, and how near every file comes to the machine: one row a file and engine."""
-    from frictid_hil.jobs.gap.export_figures import rows_of
+    from frictid_hil.jobs.gap.exports import rows_of
 
     joints = result.get("export", {}).get("joints", {})
     for name, joint in joints.items():
@@ -278,7 +278,7 @@ def diagnose(
     force: bool = False,
 ) -> Result:
     """Say where the gap lives, which unmodelled effect causes it, and how far it closes on recordings never fitted."""
-    from frictid_hil.jobs.gap.export_targets import Wanted
+    from frictid_hil.jobs.gap.exports import Wanted
     from frictid_hil.jobs.gap.logs import Source
     from frictid_hil.jobs.gap_diagnose import diagnose as job
     from frictid_hil.jobs.gap_diagnose import diagnose_arm
@@ -446,8 +446,7 @@ def record(
 ) -> Told:
     """Run the diagnostic experiments on the bus and write an experiment set."""
     from frictid_hil.cli.progress import watching
-    from frictid_hil.jobs.gap_decide import record_until_decided
-    from frictid_hil.jobs.gap_record import GapRecordOptions
+    from frictid_hil.jobs.gap_record import GapRecordOptions, record_until_decided
     from frictid_hil.jobs.gap_record import record as job
 
     if resume is not None and recorded is not None:

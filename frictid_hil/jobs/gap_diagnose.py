@@ -23,9 +23,8 @@ from frictid_hil.gap.forward import Replay, why_not
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.jobs.gap.closed_loop import side_by_side
 from frictid_hil.jobs.gap.draft import drafted
-from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
 from frictid_hil.jobs.gap.export_mujoco import export_mujoco
-from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
+from frictid_hil.jobs.gap.exports import Wanted, Withheld, check_targets, figures_of_model, rows_of, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, JointSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.logs import Source
 from frictid_hil.jobs.gap.write_model import Export, applied, exports, left_out_words, likely, natives, nearer_only

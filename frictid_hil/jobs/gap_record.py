@@ -3,14 +3,17 @@
 Scheduler, supervisor and recording are those of a calibration. Experiments without the payload run first. Then a person
 is asked to mount it (a simulated robot mounts its own), and the rest follow. An interrupted recording can be continued,
 or a set can be made of what it has without moving anything.
+
+``--until-decided`` begins with three experiments: a slow one, a fast one and one that is judged on. After each
+diagnosis that cannot decide, the experiment that is expected to tell most is added to the set, as long as the time that
+was given lasts.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,9 @@ import yaml
 from frictid_hil.config.profile import load_profile
 from frictid_hil.config.robot import Robot, load_robot
 from frictid_hil.errors import FrictidError, InputFileError, PlanRefused, UsageError
+from frictid_hil.gap.diagnose import diagnose
+from frictid_hil.gap.diagnosis import Diagnosis
+from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.experiments import (
     FULL,
     SHORT,
@@ -190,7 +196,7 @@ def _names(options: GapRecordOptions, envelope: Envelope) -> tuple[str, ...]:
 
 def _unloaded(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     """Without a payload, those that need it are left out; ordinary work is recorded unloaded."""
-    return tuple(dataclasses.replace(e, payload=False) for e in experiments if not e.payload or e.role == "validation")
+    return tuple(replace(e, payload=False) for e in experiments if not e.payload or e.role == "validation")
 
 
 def _why_no_payload(options: GapRecordOptions, belief: Belief, *, simulated: bool) -> str | None:
@@ -243,7 +249,7 @@ def _plans(
                 f"{payload['gravity_torque_nm']:.4g} N m when horizontal"
             )
             if joint.name in expected:
-                of_group[joint.name] = dataclasses.replace(
+                of_group[joint.name] = replace(
                     expected[joint.name],
                     inertia_kg_m2=expected[joint.name].inertia_kg_m2 + payload["inertia_kg_m2"],
                     gravity_nm=expected[joint.name].gravity_nm + abs(payload["gravity_torque_nm"]),
@@ -297,7 +303,7 @@ class _Recording:
         self._unloaded = ""
         """Why no recording with the payload was made although it was planned."""
         if options.resume is not None and not move and not options.robot:
-            options = dataclasses.replace(options, robot=str(options.resume / "config.yaml"))
+            options = replace(options, robot=str(options.resume / "config.yaml"))
         options = restored(options, (VERB,))
         robot, setup, joint, belief, without = _situation(options)
         self._joint, self._belief = joint, belief
@@ -392,7 +398,7 @@ class _Recording:
         """The experiments that this run has not put into the set yet."""
         manifest, joint, robot = self._run.folder.manifest, self._joint.name, self.order.robot.name
         sections = read_back(self._belief.sections, manifest["identities"].get(joint, {}))
-        belief = dataclasses.replace(self._belief, sections=sections)
+        belief = replace(self._belief, sections=sections)
         earlier = self._earlier or (existing_set(place, robot, joint) if self.order.resume else None)
         before = manifest.get("in_set", {}).get(str(place.resolve()), []) if earlier else []
         fresh = [(e, self._logs[e.name]) for e in done if e.name not in before]
@@ -429,7 +435,7 @@ class _Recording:
 
 def _joined(plans: Sequence[Plan]) -> Plan:
     """Join all plans to one plan; the entries of joints keep their order."""
-    return dataclasses.replace(
+    return replace(
         plans[0],
         joints=tuple(entry for plan in plans for entry in plan.joints),
         notes=tuple(note for plan in plans for note in plan.notes),
@@ -448,5 +454,85 @@ def _cut(samples: Samples, experiments: Sequence[Experiment]) -> dict[str, Sampl
     for name in (e.name for e in experiments if done[e.name] == len(e.motions)):
         start_ns, end_ns = spans[name]
         rows = samples.select((samples.time_ns >= start_ns) & (samples.time_ns < end_ns))
-        logs[name] = dataclasses.replace(rows, time_ns=rows.time_ns - start_ns, marks=())
+        logs[name] = replace(rows, time_ns=rows.time_ns - start_ns, marks=())
     return logs
+
+
+FIRST = ("triangle_slow", "chirp", "sines_repeat")
+"""Experiments to begin with: slow and fast, and one that nothing is fitted to."""
+DECIDED = 0.95
+"""Chance of the first cause from which nothing more is recorded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """The result of recording until the cause is decided.
+
+    ``diagnosis`` is of the whole set of the last recording; None where nothing was recorded. ``why`` nothing more was.
+    """
+
+    recorded: Recorded
+    experiments: tuple[str, ...]
+    duration_s: float
+    diagnosis: Diagnosis | None
+    why: str
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the verb: that of a recording, and the diagnosis."""
+        whole = None if self.diagnosis is None else self.diagnosis.to_json()
+        told = whole and {key: whole[key] for key in ("verdict", "causes", "summary", "next_experiment")}
+        return {
+            **self.recorded.to_json(),
+            "experiments": list(self.experiments),
+            "duration_s": self.duration_s,
+            "diagnosis": told,
+            "ended_because": self.why,
+        }
+
+
+def record_until_decided(options: GapRecordOptions, watcher: Watcher, budget_s: float) -> Decided:
+    """Record and diagnose in turn until the cause is decided or all experiments have taken ``budget_s``.
+
+    Raises:
+        UsageError: refused before anything moved.
+        HardwareError: hardware unreachable before anything moved.
+    """
+    if options.plan is not None or options.short or options.resume is not None:
+        raise UsageError("--until-decided chooses the experiments itself; leave out --plan, --short and --resume")
+    possible = recordable(options)
+    names = [name for name in FIRST if name in possible]
+    first_s = sum(possible[name] for name in names)
+    if budget_s < first_s:
+        raise UsageError(f"the first experiments take {first_s:.0f} s, and {budget_s:.0f} s are given")
+    done: list[str] = []
+    spent_s = 0.0
+    while True:
+        recorded = record(replace(options, experiments=tuple(names)), watcher)
+        done += [name for name in names if name in recorded.experiments]
+        spent_s += recorded.duration_s
+        if recorded.ended.error is not None or recorded.place is None:
+            found = None if recorded.place is None else diagnose(ExperimentSet.load(recorded.place))
+            return Decided(recorded, tuple(done), spent_s, found, f"the recording ended: {recorded.ended.outcome}")
+        options = replace(options, out=recorded.place)
+        found = diagnose(ExperimentSet.load(recorded.place))
+        watcher.note(f"{found.summary} (set: {recorded.place})")
+        names, why = _next(found, possible, done, budget_s - spent_s)
+        if not names:
+            return Decided(recorded, tuple(done), spent_s, found, why)
+        watcher.note(why)
+
+
+def _next(found: Diagnosis, possible: dict[str, float], done: list[str], left_s: float) -> tuple[list[str], str]:
+    """(experiments to add, why); none where it is decided, or nothing more can be done."""
+    if found.next_experiment is None:
+        return [], f"the verdict is {found.verdict}"
+    if found.verdict == "explained" and found.causes[0].confidence >= DECIDED:
+        return [], f"{found.causes[0].effect} stands alone"
+    asked = found.next_experiment
+    wanted = [*asked.plan["experiments"], *possible]
+    fresh = [name for name in wanted if name in possible and name not in done]
+    if not fresh:
+        return [], "every experiment that this joint can do is recorded"
+    if possible[fresh[0]] > left_s:
+        return [], f"{fresh[0]} would take {possible[fresh[0]]:.0f} s, and {left_s:.0f} s are left"
+    return [fresh[0]], asked.description if fresh[0] in asked.plan["experiments"] else f"{fresh[0]} is recorded next"

@@ -14,8 +14,7 @@ from frictid_hil.simulation.targets import TARGETS
 pytest.importorskip("mujoco", minversion="4.0")
 
 from frictid_hil.jobs.gap.closed_loop import closed_loop_gap
-from frictid_hil.jobs.gap.export_figures import Withheld, figures_of_model, rows_of
-from frictid_hil.jobs.gap.export_targets import Wanted, check_targets, write_targets
+from frictid_hil.jobs.gap.exports import Wanted, Withheld, check_targets, figures_of_model, rows_of, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import export_of, natives
 from frictid_hil.simulation.model_replay import Stepper
@@ -96,7 +95,7 @@ def test_an_engine_that_fails_is_a_row_of_its_own(monkeypatch: pytest.MonkeyPatc
     table = np.column_stack([time, q, q, 8.0 * np.cos(q) + 2.0 * np.sign(np.cos(1.3 * time))])
     np.savetxt(tmp_path / "walk.csv", table, delimiter=",", header=header, comments="")
     arm = sets_from_model(ModelLogs(tmp_path / "arm.xml", [tmp_path / "walk.csv"]))
-    monkeypatch.setattr("frictid_hil.jobs.gap.export_figures.installed", lambda: {"engine 1.0": broken})
+    monkeypatch.setattr("frictid_hil.jobs.gap.exports.installed", lambda: {"engine 1.0": broken})
     here, there = figures_of_model(Withheld(arm, ["lift"]), {}, closed_loop_gap(arm, {}))
     assert here["after_percent"] == pytest.approx(here["before_percent"])
     assert there["refused"] == "RuntimeError: no such kernel" and there["where"] == "engine 1.0"

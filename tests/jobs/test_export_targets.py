@@ -13,7 +13,7 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, Value
 
 pytest.importorskip("mujoco", minversion="4.0")
 
-from frictid_hil.jobs.gap.export_targets import Wanted, write_targets
+from frictid_hil.jobs.gap.exports import Wanted, write_targets
 from frictid_hil.jobs.gap.from_model import ArmSet, ModelLogs, sets_from_model
 from frictid_hil.jobs.gap.write_model import exports
 

@@ -28,8 +28,7 @@ from frictid_hil.gap.experiments import (
     plan_document,
 )
 from frictid_hil.jobs import gap_record
-from frictid_hil.jobs.gap_decide import FIRST, _next, record_until_decided
-from frictid_hil.jobs.gap_record import GapRecordOptions, record
+from frictid_hil.jobs.gap_record import FIRST, GapRecordOptions, _next, record, record_until_decided
 from frictid_hil.jobs.watch import Silent
 from frictid_hil.plan.plan import Plan
 from frictid_hil.runner.events import Event, PhaseStarted, Preflight
