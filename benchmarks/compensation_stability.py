@@ -46,7 +46,7 @@ from frictid_drivers.virtual import joint_drive
 from frictid_hil.config.profile import JointProfile, load_profile
 from frictid_hil.config.robot import load_robot
 from frictid_hil.errors import FrictidError
-from frictid_hil.jobs.compensation.laws import law_of
+from frictid_hil.jobs.compensation.plan import law_of
 from frictid_hil.jobs.compensation.wanted import Wanted
 from frictid_hil.plan.control import Bounds, Compensated, ControlLaw, Swing
 from frictid_hil.plan.mode import Mode

@@ -95,11 +95,8 @@ def identify(
 ) -> FrictionProfile:
     """Identify friction from one recording: a run folder, MCAP, CSV, .mat, ROS bag or bus log.
 
-    Args:
-        log: the recording.
-        robot: robot file for limits and gear; None where the recording says enough.
-        joints: names; all when empty.
-        **options: further fields of ``jobs.identify.IdentifyOptions`` (``columns``, ``method``, ...).
+    A robot file tells limits and gear; all joints are identified when none is named. Further options are fields of
+    ``jobs.identify.IdentifyOptions`` (``columns``, ``method``, ...).
 
     Raises:
         InputFileError: it is unreadable or unusable.
@@ -121,10 +118,8 @@ def load_profile(path: str | Path) -> FrictionProfile:
 def diagnose(*paths: str | Path, nominal: str | Path | None = None, **options: Any) -> Diagnosis:
     """Where a simulator differs from recordings of the machine, which effect causes it, and how far it closes.
 
-    Args:
-        *paths: the folder of an experiment set, or logs.
-        nominal: what the simulator believes; a set's own ``nominal.yaml`` when None.
-        **options: further fields of ``jobs.gap.logs.Source`` (``columns``, ``profile``, ``joint``, ``validation``).
+    Paths are an experiment set's folder, or logs; ``nominal`` is what the simulator believes, unless a set says it.
+    Further options are fields of ``jobs.gap.logs.Source`` (``columns``, ``profile``, ``joint``, ``validation``).
 
     Raises:
         InputFileError, ConfigError: the recordings are unusable.
