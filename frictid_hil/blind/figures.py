@@ -20,7 +20,7 @@ from numba import njit
 from scipy import signal
 
 from frictid_hil.blind import plant
-from frictid_hil.blind.joints import Joint, Payload, ticks
+from frictid_hil.blind.joints import Joint, ticks
 from frictid_hil.blind.plant import TICK_S, Controller, Physics
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiments import Experiment
@@ -48,7 +48,7 @@ def record(joint: Joint, physics: Physics, seed: list[int]) -> tuple[Log, ...]:
         times = ticks(experiment)
         command = experiment.position_rad(times)
         noise = joint.torque_noise_nm * _sensor_noise(rng, times.size)
-        mounted = joint.payload.on(physics) if experiment.payload else physics
+        mounted = joint.payload.on(physics, experiment.payload)
         position, velocity, torque, heat = plant.run(
             command, joint.control, mounted, heat, clock, rng.random(times.size)
         )
@@ -64,7 +64,7 @@ def believed_motion(joint: Joint) -> tuple[tuple[Array, Array], ...]:
     for experiment in joint.experiments:
         times = ticks(experiment)
         command = experiment.position_rad(times)
-        physics = _mounted(joint.belief, joint.believed_payload, experiment)
+        physics = joint.believed_payload.on(joint.belief, experiment.payload)
         position, _, torque, _ = plant.run(command, joint.control, physics, 0.0, 0.0, np.ones(times.size))
         runs.append((position, torque))
     return tuple(runs)
@@ -75,10 +75,10 @@ def figures(joint: Joint, log: Log, believed: tuple[Array, Array]) -> dict[str, 
     position, torque = believed
     differenced = np.diff(log.position_rad, prepend=log.position_rad[0]) / TICK_S
     return {
-        "inverse_nm": rms(_low_pass(_inverse_residual(joint, log))),
-        "actuation_nm": rms(_low_pass(_actuation_residual(joint.control, log))),
+        "inverse_nm": rms(low_pass(_inverse_residual(joint, log))),
+        "actuation_nm": rms(low_pass(_actuation_residual(joint.control, log))),
         "velocity_rad_s": rms(log.velocity_rad_s - differenced),
-        "forward_torque_nm": rms(_low_pass(log.torque_nm - torque)),
+        "forward_torque_nm": rms(low_pass(log.torque_nm - torque)),
         "forward_position_rad": rms(log.position_rad - position),
     }
 
@@ -106,18 +106,22 @@ def rms(values: Array) -> float:
     return math.sqrt(float(np.mean(np.square(values))))
 
 
-def _mounted(physics: Physics, payload: Payload, experiment: Experiment) -> Physics:
-    return payload.on(physics) if experiment.payload else physics
-
-
-def _low_pass(values: Array) -> Array:
-    numerator, denominator = signal.butter(2, CUTOFF_HZ * 2.0 * TICK_S)
-    smooth: Array = signal.filtfilt(numerator, denominator, values)
+def low_pass(values: Array, rate_hz: float = 1.0 / TICK_S) -> Array:
+    """Zero phase, second order, at 25 Hz or below what the rate allows; shape unchanged."""
+    b, a = signal.butter(2, min(CUTOFF_HZ, 0.3 * rate_hz) / (0.5 * rate_hz))
+    smooth: Array = signal.filtfilt(b, a, values)
     return smooth
 
 
+def lagging(values: Array, step_s: float, time_constant_s: float) -> Array:
+    """Behind a first-order lag, from 0; shape unchanged."""
+    keep = math.exp(-step_s / time_constant_s)
+    late: Array = signal.lfilter([1.0 - keep], [1.0, -keep], values)
+    return late
+
+
 def _inverse_residual(joint: Joint, log: Log) -> Array:
-    p = _mounted(joint.belief, joint.believed_payload, log.experiment)
+    p = joint.believed_payload.on(joint.belief, log.experiment.payload)
     q = log.position_rad
     speed = np.gradient(q, TICK_S)
     acceleration = np.zeros(q.size)

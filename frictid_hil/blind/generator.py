@@ -9,6 +9,7 @@ the effects: the *gap* of the belief, and the *floor* that an ideal explanation 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from frictid_hil.blind.effects import LIBRARY, Draw
+from frictid_hil.blind.effects import LIBRARY, OUTSIDERS, changed
 from frictid_hil.blind.figures import Log, believed_motion, figures, record, together
-from frictid_hil.blind.joints import Joint, changed, draw_joint, nominal_mapping
-from frictid_hil.blind.outsiders import OUTSIDERS
-from frictid_hil.blind.plant import TICK_S, Physics
+from frictid_hil.blind.joints import Joint, draw_joint, nominal_mapping
+from frictid_hil.blind.plant import TICK_S
 from frictid_hil.blind.score import PRACTICAL
 from frictid_hil.gap.experiments import FULL
 
@@ -62,23 +62,15 @@ class Assignment:
 def assignments(cases: int, seed: int) -> tuple[Assignment, ...]:
     """Kinds and effects of all cases: every effect and every outsider comes up before any comes up again."""
     rng = np.random.default_rng([seed, 101])
-    kinds = _dealt(rng, _KINDS, cases)
-    names, strangers = list(LIBRARY), list(OUTSIDERS)
-    singles = iter(_dealt(rng, names, cases))
-    outside = iter(_dealt(rng, strangers, cases))
-    aliased = [set(pair) for pair in ALIASES]
-    result = []
-    for kind in kinds:
-        if kind == "single":
-            effects: tuple[str, ...] = (next(singles),)
-        elif kind == "outside":
-            effects = (next(outside),)
-        elif kind == "double":
-            effects = _two(rng, names, aliased)
-        else:
-            effects = ()
-        result.append(Assignment(kind, effects))
-    return tuple(result)
+    kinds, names = dealt(rng, _KINDS, cases), list(LIBRARY)
+    singles, outside = iter(dealt(rng, names, cases)), iter(dealt(rng, list(OUTSIDERS), cases))
+    carried: dict[str, Callable[[], tuple[str, ...]]] = {
+        "none": lambda: (),
+        "single": lambda: (next(singles),),
+        "double": lambda: _two(rng, names),
+        "outside": lambda: (next(outside),),
+    }
+    return tuple(Assignment(kind, carried[kind]()) for kind in kinds)
 
 
 def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[str, ...] = FULL) -> Case:
@@ -94,32 +86,29 @@ def draw_case(index: int, seed: int, assignment: Assignment, experiments: tuple[
         if not _held(ideal):
             continue
         peak_nm = max(float(np.abs(log.torque_nm).max()) for log in ideal)
-        alone = [_draw_of(effect)(rng, joint, peak_nm) for effect in assignment.effects]
+        alone = [changed(effect, rng, joint, peak_nm) for effect in assignment.effects]
         physics = joint.physics
         for one in alone:
-            physics = physics._replace(**_differences(joint.physics, one))
+            physics = physics._replace(**one)
         logs = record(joint, physics, noise_seed) if alone else ideal
         if not _held(logs):
             continue
         believed = believed_motion(joint)
         floors = _figures(joint, ideal, believed)
-        separately = [
-            _ratio(joint, _figures(joint, record(joint, one, noise_seed), believed), floors, ideal)
-            if len(alone) > 1
-            else None
-            for one in alone
-        ]
         name = f"case_{index:03d}"
         truth = _truth(name, joint, assignment, logs, _figures(joint, logs, believed), floors)
-        truth["effects"] = [
-            {
+        for effect, one in zip(assignment.effects, alone, strict=True):
+            told = {
                 "name": effect,
                 "in_library": effect in LIBRARY,
-                "parameters": dict(changed(joint.physics, one)),
-                **({} if ratio is None else {"size_ratio_alone": ratio}),
+                "parameters": {n: float(v) for n, v in one.items()},
             }
-            for effect, one, ratio in zip(assignment.effects, alone, separately, strict=True)
-        ]
+            if len(alone) > 1:
+                lone = record(joint, joint.physics._replace(**one), noise_seed)
+                told["size_ratio_alone"] = _ratio(
+                    together(_figures(joint, lone, believed), ideal), together(floors, ideal)
+                )
+            truth["effects"].append(told)
         return Case(name, rounded(nominal_mapping(joint, name)), logs, rounded(truth))
     raise RuntimeError(f"no joint that its controller can hold came up for {assignment}")
 
@@ -164,15 +153,7 @@ def main() -> None:
         print(case.name, flush=True)
 
 
-def _draw_of(effect: str) -> Draw:
-    return LIBRARY[effect] if effect in LIBRARY else OUTSIDERS[effect]
-
-
-def _differences(before: Physics, after: Physics) -> dict[str, Any]:
-    return {name: new for name, old, new in zip(Physics._fields, before, after, strict=True) if old != new}
-
-
-def _dealt(rng: np.random.Generator, deck: list[str] | tuple[str, ...], count: int) -> list[str]:
+def dealt(rng: np.random.Generator, deck: Sequence[str], count: int) -> list[str]:
     """``count`` cards from shuffled copies of a deck."""
     cards: list[str] = []
     while len(cards) < count:
@@ -180,12 +161,12 @@ def _dealt(rng: np.random.Generator, deck: list[str] | tuple[str, ...], count: i
     return cards[:count]
 
 
-def _two(rng: np.random.Generator, names: list[str], aliased: list[set[str]]) -> tuple[str, str]:
+def _two(rng: np.random.Generator, names: list[str]) -> tuple[str, str]:
     """Two effects that are no alias pair, and that the plant can carry at once."""
-    exclusive = {"backlash", "joint_elasticity"}
+    apart = [set(pair) for pair in (*ALIASES, ("backlash", "joint_elasticity"))]
     while True:
         first, second = (str(name) for name in rng.choice(names, size=2, replace=False))
-        if {first, second} not in aliased and {first, second} != exclusive:
+        if {first, second} not in apart:
             return first, second
 
 
@@ -202,8 +183,7 @@ def _figures(joint: Joint, logs: tuple[Log, ...], believed: Any) -> list[dict[st
     return [figures(joint, log, run) for log, run in zip(logs, believed, strict=True)]
 
 
-def _ratio(joint: Joint, gaps: list[dict[str, float]], floors: list[dict[str, float]], logs: tuple[Log, ...]) -> float:
-    gap, floor = together(gaps, logs), together(floors, logs)
+def _ratio(gap: dict[str, float], floor: dict[str, float]) -> float:
     return max(gap[name] / floor[name] for name in SIZED_BY)
 
 
@@ -216,7 +196,7 @@ def _truth(
     floors: list[dict[str, float]],
 ) -> dict[str, Any]:
     gap, floor = together(gaps, logs), together(floors, logs)
-    ratio = max(gap[figure] / floor[figure] for figure in SIZED_BY) if assignment.effects else 1.0
+    ratio = _ratio(gap, floor) if assignment.effects else 1.0
     validation = [k for k, log in enumerate(logs) if log.experiment.role == "validation"]
     held_out = tuple(logs[k] for k in validation)
     return {

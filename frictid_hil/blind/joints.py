@@ -7,7 +7,6 @@ tolerances of up to 0.8 %, and every joint carries traces of effects below its o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,8 +29,10 @@ class Payload:
     inertia_kg_m2: float
     gravity_nm: float
 
-    def on(self, physics: Physics) -> Physics:
-        """The plant with the payload mounted."""
+    def on(self, physics: Physics, mounted: bool) -> Physics:
+        """The plant with the payload, where it is mounted."""
+        if not mounted:
+            return physics
         return physics._replace(
             link_inertia=physics.link_inertia + self.inertia_kg_m2, gravity=physics.gravity + self.gravity_nm
         )
@@ -206,11 +207,6 @@ def _told_controller(joint: Joint) -> dict[str, Any]:
 def ticks(experiment: Experiment) -> Array:
     """Times of the controller's ticks, s."""
     return np.arange(math.ceil(experiment.duration_s / TICK_S)) * TICK_S
-
-
-def changed(before: Physics, after: Physics) -> Mapping[str, float]:
-    """The plant's numbers that differ, by name: the size of an effect as truth records it."""
-    return {name: float(new) for name, old, new in zip(Physics._fields, before, after, strict=True) if old != new}
 
 
 def _believed(rng: np.random.Generator, physics: Physics, payload: Payload) -> tuple[Physics, Payload]:

@@ -17,10 +17,9 @@ import numpy as np
 from scipy import signal
 
 from frictid_hil.blind import plant
-from frictid_hil.blind.effects import LIBRARY
-from frictid_hil.blind.figures import rms, slip_of_spring
+from frictid_hil.blind.effects import LIBRARY, OUTSIDERS, changed
+from frictid_hil.blind.figures import lagging, low_pass, rms, slip_of_spring
 from frictid_hil.blind.joints import Joint, Payload, either_sign, log_uniform
-from frictid_hil.blind.outsiders import OUTSIDERS
 from frictid_hil.blind.plant import Controller, Physics
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiments import FULL, SHORT, Envelope, chosen
@@ -43,7 +42,6 @@ DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")
 """Effects that nobody sees without knowing the controller."""
 _LEFT_OUT = ("velocity_lag", "encoder_quantisation", "temperature_drift", "backlash", "joint_elasticity")
 """Effects of the narrow world that these sizes do not measure, or that a pick-and-place log hardly shows."""
-CUTOFF_HZ = 25.0
 
 Changed = tuple[Physics, Controller]
 
@@ -430,11 +428,8 @@ def _drawn(rng: np.random.Generator, setting: Setting, name: str, peak_nm: float
         ahead = log_uniform(rng, 0.02, 0.25)
         change = {"driving_loss": ahead, "backdriving_loss": ahead * rng.uniform(0.1, 0.6)}
         return Contributor(name, role, {}, _replacing(change))
-    draw = LIBRARY[name] if name in LIBRARY else OUTSIDERS[name]
-    after = draw(rng, _as_narrow(setting), peak_nm)
-    differing = {n: new for n, old, new in zip(Physics._fields, p, after, strict=True) if old != new}
-    parameters = _parameters(name, p, after)
-    return Contributor(name, role, parameters, _replacing(differing))
+    differing = changed(name, rng, _as_narrow(setting), peak_nm)
+    return Contributor(name, role, _parameters(name, p, p._replace(**differing)), _replacing(differing))
 
 
 def _parameters(name: str, before: Physics, after: Physics) -> dict[str, float]:
@@ -471,7 +466,7 @@ def _runs(setting: Setting, physics: Physics, control: Controller) -> list[Run] 
     """Every motion without noise; None where the controller cannot hold the joint."""
     runs, heat, clock = [], 0.0, 0.0
     for motion in setting.motions:
-        mounted = setting.payload.on(physics) if motion.payload else physics
+        mounted = setting.payload.on(physics, motion.payload)
         never = np.ones(motion.command.size)
         chance = np.random.default_rng(motion.command.size).random(motion.command.size) if physics.missed else never
         position, _, torque, heat = plant.run(motion.command, control, mounted, heat, clock, chance)
@@ -487,8 +482,7 @@ def _runs(setting: Setting, physics: Physics, control: Controller) -> list[Run] 
 def _asked(c: Controller, command: Array, position: Array, start_nm: float) -> Array:
     """The believed law along a motion, without its limit; row k acts from tick k on."""
     velocity = np.diff(position, prepend=position[0]) / c.tick
-    keep = math.exp(-c.tick / c.velocity_filter)
-    filtered = signal.lfilter([1.0 - keep], [1.0, -keep], velocity)
+    filtered = lagging(velocity, c.tick, c.velocity_filter)
     rate = np.diff(command, prepend=command[0]) / c.tick if c.backward else np.gradient(command, c.tick)
     bend = np.gradient(np.gradient(command, c.tick), c.tick)
     error = command - position
@@ -523,7 +517,7 @@ def _form(setting: Setting, base: Sequence[Run], floor_nm: float) -> float:
     level = max(1e-12, torques[0] - (torques[1] - torques[0]) / (speeds[1] - speeds[0]) * speeds[0])
     left = []
     for (q, torque, _), motion in zip(base, setting.motions, strict=True):
-        mounted = setting.payload.on(p) if motion.payload else p
+        mounted = setting.payload.on(p, motion.payload)
         v = np.gradient(q, tick)
         bend = np.zeros_like(q)
         bend[1:-1] = np.diff(q, 2) / tick**2
@@ -552,13 +546,6 @@ def _noise(rng: np.random.Generator, setting: Setting, rows: int) -> Array:
     keep = math.exp(-2.0 * math.pi * setting.corner_hz * setting.step_s)
     slow: Array = signal.lfilter([math.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(rows))
     return white + 0.5 * setting.noise_nm * slow
-
-
-def low_pass(values: Array, rate_hz: float) -> Array:
-    """Zero phase, second order, at 25 Hz or below what the rate allows; shape unchanged."""
-    b, a = signal.butter(2, min(CUTOFF_HZ, 0.3 * rate_hz) / (0.5 * rate_hz))
-    smooth: Array = signal.filtfilt(b, a, values)
-    return smooth
 
 
 def _applied(setting: Setting, reasons: Sequence[Contributor]) -> Changed:
@@ -628,13 +615,12 @@ def _as_wanted(
 def _recorded(rng: np.random.Generator, setting: Setting, physics: Physics, control: Controller) -> tuple[Row, ...]:
     rows, heat, clock = [], 0.0, 0.0
     for motion in setting.motions:
-        mounted = setting.payload.on(physics) if motion.payload else physics
+        mounted = setting.payload.on(physics, motion.payload)
         n = motion.command.size
         position, velocity, torque, heat = plant.run(motion.command, control, mounted, heat, clock, rng.random(n))
         clock += n * control.tick
         for _ in range(setting.filter_order):
-            keep = math.exp(-control.tick / setting.filter_s)
-            torque = torque[0] + signal.lfilter([1.0 - keep], [1.0, -keep], torque - torque[0])
+            torque = torque[0] + lagging(torque - torque[0], control.tick, setting.filter_s)
         ticks = control.tick * np.arange(n)
         times = ticks[:: setting.thin]
         if setting.jitter > 0.0:

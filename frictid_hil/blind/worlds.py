@@ -17,7 +17,7 @@ import yaml
 
 from frictid_hil.blind import judged, score, spoilt, wide, zoo
 from frictid_hil.blind import page as narrow_page
-from frictid_hil.blind.generator import assignments, draw_case, rounded, write_case
+from frictid_hil.blind.generator import assignments, dealt, draw_case, rounded, write_case
 from frictid_hil.blind.score import Answer
 from frictid_hil.files import write_whole
 
@@ -71,11 +71,7 @@ def _written(drawn: tuple[dict[str, Any], tuple[wide.Row, ...], dict[str, Any]],
 
 
 def _dealt(kinds: Sequence[str], cases: int, seed: int) -> list[str]:
-    rng = np.random.default_rng([seed, 707])
-    cards: list[str] = []
-    while len(cards) < cases:
-        cards += [str(kind) for kind in rng.permutation(list(kinds))]
-    return cards[:cases]
+    return dealt(np.random.default_rng([seed, 707]), kinds, cases)
 
 
 def _zoo_cards(cases: int, seed: int) -> list[Any]:

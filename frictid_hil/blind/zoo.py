@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.blind.figures import rms
+from frictid_hil.blind.figures import lagging, low_pass, rms
 from frictid_hil.blind.joints import either_sign, log_uniform
-from frictid_hil.blind.wide import Row, low_pass, multisine, pick_place
+from frictid_hil.blind.wide import Row, multisine, pick_place
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
 
@@ -107,7 +107,6 @@ SINGLES = (
     "stribeck", "friction_level_error", "viscous_error", "inertia_error", "gravity_error", "torque_constant_error",
     "torque_ripple", "electrical_lag", "torque_delay", "torque_bias", "joint_elasticity",
 )  # fmt: skip
-OUTSIDE = ("cable", "vibration")
 
 
 def _withheld(rng: np.random.Generator, b: Model, kind: str) -> tuple[str, Model]:
@@ -227,10 +226,7 @@ def _late(command: Array, m: Model, gains: Gains, made: tuple[Array, Array]) -> 
     """Torque less what the controller asked for a tick before."""
     position, torque = made
     velocity = np.diff(position, prepend=position[0]) / TICK_S
-    keep = math.exp(-TICK_S / gains.filter_s)
-    filtered = np.zeros_like(velocity)
-    for k in range(1, velocity.size):
-        filtered[k] = keep * filtered[k - 1] + (1.0 - keep) * velocity[k]
+    filtered = lagging(velocity, TICK_S, gains.filter_s)
     rate = np.diff(command, prepend=command[0]) / TICK_S
     error = command - position
     demand = gains.kp * error + gains.kd * (rate - filtered)

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import yaml
 
-from frictid_hil.blind.effects import LIBRARY
+from frictid_hil.blind.effects import LIBRARY, OUTSIDERS
 from frictid_hil.blind.figures import believed_motion, figures, record, together
 from frictid_hil.blind.generator import Assignment, Case, assignments, draw_case, write_case
 from frictid_hil.blind.joints import Joint, base_friction, draw_joint, nominal_mapping
-from frictid_hil.blind.outsiders import OUTSIDERS
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Replay, pooled
 
