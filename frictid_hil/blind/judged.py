@@ -6,13 +6,14 @@ right nor wrong (``neutral``), and for each contributor what can't be told from 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from frictid_hil.blind.generator import VISIBLE
-from frictid_hil.blind.score import CONFIDENT, Answer, Rate, not_taken_in
+from frictid_hil.blind.score import CONFIDENT, Answer, Rate, not_taken_in, times
 
 FALSE_CLEAR = 3.0
 """Gap over floor from which ``none`` is a false all-clear."""
@@ -39,15 +40,16 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
     def first(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
         return Rate.over(_right(t, a) for t, a in chosen).to_json()
 
+    def by(key: str) -> dict[str, Any]:
+        found = sorted({str(t[key]) for t, _ in visible})
+        return {value: first([(t, a) for t, a in visible if t[key] == value]) for value in found}
+
     return {
         "cases": len(cases),
         "errors": [{"case": t["case"], "message": a.message} for t, a, _ in cases if a.verdict == "error"],
         "first": first(visible),
-        "first_by_kind": {kind: first([(t, a) for t, a in visible if t["kind"] == kind]) for kind in _kinds(visible)},
-        "first_by_controller": {
-            told: first([(t, a) for t, a in visible if t["controller"] == told])
-            for told in sorted({str(t["controller"]) for t, _ in visible})
-        },
+        "first_by_kind": by("kind"),
+        "first_by_controller": by("controller"),
         "first_or_tied": Rate.over(_right(t, a) or a.first in _tied(t) for t, a in visible).to_json(),
         "none": Rate.over(a.verdict == "none" for t, a, _ in cases if t["kind"] == "none").to_json(),
         "first_of_all": first(wrong),
@@ -63,7 +65,7 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
         "brier": float(np.mean([(c - _there(t, e)) ** 2 for t, e, c in named])) if named else None,
         "calibration_error": _calibration_error([(c, _there(t, e)) for t, e, c in named]),
         "confusion": _confusion([(t, a) for t, a, _ in cases]),
-        "seconds": _quantiles([a.seconds for _, a, _ in cases if np.isfinite(a.seconds)]),
+        "seconds": {n: s for n, s in times([a.seconds for _, a, _ in cases]).items() if n != "worst"},
         "misses": [
             {"case": t["case"], "kind": t["kind"], "main": t["main"], "answer": a.first, "confidence": a.confidence,
              "size": t["size_ratio"]}
@@ -75,14 +77,9 @@ def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapp
 def headline(scores: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The rates that a person asks for first, by name."""
     told = {f"first_controller_{name}": rate for name, rate in scores["first_by_controller"].items()}
-    names = ("none", "outside", "false_none", "sure_and_wrong", "friction_level_taken_for_another", "parameters")
-    return {
-        "first": scores["first"],
-        "first_of_all": scores["first_of_all"],
-        **told,
-        "first_or_tied": scores["first_or_tied"],
-        **{n: scores[n] for n in names},
-    }
+    rest = ("none", "outside", "false_none", "sure_and_wrong", "friction_level_taken_for_another", "parameters")
+    names = ("first", "first_of_all", *told, "first_or_tied", *rest)
+    return {name: told.get(name) or scores[name] for name in names}
 
 
 def page(result: Mapping[str, Any]) -> str:
@@ -119,10 +116,6 @@ def page(result: Mapping[str, Any]) -> str:
 
 def _told(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
-
-
-def _kinds(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[str]:
-    return sorted({str(t["kind"]) for t, _ in cases})
 
 
 def _right(truth: Mapping[str, Any], answer: Answer) -> bool:
@@ -173,14 +166,7 @@ def _calibration_error(outcomes: Sequence[tuple[float, bool]]) -> float | None:
 
 
 def _confusion(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, dict[str, int]]:
-    rows: dict[str, dict[str, int]] = {}
+    rows: dict[str, Counter[str]] = {}
     for truth, answer in cases:
-        row = rows.setdefault(truth["main"][0] if truth["main"] else "none", {})
-        row[answer.first] = row.get(answer.first, 0) + 1
-    return dict(sorted(rows.items()))
-
-
-def _quantiles(seconds: Sequence[float]) -> dict[str, float | None]:
-    if not seconds:
-        return {"median": None, "p90": None}
-    return {"median": float(np.median(seconds)), "p90": float(np.quantile(seconds, 0.9))}
+        rows.setdefault(truth["main"][0] if truth["main"] else "none", Counter())[answer.first] += 1
+    return {row: dict(counts) for row, counts in sorted(rows.items())}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -176,7 +176,7 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
         },
         "unknown_enlarges_gap": [t["case"] for t, a in cases if a.verdict == "unknown" and _enlarged(a)],
         "confusion": _confusion(cases),
-        "seconds": _times([a.seconds for _, a in cases]),
+        "seconds": times([a.seconds for _, a in cases]),
         "misses": [_miss(t, a) for t, a in cases if not _right(t, a)],
     }
 
@@ -184,30 +184,21 @@ def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]
 def _singles(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
     """Joints with one effect, all and by its size."""
 
-    def top(count: int, chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-        return Rate.over(_name(t) in a.ranking[:count] for t, a in chosen).to_json()
+    def tops(chosen: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
+        first, second = (Rate.over(_name(t) in a.ranking[:count] for t, a in chosen) for count in (1, 2))
+        return {"top_1": first.to_json(), "top_2": second.to_json()}
 
-    sizes = {size: [(t, a) for t, a in cases if t["size_class"] == size] for size in ("small", "medium", "large")}
     return {
-        "top_1": Rate.over(a.first == _name(t) for t, a in cases).to_json(),
-        "top_2": top(2, cases),
+        **tops(cases),
         "top_1_or_alias": Rate.over(_same_or_alias(t, a) for t, a in cases).to_json(),
         "by_size": {
-            size: {
-                "top_1": Rate.over(a.first == _name(t) for t, a in chosen).to_json(),
-                "top_2": top(2, chosen),
-            }
-            for size, chosen in sizes.items()
+            size: tops([(t, a) for t, a in cases if t["size_class"] == size]) for size in ("small", "medium", "large")
         },
     }
 
 
 def score_left_out(answers: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
-    """The second check: each joint's own effect was taken out of the library before it was diagnosed.
-
-    Args:
-        answers: (truth, answer) of visible joints with one effect.
-    """
+    """The second check: visible joints with one effect, each taken out of the library before it was diagnosed."""
 
     def partner(truth: Mapping[str, Any], answer: Answer) -> bool:
         return {_name(truth), answer.first} in [set(pair) for pair in PARTNERS]
@@ -288,14 +279,9 @@ def _calibration(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> list[dict
     rows = []
     for low, high in itertools.pairwise(BINS):
         inside = [(c, right) for c, right in named if low <= c < high or (high == 1.0 and c == 1.0)]
-        rows.append(
-            {
-                "from": low,
-                "to": high,
-                "mean_confidence": float(np.mean([c for c, _ in inside])) if inside else None,
-                **Rate.over(right for _, right in inside).to_json(),
-            }
-        )
+        mean = _summed(np.mean, [c for c, _ in inside])
+        rate = Rate.over(right for _, right in inside).to_json()
+        rows.append({"from": low, "to": high, "mean_confidence": mean, **rate})
     return rows
 
 
@@ -340,18 +326,15 @@ def _held_out(truth: Mapping[str, Any], what: str, figure: str) -> float:
 
 def _agreement(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, Any]:
     """The gap that the tool reports before any fix, over the gap that the logs contain."""
-    ratios = {
-        str(truth["case"]): before / _held_out(truth, "gap", figure)
-        for truth, answer in cases
-        if (before := _figure(answer, "before", figure)) is not None and _held_out(truth, "gap", figure) > 0.0
-    }
-    too_good = {
-        str(truth["case"]): after / _held_out(truth, "ideal_residual", figure)
-        for truth, answer in cases
-        if (after := _figure(answer, "after", figure)) is not None
-        and _held_out(truth, "ideal_residual", figure) > 0.0
-        and after < _held_out(truth, "ideal_residual", figure) / AGREEMENT
-    }
+
+    def over(when: str, what: str) -> dict[str, float]:
+        return {
+            str(truth["case"]): told / _held_out(truth, what, figure)
+            for truth, answer in cases
+            if (told := _figure(answer, when, figure)) is not None and _held_out(truth, what, figure) > 0.0
+        }
+
+    ratios = over("before", "gap")
     values = list(ratios.values())
     return {
         "joints": len(values),
@@ -360,16 +343,18 @@ def _agreement(figure: str, cases: Sequence[tuple[Mapping[str, Any], Answer]]) -
         "p95_ratio": float(np.quantile(values, 0.95)) if values else None,
         "larger_than_the_logs_contain": sorted(case for case, ratio in ratios.items() if ratio > AGREEMENT),
         "smaller_than_the_logs_contain": sorted(case for case, ratio in ratios.items() if ratio < 1 / AGREEMENT),
-        "better_than_ideal": sorted(too_good),
+        "better_than_ideal": sorted(
+            case for case, ratio in over("after", "ideal_residual").items() if ratio < 1 / AGREEMENT
+        ),
     }
 
 
 def _enlarged(answer: Answer) -> bool:
-    pairs = [
-        (_figure(answer, "before", figure), _figure(answer, "after", figure))
-        for figure in ("inverse_nm", "forward_torque_nm")
-    ]
-    return any(after is not None and before is not None and after > 1.01 * before for before, after in pairs)
+    for figure in ("inverse_nm", "forward_torque_nm"):
+        before, after = _figure(answer, "before", figure), _figure(answer, "after", figure)
+        if before is not None and after is not None and after > 1.01 * before:
+            return True
+    return False
 
 
 def _confusion(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, dict[str, int]]:
@@ -382,12 +367,15 @@ def _confusion(cases: Sequence[tuple[Mapping[str, Any], Answer]]) -> dict[str, d
     return {row: dict(counts.most_common()) for row, counts in sorted(rows.items())}
 
 
-def _times(seconds: Sequence[float]) -> dict[str, float | None]:
+def times(seconds: Sequence[float]) -> dict[str, float | None]:
+    """Of those that were measured."""
     measured = [value for value in seconds if math.isfinite(value)]
-    if not measured:
-        return {"median": None, "p90": None, "worst": None}
     return {
-        "median": float(np.median(measured)),
-        "p90": float(np.quantile(measured, 0.9)),
-        "worst": float(max(measured)),
+        "median": _summed(np.median, measured),
+        "p90": _summed(lambda all_of_them: np.quantile(all_of_them, 0.9), measured),
+        "worst": _summed(max, measured),
     }
+
+
+def _summed(how: Callable[[Sequence[float]], Any], values: Sequence[float]) -> float | None:
+    return float(how(values)) if values else None
