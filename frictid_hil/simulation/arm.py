@@ -19,12 +19,9 @@ from frictid_hil.simulation.servo_loop import ServoLoop
 
 
 class ArmLoop:
-    """The arm under the drives of its joints.
+    """The arm under the drives of its joints: one per link, in the order of the chain, all of one control period.
 
-    Args:
-        model: links.
-        joints: one per link, in the order of the chain, all of one control period; from now on they move by
-            ``ArmLoop.advance`` only, and are read and switched as before.
+    From now on they move by ``ArmLoop.advance`` only, and are read and switched as before.
     """
 
     def __init__(self, model: ArmModel, joints: Sequence[ServoLoop]) -> None:
@@ -44,20 +41,15 @@ class ArmLoop:
             joint.place_again()
 
     def advance(self, duration_s: float, targets: Sequence[tuple[float | None, float, float, float]]) -> None:
-        """Let time pass for all joints.
-
-        Args:
-            duration_s: divided into control periods as ``ServoLoop.advance`` does.
-            targets: per joint, position, velocity, torque and torque offset; as for ``ServoLoop.advance``.
-        """
+        """Let time pass for all joints; targets are position, velocity, torque and offset, as for one joint."""
         if duration_s <= 0.0:
             return
         for joint, (position_rad, velocity_rad_s, torque_nm, offset_nm) in zip(self.joints, targets, strict=True):
             joint.command(duration_s, position_rad, velocity_rad_s, torque_nm, offset_nm)
         first = self.joints[0]
         modes = np.array([joint.mode for joint in self.joints])
-        for tick in range(first.periods):
-            self._look(0.5 * duration_s / first.periods)
+        for tick in range(len(first.commands)):
+            self._look(0.5 * duration_s / len(first.commands))
             for row, joint in zip(self._commands, self.joints, strict=True):
                 row[:] = joint.commands[tick]
             self._kernel.run_coupled(

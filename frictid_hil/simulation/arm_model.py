@@ -37,11 +37,7 @@ class ArmModel:
 
     @staticmethod
     def from_mapping(mapping: Mapping[str, Any], rows: Mapping[str, Mapping[str, float]]) -> ArmModel:
-        """The arm that a robot file describes.
-
-        Args:
-            mapping: ``simulated_arm`` as read from YAML.
-            rows: the joints' ``dh``, by name in the order of the chain; empty where a joint has none.
+        """The arm of ``simulated_arm`` and its joints' ``dh``, by name in the order of the chain; empty for none.
 
         Raises:
             InvalidFields: every unknown key, missing or impossible value, with its path.

@@ -138,11 +138,7 @@ class JointModel:
     ) -> JointModel:
         """The joint that a robot file's ``simulated`` mapping describes.
 
-        Args:
-            mapping: plain values as read from YAML.
-            gear_ratio: of the robot file's joint.
-            rated_torque_nm: of the robot file's joint.
-            max_torque_nm: of the robot file's joint; the drive's torque limit unless ``servo`` lowers it.
+        ``max_torque_nm`` is the drive's torque limit unless ``servo`` lowers it.
 
         Raises:
             InvalidFields: every unknown key or effect, missing or out-of-range value, with its path.
@@ -179,11 +175,7 @@ class JointModel:
 
     @staticmethod
     def of(joint: Simulated, name: str) -> JointModel:
-        """The simulated joint of a robot file.
-
-        Args:
-            joint: of the file, or as a driver knows it.
-            name: of the joint.
+        """The simulated joint of a robot file, or as a driver knows it.
 
         Raises:
             InvalidFields: what is wrong with it, by ``joints.NAME.simulated.KEY``.

@@ -45,13 +45,7 @@ class Exported:
 
 
 def described(model: JointModel, name: str, *, payload: bool = False) -> Exported:
-    """The joint as an MJCF model of one hinge, or of two with a spring between them.
-
-    Args:
-        model: with its effects.
-        name: of the model.
-        payload: the payload is mounted.
-    """
+    """The joint as an MJCF model of one hinge, or of two with a spring between them."""
     parameters, state = packing.parameters(model, payload=payload), packing.state()
     functions = kernel()
     functions.begin(parameters, state, STEP_S)
@@ -173,11 +167,7 @@ class MujocoJoint:
     """The joint's own drive, friction and sensors in a MuJoCo simulation of its exported model.
 
     Put the drive's torque demand into ``data.ctrl[0]``; ``install`` makes the model feel what the joint makes of it.
-    One joint at a time: MuJoCo has one control callback per process.
-
-    Args:
-        joint: with its effects.
-        payload: the payload is mounted; export with the same word.
+    One joint at a time: MuJoCo has one control callback per process. Export with the same word about the payload.
     """
 
     def __init__(self, joint: JointModel, *, payload: bool = False) -> None:
@@ -193,14 +183,7 @@ class MujocoJoint:
     def install(self, library: Any, model: Any, data: Any, *, position_rad: float = 0.0) -> float:
         """Place the joint at rest, switch the model's own friction and actuator off, and hang in the callback.
 
-        Args:
-            library: the ``mujoco`` module.
-            model: made of ``described(...).xml``.
-            data: of that model.
-            position_rad: where the encoder reads at the start.
-
-        Returns:
-            The holding torque, N m: the demand to begin with.
+        The model is made of ``described(...).xml``. Returns the holding torque, N m: the demand to begin with.
         """
         state, step_s = self._state, float(model.opt.timestep)
         holding = self._functions.place(self._parameters, state, position_rad)

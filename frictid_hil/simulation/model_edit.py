@@ -28,12 +28,9 @@ _ANGLES = ("ref", "springyield", "springref", "range")
 
 
 def edited_files(robot: RobotModel, natives: Mapping[str, Native], out: Path) -> dict[Path, bytes]:
-    """What to write so that ``out`` is the user's model with these changes, by path.
+    """What to write so that ``out`` is the user's model with these changes of joints, by path.
 
-    Args:
-        robot: the model as read.
-        natives: changes by joint.
-        out: where the model shall stand; the user's own file is edited in place.
+    The user's own file is edited in place.
 
     Raises:
         InputFileError: a joint does not stand in the file by its name.

@@ -56,8 +56,8 @@ def replayed(
         time_s: shape (n,).
         position_rad: measured, shape (n, k); only the first row is used.
         command_rad: shape (n, k).
-        engine: that steps the model, see ``other_engines``; MuJoCo itself unless given.
-        begin: row at which it takes over from MuJoCo.
+        engine: takes over from MuJoCo at the row ``begin``, see ``other_engines``.
+        begin: see there.
     """
     library, m = mujoco_library(), model
     data = library.MjData(m)

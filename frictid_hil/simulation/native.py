@@ -93,14 +93,9 @@ class Native:
 
 
 def native_elements(believed: ModelJoint, model: JointModel, use: Use, form: str, *, friction: bool) -> Native:
-    """What makes the user's joint move like ``model``.
+    """What makes the user's joint move like ``model``, in a form of friction out of ``FORMS``.
 
-    Args:
-        believed: the joint as the file has it.
-        model: with its effects.
-        use: of the joint.
-        form: of friction, one of ``FORMS``.
-        friction: write friction anew; else it stays as the file has it, as no cause concerns it.
+    Friction is written anew only where asked for; else it stays as the file has it, as no cause concerns it.
     """
     native = Native()
     if friction:

@@ -65,16 +65,9 @@ def torque_difference(
     time_s: Array,
     command_rad: Array,
 ) -> float:
-    """RMS of the exported joint's torque less ours, over the RMS of ours.
+    """RMS of the exported joint's torque less ours, over the RMS of ours, along commands (n,) in a posture (nq,).
 
-    Args:
-        robot: the user's model as it was.
-        exported: the edited model, compiled.
-        joint: that was edited.
-        model: our own, with effects, from ``in_posture``.
-        posture: of the user's model, (nq,).
-        time_s: shape (n,).
-        command_rad: where the joint is sent, shape (n,).
+    ``robot`` is the user's model as it was, ``model`` ours from ``in_posture``.
     """
     step_s = float(exported.opt.timestep)
     time = np.arange(time_s[0], time_s[-1], step_s)

@@ -129,13 +129,7 @@ def open_loop(
 
     Effects between command and current (delay, lag, limit) have already shaped a reported torque and are left out.
 
-    Args:
-        model: the joint.
-        time_s: increasing, evenly spaced, shape (n,).
-        torque_nm: as reported, shape (n,).
-        payload: the payload is mounted.
-        state: warmth left by the recording before.
-        start_rad: where the joint rests at the first row.
+    The torque is as reported, at even steps of time, shapes (n,); the rest is as for ``closed_loop``.
     """
     time = np.asarray(time_s, dtype=np.float64)
     period_s = float((time[-1] - time[0]) / max(1, time.size - 1))

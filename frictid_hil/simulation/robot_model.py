@@ -71,13 +71,7 @@ class ModelJoint:
 
 
 class RobotModel:
-    """A model file, compiled.
-
-    Attributes:
-        path: the file.
-        urdf: it is a URDF.
-        compiled: MuJoCo's own model of it.
-    """
+    """A model file, MJCF or URDF, and MuJoCo's own model of it (``compiled``)."""
 
     def __init__(self, path: Path, compiled: mujoco.MjModel, *, urdf: bool) -> None:
         self.path = path
@@ -244,27 +238,13 @@ class RobotModel:
         acceleration_rad_s2: Array,
         held: Mapping[str, float] | None = None,
     ) -> Array:
-        """Torque that the bodies, their gravity and the joints' springs ask for, by ``mj_inverse``.
+        """Torque that the bodies, their gravity and the joints' springs ask for, by ``mj_inverse``; all (n, k), N m.
 
-        Args:
-            joints: names, k of them.
-            position_rad: shape (n, k).
-            velocity_rad_s: shape (n, k).
-            acceleration_rad_s2: shape (n, k).
-            held: where the other joints stand; at the file's reference unless told.
-
-        Returns:
-            Shape (n, k), N m.
+        The other joints stand at the file's reference unless told.
         """
-        bodies = self.without_friction()
-        return inverse_torque(
-            bodies,
-            self.posture(held or {}),
-            [self.number(name) for name in joints],
-            position_rad,
-            velocity_rad_s,
-            acceleration_rad_s2,
-        )
+        numbers, posture = [self.number(name) for name in joints], self.posture(held or {})
+        motion = position_rad, velocity_rad_s, acceleration_rad_s2
+        return inverse_torque(self.without_friction(), posture, numbers, *motion)
 
     def inertia_kg_m2(self, joints: Sequence[str], position_rad: Array, held: Mapping[str, float]) -> Array:
         """Inertia that each joint feels of itself in some postures, armature included, shape (n, k)."""

@@ -32,11 +32,10 @@ class ServoLoop:
         position_rad: where the joint stands at first, as its encoder reads it; unpowered, brake engaged.
 
     Attributes:
-        model: the joint.
+        mode: as ``set_mode`` has set it.
         commands: what the coming control periods are told, shape (periods, ``plant.COMMANDS``).
         readings: what they read, shape (periods, ``plant.READINGS``).
-        substeps: of one control period.
-        step_s: of one sub-step.
+        substeps: of one control period, each of ``step_s``.
     """
 
     def __init__(self, model: JointModel, *, period_s: float = 0.001, seed: int = 0, position_rad: float = 0.0) -> None:
@@ -45,7 +44,7 @@ class ServoLoop:
         self._parameters = packing.parameters(model)
         self._state = packing.state()
         self._step_rad = model.encoder.step_rad(model.gear_ratio)
-        self._mode = plant.POSITION_MODE
+        self.mode = plant.POSITION_MODE
         self._target_rad = position_rad
         self._noise_nm = model.drive.torque_noise_per_mille * 1e-3 * model.drive.rated_torque_nm
         self._random = np.random.default_rng(seed)
@@ -58,17 +57,10 @@ class ServoLoop:
         self.substeps, self.step_s = 1, period_s
         self.commands = np.zeros((0, plant.COMMANDS))
         self.readings = np.zeros((0, plant.READINGS))
-        self._row: list[float] = [
-            self._state[plant.MEASURED],
-            0.0,
-            0.0,
-            self._state[plant.LINK_POSITION],
-            0.0,
-            0.0,
-            0.0,
-            25.0,
-            0.0,
-        ]
+        self._row = [0.0] * plant.READINGS
+        self._row[plant.READ_POSITION] = self._state[plant.MEASURED]
+        self._row[plant.READ_TRUE_POSITION] = self._state[plant.LINK_POSITION]
+        self._row[plant.READ_TEMPERATURE] = 25.0
 
     @property
     def period_s(self) -> float:
@@ -101,8 +93,8 @@ class ServoLoop:
         """
         if mode not in (plant.POSITION_MODE, plant.VELOCITY_MODE, plant.TORQUE_MODE):
             raise UsageError(f"no such mode: {mode}; there are 8 (position), 9 (velocity), 10 (torque)")
-        if mode != self._mode:
-            self._mode = mode
+        if mode != self.mode:
+            self.mode = mode
             self._take_over(self._row[plant.READ_TORQUE])
 
     def limits(self, torque_nm: float) -> None:
@@ -152,7 +144,7 @@ class ServoLoop:
             return
         self.command(duration_s, position_rad, velocity_rad_s, torque_nm, torque_offset_nm)
         self._kernel.run(
-            self._parameters, self._state, self.commands, self.readings, self._mode, self.substeps, self.step_s
+            self._parameters, self._state, self.commands, self.readings, self.mode, self.substeps, self.step_s
         )
         self.read()
 
@@ -170,7 +162,7 @@ class ServoLoop:
         if position_rad is None:
             position_rad = self._target_rad
         commands = self.commands
-        if self._mode == plant.POSITION_MODE:
+        if self.mode == plant.POSITION_MODE:
             velocity_rad_s = (position_rad - self._target_rad) / duration_s
             self._target_rad = position_rad
             if len(commands) > 1:
@@ -193,16 +185,6 @@ class ServoLoop:
         if not self._noise:
             self._noise = (self._random.standard_normal(_NOISE_BLOCK) * self._noise_nm).tolist()
         self._torque_noise_nm = self._noise.pop()
-
-    @property
-    def mode(self) -> int:
-        """As set."""
-        return self._mode
-
-    @property
-    def periods(self) -> int:
-        """Control periods of the last ``command``."""
-        return len(self.commands)
 
     @staticmethod
     def shared_rows(joints: Sequence[ServoLoop]) -> tuple[packing.Vector, packing.Vector]:
@@ -262,7 +244,7 @@ class ServoLoop:
     @property
     def following_error_rad(self) -> float:
         """Last position target minus encoder position; 0 outside position mode."""
-        return self._target_rad - self._row[plant.READ_POSITION] if self._mode == plant.POSITION_MODE else 0.0
+        return self._target_rad - self._row[plant.READ_POSITION] if self.mode == plant.POSITION_MODE else 0.0
 
     @property
     def saturated(self) -> bool:

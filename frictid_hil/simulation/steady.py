@@ -11,12 +11,9 @@ from frictid_hil.simulation.joint import JointModel
 
 
 def steady_friction_nm(model: JointModel, velocity_rad_s: Array, *, position_rad: float = 0.0) -> Array:
-    """Friction of steady sliding with all effects, cold, without ripple, N m.
+    """Friction of steady sliding with all effects, cold, without ripple, N m; signed, any shape; 0 gives 0.
 
-    Args:
-        model: the joint.
-        velocity_rad_s: signed, any shape; 0 gives 0.
-        position_rad: where the joint slides; matters where friction depends on load.
+    Where the joint slides matters where friction depends on load.
     """
     velocity = np.ascontiguousarray(velocity_rad_s, dtype=np.float64)
     torque = np.zeros(velocity.size)
@@ -25,16 +22,9 @@ def steady_friction_nm(model: JointModel, velocity_rad_s: Array, *, position_rad
 
 
 def true_curve_nm(model: JointModel, speed_rad_s: Array, *, position_rad: float = 0.0) -> Array:
-    """The odd part of steady sliding friction: what a symmetric curve can know of this joint, N m.
-
-    Args:
-        model: the joint.
-        speed_rad_s: positive, any shape.
-        position_rad: see ``steady_friction_nm``.
-    """
-    speed = np.abs(np.asarray(speed_rad_s, dtype=np.float64))
+    """The odd part of steady sliding friction: what a symmetric curve can know of this joint, N m; any shape."""
     # At standstill the curve continues its limit from motion.
-    speed = np.maximum(speed, 1e-9)
+    speed = np.maximum(np.abs(np.asarray(speed_rad_s, dtype=np.float64)), 1e-9)
     forward = steady_friction_nm(model, speed, position_rad=position_rad)
     backward = steady_friction_nm(model, -speed, position_rad=position_rad)
     return (forward - backward) / 2

@@ -40,13 +40,7 @@ class Law:
 
 
 def laws_of(target: str, texts: Mapping[str, str], joints: Iterable[str]) -> list[dict[str, Law]]:
-    """What the files of a target say, by joint; several sets for ``samples``.
-
-    Args:
-        target: one of ``targets.TARGETS``.
-        texts: by file name, as ``targets.written_as`` gives them.
-        joints: their names.
-    """
+    """What the files of a target, as ``targets.written_as`` gives them, say by joint; several sets for ``samples``."""
     if target == "bam":
         by_stem = {Path(file).stem: _bam(json.loads(text)) for file, text in texts.items()}
         return [{name: law for name in joints for stem, law in by_stem.items() if stem.endswith(f"_{name}")}]
@@ -153,12 +147,7 @@ def c_compiler() -> str | None:
 
 
 def run_c(header: str, velocity_rad_s: Mapping[str, Array], step_s: float) -> dict[str, Array]:
-    """Friction of the header's step function along a motion, by joint, N m.
-
-    Args:
-        header: text of the C header.
-        velocity_rad_s: by joint, (n,), at even steps.
-        step_s: between them.
+    """Friction of the header's step function along velocities at even steps, by joint, N m, (n,).
 
     Raises:
         FrictidError: there is no compiler, or the header does not compile or run.

@@ -41,13 +41,7 @@ class Numbers:
 
 
 def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
-    """The numbers of a joint with its causes.
-
-    Args:
-        believed: the joint as the user's file has it.
-        model: ours, with effects.
-        use: how it moves.
-    """
+    """The numbers of a joint with its causes: ``believed`` as the user's file has it, ``model`` ours with effects."""
     dry, rise, at, damping = curve_numbers(model, use)
     speed = np.quantile(use.speed_rad_s, np.linspace(0.1, 1.0, 40))
     bump = rise * np.exp(-((speed / at) ** 2)) if at > 0.0 else 0.0
@@ -354,14 +348,9 @@ def place_of(target: str, effect: str) -> str | None:
 def written_as(
     target: str, file: str, joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numbers]], step_s: float
 ) -> dict[str, str]:
-    """Text by file name.
+    """Text by file name, for the physics step of the user's model; samples of the posterior may be empty.
 
-    Args:
-        target: one of ``TARGETS`` but ``newton``, whose text ``usd`` makes.
-        file: name of the file; BAM has one a joint, ``NAME_JOINT.json``.
-        joints: to write.
-        samples: of the posterior, by joint; may be empty.
-        step_s: physics step of the user's model.
+    BAM has a file for each joint, ``NAME_JOINT.json``; the text for ``newton`` is made by ``usd``.
 
     Raises:
         UsageError: no such target.

@@ -30,13 +30,7 @@ _UNITS = '    defaultPrim = "robot"\n    kilogramsPerUnit = 1\n    metersPerUnit
 
 
 def overlay(stage: Path, prims: Mapping[str, tuple[str, bool]], joints: Mapping[str, Numbers]) -> str:
-    """A layer over a stage: opinions on its joints, and nothing else.
-
-    Args:
-        stage: the user's; stands as the layer below.
-        prims: (path, slides) by joint, see ``joint_prims``.
-        joints: what to say of each.
-    """
+    """A layer over the user's stage: opinions on its joints (prims as ``joint_prims`` finds them), nothing else."""
     doc = "Joints identified by frictid-hil. Open this file instead of the one below it."
     below = f"    subLayers = [\n        @{stage.as_posix()}@\n    ]\n"
     told = {}
