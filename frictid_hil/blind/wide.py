@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -54,6 +54,12 @@ class Contributor:
     role: str  # ``tolerance``, ``withheld`` or ``outside``
     parameters: dict[str, float]  # as the diagnosis would state them, by name; empty where it has other ones
     apply: Callable[[Physics, Controller], Changed]  # from a joint to the same joint with this reason
+    sizes: dict[str, float] = field(default_factory=dict)  # what it alone changes by channel, in floors
+
+    @property
+    def alone(self) -> float:
+        """Its size."""
+        return max(self.sizes.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,38 +137,27 @@ def draw_wide(index: int, seed: int, kind: str) -> tuple[dict[str, Any], tuple[R
         form = _form(setting, base, floor)
         if form > FORM[kind]:
             continue
-        chosen_ones = _contributors(rng, setting, kind, max(float(np.abs(t).max()) for _, t, _ in base))
-        sizes = [_size(setting, base, [one], floor) for one in chosen_ones]
-        if any(size is None for size in sizes):
+        drawn = _contributors(rng, setting, kind, max(float(np.abs(t).max()) for _, t, _ in base))
+        sizes = [_size(setting, base, [one], floor) for one in drawn]
+        reasons = [replace(one, sizes=size) for one, size in zip(drawn, sizes, strict=True) if size is not None]
+        if len(reasons) < len(drawn):
             continue
-        measured = [dict(size) for size in sizes if size is not None]
         if kind == "none":
-            chosen_ones, measured = _shrunk(setting, base, chosen_ones, measured, floor)
-        total = _size(setting, base, chosen_ones, floor)
-        if total is None or not _as_wanted(kind, chosen_ones, measured, total):
+            reasons = _shrunk(setting, base, reasons, floor)
+        total = _size(setting, base, reasons, floor)
+        if total is None or not _as_wanted(kind, reasons, max(total.values())):
             continue
-        physics, control = _applied(setting, chosen_ones)
-        logs = _recorded(rng, setting, physics, control)
+        logs = _recorded(rng, setting, *_applied(setting, reasons))
         name = f"case_{index:03d}"
-        truth = _truth(name, kind, setting, base, chosen_ones, measured, total, floor, form)
-        return _nominal(name, setting), logs, truth
+        return _nominal(name, setting), logs, _truth(name, kind, setting, base, reasons, total, floor, form)
     raise RuntimeError(f"no joint came up for case {index} of kind {kind}")
 
 
 # -- the joint ----------------------------------------------------------------------------------------------------
 
 
-class _Sized(NamedTuple):
-    """A joint of some size: its inertia and physics, what it may carry, its rated torque and its highest speed."""
-
-    inertia: float
-    physics: Physics
-    payload: Payload
-    rated_nm: float
-    speed: float
-
-
-def _sized(rng: np.random.Generator, size: str) -> _Sized:
+def _sized(rng: np.random.Generator, size: str) -> tuple[float, Physics, Payload, float, float]:
+    """A joint of some size: inertia, physics, what it may carry, rated torque, highest speed."""
     (lightest, heaviest), gears, (slow, fast) = _SIZES[size]
     inertia, gear, speed = log_uniform(rng, lightest, heaviest), float(rng.choice(gears)), rng.uniform(slow, fast)
     scale = 8.0 * inertia**0.75 * (0.15 if gear == 1 else 0.5 if gear <= 10 else 1.0)
@@ -194,7 +189,7 @@ def _sized(rng: np.random.Generator, size: str) -> _Sized:
         rate_family=family,
         slip_family=int(rng.choice(4, p=[0.4, 0.2, 0.2, 0.2])),
     )
-    return _Sized(inertia, physics, payload, rated, speed)
+    return inertia, physics, payload, rated, speed
 
 
 def _setting(rng: np.random.Generator) -> Setting:
@@ -339,33 +334,36 @@ def _tolerances(rng: np.random.Generator, setting: Setting) -> list[Contributor]
     def drawn(sigma: float) -> float:
         return float(np.clip(rng.normal(0.0, sigma), -2.5 * sigma, 2.5 * sigma))
 
-    t, a = setting.tolerance, setting.absolute
+    t = setting.tolerance
     whole = setting.physics.motor_inertia + setting.physics.link_inertia
-    link = setting.physics.link_inertia
-    made: list[Contributor] = []
-
-    def add(name: str, parameters: dict[str, float], factors: dict[str, float]) -> None:
-        made.append(Contributor(name, "tolerance", parameters, _scaling(factors)))
-
-    e = drawn(t["inertia_kg_m2"]) * whole / link
-    add("inertia_error", {"error_share": e}, {"link_inertia": 1 + e})
+    made = [_share("inertia_error", drawn(t["inertia_kg_m2"]) * whole / setting.physics.link_inertia)]
     if "gravity_torque_nm" in t:
-        e = drawn(t["gravity_torque_nm"])
-        add("gravity_error", {"error_share": e}, {"gravity": 1 + e})
-    e = drawn(t["friction_torque"])
-    add("friction_level_error", {"error_share": e}, dict.fromkeys(_FRICTION, 1 + e))
-    e = drawn(t["viscous"])
-    add("viscous_error", {"error_share": e}, dict.fromkeys(_FRICTION[1:], 1 + e))
-    add("presliding_hysteresis", {}, {"slip_length": 1 / (1 + drawn(t["presliding_stiffness"]))})
-    e = drawn(t["torque_constant"])
-    add("torque_constant_error", {"error_share": e}, {"gain": 1 + e})
-    if "zero_offset_rad" in a:
-        e = drawn(a["zero_offset_rad"])
+        made.append(_share("gravity_error", drawn(t["gravity_torque_nm"])))
+    made += [_share("friction_level_error", drawn(t["friction_torque"])), _share("viscous_error", drawn(t["viscous"]))]
+    softer = _scaling({"slip_length": 1 / (1 + drawn(t["presliding_stiffness"]))})
+    made.append(Contributor("presliding_hysteresis", "tolerance", {}, softer))
+    made.append(_share("torque_constant_error", drawn(t["torque_constant"])))
+    if "zero_offset_rad" in setting.absolute:
+        e = drawn(setting.absolute["zero_offset_rad"])
         made.append(Contributor("encoder_offset", "tolerance", {"offset_rad": -e}, _replacing({"gravity_angle": e})))
     if t.get("controller_gains"):
-        gains = [1 + drawn(t["controller_gains"]) for _ in range(3)]
-        made.append(_gains(setting, gains))
+        made.append(_gains(setting, [1 + drawn(t["controller_gains"]) for _ in range(3)]))
     return made
+
+
+_FRICTION = ("coulomb", "viscous_low", "viscous_high")
+_SHARES = {
+    "inertia_error": ("link_inertia",),
+    "gravity_error": ("gravity",),
+    "friction_level_error": _FRICTION,
+    "viscous_error": _FRICTION[1:],
+    "torque_constant_error": ("gain",),
+}
+
+
+def _share(name: str, e: float, role: str = "tolerance") -> Contributor:
+    """Numbers of the plant that are (1 + e) times what is believed."""
+    return Contributor(name, role, {"error_share": e}, _scaling(dict.fromkeys(_SHARES[name], 1 + e)))
 
 
 def _gains(setting: Setting, gains: Sequence[float], role: str = "tolerance") -> Contributor:
@@ -375,9 +373,6 @@ def _gains(setting: Setting, gains: Sequence[float], role: str = "tolerance") ->
         return p, c._replace(kp=c.kp * gains[0], ki=c.ki * gains[1], kd=c.kd * gains[2])
 
     return Contributor("controller_gain_error", role, named if setting.law != "cascade" else {}, change)
-
-
-_FRICTION = ("coulomb", "viscous_low", "viscous_high")
 
 
 def _scaling(factors: dict[str, float]) -> Callable[[Physics, Controller], Changed]:
@@ -411,12 +406,9 @@ def _contributors(rng: np.random.Generator, setting: Setting, kind: str, peak_nm
 
 def _drawn(rng: np.random.Generator, setting: Setting, name: str, peak_nm: float, role: str) -> Contributor:
     p = setting.physics
-    if name == "friction_level_error":
-        e = either_sign(rng, 0.08, 0.4)
-        return Contributor(name, role, {"error_share": e}, _scaling(dict.fromkeys(_FRICTION, 1 + e)))
-    if name == "viscous_error":
-        e = either_sign(rng, 0.15, 0.7)
-        return Contributor(name, role, {"error_share": e}, _scaling(dict.fromkeys(_FRICTION[1:], 1 + e)))
+    if name in ("friction_level_error", "viscous_error"):
+        least, most = (0.08, 0.4) if name == "friction_level_error" else (0.15, 0.7)
+        return _share(name, either_sign(rng, least, most), role)
     if name == "controller_gain_error":
         return _gains(setting, [1 + either_sign(rng, 0.1, 0.4) for _ in range(3)], role)
     if name == "transmission_error":
@@ -578,35 +570,26 @@ def _size(
 
 
 def _shrunk(
-    setting: Setting,
-    base: Sequence[Run],
-    reasons: list[Contributor],
-    sizes: list[dict[str, float]],
-    floor_nm: float,
-) -> tuple[list[Contributor], list[dict[str, float]]]:
+    setting: Setting, base: Sequence[Run], reasons: Sequence[Contributor], floor_nm: float
+) -> list[Contributor]:
     """Deviations taken away, the largest first, until what is left together is no gap."""
-    kept = sorted(zip(reasons, sizes, strict=True), key=lambda pair: max(pair[1].values()))
+    kept = sorted(reasons, key=lambda one: one.alone)
     while kept:
-        together = _size(setting, base, [one for one, _ in kept], floor_nm)
+        together = _size(setting, base, kept, floor_nm)
         if together is not None and max(together.values()) < PRESENT:
             break
         kept.pop()
-    return [one for one, _ in kept], [size for _, size in kept]
+    return kept
 
 
-def _as_wanted(
-    kind: str, reasons: Sequence[Contributor], sizes: Sequence[dict[str, float]], total: dict[str, float]
-) -> bool:
-    largest = {
-        role: [max(s.values()) for r, s in zip(reasons, sizes, strict=True) if r.role == role]
-        for role in ("tolerance", "withheld", "outside")
-    }
+def _as_wanted(kind: str, reasons: Sequence[Contributor], total: float) -> bool:
     if kind == "none":
         return True
+    within = max((r.alone for r in reasons if r.role == "tolerance"), default=0.0)
     if kind == "tolerance":
-        return 80.0 > max(total.values()) >= 1.0 and max(largest["tolerance"]) >= 2.0 * PRESENT
-    own = largest["outside"] if kind == "outside" else largest["withheld"]
-    return min(own) >= WITHHELD and max(own) < 80.0 and min(own) >= max(largest["tolerance"], default=0.0)
+        return 80.0 > total >= 1.0 and within >= 2.0 * PRESENT
+    own = [r.alone for r in reasons if r.role == ("outside" if kind == "outside" else "withheld")]
+    return min(own) >= WITHHELD and max(own) < 80.0 and min(own) >= within
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
@@ -660,7 +643,6 @@ def _nominal(name: str, setting: Setting) -> dict[str, Any]:
         "drive": {
             "rated_torque_nm": setting.rated_nm,
             "torque_quantum_nm": 1e-3 * setting.rated_nm,
-            **_declared_filter(setting),
         },
         "encoder": {"resolution_rad": p.encoder_step},
         "tolerance": {**setting.tolerance, "absolute": setting.absolute},
@@ -676,6 +658,9 @@ def _nominal(name: str, setting: Setting) -> dict[str, Any]:
             for order, m in enumerate(setting.motions)
         ],
     }
+    if setting.filter_order:
+        told = {"order": setting.filter_order, "time_constant_s": setting.filter_s}
+        document["drive"]["torque_report_filter"] = told
     if any(m.payload for m in setting.motions):
         document["payload"] = {
             "inertia_kg_m2": setting.payload.inertia_kg_m2,
@@ -702,37 +687,22 @@ def _bare(p: Physics) -> Physics:
     return p._replace(rounding=0.0, rate_extra=0.0)
 
 
-def _declared_filter(setting: Setting) -> dict[str, Any]:
-    if setting.filter_order == 0:
-        return {}
-    return {"torque_report_filter": {"order": setting.filter_order, "time_constant_s": setting.filter_s}}
-
-
 def _truth(
     name: str,
     kind: str,
     setting: Setting,
     base: Sequence[Run],
     reasons: Sequence[Contributor],
-    sizes: Sequence[dict[str, float]],
     total: dict[str, float],
     floor_nm: float,
     form: float,
 ) -> dict[str, Any]:
-    alone = [max(size.values()) for size in sizes]
     withheld = [r for r in reasons if r.role != "tolerance"]
-    largest = max(alone, default=0.0)
-    first = [r.name for r, a in zip(reasons, alone, strict=True) if a >= SHARED * largest and a >= PRESENT]
+    largest = max((r.alone for r in reasons), default=0.0)
+    first = [r.name for r in reasons if r.alone >= SHARED * largest and r.alone >= PRESENT]
     if kind == "single" or kind == "double":
         first = list(dict.fromkeys([*(r.name for r in withheld), *first]))
-    there = [r.name for r, a in zip(reasons, alone, strict=True) if a >= PRESENT or r in withheld]
-    tied = {r.name: _tied(setting, base, r, floor_nm) for r, a in zip(reasons, alone, strict=True) if a >= PRESENT}
-    parameters = [
-        {"effect": r.name, "parameter": parameter, "value": value}
-        for r, a in zip(reasons, alone, strict=True)
-        if a >= 1.0 and r.role != "outside"
-        for parameter, value in r.parameters.items()
-    ]
+    there = [r.name for r in reasons if r.alone >= PRESENT or r in withheld]
     return {
         "case": name,
         "world": "wide",
@@ -741,7 +711,7 @@ def _truth(
         "effects": [{"name": r.name, "in_library": r.role != "outside"} for r in withheld],
         "present": [*there, *(FORMS if form >= PRESENT else ())],
         "neutral": [
-            *(r.name for r, a in zip(reasons, alone, strict=True) if NOTHING <= a < PRESENT),
+            *(r.name for r in reasons if NOTHING <= r.alone < PRESENT),
             *(FORMS if NOTHING <= form < PRESENT else ()),
         ],
         "form": form,
@@ -752,27 +722,28 @@ def _truth(
             {
                 "name": r.name,
                 "role": r.role,
-                "size_alone": a,
-                "by_channel": dict(s),
-                "indistinguishable": tied.get(r.name, []),
+                "size_alone": r.alone,
+                "by_channel": r.sizes,
+                "indistinguishable": _tied(setting, base, r, floor_nm) if r.alone >= PRESENT else [],
             }
-            for r, a, s in zip(reasons, alone, sizes, strict=True)
+            for r in reasons
         ],
-        "true_parameters": parameters,
-        "facts": _facts(setting),
-    }
-
-
-def _facts(setting: Setting) -> dict[str, Any]:
-    """Of the joint, for who looks at a miss."""
-    return {
-        "size": setting.size,
-        "law": setting.law,
-        "motions": setting.kind,
-        "gear_ratio": setting.physics.gear_ratio,
-        "rate_family": setting.physics.rate_family,
-        "slip_family": setting.physics.slip_family,
-        "rate_hz": 1.0 / setting.step_s,
+        "true_parameters": [
+            {"effect": r.name, "parameter": parameter, "value": value}
+            for r in reasons
+            if r.alone >= 1.0 and r.role != "outside"
+            for parameter, value in r.parameters.items()
+        ],
+        # Of the joint, for who looks at a miss.
+        "facts": {
+            "size": setting.size,
+            "law": setting.law,
+            "motions": setting.kind,
+            "gear_ratio": setting.physics.gear_ratio,
+            "rate_family": setting.physics.rate_family,
+            "slip_family": setting.physics.slip_family,
+            "rate_hz": 1.0 / setting.step_s,
+        },
     }
 
 

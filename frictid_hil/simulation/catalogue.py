@@ -67,20 +67,9 @@ def section(effect: Effect) -> str:
         f"{'' if p.off is None else f'off {p.off:g}, '}typical {p.typical:g}"
         for p in effect.parameters
     ]
-    return "\n".join(
-        [
-            f"## {effect.name}",
-            "",
-            effect.summary,
-            "",
-            f"![{effect.name}]({PICTURES}/{effect.name}.svg)",
-            "",
-            effect.documentation,
-            "",
-            *rows,
-            "",
-        ]
-    )
+    name, picture_of_it = effect.name, f"{PICTURES}/{effect.name}.svg"
+    parts = [f"## {name}", effect.summary, f"![{name}]({picture_of_it})", effect.documentation, "\n".join(rows)]
+    return "\n\n".join(parts) + "\n"
 
 
 def picture(illustration: Illustration) -> str:

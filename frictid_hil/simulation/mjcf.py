@@ -58,6 +58,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     nothing = functions.shaft_torque(even, 0.0, 0.0, model.gear_ratio)
     gain = functions.shaft_torque(even, 1.0, 0.0, model.gear_ratio) - nothing
     limit = largest_torque(model)
+    limits = f'ctrllimited="true" ctrlrange="{-limit:.9g} {limit:.9g}"' if math.isfinite(limit) else ""
     soft = stiffness > 0.0
     own = _own_friction(model)
     on_joint = f'armature="{motor:.9g}" ' + " ".join(f'{key}="{value}"' for key, value in own.joint.items())
@@ -83,7 +84,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
   </worldbody>
   <actuator>
     <general name="motor" joint="joint" gaintype="fixed" gainprm="{gain:.9g}" biastype="affine"
-             biasprm="{nothing:.9g} 0 0" {_limits(limit)}/>
+             biasprm="{nothing:.9g} 0 0" {limits}/>
     {_lines(own.more_actuators)}
   </actuator>
   <tendon>
@@ -97,10 +98,6 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
 </mujoco>
 """
     return Exported(xml, *_accounts(model, soft, own))
-
-
-def _limits(limit_nm: float) -> str:
-    return f'ctrllimited="true" ctrlrange="{-limit_nm:.9g} {limit_nm:.9g}"' if math.isfinite(limit_nm) else ""
 
 
 def _body(inertia_kg_m2: float, cos_nm: float, sin_nm: float) -> str:

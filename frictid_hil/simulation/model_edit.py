@@ -115,8 +115,7 @@ def _names(model: Any, kind: str) -> list[str]:
 
 
 def _row(model: Any, kind: str, table: Any, k: int) -> Any:
-    at = int(model.jnt_dofadr[k]) if kind == "joint" and table.shape[0] == model.nv else k
-    return table[at]
+    return table[int(model.jnt_dofadr[k]) if kind == "joint" and table.shape[0] == model.nv else k]
 
 
 # -- MJCF -----------------------------------------------------------------------------------------------------------
@@ -213,19 +212,15 @@ def _add(text: ModelText, section: str, elements: str) -> None:
 def _edit_urdf(text: ModelText, name: str, native: Native) -> None:
     """Damping, friction and effort: all that a URDF holds."""
     joint = text.joint(name)
-    dynamics = {}
+    told: dict[str, dict[str, str]] = {}
     if "frictionloss" in native.joint:
-        dynamics = {"damping": native.joint["damping"].split()[0], "friction": native.joint["frictionloss"]}
-    for tag, attributes in (("dynamics", dynamics), ("limit", _effort(native))):
-        if not attributes:
-            continue
+        told["dynamics"] = {"damping": native.joint["damping"].split()[0], "friction": native.joint["frictionloss"]}
+    if "forcerange" in native.actuators:
+        told["limit"] = {"effort": native.actuators["forcerange"].split()[-1]}
+    for tag, attributes in told.items():
         found = text.children(joint, tag)
         if found:
             text.set(found[0], dict(attributes))
         else:
             words = "".join(f' {key}="{value}"' for key, value in attributes.items())
             text.add_inside(joint, f"<{tag}{words}/>")
-
-
-def _effort(native: Native) -> dict[str, str]:
-    return {"effort": native.actuators["forcerange"].split()[-1]} if "forcerange" in native.actuators else {}

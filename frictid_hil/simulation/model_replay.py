@@ -69,7 +69,7 @@ def replayed(
     gears = np.array([float(m.actuator_gear[drive][0]) for drive in drives])
     forces = [force_of(m, drive) for drive in drives]
     data.qpos[places] = position_rad[0]
-    frozen = _frozen(m, held)
+    frozen = [int(m.joint(name).dofadr[0]) for name in held]
     ticks = np.round((time_s - time_s[0]) / float(m.opt.timestep)).astype(int)
     steps = np.maximum(1, np.diff(ticks))
     positions, torques = np.empty_like(position_rad), np.empty_like(position_rad)
@@ -96,19 +96,14 @@ def replayed(
 class Stepper(Protocol):
     """A model that some engine moves, step by step."""
 
-    def step(self, control: Array) -> Array:
-        """One step under a control, (nu,); the force of every actuator."""
-        ...
-
-    def position(self) -> Array:
-        """Coordinates of the model, (nq,)."""
-        ...
+    def step(self, control: Array) -> Array: ...  # noqa: D102 - under a control, (nu,); the force of every actuator
+    def position(self) -> Array: ...  # noqa: D102 - coordinates of the model, (nq,)
 
 
 class _InMujoco:
     """MuJoCo itself."""
 
-    def __init__(self, model: Any, data: Any, frozen: list[int] | None) -> None:
+    def __init__(self, model: Any, data: Any, frozen: list[int]) -> None:
         self._model, self._data, self._frozen = model, data, frozen
         self._step = mujoco_library().mj_step
 
@@ -116,23 +111,15 @@ class _InMujoco:
         data = self._data
         data.ctrl[:] = control
         self._step(self._model, data)
-        if self._frozen is not None:
-            data.qvel[self._frozen] = 0.0
-        force: Array = data.actuator_force
-        return force
+        data.qvel[self._frozen] = 0.0
+        return np.asarray(data.actuator_force)
 
     def position(self) -> Array:
-        place: Array = self._data.qpos
-        return place
+        return np.asarray(self._data.qpos)
 
 
-def _holding(model: Any, frozen: list[int] | None) -> Any:
+def _holding(model: Any, frozen: list[int]) -> Any:
     """The model with joints that stand, by an inertia that nothing moves."""
     held = copy.copy(model)
-    held.dof_armature[frozen or []] = HELD_KG_M2
+    held.dof_armature[frozen] = HELD_KG_M2
     return held
-
-
-def _frozen(model: Any, held: Mapping[str, float]) -> list[int] | None:
-    dofs = [int(model.joint(name).dofadr[0]) for name in held]
-    return dofs or None

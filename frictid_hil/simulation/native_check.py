@@ -17,7 +17,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.joint import JointModel, ServoGains
 from frictid_hil.simulation.replay import Controller, closed_loop
 from frictid_hil.simulation.rigid_bodies import mujoco_library
-from frictid_hil.simulation.robot_model import ModelJoint, RobotModel, inverse_torque, relax
+from frictid_hil.simulation.robot_model import Motor, RobotModel, inverse_torque, relax
 
 if TYPE_CHECKING:
     import mujoco
@@ -42,7 +42,8 @@ def in_posture(robot: RobotModel, joint: str, model: JointModel, posture: Array)
     cos, sin = np.linalg.lstsq(columns, gravity, rcond=None)[0]
     believed = robot.joint(joint)
     motor = believed.armature_kg_m2 or model.motor_inertia_share * inertia
-    whole = inertia if believed.armature_kg_m2 or not _soft(model) else inertia + motor
+    soft = {"backlash", "joint_elasticity"} & set(model.effects)
+    whole = inertia if believed.armature_kg_m2 or not soft else inertia + motor
     return replace(
         model,
         inertia_kg_m2=whole,
@@ -50,10 +51,6 @@ def in_posture(robot: RobotModel, joint: str, model: JointModel, posture: Array)
         gravity_cos_nm=float(cos),
         gravity_sin_nm=float(sin),
     )
-
-
-def _soft(model: JointModel) -> bool:
-    return bool({"backlash", "joint_elasticity"} & set(model.effects))
 
 
 def torque_difference(
@@ -74,19 +71,18 @@ def torque_difference(
     command = np.interp(time, time_s, command_rad)
     believed = robot.joint(joint)
     by_position = believed.motor is not None and believed.motor.law == "position"
-    loop = _loop(believed, model, step_s, by_position=by_position)
+    loop = _loop(believed.motor if by_position else None, model, step_s)
     ours = closed_loop(model, loop, time, command).torque_nm[1:]
-    theirs = _in_mujoco(robot, exported, joint, believed, posture, command, loop, ours[0], by_position=by_position)[:-1]
+    theirs = _in_mujoco(robot, exported, joint, posture, command, loop, ours[0], by_position=by_position)[:-1]
     # A drive with another torque constant reports what it believes; MuJoCo tells what it gives.
     theirs = theirs / (1.0 + model.effects.get("torque_constant_error", {}).get("error_share", 0.0))
     settled = round(SETTLED_S / step_s)
     return float(np.sqrt(np.mean((theirs - ours)[settled:] ** 2) / np.mean(ours[settled:] ** 2)))
 
 
-def _loop(believed: ModelJoint, model: JointModel, step_s: float, *, by_position: bool) -> Controller:
+def _loop(motor: Motor | None, model: JointModel, step_s: float) -> Controller:
     limit = model.drive.torque_limit_nm
-    if by_position and believed.motor is not None:
-        motor = believed.motor
+    if motor is not None:
         return Controller(
             motor.kp_nm_per_rad, 0.0, motor.kv_nm_s_per_rad, 1.0 / step_s,
             torque_limit_nm=limit, command_rate="backward", command_rate_weight=0.0,
@@ -101,7 +97,6 @@ def _in_mujoco(
     robot: RobotModel,
     exported: Any,
     joint: str,
-    believed: ModelJoint,
     posture: Array,
     command: Array,
     loop: Controller,
@@ -124,9 +119,10 @@ def _in_mujoco(
     data.qpos[place] = command[0]
     if play is not None:
         _let_link_rest(library, m, data, dof)
-    drive = drive_of(m, number) if believed.motor is not None else None
+    motor = robot.joint(joint).motor
+    drive = drive_of(m, number) if motor is not None else None
     gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
-    own_gear = believed.motor.gear if believed.motor is not None else 1.0
+    own_gear = motor.gear if motor is not None else 1.0
     control = control_of(m, drive)
     if control is not None:
         # What the other side begins with: the torque that holds the joint.

@@ -19,9 +19,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.model_replay import Stepper
 
 
-class InWarp:
-    """mujoco-warp."""
-
+class _InWarp:
     def __init__(self, model: Any, data: Any) -> None:
         warp, self._engine = importlib.import_module("warp"), importlib.import_module("mujoco_warp")
         warp.config.quiet = True
@@ -30,18 +28,16 @@ class InWarp:
             self._model, self._data = self._engine.put_model(model), self._engine.put_data(model, data)
 
     def step(self, control: Array) -> Array:
-        """One step; the force of every actuator."""
         with self._device:
             self._data.ctrl.assign(control.astype(np.float32)[None])
             self._engine.step(self._model, self._data)
             return np.asarray(self._data.actuator_force.numpy()[0], dtype=np.float64)
 
     def position(self) -> Array:
-        """Coordinates of the model."""
         return np.asarray(self._data.qpos.numpy()[0], dtype=np.float64)
 
 
-class InMjx:
+class _InMjx:
     """MJX, its JAX path."""
 
     def __init__(self, model: Any, data: Any) -> None:
@@ -50,12 +46,10 @@ class InMjx:
         self._data, self._step = mjx.put_data(model, data), importlib.import_module("jax").jit(mjx.step)
 
     def step(self, control: Array) -> Array:
-        """One step; the force of every actuator."""
         self._data = self._step(self._model, self._data.replace(ctrl=control))
         return np.asarray(self._data.actuator_force, dtype=np.float64)
 
     def position(self) -> Array:
-        """Coordinates of the model."""
         return np.asarray(self._data.qpos, dtype=np.float64)
 
 
@@ -63,9 +57,9 @@ def installed() -> dict[str, Callable[[Any, Any], Stepper]]:
     """Engines that can step a compiled model here, by name and version."""
     found: dict[str, Callable[[Any, Any], Stepper]] = {}
     if _there("mujoco_warp"):
-        found[_named("mujoco-warp")] = InWarp
+        found[_named("mujoco-warp")] = _InWarp
     if _there("mujoco.mjx"):
-        found[_named("mujoco-mjx")] = InMjx
+        found[_named("mujoco-mjx")] = _InMjx
     return found
 
 

@@ -155,7 +155,11 @@ def _simulate(
     vector = packing.state()
     functions = kernel()
     holding_nm = functions.place(parameters, vector, float(start_rad))
-    _restore(vector, carried)
+    states = layout().states
+    slots = {e.name: slice(states[e.name], states[e.name] + e.state_size) for e in all_effects().values() if e.carried}
+    for name, slot in slots.items():
+        if carried is not None and name in carried.memory:
+            vector[slot] = carried.memory[name]
     first_rad = vector[plant.MEASURED]
     substeps = max(1, math.ceil(period_s / substep_s - 1e-6))
     readings = np.empty((len(commands), plant.READINGS))
@@ -167,7 +171,8 @@ def _simulate(
     # The mean torque of a row, whatever its length: difference of the torque's integral.
     integral = np.interp(time, ticks, np.concatenate([[0.0], np.cumsum(readings[:, plant.READ_TORQUE]) * period_s]))
     torque = np.concatenate([[holding_nm], np.diff(integral) / np.diff(time)])
-    return Simulated(position, velocity, torque, _carry(vector))
+    memory = {name: tuple(vector[slot].tolist()) for name, slot in slots.items()}
+    return Simulated(position, velocity, torque, CarryOver(memory))
 
 
 def _noisy(rows: Simulated, model: JointModel, seed: int) -> Simulated:
@@ -177,18 +182,3 @@ def _noisy(rows: Simulated, model: JointModel, seed: int) -> Simulated:
     torque = rows.torque_nm + noise * model.drive.torque_noise_per_mille * per_mille_nm
     quantum = model.drive.torque_quantum_per_mille * per_mille_nm
     return replace(rows, torque_nm=np.round(torque / quantum) * quantum if quantum > 0 else torque)
-
-
-def _carry(vector: packing.Vector) -> CarryOver:
-    return CarryOver({name: tuple(vector[at : at + size].tolist()) for name, at, size in _carried_slots()})
-
-
-def _restore(vector: packing.Vector, carried: CarryOver | None) -> None:
-    for name, at, size in _carried_slots():
-        if carried is not None and name in carried.memory:
-            vector[at : at + size] = carried.memory[name]
-
-
-def _carried_slots() -> list[tuple[str, int, int]]:
-    states = layout().states
-    return [(e.name, states[e.name], e.state_size) for e in all_effects().values() if e.carried]

@@ -15,7 +15,6 @@ import yaml
 from scipy.optimize import nnls
 
 from frictid_hil.errors import UsageError
-from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.native import Use, curve_numbers, largest_torque
 from frictid_hil.simulation.robot_model import ModelJoint
@@ -46,6 +45,7 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
     speed = np.quantile(use.speed_rad_s, np.linspace(0.1, 1.0, 40))
     bump = rise * np.exp(-((speed / at) ** 2)) if at > 0.0 else 0.0
     rest = (damping[0] + (damping[1] + damping[2] * speed) * speed) * speed
+    straight = nnls(np.stack([np.ones_like(speed), speed], axis=1), dry + bump + rest)[0]
     effects, motor = model.effects, believed.motor
     gains = effects.get("controller_gain_error", {})
     constant = 1.0 + effects.get("torque_constant_error", {}).get("error_share", 0.0)
@@ -56,7 +56,7 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
         stribeck_rad_s=at,
         damping=damping,
         viscous_nm_s_per_rad=float(speed @ rest / (speed @ speed)),
-        straight=_straight(speed, dry + bump + rest),
+        straight=(float(straight[0]), float(straight[1])),
         presliding_nm_per_rad=model.presliding_stiffness_nm_per_rad,
         armature_kg_m2=max(
             0.0, believed.armature_kg_m2 + effects.get("inertia_error", {}).get("error_share", 0.0) * link
@@ -66,12 +66,6 @@ def numbers_of(believed: ModelJoint, model: JointModel, use: Use) -> Numbers:
         torque_limit_nm=largest_torque(model) * constant,
         delay_s=(motor.delay_s if motor else 0.0) + effects.get("torque_delay", {}).get("delay_s", 0.0),
     )
-
-
-def _straight(speed: Array, torque: Array) -> tuple[float, float]:
-    """Level and slope nearest to a curve, neither below zero."""
-    level, slope = nnls(np.stack([np.ones_like(speed), speed], axis=1), torque)[0]
-    return float(level), float(slope)
 
 
 def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numbers]], step_s: float) -> str:
