@@ -16,8 +16,7 @@ from frictid_hil.blind import plant
 from frictid_hil.blind.joints import Joint, either_sign, log_uniform
 from frictid_hil.blind.plant import Physics
 
-Changes = dict[str, Any]
-"""Numbers of ``Physics`` by name."""
+Changes = dict[str, Any]  # numbers of ``Physics`` by name
 Draw = Callable[[np.random.Generator, Joint, float], Changes]
 
 

@@ -32,8 +32,7 @@ ALIASES = (
 )
 """Pairs that these columns can hardly separate."""
 
-VISIBLE = 1.5
-"""Gap over floor from which an effect counts as visible."""
+VISIBLE = 1.5  # gap over floor from which an effect counts as visible
 SMALL, MEDIUM = 4.0, 12.0
 SIZED_BY = ("inverse_nm", "actuation_nm", "forward_torque_nm")
 _COLUMNS = "time_s,position_rad,velocity_rad_s,torque_nm,position_command_rad"
@@ -197,6 +196,7 @@ def _truth(
 ) -> dict[str, Any]:
     gap, floor = together(gaps, logs), together(floors, logs)
     ratio = _ratio(gap, floor) if assignment.effects else 1.0
+    size = "small" if ratio < SMALL else "medium" if ratio < MEDIUM else "large"
     validation = [k for k, log in enumerate(logs) if log.experiment.role == "validation"]
     held_out = tuple(logs[k] for k in validation)
     return {
@@ -205,7 +205,7 @@ def _truth(
         "effects": [],
         "visible": ratio >= VISIBLE or not assignment.effects,
         "size_ratio": ratio,
-        "size_class": _size_class(ratio, assignment.effects),
+        "size_class": size if assignment.effects else "none",
         "gap_over_floor": {figure.removesuffix("_nm"): gap[figure] / floor[figure] for figure in SIZED_BY},
         "practical_over_floor": PRACTICAL * joint.belief.coulomb / max(floor[figure] for figure in SIZED_BY),
         "torque_noise_floor_nm": joint.torque_noise_nm,
@@ -223,12 +223,6 @@ def _truth(
             for log, one, ideal in zip(logs, gaps, floors, strict=True)
         ],
     }
-
-
-def _size_class(ratio: float, effects: tuple[str, ...]) -> str:
-    if not effects:
-        return "none"
-    return "small" if ratio < SMALL else "medium" if ratio < MEDIUM else "large"
 
 
 def rounded(value: Any) -> Any:

@@ -163,7 +163,17 @@ def nominal_mapping(joint: Joint, name: str) -> dict[str, Any]:
             "inertia_kg_m2": joint.believed_payload.inertia_kg_m2,
             "gravity_torque_nm": joint.believed_payload.gravity_nm,
         },
-        "controller": _told_controller(joint),
+        "controller": {
+            "type": "pid",
+            "rate_hz": round(1.0 / TICK_S),
+            "kp": joint.control.kp,
+            "ki": joint.control.ki,
+            "kd": joint.control.kd,
+            "velocity_filter_s": joint.control.velocity_filter,
+            "torque_limit_nm": joint.control.torque_limit,
+            "law": "kp*(cmd-q) + integral(ki*(cmd-q)) + kd*(d cmd/dt - filtered v)",
+            "integral_starts_at": "static holding torque; frozen while the limit is active",
+        },
         "drive": {
             "rated_torque_nm": joint.rated_torque_nm,
             "torque_quantum_nm": joint.torque_quantum_nm,
@@ -187,20 +197,6 @@ def nominal_mapping(joint: Joint, name: str) -> dict[str, Any]:
             }
             for order, experiment in enumerate(joint.experiments)
         ],
-    }
-
-
-def _told_controller(joint: Joint) -> dict[str, Any]:
-    return {
-        "type": "pid",
-        "rate_hz": round(1.0 / TICK_S),
-        "kp": joint.control.kp,
-        "ki": joint.control.ki,
-        "kd": joint.control.kd,
-        "velocity_filter_s": joint.control.velocity_filter,
-        "torque_limit_nm": joint.control.torque_limit,
-        "law": "kp*(cmd-q) + integral(ki*(cmd-q)) + kd*(d cmd/dt - filtered v)",
-        "integral_starts_at": "static holding torque; frozen while the limit is active",
     }
 
 

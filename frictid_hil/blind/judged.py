@@ -15,20 +15,13 @@ import numpy as np
 from frictid_hil.blind.generator import VISIBLE
 from frictid_hil.blind.score import CONFIDENT, Answer, Rate, not_taken_in, times
 
-FALSE_CLEAR = 3.0
-"""Gap over floor from which ``none`` is a false all-clear."""
-BINS = 10
-"""Of confidence, for the calibration error."""
+FALSE_CLEAR = 3.0  # gap over floor from which ``none`` is a false all-clear
+BINS = 10  # of confidence, for the calibration error
 LEVEL = "friction_level_error"
 
 
 def judged(truths: Mapping[str, Mapping[str, Any]], documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Every figure, plain values.
-
-    Args:
-        truths: by case name.
-        documents: lines of the diagnosing process by case name; a case without one counts as an error.
-    """
+    """Every figure, plain values, from truths and answered lines by case name; a case without a line is an error."""
     absent = {"error": "no answer"}
     cases = [(t, Answer.from_json(documents.get(n, absent)), documents.get(n, absent)) for n, t in truths.items()]
     wrong = [(t, a) for t, a, _ in cases if t["kind"] in ("tolerance", "single", "double")]

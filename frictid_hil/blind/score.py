@@ -17,10 +17,8 @@ import numpy as np
 
 NAMING = ("explained", "ambiguous")
 CONFIDENT = 0.9
-PROMISED = 2.0
-"""Gap over floor below which a verdict may be ``none``, whatever makes it."""
-PRACTICAL = 0.05
-"""The same over the believed friction level."""
+PROMISED = 2.0  # gap over floor below which a verdict may be ``none``, whatever makes it
+PRACTICAL = 0.05  # the same over the believed friction level
 BINS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.0)
 
 PARTNERS = (
@@ -122,12 +120,7 @@ class Rate:
 
 
 def score(truths: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Answer]) -> dict[str, Any]:
-    """Every rate of the blind check, plain values.
-
-    Args:
-        truths: by case name.
-        answers: by case name; a case without an answer counts as an error.
-    """
+    """Every rate of the blind check, plain values; by case name. A case without an answer counts as an error."""
     cases = [(truth, answers.get(name, Answer("error", message="no answer"))) for name, truth in truths.items()]
     visible = [(t, a) for t, a in cases if t["visible"]]
     singles = [(t, a) for t, a in visible if t["kind"] == "single"]

@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from frictid_hil.blind.joints import either_sign
-from frictid_hil.blind.wide import Row
+from frictid_hil.blind.wide import Drawn, Row
 from frictid_hil.blind.zoo import truth_of
 from frictid_hil.friction.trajectory import Array
 
@@ -37,8 +37,8 @@ def recorded_sets() -> tuple[Path, ...]:
     return tuple(path for path in found if "torque_nm" in _header(path))
 
 
-def draw_spoilt(index: int, seed: int, folder: Path) -> tuple[dict[str, Any], tuple[Row, ...], dict[str, Any]]:
-    """(nominal.yaml, logs, truth): a recorded set with one effect added."""
+def draw_spoilt(index: int, seed: int, folder: Path) -> Drawn:
+    """A recorded set with one effect added."""
     rng = np.random.default_rng([seed, 606, index])
     nominal = yaml.safe_load((folder / "nominal.yaml").read_text())
     logs = [_read(folder, entry) for entry in nominal["experiments"]]

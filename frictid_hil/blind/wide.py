@@ -24,20 +24,17 @@ from frictid_hil.blind.plant import Controller, Physics
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiments import FULL, SHORT, Envelope, chosen
 
-KINDS = ("none",) * 4 + ("tolerance",) * 4 + ("single",) * 7 + ("double",) * 2 + ("outside",) * 3
-"""Out of 20 cases."""
+KINDS = ("none",) * 4 + ("tolerance",) * 4 + ("single",) * 7 + ("double",) * 2 + ("outside",) * 3  # out of 20 cases
 NOTHING, PRESENT, WITHHELD = 0.2, 0.5, 1.5
 """Sizes, in floors: below the first a contributor is nothing, from the second on it is there; what is withheld has at
 least the third."""
-SHARED = 0.7
-"""A contributor of this share of the largest is as good a first answer."""
+SHARED = 0.7  # a contributor of this share of the largest is as good a first answer
 FORM = {"none": 0.45, "tolerance": 0.7, "single": 1.0, "double": 1.0, "outside": 0.7}
 """Largest size, in floors, of what no number of the belief can say: another form of presliding, bends between pairs."""
 FORMS = ("presliding_hysteresis", "viscous_nonlinearity", "stribeck", "stiction_breakaway")
 """What that may rightly be called."""
 PAIRS = 14
-TIE = 0.35
-"""A single cause that leaves less of another one than this, in floors, can't be told from it."""
+TIE = 0.35  # a single cause that leaves less of another one than this, in floors, can't be told from it
 DRIVE = ("torque_delay", "electrical_lag", "torque_saturation")
 """Effects that nobody sees without knowing the controller."""
 _LEFT_OUT = ("velocity_lag", "encoder_quantisation", "temperature_drift", "backlash", "joint_elasticity")
@@ -111,6 +108,8 @@ class Row:
     columns: dict[str, Array]
 
 
+Drawn = tuple[dict[str, Any], tuple[Row, ...], dict[str, Any]]  # nominal.yaml, logs, truth
+
 _SIZES: dict[str, tuple[tuple[float, float], tuple[int, ...], tuple[float, float]]] = {
     "hobby": ((3e-4, 6e-3), (200, 254, 288, 345), (1.5, 4.0)),
     "direct": ((2e-4, 2e-2), (1,), (4.0, 12.0)),
@@ -122,8 +121,8 @@ _SIZES: dict[str, tuple[tuple[float, float], tuple[int, ...], tuple[float, float
 """Inertia, gear ratios and peak speed by class."""
 
 
-def draw_wide(index: int, seed: int, kind: str) -> tuple[dict[str, Any], tuple[Row, ...], dict[str, Any]]:
-    """(nominal.yaml, logs, truth) of one case; the same from the same arguments.
+def draw_wide(index: int, seed: int, kind: str) -> Drawn:
+    """One case; the same from the same arguments.
 
     A joint that its controller cannot hold, or whose withheld effect cannot be seen, is drawn anew.
     """

@@ -6,9 +6,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from frictid_hil.blind.generator import assignments, dealt, draw_case, rounded, 
 from frictid_hil.blind.score import Answer
 from frictid_hil.files import write_whole
 
+_Plain = dict[str, Any]
 Documents = Mapping[str, Mapping[str, Any]]
 
 
@@ -54,20 +55,15 @@ def _draw_narrow(index: int, seed: int, card: Any, folder: Path) -> dict[str, An
     return case.truth
 
 
-def _draw_wide(index: int, seed: int, card: Any, folder: Path) -> dict[str, Any]:
-    return _written(wide.draw_wide(index, seed, card), folder)
-
-
-def _draw_zoo(index: int, seed: int, card: Any, folder: Path) -> dict[str, Any]:
-    drawn = spoilt.draw_spoilt(index, seed, card) if isinstance(card, Path) else zoo.draw_zoo(index, seed, card)
-    return _written(drawn, folder)
-
-
-def _written(drawn: tuple[dict[str, Any], tuple[wide.Row, ...], dict[str, Any]], folder: Path) -> dict[str, Any]:
-    nominal, rows, truth = drawn
+def _written(draw: Callable[[int, int, Any], wide.Drawn], index: int, seed: int, card: Any, folder: Path) -> _Plain:
+    nominal, rows, truth = draw(index, seed, card)
     write_rows(folder / truth["case"], nominal, rows)
-    plain: dict[str, Any] = rounded(truth)
+    plain: _Plain = rounded(truth)
     return plain
+
+
+def _draw_zoo(index: int, seed: int, card: Any) -> wide.Drawn:
+    return spoilt.draw_spoilt(index, seed, card) if isinstance(card, Path) else zoo.draw_zoo(index, seed, card)
 
 
 def _dealt(kinds: Sequence[str], cases: int, seed: int) -> list[str]:
@@ -88,8 +84,9 @@ def _score_narrow(truths: Mapping[str, Mapping[str, Any]], documents: Documents)
     return score.score(truths, {name: Answer.from_json(line) for name, line in documents.items()})
 
 
+_JUDGED = judged.judged, judged.headline, judged.page
 WORLDS: dict[str, World] = {
     "narrow": World(assignments, _draw_narrow, _score_narrow, narrow_page.headline, narrow_page.page),
-    "wide": World(functools.partial(_dealt, wide.KINDS), _draw_wide, judged.judged, judged.headline, judged.page),
-    "zoo": World(_zoo_cards, _draw_zoo, judged.judged, judged.headline, judged.page),
+    "wide": World(partial(_dealt, wide.KINDS), partial(_written, wide.draw_wide), *_JUDGED),
+    "zoo": World(_zoo_cards, partial(_written, _draw_zoo), *_JUDGED),
 }

@@ -16,14 +16,13 @@ import numpy as np
 
 from frictid_hil.blind.figures import lagging, low_pass, rms
 from frictid_hil.blind.joints import either_sign, log_uniform
-from frictid_hil.blind.wide import Row, multisine, pick_place
+from frictid_hil.blind.wide import Drawn, Row, multisine, pick_place
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
 
 STEP_S = 2e-4
 TICK_S = 0.002
-KINDS = ("none",) * 3 + ("single",) * 13 + ("outside",) * 4
-"""Out of 20 cases."""
+KINDS = ("none",) * 3 + ("single",) * 13 + ("outside",) * 4  # out of 20 cases
 VISIBLE = 2.0
 
 
@@ -53,8 +52,8 @@ class Model:
     shake_hz: float = 5.0
 
 
-def draw_zoo(index: int, seed: int, kind: str) -> tuple[dict[str, Any], tuple[Row, ...], dict[str, Any]]:
-    """(nominal.yaml, logs, truth) of one case; an effect that cannot be seen is drawn anew."""
+def draw_zoo(index: int, seed: int, kind: str) -> Drawn:
+    """One case; an effect that cannot be seen is drawn anew."""
     for attempt in range(60):
         rng = np.random.default_rng([seed, 505, index, attempt])
         belief = _belief(rng)
@@ -316,5 +315,4 @@ def truth_of(
     }
 
 
-TIED = (("torque_delay", "electrical_lag"),)
-"""Pairs that these recordings can hardly tell apart."""
+TIED = (("torque_delay", "electrical_lag"),)  # pairs that these recordings can hardly tell apart

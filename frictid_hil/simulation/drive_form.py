@@ -95,8 +95,7 @@ class KinematicForm:
     position_step: bool = False
 
 
-LATEST_S = 0.05
-"""Longest time by which a torque comes late."""
+LATEST_S = 0.05  # longest time by which a torque comes late
 
 
 def guesses_by_sample(views: Sequence[DriveView], seen: float | None) -> Array:

@@ -17,8 +17,7 @@ from frictid_hil.friction.trajectory import Array
 
 Shape = Mapping[str, float]
 
-ENOUGH_ROWS = 60_000
-"""Rows of recordings by which the most telling shape is chosen, about."""
+ENOUGH_ROWS = 60_000  # rows of recordings by which the most telling shape is chosen, about
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +93,7 @@ def behind_transmission(v: View, gap_rad: float, stiffness_nm_per_rad: float, re
     return np.asarray(torque - rigid)[:, None]
 
 
-PERIODIC = ("first", "second", "third", "fourth")
-"""Names of the lines of a shape that repeats with the motor's angle."""
+PERIODIC = ("first", "second", "third", "fourth")  # names of the lines of a shape that repeats with the motor's angle
 
 
 def periodic_lines(unit: str) -> Callable[[Shape, Array], dict[str, float]]:

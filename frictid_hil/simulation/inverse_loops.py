@@ -10,8 +10,7 @@ from scipy import signal
 
 from frictid_hil.friction.trajectory import Array
 
-NEAR_RAD = 0.1
-"""Angle between motor and link up to which a series of sine and cosine is exact to 1e-5."""
+NEAR_RAD = 0.1  # angle between motor and link up to which a series of sine and cosine is exact to 1e-5
 
 
 def lagged(values: Array, step_s: float, time_constant_s: float) -> Array:

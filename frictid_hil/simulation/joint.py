@@ -18,8 +18,7 @@ from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.fields import Fields
 
-PRESLIDING_TRAVEL_RAD = 5e-4
-"""Travel from rest to full sliding where a file gives no presliding stiffness."""
+PRESLIDING_TRAVEL_RAD = 5e-4  # travel from rest to full sliding where a file gives no presliding stiffness
 
 
 @dataclass(frozen=True, slots=True)

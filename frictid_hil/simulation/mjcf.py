@@ -22,8 +22,7 @@ from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.native import FRICTION, Native, Use, largest_torque, limits_of_gap, native_elements
 from frictid_hil.simulation.robot_model import ModelJoint
 
-STEP_S = 1e-4
-"""Time step of the model; the slip spring asks for it."""
+STEP_S = 1e-4  # time step of the model; the slip spring asks for it
 GRAVITY_M_S2 = 9.81
 
 _IN_MJCF = {"inertia", "gravity", "coupling", "coupling_damping", "play"}

@@ -23,8 +23,7 @@ from frictid_hil.simulation.robot_model import RobotModel
 if TYPE_CHECKING:
     import mujoco
 
-_ANGLES = ("ref", "springyield", "springref", "range")
-"""Attributes of a hinge that are degrees where the file says so."""
+_ANGLES = ("ref", "springyield", "springref", "range")  # attributes of a hinge that are degrees where the file says so
 
 
 def edited_files(robot: RobotModel, natives: Mapping[str, Native], out: Path) -> dict[Path, bytes]:
@@ -118,9 +117,6 @@ def _row(model: Any, kind: str, table: Any, k: int) -> Any:
     return table[int(model.jnt_dofadr[k]) if kind == "joint" and table.shape[0] == model.nv else k]
 
 
-# -- MJCF -----------------------------------------------------------------------------------------------------------
-
-
 def _in_degrees(text: ModelText) -> bool:
     """MuJoCo's angles are degrees unless a compiler element says otherwise."""
     compilers = [e.attributes for file in text.files.values() for e in file.elements if e.tag == "compiler"]
@@ -204,9 +200,6 @@ def _add(text: ModelText, section: str, elements: str) -> None:
         return
     lines = "\n".join(f"  {line}" for line in elements.splitlines())
     text.add_inside(text.main.root, f"<{section}>\n{lines}\n</{section}>")
-
-
-# -- URDF -----------------------------------------------------------------------------------------------------------
 
 
 def _edit_urdf(text: ModelText, name: str, native: Native) -> None:

@@ -34,35 +34,22 @@ FRICTION = {
     "presliding_hysteresis", "stiction_breakaway", "friction_level_error", "viscous_error", "temperature_drift",
 }  # fmt: skip
 """Effects that are a part of sliding friction."""
-_STEEP = 1.2
-"""The damping polynomial may not fall up to this multiple of the fastest speed."""
-_STIFFEST = 0.4
-"""Stiffness times squared step over inertia, at most: what an explicit spring bears without ringing."""
-_STEP_RULE = 1.3
-"""sigma1 over the least that LuGre needs at the model's step."""
-_SMALLEST_RISE = 1e-3
-"""Rise at standstill over the level, below which it is rounding."""
-_RISE_BASE = 0.05
-"""Level that LuGre needs at speed, over its rise; taken off the spring."""
+_STEEP = 1.2  # the damping polynomial may not fall up to this multiple of the fastest speed
+_STIFFEST = 0.4  # stiffness times squared step over inertia, at most: what an explicit spring bears without ringing
+_STEP_RULE = 1.3  # sigma1 over the least that LuGre needs at the model's step
+_SMALLEST_RISE = 1e-3  # rise at standstill over the level, below which it is rounding
+_RISE_BASE = 0.05  # level that LuGre needs at speed, over its rise; taken off the spring
 _KNEES = (0.12, 0.4, 0.9, 1.8, 3.4)
 """Speeds at which the ramps of a falling curve end, over that of the curve: a fall of an exponential to 1 %."""
-_HOLDS = 1.2
-"""Damping of what holds the ramps at rest over theirs."""
-_HOLDS_NM = 2e-3
-"""Its level over that of the joint."""
-_LOOP_ENDS = 20.0
-"""Travel over that of a presliding loop, after which it is turned over."""
-_LOOP_KNOTS = (0.3, 0.6, 0.85, 0.97)
-"""Parts of its turn-over at which one of the springs that stand for it yields."""
-_LOADS = (np.arange(12) + 0.5) / 12
-"""Quantiles of the load at which friction that depends on it is read."""
-_LEAST_SHARE = 0.03
-"""Share of a loop below which a spring is not worth its line."""
-_POWERS = ((1, 2, 3), (1, 2), (1,))
-"""Of damping's polynomial, to be tried in turn."""
+_HOLDS = 1.2  # damping of what holds the ramps at rest over theirs
+_HOLDS_NM = 2e-3  # its level over that of the joint
+_LOOP_ENDS = 20.0  # travel over that of a presliding loop, after which it is turned over
+_LOOP_KNOTS = (0.3, 0.6, 0.85, 0.97)  # parts of its turn-over at which one of the springs that stand for it yields
+_LOADS = (np.arange(12) + 0.5) / 12  # quantiles of the load at which friction that depends on it is read
+_LEAST_SHARE = 0.03  # share of a loop below which a spring is not worth its line
+_POWERS = ((1, 2, 3), (1, 2), (1,))  # of damping's polynomial, to be tried in turn
 _Damping = tuple[float, float, float]
-FAR_RAD = 3e5
-"""Where a spring is anchored whose torque shall not depend on the joint."""
+FAR_RAD = 3e5  # where a spring is anchored whose torque shall not depend on the joint
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +129,8 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     fastest = float(np.max(use.speed_rad_s))
     speed = _speeds(use, falling=form == "lugre")
     odd, even = _sliding(model, speed, use)
-    soft_nm = _soft_nm(model)
+    soft = model.effects.get("presliding_hysteresis")
+    soft_nm = soft["share"] * model.friction.coulomb_nm if soft else 0.0
     ramps: list[tuple[float, float]] = []
     dry, rise, at, poly = _with_stribeck(speed, odd, fastest) if form == "lugre" else (0.0, 0.0, 0.0, (0.0, 0.0, 0.0))
     if form == "ramps":
@@ -178,8 +166,8 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
         else:
             native.more_tendons.append(_slipping(f"{name}_friction", name, stiffness, dry / stiffness))
             where = "tendon with springyield, and damping of three numbers"
-    if soft_nm > 0.0:
-        for number, (share, yields_rad) in enumerate(_slip_elements(model.effects["presliding_hysteresis"]), 1):
+    if soft and soft_nm > 0.0:
+        for number, (share, yields_rad) in enumerate(_slip_elements(soft), 1):
             stiffness = share * soft_nm / yields_rad
             native.more_tendons.append(_slipping(f"{name}_presliding_{number}", name, stiffness, yields_rad))
         where += "; presliding: more springs that yield, one after the other"
@@ -231,12 +219,6 @@ def _sliding(model: JointModel, speed: Array, use: Use) -> tuple[Array, float]:
     forward = np.mean([steady_friction_nm(one, speed) for one in under], axis=0)
     backward = np.mean([steady_friction_nm(one, -speed) for one in under], axis=0)
     return 0.5 * (forward - backward), float(np.mean(0.5 * (forward + backward)))
-
-
-def _soft_nm(model: JointModel) -> float:
-    """Torque of the soft presliding element."""
-    values = model.effects.get("presliding_hysteresis")
-    return values["share"] * model.friction.coulomb_nm if values else 0.0
 
 
 def _polynomial(weights: Sequence[float] | Array, fastest: float) -> _Damping | None:

@@ -17,17 +17,14 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.joint import JointModel, ServoGains
 from frictid_hil.simulation.replay import Controller, closed_loop
 from frictid_hil.simulation.rigid_bodies import mujoco_library
-from frictid_hil.simulation.robot_model import Motor, RobotModel, inverse_torque, relax
+from frictid_hil.simulation.robot_model import Motor, RobotModel, actuators_on, inverse_torque, relax
 
 if TYPE_CHECKING:
     import mujoco
 
-HELD_KG_M2 = 1e9
-"""Armature of the joints that shall stand."""
-RESTED_S = 1.0
-"""Time in which a link behind play or spring comes to rest."""
-SETTLED_S = 0.3
-"""Start of a motion that is not compared."""
+HELD_KG_M2 = 1e9  # armature of the joints that shall stand
+RESTED_S = 1.0  # time in which a link behind play or spring comes to rest
+SETTLED_S = 0.3  # start of a motion that is not compared
 
 
 def in_posture(robot: RobotModel, joint: str, model: JointModel, posture: Array) -> JointModel:
@@ -183,12 +180,8 @@ def _let_friction_hold(m: Any, data: Any, joint: int, applied_nm: float) -> None
 
 def drive_of(m: Any, joint: int) -> int | None:
     """The first actuator that drives a joint; passive ones have no control."""
-    joints = (int(mujoco_library().mjtTrn.mjTRN_JOINT), int(mujoco_library().mjtTrn.mjTRN_JOINTINPARENT))
     controls = getattr(m, "actuator_ctrlnum", np.ones(len(m.actuator_trntype)))
-    for a in range(len(m.actuator_trntype)):
-        if int(m.actuator_trntype[a]) in joints and int(m.actuator_trnid[a][0]) == joint and controls[a] > 0:
-            return a
-    return None
+    return next((a for a in actuators_on(m, joint) if controls[a] > 0), None)
 
 
 def control_of(m: Any, actuator: int | None) -> int | None:

@@ -45,13 +45,10 @@ READ_EXTERNAL, READ_SATURATED, READ_TEMPERATURE, READ_FRICTION, READINGS = range
 
 POSITION_MODE, VELOCITY_MODE, TORQUE_MODE = 8, 9, 10
 
-COUPLING_RAD_S = 1e-12
-"""Joints of an arm are solved in turn until no mean velocity changes by more ..."""
-COUPLING_ROUNDS = 200
-"""... or for so many rounds."""
+COUPLING_RAD_S = 1e-12  # joints of an arm are solved in turn until no mean velocity changes by more
+COUPLING_ROUNDS = 200  # ... or for so many rounds
 
-Vector = Any
-"""A flat float64 array; typed loosely because the compiled kernel replaces this module's functions."""
+Vector = Any  # a flat float64 array; typed loosely because the compiled kernel replaces this module's functions
 
 
 def rate_torque(parameters: Vector, velocity_rad_s: float) -> float:

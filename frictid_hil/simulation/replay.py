@@ -18,8 +18,7 @@ from frictid_hil.simulation.compose import kernel, layout
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import JointModel
 
-SUBSTEP_S = 1e-4
-"""Longest sub-step of the physics."""
+SUBSTEP_S = 1e-4  # longest sub-step of the physics
 
 
 @dataclass(frozen=True, slots=True)

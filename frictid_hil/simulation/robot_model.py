@@ -26,8 +26,7 @@ from frictid_hil.simulation.rigid_bodies import mujoco_library
 if TYPE_CHECKING:
     import mujoco
 
-THREADS = 2
-"""MuJoCo computes without Python's lock, so that two threads halve the time."""
+THREADS = 2  # MuJoCo computes without Python's lock, so that two threads halve the time
 _ROWS_PER_THREAD = 5000
 
 
@@ -145,7 +144,7 @@ class RobotModel:
             dry, presliding = dry + stiffness * yields, stiffness
         rise = at = 0.0
         gradually = False
-        for a in self._actuators(k):
+        for a in actuators_on(m, k):
             if (lugre := self._lugre(a)) is not None:
                 sigma, coulomb, static, speed = lugre
                 dry, presliding, rise, at = dry + coulomb, sigma, static - coulomb, speed
@@ -164,14 +163,6 @@ class RobotModel:
             motor=self._motor(k),
         )
 
-    def _actuators(self, joint: int) -> list[int]:
-        """Actuators on the joint, passive ones included."""
-        m, library = self.compiled, mujoco_library()
-        kinds = (int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT))
-        # An actuator list may be longer than the controls: passive ones have none.
-        count = len(m.actuator_trntype)
-        return [a for a in range(count) if int(m.actuator_trntype[a]) in kinds and int(m.actuator_trnid[a][0]) == joint]
-
     def _lugre(self, a: int) -> tuple[float, float, float, float] | None:
         """(sigma0, Coulomb, static, Stribeck speed) on the joint's side of a LuGre element; None for others."""
         m, library = self.compiled, mujoco_library()
@@ -187,7 +178,7 @@ class RobotModel:
         m, library = self.compiled, mujoco_library()
         affine, none = int(library.mjtBias.mjBIAS_AFFINE), int(library.mjtBias.mjBIAS_NONE)
         fixed, gears = int(library.mjtGain.mjGAIN_FIXED), np.asarray(m.actuator_gear)[:, 0]
-        driven = [a for a in self._actuators(joint) if self._lugre(a) is None]
+        driven = [a for a in actuators_on(m, joint) if self._lugre(a) is None]
         if not driven:
             return None
         kp = kv = 0.0
@@ -282,6 +273,13 @@ class RobotModel:
             m.tendon_stiffness[m.tendon_springyield > 0.0] = 0.0
         m.opt.disableflags |= int(library.mjtDisableBit.mjDSBL_CONSTRAINT) | int(library.mjtDisableBit.mjDSBL_ACTUATION)
         return m
+
+
+def actuators_on(m: Any, joint: int) -> list[int]:
+    """Actuators on a joint, passive ones included; the list may be longer than that of controls, which those lack."""
+    kinds = (int(mujoco_library().mjtTrn.mjTRN_JOINT), int(mujoco_library().mjtTrn.mjTRN_JOINTINPARENT))
+    count = len(m.actuator_trntype)
+    return [a for a in range(count) if int(m.actuator_trntype[a]) in kinds and int(m.actuator_trnid[a][0]) == joint]
 
 
 def inverse_torque(

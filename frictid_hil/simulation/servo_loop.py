@@ -16,8 +16,7 @@ from frictid_hil.simulation import packing, plant
 from frictid_hil.simulation.compose import kernel
 from frictid_hil.simulation.joint import HandImpedance, JointModel
 
-SUBSTEP_S = 1e-4
-"""Longest sub-step of the physics."""
+SUBSTEP_S = 1e-4  # longest sub-step of the physics
 
 _NOISE_BLOCK = 4096
 

@@ -126,8 +126,6 @@ def _c_header(text: str) -> dict[str, Law]:
     return laws
 
 
-# -- the C header, run ------------------------------------------------------------------------------------------------
-
 _PROGRAM = """#include <stdio.h>
 #include <stdlib.h>
 #include "friction.h"

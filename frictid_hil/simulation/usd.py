@@ -22,8 +22,7 @@ from frictid_hil.simulation.robot_model import RobotModel
 if TYPE_CHECKING:
     from frictid_hil.simulation.targets import Numbers
 
-ROOT = "/robot"
-"""Prim of the articulation in a stage of our own."""
+ROOT = "/robot"  # prim of the articulation in a stage of our own
 _HEAD = '#usda 1.0\n(\n    doc = "{doc}"\n{more})\n'
 _JOINT = re.compile(r'"(\w+)" \(\n\s+prepend apiSchemas = \["PhysicsDriveAPI:(\w+)", "NewtonJointAPI"\]([^}]*)}')
 _UNITS = '    defaultPrim = "robot"\n    kilogramsPerUnit = 1\n    metersPerUnit = 1\n    upAxis = "Z"\n'

@@ -15,8 +15,7 @@ from importlib.metadata import entry_points
 from frictid_hil.errors import UsageError
 from frictid_hil.simulation.effect import Effect
 
-GROUP = "frictid_hil.effects"
-"""Entry points of users' own effects."""
+GROUP = "frictid_hil.effects"  # entry points of users' own effects
 
 
 @functools.cache

@@ -33,8 +33,7 @@ def coupling_damping(
     return max(coupling_nm_s_per_rad, contact_relaxation_s * coupling_nm_per_rad)
 
 
-STIFFNESS_BOUNDS = (100.0, 1e7)
-"""From a wrist of 0.01 kg m2 to a base joint of tens of kg m2 that rings at 100 Hz."""
+STIFFNESS_BOUNDS = (100.0, 1e7)  # from a wrist of 0.01 kg m2 to a base joint of tens of kg m2 that rings at 100 Hz
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
@@ -75,8 +74,7 @@ def _shape(link_kg_m2: float, gap_rad: float, frequency_hz: float, ratio: float)
 
 CONTACTS = ((35.0, 0.08), (70.0, 0.08), (30.0, 0.4), (70.0, 0.4))
 """Frequency in Hz at which the link rings in the closed contact, and damping over the critical one."""
-CLOSER = (0.75, 0.85, 1.15, 1.3)
-"""Gaps that are tried beside the one that describes most."""
+CLOSER = (0.75, 0.85, 1.15, 1.3)  # gaps that are tried beside the one that describes most
 
 
 def behind_play(position_rad: Array, gap_rad: float, step_s: float) -> Array:

@@ -16,8 +16,7 @@ def resolution(resolution_rad: float, step_rad: float) -> float:
     return max(resolution_rad, step_rad)
 
 
-COARSER = 1.5
-"""Step over the stated resolution from which it is called coarser."""
+COARSER = 1.5  # step over the stated resolution from which it is called coarser
 
 
 def read(views: Sequence[MotionView], believed: Believed) -> Finding | None:

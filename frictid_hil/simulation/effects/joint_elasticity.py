@@ -23,8 +23,7 @@ def coupling_damping(
     return relaxation_s * coupling_nm_per_rad if compliance_rad_per_nm > 0.0 else coupling_nm_s_per_rad
 
 
-COMPLIANCE_BOUNDS = (1e-7, 0.2)
-"""From a large joint's stiff gear to a wrist of 0.01 kg m2 that swings at 4 Hz."""
+COMPLIANCE_BOUNDS = (1e-7, 0.2)  # from a large joint's stiff gear to a wrist of 0.01 kg m2 that swings at 4 Hz
 
 
 def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
@@ -55,10 +54,8 @@ def _shape(link_kg_m2: float, frequency_hz: float, ratio: float) -> dict[str, fl
 
 
 RESONANCES_HZ = (4.0, 5.0, 6.0, 7.0, 8.0, 9.5, 11.0, 13.0, 15.0, 18.0, 21.0, 25.0, 30.0, 37.0, 45.0)
-RATIOS = (0.03, 0.12)
-"""Damping of the resonance over the critical one."""
-CLOSER = (0.9, 0.95, 1.05, 1.1)
-"""Resonances that are tried beside the one that describes most."""
+RATIOS = (0.03, 0.12)  # damping of the resonance over the critical one
+CLOSER = (0.9, 0.95, 1.05, 1.1)  # resonances that are tried beside the one that describes most
 
 
 def illustrate(p: Mapping[str, float]) -> Illustration:

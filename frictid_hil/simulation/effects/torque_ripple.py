@@ -12,12 +12,9 @@ from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, P
 from frictid_hil.simulation.inverse import PERIODIC, InverseForm, Shape, View, periodic_lines
 
 PREFIXES = ("", "second_", "third_", "fourth_")
-MOST_CYCLES = 600
-"""Highest line looked for; 300 slots times two is more than motors have."""
-MOST_ROWS = 12_000
-"""Rows that lines are looked for in; more tell no more."""
-NEIGHBOURS = 8
-"""Lines on either side that make a line's floor."""
+MOST_CYCLES = 600  # highest line looked for; 300 slots times two is more than motors have
+MOST_ROWS = 12_000  # rows that lines are looked for in; more tell no more
+NEIGHBOURS = 8  # lines on either side that make a line's floor
 USUAL: tuple[Shape, ...] = tuple({"first": k} for k in (1.0, 2.0, 4.0)) + tuple(
     {"first": a, "second": b} for a, b in ((1.0, 2.0), (2.0, 4.0), (1.0, 4.0))
 )

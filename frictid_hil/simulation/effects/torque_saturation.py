@@ -12,10 +12,8 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import ActuationForm, DriveView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
-HARD = 60.0
-"""Exponent from which a knee is a corner."""
-LASTS_S = 0.01
-"""Time for which a demand beyond the limit lasts at least where a flat top can be told."""
+HARD = 60.0  # exponent from which a knee is a corner
+LASTS_S = 0.01  # time for which a demand beyond the limit lasts at least where a flat top can be told
 
 
 def current(current_nm: float, limit_nm: float, limit_share: float, exponent: float) -> float:

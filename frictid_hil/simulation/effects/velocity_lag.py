@@ -27,10 +27,8 @@ def settle(state: Any, at: int, velocity_rad_s: float) -> None:
     state[at] = velocity_rad_s
 
 
-LEAST_SHARE = 0.5
-"""Part of the channel's squares that a lag must explain."""
-LEAST_RAD_S = 1e-3
-"""RMS of the channel below which nothing is looked for."""
+LEAST_SHARE = 0.5  # part of the channel's squares that a lag must explain
+LEAST_RAD_S = 1e-3  # RMS of the channel below which nothing is looked for
 
 
 def read(views: Sequence[MotionView], believed: Believed) -> Finding | None:
