@@ -7,6 +7,7 @@ tolerances of up to 0.8 %, and every joint carries traces of effects below its o
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -148,10 +149,7 @@ def nominal_mapping(joint: Joint, name: str) -> dict[str, Any]:
             "the command of row k acts from t_k"
         ),
         "joint": {
-            "inertia_kg_m2": belief.motor_inertia + belief.link_inertia,
-            "motor_inertia_share": belief.motor_inertia / (belief.motor_inertia + belief.link_inertia),
-            "gravity_torque_nm": belief.gravity,
-            "gear_ratio": belief.gear_ratio,
+            **told_body(belief.motor_inertia, belief.link_inertia, belief.gravity, belief.gear_ratio),
             "gear": "harmonic_drive",
             "friction": {
                 "velocity_rad_s": speeds,
@@ -186,18 +184,35 @@ def nominal_mapping(joint: Joint, name: str) -> dict[str, Any]:
             "zero_offset_rad": 0.0,
             "velocity": "backward difference of position, no filter",
         },
-        "experiments": [
-            {
-                "name": experiment.name,
-                "file": f"{experiment.name}.csv",
-                "role": experiment.role,
-                "payload": experiment.payload,
-                "run_order": order,
-                "duration_s": ticks(experiment).size * TICK_S,
-            }
-            for order, experiment in enumerate(joint.experiments)
-        ],
+        "experiments": told_experiments(
+            ".csv", ((e.name, e.role == "validation", e.payload, ticks(e).size * TICK_S) for e in joint.experiments)
+        ),
     }
+
+
+def told_body(motor_kg_m2: float, link_kg_m2: float, gravity_nm: float, gear_ratio: float) -> dict[str, float]:
+    """The believed joint without its friction."""
+    return {
+        "inertia_kg_m2": motor_kg_m2 + link_kg_m2,
+        "motor_inertia_share": motor_kg_m2 / (motor_kg_m2 + link_kg_m2),
+        "gravity_torque_nm": gravity_nm,
+        "gear_ratio": gear_ratio,
+    }
+
+
+def told_experiments(ending: str, recorded: Iterable[tuple[str, bool, bool, float]]) -> list[dict[str, Any]]:
+    """The recordings of a set in order, each (name, judged on, payload mounted, duration in s)."""
+    return [
+        {
+            "name": name,
+            "file": f"{name}{ending}",
+            "role": "validation" if judged else "identification",
+            "payload": payload,
+            "run_order": order,
+            "duration_s": duration_s,
+        }
+        for order, (name, judged, payload, duration_s) in enumerate(recorded)
+    ]
 
 
 def ticks(experiment: Experiment) -> Array:

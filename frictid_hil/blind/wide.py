@@ -19,7 +19,7 @@ from scipy import signal
 from frictid_hil.blind import plant
 from frictid_hil.blind.effects import LIBRARY, OUTSIDERS, changed
 from frictid_hil.blind.figures import lagging, low_pass, rms, slip_of_spring
-from frictid_hil.blind.joints import Joint, Payload, either_sign, log_uniform
+from frictid_hil.blind.joints import Joint, Payload, either_sign, log_uniform, told_body, told_experiments
 from frictid_hil.blind.plant import Controller, Physics
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiments import FULL, SHORT, Envelope, chosen
@@ -628,10 +628,7 @@ def _nominal(name: str, setting: Setting) -> dict[str, Any]:
     document: dict[str, Any] = {
         "case": name,
         "joint": {
-            "inertia_kg_m2": p.motor_inertia + p.link_inertia,
-            "motor_inertia_share": p.motor_inertia / (p.motor_inertia + p.link_inertia),
-            "gravity_torque_nm": p.gravity,
-            "gear_ratio": p.gear_ratio,
+            **told_body(p.motor_inertia, p.link_inertia, p.gravity, p.gear_ratio),
             "continuous": p.gravity == 0.0,
             "friction": {
                 "velocity_rad_s": speeds,
@@ -645,17 +642,9 @@ def _nominal(name: str, setting: Setting) -> dict[str, Any]:
         },
         "encoder": {"resolution_rad": p.encoder_step},
         "tolerance": {**setting.tolerance, "absolute": setting.absolute},
-        "experiments": [
-            {
-                "name": m.name,
-                "file": f"{m.name}.csv.gz",
-                "role": "validation" if m.validation else "identification",
-                "payload": m.payload,
-                "run_order": order,
-                "duration_s": m.command.size * c.tick,
-            }
-            for order, m in enumerate(setting.motions)
-        ],
+        "experiments": told_experiments(
+            ".csv.gz", ((m.name, m.validation, m.payload, m.command.size * c.tick) for m in setting.motions)
+        ),
     }
     if setting.filter_order:
         told = {"order": setting.filter_order, "time_constant_s": setting.filter_s}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.blind.figures import lagging, low_pass, rms
-from frictid_hil.blind.joints import either_sign, log_uniform
+from frictid_hil.blind.joints import either_sign, log_uniform, told_body, told_experiments
 from frictid_hil.blind.wide import Drawn, Row, multisine, pick_place
 from frictid_hil.errors import UsageError
 from frictid_hil.friction.trajectory import Array
@@ -253,10 +253,7 @@ def _nominal(case: str, b: Model, g: Gains, rated: float, motions: Mapping[str, 
     return {
         "case": case,
         "joint": {
-            "inertia_kg_m2": b.inertia + b.armature,
-            "motor_inertia_share": b.armature / (b.inertia + b.armature),
-            "gravity_torque_nm": b.gravity,
-            "gear_ratio": GEAR_RATIO,
+            **told_body(b.armature, b.inertia, b.gravity, GEAR_RATIO),
             "friction": {
                 "velocity_rad_s": speeds,
                 "torque_nm": [b.level + b.viscous * v for v in speeds],
@@ -271,11 +268,9 @@ def _nominal(case: str, b: Model, g: Gains, rated: float, motions: Mapping[str, 
         "encoder": {"resolution_rad": 2.0 * math.pi / (2**17 * GEAR_RATIO)},
         "tolerance": {"inertia_kg_m2": 0.01, "gravity_torque_nm": 0.01, "friction_torque": 0.01, "viscous": 0.02,
                       "torque_constant": 0.005, "controller_gains": 0.0},
-        "experiments": [
-            {"name": n, "file": f"{n}.csv.gz", "role": "validation" if n == "judged" else "identification",
-             "payload": False, "run_order": order, "duration_s": c.size * TICK_S}
-            for order, (n, c) in enumerate(motions.items())
-        ],
+        "experiments": told_experiments(
+            ".csv.gz", ((n, n == "judged", False, c.size * TICK_S) for n, c in motions.items())
+        ),
     }  # fmt: skip
 
 

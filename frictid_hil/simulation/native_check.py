@@ -66,11 +66,9 @@ def torque_difference(
     step_s = float(exported.opt.timestep)
     time = np.arange(time_s[0], time_s[-1], step_s)
     command = np.interp(time, time_s, command_rad)
-    believed = robot.joint(joint)
-    by_position = believed.motor is not None and believed.motor.law == "position"
-    loop = _loop(believed.motor if by_position else None, model, step_s)
+    loop = _loop(robot.joint(joint).motor, model, step_s)
     ours = closed_loop(model, loop, time, command).torque_nm[1:]
-    theirs = _in_mujoco(robot, exported, joint, posture, command, loop, ours[0], by_position=by_position)[:-1]
+    theirs = _in_mujoco(robot, exported, joint, posture, command, loop, ours[0])[:-1]
     # A drive with another torque constant reports what it believes; MuJoCo tells what it gives.
     theirs = theirs / (1.0 + model.effects.get("torque_constant_error", {}).get("error_share", 0.0))
     settled = round(SETTLED_S / step_s)
@@ -79,7 +77,7 @@ def torque_difference(
 
 def _loop(motor: Motor | None, model: JointModel, step_s: float) -> Controller:
     limit = model.drive.torque_limit_nm
-    if motor is not None:
+    if motor is not None and motor.law == "position":
         return Controller(
             motor.kp_nm_per_rad, 0.0, motor.kv_nm_s_per_rad, 1.0 / step_s,
             torque_limit_nm=limit, command_rate="backward", command_rate_weight=0.0,
@@ -91,15 +89,7 @@ def _loop(motor: Motor | None, model: JointModel, step_s: float) -> Controller:
 
 
 def _in_mujoco(
-    robot: RobotModel,
-    exported: Any,
-    joint: str,
-    posture: Array,
-    command: Array,
-    loop: Controller,
-    start_nm: float,
-    *,
-    by_position: bool,
+    robot: RobotModel, exported: Any, joint: str, posture: Array, command: Array, loop: Controller, start_nm: float
 ) -> Array:
     """Torque of the joint's drive in each step, shape (n,)."""
     library = mujoco_library()
@@ -117,6 +107,7 @@ def _in_mujoco(
     if play is not None:
         _let_link_rest(library, m, data, dof)
     motor = robot.joint(joint).motor
+    by_position = motor is not None and motor.law == "position"
     drive = drive_of(m, number) if motor is not None else None
     gear = float(m.actuator_gear[drive][0]) if drive is not None else 1.0
     own_gear = motor.gear if motor is not None else 1.0
