@@ -49,13 +49,10 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class JointColumns:
-    """The columns of one joint.
+    """The columns of one joint, by the names of ``Samples`` (``position_rad``, ...); m, m/s, N on a prismatic one.
 
-    Attributes:
-        sources: by the names of ``Samples`` (``position_rad``, ...).
-        prismatic: the values are m, m/s, N.
-        meta: what else is known (torque_source, ...); travels with the samples.
-        command_shift_s: the command is brought this much later, where the log stamps it too early.
+    What else is known (torque_source, ...) travels with the samples. The command is brought ``command_shift_s`` later,
+    where the log stamps it too early.
     """
 
     sources: Mapping[str, Source]

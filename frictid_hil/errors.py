@@ -134,9 +134,7 @@ class Defect(FrictidError):
 class FieldProblem:
     """One thing wrong with one field of a mapping; the loader adds file:line:column.
 
-    Attributes:
-        path: keys and indices from the root of the mapping, e.g. ``("joints", "1", "gear_ratio")``.
-        message: what was expected and what was found.
+    The path are keys and indices from the root of the mapping, e.g. ``("joints", "1", "gear_ratio")``.
     """
 
     path: tuple[str | int, ...]

@@ -78,10 +78,6 @@ def write_whole(path: Path, text: str | bytes) -> None:
 
     The new content is staged in the same folder (a rename works only within one file system), synced, and named last.
 
-    Args:
-        path: of the file; its folder must exist.
-        text: the whole content.
-
     Raises:
         FrictidError: disk full, or no permission.
     """

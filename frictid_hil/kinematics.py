@@ -7,7 +7,7 @@ robot's base; joint i turns about the z axis of frame i.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +18,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DhRow:
-    """One joint's Denavit-Hartenberg parameters.
+    """One joint's Denavit-Hartenberg parameters: along its axis, along the common normal, twist to the next axis.
 
-    Attributes:
-        d_m: along this joint's axis.
-        a_m: along the common normal.
-        alpha_rad: twist to the next joint's axis.
-        theta_rad: angle at joint position 0.
+    ``theta_rad`` is the angle at joint position 0.
     """
 
     d_m: float = 0.0
@@ -32,21 +28,11 @@ class DhRow:
     alpha_rad: float = 0.0
     theta_rad: float = 0.0
 
-    @staticmethod
-    def of(values: Mapping[str, float]) -> DhRow:
-        """From the plain values of a robot file."""
-        return DhRow(**values)
-
 
 def chain_points_m(
     rows: Sequence[DhRow], positions_rad: Array, tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Origins of all frames and the tool, in the base frame.
-
-    Args:
-        rows: n joints from the base on.
-        positions_rad: shape (k, n).
-        tool_m: tool point in the last frame.
+    """Origins of all frames and the tool (a point in the last frame), in the base frame, for postures of shape (k, n).
 
     Returns:
         Shape (k, n + 1, 3): the origin behind every joint, then the tool. The origin of the base is left out.

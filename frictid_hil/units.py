@@ -29,42 +29,25 @@ _QUANTITY = re.compile(r"^\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)\s*(
 
 
 def parse_quantity(text: str, dimension: str) -> float:
-    """Convert a typed quantity to SI.
-
-    Args:
-        text: a number and a unit, e.g. ``20deg``, ``115 deg/s``, ``0.5s``.
-        dimension: one of the keys above, e.g. ``"angle"``.
-
-    Returns:
-        The value in the SI unit of the dimension.
+    """Convert a typed quantity, e.g. ``20deg``, ``115 deg/s``, ``0.5s``, to the SI unit of its dimension.
 
     Raises:
         UsageError: not a finite number, no unit, or a unit of another dimension.
     """
     units = _UNITS[dimension]
-    known = ", ".join(units)
+    known, example = ", ".join(units), f"write it as e.g. 20{next(iter(units))}"
     match = _QUANTITY.match(text)
     if match is None:
-        raise UsageError(
-            f"{text!r} is not a number with a unit; {dimension} takes {known}", next_step=_example(dimension)
-        )
+        raise UsageError(f"{text!r} is not a number with a unit; {dimension} takes {known}", next_step=example)
     number, unit = match.groups()
     if not unit:
-        raise UsageError(f"{text!r} has no unit; {dimension} takes {known}", next_step=_example(dimension))
+        raise UsageError(f"{text!r} has no unit; {dimension} takes {known}", next_step=example)
     if unit not in units:
-        raise UsageError(
-            f"{text!r}: {unit!r} is not a unit of {dimension}; it takes {known}",
-            next_step=_example(dimension),
-        )
+        raise UsageError(f"{text!r}: {unit!r} is not a unit of {dimension}; it takes {known}", next_step=example)
     value = float(number) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{text!r} is not a finite number")
     return value
-
-
-def _example(dimension: str) -> str:
-    first = next(iter(_UNITS[dimension]))
-    return f"write it as e.g. 20{first}"
 
 
 def degrees(angle_rad: float) -> float:

@@ -167,10 +167,7 @@ _QUANTITY_OF = {
 
 
 def load_columns(name: str | Path) -> ColumnMap:
-    """Read and check a column map.
-
-    Args:
-        name: a path, or the name of one that is shipped or lies in a ``columns`` folder of the search path.
+    """Read and check a column map: a path, or one that is shipped or lies in a ``columns`` folder of the search path.
 
     Raises:
         ConfigError: not found, or wrong; every problem with file:line:column.

@@ -310,23 +310,14 @@ class NominalFile(Open):
 
 @dataclass(frozen=True, slots=True)
 class NominalSet:
-    """A ``nominal.yaml``, read and checked.
-
-    Attributes:
-        file: its values.
-        document: where they stand; ``document.data`` is the plain mapping, further keys included.
-    """
+    """A ``nominal.yaml``, read and checked; ``document.data`` is the plain mapping, further keys included."""
 
     file: NominalFile
     document: Document
 
 
 def load_nominal(path: Path, *, logs: bool = True) -> NominalSet:
-    """Read and check a ``nominal.yaml``.
-
-    Args:
-        path: of the file, or of the folder that holds it.
-        logs: it must list experiments.
+    """Read and check a ``nominal.yaml``, or that of a folder; it must list experiments unless ``logs`` says otherwise.
 
     Raises:
         ConfigError: unreadable or wrong, every problem with file:line:column.

@@ -395,7 +395,9 @@ class JointProfile(Strict):
         _same_length(self.velocity_rad_s, self.torque_nm)
         if self.torque_interval_nm is not None:
             _same_length(self.velocity_rad_s, self.torque_interval_nm)
-        for name, follows in (("measured range", self._range_follows()), ("slopes", self._slopes_follow())):
+        stated = self.measured_range_rad_s
+        range_follows = stated is None or stated == self.curve().measured_range_rad_s
+        for name, follows in (("measured range", range_follows), ("slopes", self._slopes_follow())):
             if not follows:
                 raise ValueError(f"the {name} do not follow from the pairs; delete them, or undo the edit of the pairs")
         return self
@@ -407,13 +409,9 @@ class JointProfile(Strict):
     def curve(self, velocity_rad_s: ArrayLike) -> NDArray[np.float64]: ...
 
     def curve(self, velocity_rad_s: ArrayLike | None = None) -> FrictionCurve | NDArray[np.float64]:
-        """phi of (8) through the pairs: the curve itself, or its torque at velocities.
+        """phi of (8) through the pairs: the curve itself, or its torque, N m (N on a linear axis), at velocities.
 
-        Args:
-            velocity_rad_s: any shape, both directions; beyond the measured range the curve goes on straight.
-
-        Returns:
-            N m, of the same shape (N, at m/s, on a linear axis).
+        They may have any shape and both directions; beyond the measured range the curve goes on straight.
         """
         curve = FrictionCurve(self.velocity_rad_s, self.torque_nm)
         if velocity_rad_s is None:
@@ -421,32 +419,18 @@ class JointProfile(Strict):
         return np.asarray(curve.torque(np.asarray(velocity_rad_s, dtype=np.float64)), dtype=np.float64)
 
     def interval_nm(self, velocity_rad_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper end of the curve's 95 % interval at velocities, between the pairs by straight lines.
+        """Lower and upper end of the curve's 95 % interval at velocities of any shape, both directions, N m each.
 
-        Args:
-            velocity_rad_s: any shape, both directions.
-
-        Returns:
-            N m, each of the same shape; NaN where no interval is known: outside of [V_1, V_N], or without intervals.
+        Between the pairs by straight lines; NaN where no interval is known: outside of [V_1, V_N], or without any.
         """
         v = np.asarray(velocity_rad_s, dtype=np.float64)
-        ends = (
-            np.full((len(self.velocity_rad_s), 2), np.nan)
-            if self.torque_interval_nm is None
-            else self.torque_interval_nm
-        )
-        low, high = (
-            np.interp(np.abs(v), self.velocity_rad_s, end, left=np.nan, right=np.nan) for end in np.asarray(ends).T
-        )
+        ends = np.array(self.torque_interval_nm or [(np.nan, np.nan)] * len(self.velocity_rad_s))
+        low, high = (np.interp(np.abs(v), self.velocity_rad_s, end, left=np.nan, right=np.nan) for end in ends.T)
         return np.where(v < 0, -high, low), np.where(v < 0, -low, high)
 
     def __call__(self, velocity_rad_s: ArrayLike) -> NDArray[np.float64]:
         """Friction torque [N m] at any velocity [rad/s], same shape: phi of (8), odd, 0 at rest."""
         return np.asarray(self.curve().torque(np.asarray(velocity_rad_s, dtype=np.float64)))
-
-    def _range_follows(self) -> bool:
-        stated = self.measured_range_rad_s
-        return stated is None or stated == self.curve().measured_range_rad_s
 
     def _slopes_follow(self) -> bool:
         """Of each section to a small part of the torque: older files have more digits."""

@@ -289,13 +289,7 @@ class RobotFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot file, read and checked.
-
-    Attributes:
-        path: of the file named by the person (a site file, where there is one).
-        file: its values.
-        document: where they stand.
-    """
+    """A robot file (a site file, where there is one), read and checked, and where its values stand."""
 
     path: Path
     file: RobotFile
@@ -327,10 +321,7 @@ class Robot:
         return hashlib.sha256(canonical.encode()).hexdigest()
 
     def driver(self, bus: str | None = None) -> str:
-        """The driver for a bus: the file's own, unless the bus given is of a kind that needs another.
-
-        Args:
-            bus: ``interface:channel`` as typed with ``--bus``; None for the file's own.
+        """The driver for a bus, ``interface:channel``: the file's own, unless it is of a kind that needs another.
 
         Raises:
             UsageError: no ``interface:`` in ``bus``, or no driver of this robot for such a bus.
@@ -369,31 +360,20 @@ class Robot:
     ) -> Procedure:
         """The procedure of one joint: what is given here, else the joint's own, else the robot's.
 
-        Args:
-            joint: name.
-            amplitude_rad: A.
-            velocity_rad_s: V.
-            cycles: N.
-            ratio: c.
-            shares: peak speeds of a short programme as shares of V; their number is then N.
+        ``shares`` are the peak speeds of a short programme as shares of V; their number is then N.
 
         Raises:
             UsageError: no such joint, or values that make no procedure.
         """
         self.check_joints([joint])
         own, common = self.file.joints[joint].procedure, self.file.procedure
-        given = {
-            "amplitude_rad": amplitude_rad,
-            "velocity_rad_s": velocity_rad_s,
-            "cycles": len(shares) or cycles,
-            "ratio": ratio,
-        }
-        for name, value in given.items():
-            if value is None:
-                override = getattr(own, name)
-                given[name] = getattr(common, name) if override is None else override
+        asked = {"amplitude_rad": amplitude_rad, "velocity_rad_s": velocity_rad_s, "ratio": ratio}
+        asked["cycles"] = len(shares) or cycles
+        known: dict[str, Any] = common.model_dump(exclude={"measure_skew"})
+        for part in (own.model_dump(), asked):
+            known |= {name: value for name, value in part.items() if value is not None}
         try:
-            return Procedure(**given, shares=shares)  # type: ignore[arg-type]  # cycles is an int in the model and in the argument
+            return Procedure(**known, shares=shares)
         except ValueError as error:
             raise UsageError(str(error), where=f"joint {joint}") from None
 
@@ -406,12 +386,9 @@ class Robot:
                 )
 
     def to_setup(self, bus: str | None = None, *, realtime: bool = False, seed: int = 0) -> RobotSetup:
-        """The robot as a driver needs to know it.
+        """The robot as a driver needs to know it, on another bus than the file's own where one is given.
 
-        Args:
-            bus: ``interface:channel`` instead of the file's own.
-            realtime: wall clock even where lock-step is possible.
-            seed: of simulated noise.
+        ``realtime`` is the wall clock even where lock-step is possible, ``seed`` that of simulated noise.
 
         Raises:
             ConfigError: a joint has no address of the kind that the driver of this bus needs.
@@ -459,10 +436,7 @@ class Robot:
 
 
 def load_robot(name: str | Path) -> Robot:
-    """Read and check a robot file.
-
-    Args:
-        name: a path, or a name on the search path (``hp3j.yaml``, ``hp3j``).
+    """Read and check a robot file: a path, or a name on the search path (``hp3j.yaml``, ``hp3j``).
 
     Raises:
         ConfigError: not found, or wrong; the message lists every problem with file:line:column.
@@ -556,18 +530,9 @@ def _in_degrees(holder: Strict, at: KeyPath) -> list[FieldProblem]:
         far = name in ("position_min_rad", "position_max_rad", "amplitude_rad") and abs(value) > MOST_TRAVEL_RAD
         far |= name == "position_max_rad" and travel > MOST_TRAVEL_RAD
         if fast or far:
-            told = (
-                f"{value:g} rad/s is faster than any robot's joint"
-                if fast
-                else f"{value:g} rad: over two turns of travel"
-            )
-            unit = "deg/s" if fast else "deg"
-            problems.append(
-                FieldProblem(
-                    (*at, name),
-                    f"{told}; in degrees? write {value:g}{unit}; an endless axis says `continuous: true`",
-                )
-            )
+            why = "/s is faster than any robot's joint" if fast else ": over two turns of travel"
+            hint = f"write {value:g}{'deg/s' if fast else 'deg'}; an endless axis says `continuous: true`"
+            problems.append(FieldProblem((*at, name), f"{value:g} rad{why}; in degrees? {hint}"))
     return problems
 
 
@@ -598,14 +563,13 @@ _NOT_OF_SETUP = {"node", "axis", "id", "continuous", "procedure", "expected", "o
 
 def _joint_setup(name: str, joint: JointFile, address: int, gates: Mapping[str, float]) -> JointSetup:
     values = joint.model_dump(exclude=_NOT_OF_SETUP)
-    row = joint.dh.model_dump() if joint.dh else {}
     return JointSetup(
         name=name,
         address=address,
         options=joint.options,
         simulated=joint.simulated,
         expected_inertia_kg_m2=joint.expected.inertia_kg_m2 if joint.expected else 0.0,
-        dh=row,
+        dh=joint.dh.model_dump() if joint.dh else {},
         gates=gates,
         **values,
     )

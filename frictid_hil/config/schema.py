@@ -61,7 +61,8 @@ def schema_version(document: Document, kind: str, newest: int) -> int:
     where = str(declared.place)
     found_kind, _, major = str(declared.content).partition("/")
     if found_kind != kind:
-        raise ConfigError(f"this is a {declared.content}, not a {kind}", where=where, next_step=_right_verb(kind))
+        wanted = f"give a file that starts with `schema: {kind}/...`"
+        raise ConfigError(f"this is a {declared.content}, not a {kind}", where=where, next_step=wanted)
     if not major.isascii() or not major.isdigit() or int(major) < 1:
         raise ConfigError(f"schema: expected {expected}, found {declared.content!r}", where=where)
     if int(major) > newest:
@@ -73,17 +74,10 @@ def schema_version(document: Document, kind: str, newest: int) -> int:
     return int(major)
 
 
-def _right_verb(kind: str) -> str:
-    return f"give a file that starts with `schema: {kind}/...`"
-
-
 def validated(document: Document, model: type[Model], data: Mapping[str, Any] | None = None) -> Model:
-    """The document as a model.
+    """The document, which gives the places for errors, as a model.
 
-    Args:
-        document: gives the places for errors.
-        model: what it should be.
-        data: the values, where they were changed (migrated, renamed) since reading.
+    ``data`` are its values where they were changed (migrated, renamed) since reading.
 
     Raises:
         ConfigError: every field that is wrong, with file:line:column.

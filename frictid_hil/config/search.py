@@ -31,24 +31,17 @@ def shipped_dir() -> Path:
 
 
 def places(folder: str = "") -> list[Path]:
-    """The folders searched, in order, whether they exist or not.
-
-    Args:
-        folder: below each of them (``columns`` for column maps).
-    """
+    """The folders searched, in order, whether they exist or not; or a folder below each of them (``columns``)."""
     named = [Path(place) for place in os.environ.get("FRICTID_HIL_PROFILES", "").split(os.pathsep) if place]
     everywhere = [*named, Path("profiles"), user_data_dir() / "profiles", shipped_dir()]
     return [place / folder for place in everywhere]
 
 
 def find(name: str | Path, *, folder: str = "", what: str = "robot file", beside: Path | None = None) -> Path:
-    """The file a person means by ``name``, with or without its suffix.
+    """The file a person means by ``name``, with or without its suffix: a path, or a bare name to search for.
 
-    Args:
-        name: a path, or a bare name to search for.
-        folder: below each searched folder.
-        what: how errors call it.
-        beside: a folder tried before all others (that of the file which mentions ``name``).
+    The folder ``beside`` (that of the file which mentions ``name``) is tried before all others; ``what`` is how errors
+    call it.
 
     Raises:
         ConfigError: not found; the message lists the places searched and the nearest names there are.
@@ -63,7 +56,7 @@ def find(name: str | Path, *, folder: str = "", what: str = "robot file", beside
     for candidate in candidates:
         for suffix in _SUFFIXES:
             path = candidate.with_name(candidate.name + suffix) if suffix else candidate
-            if _is_file(path):
+            if _exists(path) and not path.is_dir():
                 return path
     if _exists(literal):
         raise ConfigError(f"{literal} is a folder; expected a {what}", where=str(literal))
@@ -73,13 +66,6 @@ def find(name: str | Path, *, folder: str = "", what: str = "robot file", beside
 def available(folder: str = "") -> list[str]:
     """Names of the YAML files in the searched folders, sorted."""
     return sorted({path.name for place in places(folder) if place.is_dir() for path in place.glob("*.y*ml")})
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.exists() and not path.is_dir()
-    except OSError:
-        return False
 
 
 def _exists(path: Path) -> bool:

@@ -43,11 +43,9 @@ class Place(NamedTuple):
 
 
 class Node(NamedTuple):
-    """One value of the file with its place.
+    """One value of the file with its place, and that of the key that names it (its own in a list and at the root).
 
     Attributes:
-        place: of the value.
-        key_place: of the key that names it (of the value itself in a list and at the root).
         content: a scalar, or the children by key or index.
         is_list: tells lists from mappings; both keep their children in ``content``.
         size: number of nodes, aliases counted as often as they are used.
@@ -78,7 +76,6 @@ class Document:
     """A file read: its values, and where each stands.
 
     Attributes:
-        path: of the file.
         root: its values; always a mapping.
         spelled: from a path of ``root`` to the keys as the file spells them, where the loader renamed some.
     """
@@ -109,16 +106,14 @@ class Document:
         return node.key_place if of_key or found != path else node.place
 
     def error(self, problems: Iterable[FieldProblem], *, at_key: Collection[KeyPath] = ()) -> ConfigError:
-        """All problems, one a line in the order of the file, each with its place.
+        """All problems, with paths from the root, one a line in the order of the file, each with its place.
 
-        Args:
-            problems: paths from the root of the file.
-            at_key: paths whose key is at fault rather than their value.
+        Of paths ``at_key`` the key is at fault rather than the value.
         """
         placed = [(self.place(p.path, of_key=p.path in at_key), p) for p in problems]
         placed.sort(key=lambda one: (one[0].path.name, one[0].line, one[0].column))
         lines = [
-            (str(place), f"{_dotted(self.spelled(p.path))}: {p.message}" if p.path else p.message)
+            (str(place), f"{'.'.join(map(str, self.spelled(p.path)))}: {p.message}" if p.path else p.message)
             for place, p in placed
         ]
         (where, what), *others = lines
@@ -171,10 +166,6 @@ def merge(base: Node, over: Node) -> Node:
         else:
             children[key] = merge(children[key], child) if key in children else child
     return Node(over.place, over.key_place, children, size=1 + sum(c.size for c in children.values()))
-
-
-def _dotted(path: KeyPath) -> str:
-    return ".".join(map(str, path))
 
 
 def _text(path: Path) -> str:

@@ -23,12 +23,9 @@ from frictid_hil.plan.plan import Motion, Sine
 
 @dataclass(frozen=True, slots=True)
 class Gravity:
-    """Torque that holds the joint where it stands, as identified.
+    """Torque that holds the joint where it stands, as identified: ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``.
 
     Attributes:
-        cos_nm: of ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``.
-        sin_nm: see there.
-        bias_nm: constant part.
         centre_rad: middle of the travel over which it was identified.
         spread_rad: rms distance from there, over that travel.
         unsure_nm: half of the 95 % interval of the bias.
@@ -64,9 +61,7 @@ class Gravity:
 class RippleTorque:
     """Torque that repeats over a stretch of joint travel, as identified.
 
-    Attributes:
-        period_rad: after which it repeats.
-        torque_nm: at equal steps over one period, the first at position 0, shape (k,).
+    It is told at equal steps over one period, the first at position 0, shape (k,).
     """
 
     period_rad: float
@@ -83,12 +78,7 @@ class RippleTorque:
 
 @dataclass(frozen=True, slots=True)
 class PositionGains:
-    """A PD on position.
-
-    Attributes:
-        stiffness_nm_per_rad: k_p.
-        damping_nm_s_per_rad: k_d.
-    """
+    """A PD on position: k_p and k_d."""
 
     stiffness_nm_per_rad: float
     damping_nm_s_per_rad: float
@@ -102,17 +92,15 @@ class PositionGains:
 
 @dataclass(frozen=True, slots=True)
 class ControlLaw:
-    """All that decides the torque of one joint.
+    """All that decides the torque of one joint; gravity is always compensated.
 
     Attributes:
         mode: ``nc``, ``mo``, ``mol``, ``mop`` or ``mop-reference``.
-        gravity: always compensated.
         gains: None where a person moves the joint.
         friction: None for ``nc``.
         ripple: None where it is not compensated.
         follows_reference: friction is that of the reference velocity instead of the measured one.
-        torque_limit_nm: no more is ever commanded.
-        slew_nm_per_s: nor changed faster.
+        torque_limit_nm: no more is ever commanded, nor changed faster than ``slew_nm_per_s``.
     """
 
     mode: str
@@ -142,12 +130,8 @@ class Probe:
     """A slow sine that asks whether a profile still describes the joint, before anything is compensated with it.
 
     Attributes:
-        sine: the travel, in position control.
-        curve: friction as identified.
-        gravity: as identified.
         tolerance: largest deviation of friction, and of gravity as a share of F_0.
         temperature_c: at which it was identified, None where unknown.
-        temperature_tolerance_c: largest difference from it.
         enforced: False only tells.
     """
 
@@ -178,11 +162,7 @@ class Probe:
 class Swing:
     """Where a person is expected to guide a joint: centre + amplitude sin(2 pi f t) (section 5.1).
 
-    Attributes:
-        centre_rad: middle of the travel.
-        amplitude_rad: to either side.
-        frequency_hz: of the metronome.
-        duration_s: infinite for a service.
+    The frequency is that of the metronome; the duration is infinite for a service.
     """
 
     centre_rad: float
@@ -198,27 +178,19 @@ class Swing:
 
     def position_rad(self, time_s: Array) -> Array:
         """Along the sine."""
-        swung: Array = self.amplitude_rad * np.sin(2.0 * math.pi * self.frequency_hz * np.asarray(time_s))
-        return self.centre_rad + swung
+        phase = 2.0 * math.pi * self.frequency_hz * np.asarray(time_s)
+        return np.asarray(self.centre_rad + self.amplitude_rad * np.sin(phase))
 
     def details(self) -> Mapping[str, Any]:
         """Centre, amplitude, frequency."""
-        return {
-            "centre_rad": self.centre_rad,
-            "amplitude_rad": self.amplitude_rad,
-            "frequency_hz": self.frequency_hz,
-        }
+        return {name: getattr(self, name) for name in ("centre_rad", "amplitude_rad", "frequency_hz")}
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What the supervisor allows while a control law commands the joint.
+    """What the supervisor allows while a control law commands the joint: measured position and speed, mechanical power.
 
     Attributes:
-        position_min_rad: lowest position.
-        position_max_rad: highest position.
-        velocity_rad_s: largest measured speed.
-        power_w: largest mechanical power.
         growth_s: speed that grows for longer than this is a runaway; see ``runner.runaway``.
         withstands_nm: commanded torque that changes by more than this moves the joint.
     """
@@ -238,8 +210,6 @@ class Compensated:
     Attributes:
         name: ``stand``, ``hand``, ``track``, ... with the mode behind it.
         path: the reference, or where a person is expected to guide the joint; endless where its duration is infinite.
-        law: decides the torque.
-        bounds: for the supervisor.
         drive_mode: TORQUE: the law commands all torque; POSITION, VELOCITY: the drive follows the path by its own
             loop, and the law's torque is an offset (60B2).
     """

@@ -27,27 +27,21 @@ REHEARSAL = "rehearsal"
 
 
 class Motion(Protocol):
-    """One stretch of set-points of one joint.
-
-    Attributes:
-        name: as it appears in marks and progress (``cycles``, ``move``, ``reversal``, ...).
-    """
+    """One stretch of set-points of one joint."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102 - documented above
+    def name(self) -> str:
+        """As it appears in marks and progress (``cycles``, ``move``, ``reversal``, ...)."""
 
     @property
     def duration_s(self) -> float:
         """Length of the stretch."""
-        ...
 
     def position_rad(self, time_s: Array) -> Array:
         """Absolute set-points at times since the start of the stretch, same shape."""
-        ...
 
     def details(self) -> Mapping[str, Any]:
         """Parameters for the mark in the recording; plain values."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +106,9 @@ class Cycles:
 
     def details(self) -> Mapping[str, Any]:
         """V, A, N, c, and the shares of V where the speeds are not the paper's."""
-        p = self.procedure
-        return {
-            "start_rad": self.start_rad,
-            "amplitude_rad": p.amplitude_rad,
-            "velocity_rad_s": p.velocity_rad_s,
-            "cycles": p.cycles,
-            "ratio": p.ratio,
-            **({"shares": list(p.shares)} if p.shares else {}),
-        }
+        told = _values(self.procedure, "amplitude_rad", "velocity_rad_s", "cycles", "ratio")
+        shares = list(self.procedure.shares)
+        return {"start_rad": self.start_rad, **told, **({"shares": shares} if shares else {})}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +133,7 @@ class Sine:
 
     def details(self) -> Mapping[str, Any]:
         """Travel, speed, repeats."""
-        return {
-            "start_rad": self.start_rad,
-            "amplitude_rad": self.amplitude_rad,
-            "peak_velocity_rad_s": self.peak_velocity_rad_s,
-            "repeats": self.repeats,
-        }
+        return _values(self, "start_rad", "amplitude_rad", "peak_velocity_rad_s", "repeats")
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +143,6 @@ class Shake:
     Shaking never reverses the motion nor leaves the travel.
 
     Attributes:
-        start_rad: where it begins and ends.
-        amplitude_rad: peak-to-peak travel.
-        duration_s: of all cycles.
-        periods: of shaking within the duration.
         shake_rad: zero-to-peak; negative shakes in antiphase.
         turns: slow cycles within the duration.
     """
@@ -195,18 +174,12 @@ class Shake:
         phase = 2.0 * math.pi * np.asarray(time_s) / self.duration_s
         slow = self.turns * phase
         shaking = self.shake_rad * np.sin(slow) ** 2 * np.sin(self.periods * phase)
-        path: Array = _out_and_back(self.start_rad, self.amplitude_rad, slow) + shaking
-        return path
+        return np.asarray(_out_and_back(self.start_rad, self.amplitude_rad, slow) + shaking)
 
     def details(self) -> Mapping[str, Any]:
         """Travel, and what shakes on it."""
-        return {
-            "start_rad": self.start_rad,
-            "amplitude_rad": self.amplitude_rad,
-            "periods": self.periods,
-            "shake_rad": self.shake_rad,
-            **({"turns": self.turns} if self.turns > 1 else {}),
-        }
+        turns = ("turns",) if self.turns > 1 else ()
+        return _values(self, "start_rad", "amplitude_rad", "periods", "shake_rad", *turns)
 
 
 _SHORTEST_SHAKE_S = 2.0
@@ -218,12 +191,8 @@ class WarmUp:
     """One cycle repeated until friction has settled, or for the whole duration.
 
     Attributes:
-        start_rad: where a cycle begins and ends.
-        amplitude_rad: peak-to-peak travel.
-        peak_velocity_rad_s: of every cycle.
         longest_s: at most; rounded up to whole cycles.
         settled_percent_per_min: it ends earlier once friction changes by less than this; None: never earlier.
-        name: as in marks.
     """
 
     start_rad: float
@@ -250,21 +219,14 @@ class WarmUp:
 
     def details(self) -> Mapping[str, Any]:
         """Travel, speed, when it ends."""
-        return {
-            "start_rad": self.start_rad,
-            "amplitude_rad": self.amplitude_rad,
-            "peak_velocity_rad_s": self.peak_velocity_rad_s,
-            "settled_percent_per_min": self.settled_percent_per_min,
-        }
+        return _values(self, "start_rad", "amplitude_rad", "peak_velocity_rad_s", "settled_percent_per_min")
 
 
 @dataclass(frozen=True, slots=True)
 class Corners:
     """Set-points through given corners, joined by straight lines of constant speed (triangles, dwells, steps).
 
-    Attributes:
-        times_s: corner times, increasing, first 0, shape (k,).
-        positions_rad: corner positions, shape (k,).
+    Times and positions have shape (k,); times increase from 0.
     """
 
     name: str
@@ -290,10 +252,8 @@ class JointPlan:
     """What one joint will do while the others are locked or move in step with it.
 
     Attributes:
-        joint: name of the joint.
         motions: in order; the first starts where ``approach_from_rad`` ends.
         locked: planned position of every joint that is locked meanwhile, rad.
-        peak_velocity_rad_s: largest commanded speed of all motions.
         predicted_torque_nm: largest torque expected, by the best model at hand (0 where none is).
         travel_rad: (lowest, highest) commanded position.
         max_deceleration_rad_s2: highest of a stop on request: what its torque allows, or what the plan asks for itself.
@@ -318,8 +278,6 @@ class Plan:
     """The whole run, joint by joint.
 
     Attributes:
-        robot: name of the robot.
-        cycle_hz: rate of set-points.
         joints: in order of execution.
         notes: sentences a person should read before saying yes.
         together: all joints move at once, motion by motion, each as long for one as for the other.
@@ -419,14 +377,8 @@ def joint_plan(
 ) -> JointPlan:
     """The plan of one joint with its peaks filled in by sampling every motion at 1 ms.
 
-    Corners of straight-line motions are left out of the torque: the drive rounds them.
-
-    Args:
-        joint: which.
-        motions: in order.
-        locked: positions of the joints that are locked meanwhile, rad.
-        expected: to predict the torque with.
-        coupling_nm: at most needed because of other joints' accelerations (``coupling_bound_nm``).
+    Corners of straight-line motions are left out of the torque: the drive rounds them. ``locked`` are positions of the
+    joints that are locked meanwhile, ``coupling_nm`` is of ``coupling_bound_nm``.
     """
     travel, peak_rad_s, peak_rad_s2 = _peaks(motions)
     torque_nm = 0.0
@@ -453,15 +405,10 @@ def _torque_deceleration_rad_s2(joint: JointSetup, expected: Expected | None, co
 
 
 def coupling_bound_nm(joint: str, motions: Mapping[str, Sequence[Motion]], expected: Mapping[str, Expected]) -> float:
-    """What a joint needs at most because other joints accelerate, N m.
+    """What a joint needs at most because other joints, with their motions by name, accelerate, N m.
 
     An arm's inertia matrix is positive definite, so that abs(M_ij) <= sqrt(M_ii M_jj): the link inertias alone bound
     the coupling in every posture. Joints of which nothing is expected count nothing.
-
-    Args:
-        joint: whose torque.
-        motions: of every joint that moves at the same time, by name.
-        expected: link inertias, by name.
     """
     if joint not in expected:
         return 0.0
@@ -473,10 +420,13 @@ def coupling_bound_nm(joint: str, motions: Mapping[str, Sequence[Motion]], expec
     )
 
 
+def _values(holder: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(holder, name) for name in names}
+
+
 def _out_and_back(start_rad: float, amplitude_rad: float, phase: Array) -> Array:
     """start + A/2 (1 - cos), the shape of every cycle."""
-    path: Array = start_rad + amplitude_rad / 2 * (1.0 - np.cos(phase))
-    return path
+    return np.asarray(start_rad + amplitude_rad / 2 * (1.0 - np.cos(phase)))
 
 
 def _peaks(motions: Sequence[Motion]) -> tuple[tuple[float, float], float, float]:

@@ -16,17 +16,10 @@ class JointSetup:
     """One joint as a driver needs to know it; values of the robot file, joint side of the gear.
 
     Attributes:
-        name: the joint's name in the robot file ("0".."5").
         address: node id, axis index or id, as the driver's ``kind`` says.
-        gear_ratio: motor revolutions per joint revolution.
         direction: +1 or -1, sign of joint motion for positive motor motion.
-        max_velocity_rad_s: limit of the joint.
-        max_torque_nm: limit of the joint.
         rated_torque_nm: joint-side torque that the drive calls 1000 per mille (motor rated torque times gear ratio).
-        position_min_rad: software limit.
-        position_max_rad: software limit.
         start_position_rad: where its identification starts; the travel goes to start + A.
-        locked_position_rad: where it is held while another joint moves.
         options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
         simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
         expected_inertia_kg_m2: of the whole joint, as the robot file expects it; 0 where it does not say.
@@ -60,16 +53,13 @@ class RobotSetup:
     """A robot as a driver needs to know it.
 
     Attributes:
-        name: the robot's name.
         bus: ``interface:channel`` as typed (``socketcan:can0``, ``virtual:hp3j``, ``serial:/dev/ttyUSB0``).
         cycle_hz: requested cycle rate.
-        joints: in the order of the robot file.
         options: driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
         realtime: run on the wall clock even where lock-step is possible.
         seed: seed of every simulated noise; ignored by real hardware.
         simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
         simulated: nothing real moves; a setup that says nothing of it is taken for a real robot's.
-        workspace: the box that the arm may not leave; None where the robot file names none.
         care: bounds of the supervisor that robot file or driver set, by name; see ``runner.care.Care``.
         folder: of the robot file; file names in options count from there.
     """

@@ -24,8 +24,7 @@ class Outside:
     """The point that is furthest beyond a face of the box.
 
     Attributes:
-        moment: index of the posture.
-        positions_rad: of all joints then, in the order of the chain.
+        moment: index of the posture, with the positions of all joints then, in the order of the chain.
         link: index of the joint that carries the point; the number of joints for the tool.
         point_m: in the base frame.
         axis: of the face, 0..2.
@@ -40,11 +39,7 @@ class Outside:
     bound_m: float
 
     def described(self, names: Sequence[str]) -> str:
-        """Say which point is how far beyond which side, and at which joint angles.
-
-        Args:
-            names: of the joints, in the order of the chain.
-        """
+        """Say which point is how far beyond which side, and at which angles of the joints, named along the chain."""
         part = f"the far end of joint {names[self.link]}'s link" if self.link < len(names) else "the tool point"
         at = self.point_m[self.axis]
         side = "above" if at > self.bound_m else "below"
@@ -60,13 +55,9 @@ class Outside:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """A box in the base frame, and the chain that must stay inside.
+    """A box in the base frame, from and to along x, y, z, and the chain that must stay inside, clear of every face.
 
-    Attributes:
-        rows: where the joints are.
-        box_m: from and to along x, y, z.
-        clearance_m: kept from every face.
-        tool_m: tool point in the last joint's frame.
+    The tool point is in the last joint's frame.
     """
 
     rows: tuple[DhRow, ...]
@@ -75,10 +66,9 @@ class Workspace:
     tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def outside(self, positions_rad: Array) -> Outside | None:
-        """Where the arm is furthest outside, None where it stays inside.
+        """Where the arm is furthest outside in postures of shape (k, n), None where it stays inside.
 
-        Args:
-            positions_rad: postures, shape (k, n). One that is not a number is outside.
+        A posture that is not a number is outside.
         """
         points = chain_points_m(self.rows, positions_rad, self.tool_m)
         low = np.array([side[0] for side in self.box_m]) + self.clearance_m

@@ -21,7 +21,6 @@ class JointDrift:
         distance_percent: of the older curve's mean.
         coulomb_change_percent: of F_0; None where one of them has none.
         overlap_share: share of the newer pairs whose interval meets the older curve's; None without intervals.
-        temperature_change_c: None where one was not measured.
         other_changes: what else differs and could explain it (estimator, drive, gear, torque source), old -> new.
     """
 

@@ -25,12 +25,7 @@ _AT_ONCE = 200
 
 
 class Index:
-    """JSON values by kind and name.
-
-    Args:
-        path: of the database; its folder need not exist.
-        told: how many of how many files were read so far.
-    """
+    """JSON values by kind and name in a database that need not exist; ``told`` how many of how many files were read."""
 
     def __init__(self, path: Path, told: Callable[[int, int], None]) -> None:
         self._path = path

@@ -24,15 +24,10 @@ _NEVER_SILENTLY = ("drive serial", "gear_ratio", "rated_torque_nm", "torque_sour
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is to be done with a new profile.
+    """What is to be done with a new profile, why in a sentence, and the next step for the person who reads it.
 
-    Attributes:
-        promote: it becomes the active one.
-        refused: it must not, until a person has looked.
-        drifted: joints beyond the policy's limit.
-        joints: per joint the figures behind it, plain values.
-        reason: in a sentence.
-        next_step: for the person who reads it.
+    It is promoted, or refused until a person has looked. ``drifted`` are joints beyond the policy's limit; ``joints``
+    hold the figures behind it, plain values.
     """
 
     promote: bool
@@ -52,15 +47,10 @@ def judge(
     failed: Mapping[str, str],
     promote_by_hand: str = "frictid-hil profile promote RUN",
 ) -> Verdict:
-    """Apply the policy.
+    """Apply the policy to what was just measured; active profile and baseline are None where nothing was promoted yet.
 
-    Args:
-        policy: of the robot file.
-        newer: just measured.
-        active: in use; None where none is.
-        baseline: that drift is measured from; None where nothing was promoted yet.
-        failed: joints without a trustworthy result, and why.
-        promote_by_hand: command with which a person makes the new one active all the same.
+    ``failed`` are joints without a trustworthy result, and why; ``promote_by_hand`` is the command with which a person
+    makes the new one active all the same.
     """
     reference = baseline if policy.drift_reference == "baseline" else active
     from_reference = {} if reference is None else drift(reference, newer)

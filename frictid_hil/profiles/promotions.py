@@ -14,9 +14,7 @@ class Promotion:
         action: ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from).
         id: the profile that is active, or the baseline, from here on.
         sha256: of its file.
-        utc: when.
         by: person or job.
-        reason: in words.
     """
 
     action: str
@@ -29,19 +27,14 @@ class Promotion:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A file of ``recalibrations/``: how one of them ended.
+    """A file of ``recalibrations/``: how one that began at ``utc`` ended; its reason says why it was promoted or not.
 
     Attributes:
-        utc: when it began.
         outcome: word of its JSON.
-        exit_code: of the process.
-        promoted: its profile became the active one.
         profile: id in the store; "" where nothing was identified.
         drift_percent: distance (15) from the reference by joint; None where there was none.
         drift_limit_percent: of the distance from the baseline, by the policy; None where drift is measured otherwise.
         drifted: joints beyond the policy's limit.
-        reason: why it was promoted or not, in a sentence.
-        next_step: for the person who reads it.
         run: folder; "" where none was kept.
     """
 

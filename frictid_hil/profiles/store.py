@@ -49,11 +49,9 @@ Note = TypeVar("Note", Promotion, Attempt)
 
 
 class ProfileStore:
-    """All robots' profiles below one folder.
+    """All robots' profiles below one folder, the user's data folder unless told. It is made when something is added.
 
-    Args:
-        root: the folder; the user's data folder unless told. It is made when something is added.
-        told: how many of how many profiles were read so far, where all of them have to be.
+    ``told`` is given how many of how many profiles were read so far, where all of them have to be.
     """
 
     def __init__(self, root: Path | None = None, told: Callable[[int, int], None] | None = None) -> None:
@@ -77,11 +75,7 @@ class ProfileStore:
             return _written(folder / "profiles", profile.provenance.created_utc, profile.to_yaml())
 
     def path(self, robot: str, identity: str) -> Path:
-        """The file of a profile.
-
-        Args:
-            robot: name.
-            identity: id, or a beginning of one that fits no other.
+        """The file of a profile, by its id, or a beginning of one that fits no other.
 
         Raises:
             UsageError: there is none, or more than one.
@@ -234,10 +228,8 @@ class ProfileStore:
     def _notes(self, kind: type[Note], robot: str, where: str, last: int | None) -> list[Note]:
         folder = self._folder(robot)
         names = _names(folder, where)[-last if last else None :]
-        index = Index(folder / "index.sqlite", self._told)
-        return [
-            kind(**values) for values in index.values(where, names, lambda n: _note(folder / where, n, kind)).values()
-        ]
+        kept = self._index(folder).values(where, names, lambda name: _note(folder / where, name, kind))
+        return [kind(**values) for values in kept.values()]
 
     def _index(self, folder: Path) -> Index:
         return Index(folder / "index.sqlite", self._told)

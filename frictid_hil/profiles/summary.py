@@ -13,16 +13,10 @@ from frictid_hil.profiles.drift import distance_and_mean_nm
 
 @dataclass(frozen=True, slots=True)
 class JointSummary:
-    """One joint of one profile, as far as history shows it.
+    """One joint of one profile, as far as history shows it; a figure is None where it could not be formed.
 
-    Attributes:
-        coulomb_nm: F_0, None where it could not be formed.
-        coulomb_low_nm: its interval.
-        coulomb_high_nm: its interval.
-        temperature_c: during the cycles, None where not measured.
-        gates_failed: names of failed quality gates.
-        distance_percent: (15) from the baseline's curve, in percent of its mean; None where it has none.
-        prismatic: a linear axis: N instead of N m.
+    F_0 has its interval. The distance is (15) from the baseline's curve, in percent of its mean. On a linear axis N
+    stands instead of N m.
     """
 
     coulomb_nm: float | None
@@ -36,14 +30,7 @@ class JointSummary:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A profile in the store.
-
-    Attributes:
-        id: ``<UTC>-<first 12 digits of sha256>``; sorts by time.
-        robot: name.
-        created_utc: from its provenance.
-        joints: summaries by name.
-    """
+    """A profile in the store, whose id ``<UTC>-<first 12 digits of sha256>`` sorts by time; summaries of its joints."""
 
     id: str
     robot: str
@@ -53,13 +40,7 @@ class Stored:
 
 @dataclass(frozen=True, slots=True)
 class TrendPoint:
-    """One joint at one time.
-
-    Attributes:
-        id: of the profile.
-        created_utc: when.
-        joint: its figures; ``distance_percent`` is from the baseline of today.
-    """
+    """One joint at one time, its ``distance_percent`` from the baseline of today, by the id of the profile."""
 
     id: str
     created_utc: str

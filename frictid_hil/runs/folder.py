@@ -62,13 +62,9 @@ class RunFolder:
 
     @staticmethod
     def create(robot: Robot, verb: str, options: Mapping[str, Any], out: Path | None = None) -> RunFolder:
-        """A new folder, ``runs/<robot>/<UTC>-<verb>`` unless told.
+        """A new folder, ``runs/<robot>/<UTC>-<verb>`` unless told; it may hold other things, but nothing of a run.
 
-        Args:
-            robot: its file.
-            verb: that the run is of.
-            options: what was asked for, plain values; a run is continued with them.
-            out: folder to use; it may hold other things, but nothing of a run.
+        A run is continued with its options, plain values.
 
         Raises:
             UsageError: ``out`` holds a run, or a file that a run would write.
@@ -115,11 +111,9 @@ class RunFolder:
     # -- while it runs ------------------------------------------------------------------------------------------
 
     def add_part(self, joints: list[str], seen: Callable[[Rows], None]) -> RowKeeper:
-        """New files for samples and frames, beside those of earlier parts.
+        """New files for samples and frames, beside those of earlier parts, joints in the order of the driver.
 
-        Args:
-            joints: names, order of the driver.
-            seen: given the rows, once they are kept.
+        ``seen`` is given the rows, once they are kept.
 
         Raises:
             FrictidError: they cannot be created, or the folder cannot take a result; only what is new was removed.

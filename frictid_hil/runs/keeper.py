@@ -21,12 +21,7 @@ _FLUSH_S = 0.25
 class RowKeeper:
     """Writes rows as they come and remembers them for the identification.
 
-    Args:
-        samples: file of samples, new or empty.
-        frames: file of frames, new or empty.
-        joints: names, order of the driver.
-        meta: provenance of the samples.
-        seen: given the rows, once they are kept.
+    The files are new or empty, joints in the order of the driver; ``seen`` is given the rows, once they are kept.
 
     Raises:
         FrictidError: a file cannot be opened; the other one is closed again.

@@ -51,19 +51,15 @@ class Follower(Protocol):
 
     def plan(self, plan: Plan, setup: RobotSetup) -> None:
         """The plan, before anything is opened."""
-        ...
 
     def confirm(self, plan: Plan, preflight: Preflight) -> bool:
         """Ask the person, with the hardware read and the plan shown."""
-        ...
 
     def event(self, event: Event) -> None:
         """Something happened on the hardware."""
-        ...
 
     def rows(self, rows: Rows) -> None:
         """What was measured since the last call, rows of ``ring.SAMPLE_ROW``; as it is written to disk."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +67,6 @@ class Order:
     """What shall be run, and where it is kept.
 
     Attributes:
-        verb: that the run is of.
-        robot: its file.
-        setup: the robot as its driver knows it.
         bus: ``interface:channel`` as typed; None for the robot file's own.
         options: what was asked for, plain values, for the manifest.
         out: folder to use; None for a new one below ``runs/``.
@@ -100,13 +93,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a run ended; every verb's result holds one.
-
-    Attributes:
-        robot: name.
-        run: folder.
-        error: what ended it early, or why its result is not good enough.
-    """
+    """How a run ended; every verb's result holds one. An error ended it early, or its result is not good enough."""
 
     robot: str
     run: Path
@@ -129,12 +116,7 @@ class Ended:
 
 
 class Run:
-    """The one owner of folder, manifest, stop, rehearsals and ending of a run; a context manager.
-
-    Args:
-        order: what shall be run.
-        follower: follows it.
-    """
+    """The one owner of folder, manifest, stop, rehearsals and ending of a run; a context manager."""
 
     def __init__(self, order: Order, follower: Follower) -> None:
         self.state = State.PLANNED
@@ -152,8 +134,8 @@ class Run:
         """Write into the manifest what ended the job between motion and result."""
         if self.state is State.MEASURING and error is not None:
             interrupted = isinstance(error, KeyboardInterrupt)
-            told = Interrupted("interrupted after the motion had ended") if interrupted else _as_ours(error)
-            self.end(told)
+            told = Interrupted("interrupted after the motion had ended") if interrupted else Defect.of(error)
+            self.end(error if isinstance(error, FrictidError) else told)
             if interrupted:
                 raise self._with_next_step(told) from error
 
@@ -175,10 +157,10 @@ class Run:
         prepare: Callable[[Driver], None] | None = None,
         care: Care | None = None,
     ) -> FrictidError | None:
-        """Show a plan, open the files, read the hardware, ask, and move.
+        """Show a plan within every limit, open the files, read the hardware, ask, and move.
 
         Args:
-            plan: within every limit.
+            plan: to be shown and done.
             each: given every joint's run when it is over, before the next one begins.
             asked: told the preflight before the person is asked; refuses by raising.
             noticed: told everything that happens.
@@ -222,7 +204,9 @@ class Run:
                     care=care,
                     prepare=prepare,
                 )
-            ended = _rows_lost(lost) if lost else None
+            if lost:
+                cause = "a slow disk or an overloaded computer"
+                ended = GateFailed(f"{lost} rows were lost because files were written too slowly", cause=cause)
         except BaseException as error:
             if self.state is State.PREFLIGHT:
                 self.state = before
@@ -338,13 +322,3 @@ def _closed(keeper: RowKeeper | None) -> FrictidError | None:
     except FrictidError as error:
         return error
     return None
-
-
-def _rows_lost(lost: int) -> FrictidError:
-    return GateFailed(
-        f"{lost} rows were lost because files were written too slowly", cause="a slow disk or an overloaded computer"
-    )
-
-
-def _as_ours(error: BaseException) -> FrictidError:
-    return error if isinstance(error, FrictidError) else Defect.of(error)

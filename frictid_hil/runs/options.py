@@ -24,17 +24,14 @@ class Options(Protocol):
     @property
     def robot(self) -> str:
         """Robot file; "" where a run that is continued knows it."""
-        ...
 
     @property
     def resume(self) -> Path | None:
         """Run folder to continue."""
-        ...
 
     @property
     def out(self) -> Path | None:
         """Folder to write."""
-        ...
 
 
 Asked = TypeVar("Asked", bound=Options)
@@ -47,11 +44,7 @@ def kept_options(options: Options) -> dict[str, Any]:
 
 
 def restored(options: Asked, verbs: Collection[str]) -> Asked:
-    """The options that a run began with; those of ``options`` itself where nothing is continued.
-
-    Args:
-        options: as asked for now.
-        verbs: whose runs are continued so.
+    """The options that a run of these verbs began with; those of ``options`` itself where nothing is continued.
 
     Raises:
         UsageError: no run of these verbs, no robot, or an option that differs from that of the run.

@@ -28,16 +28,9 @@ _KEPT = 200
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """One joint's travel, seen slowly.
+    """One joint's travel, seen slowly, by the digest of the robot file, the bus and the drive's serial number.
 
-    Attributes:
-        config_sha256: of the robot file.
-        bus: ``interface:channel``.
-        joint: name.
-        moving: joints that moved with it, itself included, sorted.
-        low_rad: lowest position seen.
-        high_rad: highest.
-        serial: of the drive.
+    ``moving`` are joints that moved with it, itself included, sorted.
     """
 
     config_sha256: str
@@ -50,12 +43,7 @@ class Rehearsal:
 
 
 class Rehearsals:
-    """The rehearsals of one robot on one bus.
-
-    Args:
-        robot: its file.
-        bus: ``interface:channel``; None for the file's own.
-    """
+    """The rehearsals of one robot on one bus, the file's own unless told."""
 
     def __init__(self, robot: Robot, bus: str | None = None) -> None:
         self._robot = robot

@@ -25,11 +25,9 @@ class Keeper(Protocol):
 
     def samples(self, rows: Rows) -> None:
         """Rows of ``ring.SAMPLE_ROW``, in order."""
-        ...
 
     def frames(self, rows: Rows) -> None:
         """Rows of ``ring.FRAME_ROW``, in order."""
-        ...
 
 
 def run_plan(
@@ -43,12 +41,12 @@ def run_plan(
     care: Care | None = None,
     prepare: Callable[[Driver], None] | None = None,
 ) -> int:
-    """Run a plan to its end.
+    """Run a plan, checked against limits, to its end.
 
     Args:
         driver_name: entry-point name of the driver.
         setup: the robot as the driver knows it.
-        plan: checked against limits.
+        plan: what moves.
         keeper: given every row, also after an error.
         notify: told what happens.
         proceed: asked once, after the preflight and before anything moves.

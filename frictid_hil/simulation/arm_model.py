@@ -53,7 +53,7 @@ class ArmModel:
         parts.no_others()
         top.no_others()
         top.finish()
-        return ArmModel(tuple(DhRow.of(row) for row in rows.values()), tuple(links), gravity)
+        return ArmModel(tuple(DhRow(**row) for row in rows.values()), tuple(links), gravity)
 
 
 def _link(fields: Fields, *, present: bool, top: Fields, name: str) -> Link:
