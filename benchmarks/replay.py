@@ -21,8 +21,7 @@ from frictid_hil.config.profile import load_profile
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.replay import ReplayOptions, replay
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.recording.bus_log import BusLogWriter, Frames, read_frames
-from frictid_hil.recording.playback import logged
+from frictid_hil.recording.bus_log import BusLogWriter, Frames, logged, read_frames
 
 SHARE = 0.01
 SEEDS = range(5)

@@ -18,6 +18,7 @@ Interrupted         130   interrupted  a person or the system asked to stop
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 
@@ -51,11 +52,8 @@ class FrictidError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Errors cross process borders (the cyclic loop is a process of its own).
-        return (_rebuild, (type(self), self.what, self.where, self.cause, self.next_step))
-
-
-def _rebuild(kind: type[FrictidError], what: str, where: str, cause: str, next_step: str) -> FrictidError:
-    return kind(what, where=where, cause=cause, next_step=next_step)
+        told = {"where": self.where, "cause": self.cause, "next_step": self.next_step}
+        return (partial(type(self), self.what, **told), ())
 
 
 class UsageError(FrictidError):

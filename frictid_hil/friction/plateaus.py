@@ -98,23 +98,17 @@ def plateaus(
     fine = Gaussian(step_s, 2 * step_s)
     velocity, force = fine.rate(position), fine.smooth(torque, torque_delay_s)
     groups = _groups(found)
-    rows = [_row(velocity, force, group, where) for group in groups]
+    rows = [(_means(velocity, force, group, 1, where), _means(velocity, force, group, -1, where)) for group in groups]
     if len(rows) < 2:
         raise IdentificationError(
-            f"only one speed ({rows[0][0]:.4g}) is held; a curve needs at least 2",
+            f"only one speed ({rows[0][0][0]:.4g}) is held; a curve needs at least 2",
             where=where,
             next_step="record plateaus of several speeds, both ways",
         )
-    v_plus, v_minus, f_plus, f_minus, n_plus, n_minus = (np.array(column) for column in zip(*rows, strict=True))
-    pairs = IdentifiedPairs(
-        velocity_rad_s=v_plus,
-        torque_nm=(f_plus - f_minus) / 2,
-        velocity_minus_rad_s=v_minus,
-        torque_plus_nm=f_plus,
-        torque_minus_nm=f_minus,
-        samples_plus=n_plus,
-        samples_minus=n_minus,
+    (v_plus, f_plus, n_plus), (v_minus, f_minus, n_minus) = (
+        (np.array(column) for column in zip(*one_way, strict=True)) for one_way in zip(*rows, strict=True)
     )
+    pairs = IdentifiedPairs(v_plus, (f_plus - f_minus) / 2, v_minus, f_plus, f_minus, n_plus, n_minus)
     half = _half_widths(position, force, groups)
     curve = pairs.curve(where=where)
     half = half[np.argsort(v_plus, kind="stable")]
@@ -146,28 +140,19 @@ def _groups(found: list[_Plateau]) -> list[list[_Plateau]]:
     return groups
 
 
-def _row(
-    velocity: Array, torque: Array, group: list[_Plateau], where: str
-) -> tuple[float, float, float, float, int, int]:
-    inside = {+1: np.zeros(velocity.size, np.bool_), -1: np.zeros(velocity.size, np.bool_)}
+def _means(velocity: Array, torque: Array, group: list[_Plateau], way: int, where: str) -> tuple[float, float, int]:
+    """Mean speed, mean torque and number of the samples of one speed, one way."""
+    inside = np.zeros(velocity.size, np.bool_)
     for plateau in group:
-        inside[1 if plateau.speed > 0 else -1][plateau.start : plateau.stop] = True
-    forward, backward = inside[1], inside[-1]
-    for direction, mask in (("forward", forward), ("backward", backward)):
-        if not mask.any():
-            raise IdentificationError(
-                f"the speed {abs(group[0].speed):.4g} is held, but never {direction}",
-                where=where,
-                cause="half the difference of both directions is what cancels gravity",
-            )
-    return (
-        float(velocity[forward].mean()),
-        float(-velocity[backward].mean()),
-        float(torque[forward].mean()),
-        float(torque[backward].mean()),
-        int(forward.sum()),
-        int(backward.sum()),
-    )
+        if plateau.speed * way > 0:
+            inside[plateau.start : plateau.stop] = True
+    if not inside.any():
+        raise IdentificationError(
+            f"the speed {abs(group[0].speed):.4g} is held, but never {'forward' if way > 0 else 'backward'}",
+            where=where,
+            cause="half the difference of both directions is what cancels gravity",
+        )
+    return float(way * velocity[inside].mean()), float(torque[inside].mean()), int(inside.sum())
 
 
 def _half_widths(position: Array, force: Array, groups: list[list[_Plateau]]) -> Array:

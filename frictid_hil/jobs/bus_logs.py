@@ -18,8 +18,7 @@ from frictid_hil.config.robot import Robot
 from frictid_hil.config.yaml import read as read_yaml
 from frictid_hil.errors import InputFileError, InvalidFields, UsageError
 from frictid_hil.protocol.frames import LoggedFrame, frame_decoders, joint_names
-from frictid_hil.recording.bus_log import LOG_SUFFIXES, Frames, read_frames
-from frictid_hil.recording.playback import LogBus
+from frictid_hil.recording.bus_log import LOG_SUFFIXES, Frames, LogBus, read_frames
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.runner.ring import SAMPLE_ROW, Rows

@@ -22,7 +22,7 @@ from frictid_hil.jobs.identification.executors import answers, executor
 from frictid_hil.jobs.identification.joint_profile import failed_result, identify_joint, joint_result
 from frictid_hil.jobs.plans import given_procedure
 from frictid_hil.plan.setup import RobotSetup
-from frictid_hil.recording.parquet import is_lerobot
+from frictid_hil.recording.array_files import is_lerobot
 from frictid_hil.recording.read import READABLE, read
 from frictid_hil.recording.ros import is_bag
 from frictid_hil.recording.samples import Samples

@@ -30,7 +30,7 @@ from frictid_hil.jobs.report import NIGHT_PAGE, write_index_page
 from frictid_hil.jobs.watch import Watcher
 from frictid_hil.plan.linear_axis import rotary_name
 from frictid_hil.profiles.judgement import Verdict, judge
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.pages import write_page
 from frictid_hil.report.recalibration import recalibration_page

@@ -8,11 +8,11 @@ taken as damage, and refused: nothing is promoted until a person has looked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from frictid_hil.config.policy import Policy
-from frictid_hil.config.profile import FrictionProfile
+from frictid_hil.config.profile import FrictionProfile, JointProfile
 from frictid_hil.profiles.drift import JointDrift, drift
 
 _SAME = 0.5
@@ -58,8 +58,9 @@ def judge(
     drifted = tuple(name for name, one in from_reference.items() if _has_drifted(one, policy.drift_percent))
     broken = tuple(name for name, one in from_active.items() if one.distance_percent > policy.refuse_percent)
     joints = {
-        name: _figures(newer, name, from_reference.get(name), from_active.get(name), name in drifted, name in broken)
-        for name in newer.joints
+        name: _figures(joint, from_reference.get(name), from_active.get(name))
+        | {"drifted": name in drifted, "broken": name in broken}
+        for name, joint in newer.joints.items()
     }
     changed = {
         name: "; ".join(f"{what} {how}" for what, how in one.other_changes.items() if what in _NEVER_SILENTLY)
@@ -134,25 +135,11 @@ def _has_drifted(one: JointDrift, limit_percent: float) -> bool:
     return one.distance_percent > limit_percent and significant
 
 
-def _figures(
-    newer: FrictionProfile,
-    name: str,
-    reference: JointDrift | None,
-    active: JointDrift | None,
-    drifted: bool,
-    broken: bool,
-) -> dict[str, Any]:
-    joint = newer.joints[name]
+def _figures(joint: JointProfile, reference: JointDrift | None, active: JointDrift | None) -> dict[str, Any]:
+    nothing = dict.fromkeys(field.name for field in fields(JointDrift)) | {"other_changes": {}}
     return {
-        "distance_percent": reference.distance_percent if reference else None,
-        "distance_nm": reference.distance_nm if reference else None,
+        **(asdict(reference) if reference else nothing),
         "distance_from_active_percent": active.distance_percent if active else None,
-        "overlap_share": reference.overlap_share if reference else None,
         "coulomb_nm": joint.coulomb_nm.value,
-        "coulomb_change_percent": reference.coulomb_change_percent if reference else None,
         "temperature_c": joint.temperature_c,
-        "temperature_change_c": reference.temperature_change_c if reference else None,
-        "other_changes": dict(reference.other_changes) if reference else {},
-        "drifted": drifted,
-        "broken": broken,
     }

@@ -34,8 +34,16 @@ from frictid_hil.config.yaml import read
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
 from frictid_hil.profiles.index import Index
-from frictid_hil.profiles.promotions import Attempt, Promotion, active_stack, baseline_of
-from frictid_hil.profiles.summary import Stored, TrendPoint, stored_of, summary
+from frictid_hil.profiles.records import (
+    Attempt,
+    Promotion,
+    Stored,
+    TrendPoint,
+    active_stack,
+    baseline_of,
+    stored_of,
+    summary,
+)
 
 _LOCK_TIMEOUT_S = 30.0
 _NAMES = {

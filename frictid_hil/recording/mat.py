@@ -20,9 +20,9 @@ import numpy as np
 
 from frictid_hil.errors import InputFileError
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.recording.array_files import open_hdf5
 from frictid_hil.recording.arrays import ArrayTable
 from frictid_hil.recording.bounds import allowed_bytes
-from frictid_hil.recording.numpy_files import open_hdf5
 
 HEADER_SIZE = 128
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

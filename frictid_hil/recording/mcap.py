@@ -107,22 +107,10 @@ class SampleWriter(GrowingLog):
 
     def mark(self, joint: str, mark: Mark) -> None:
         """Take a mark of one joint."""
-        body = {
-            "joint": joint,
-            "name": mark.name,
-            "start_ns": mark.start_ns,
-            "end_ns": mark.end_ns,
-            "details": dict(mark.details),
-        }
-        self._marks.append(
-            Message(
-                channel_id=_MARKS_CHANNEL,
-                sequence=len(self._marks),
-                log_time=mark.start_ns,
-                publish_time=mark.start_ns,
-                data=json.dumps(body).encode(),
-            )
-        )
+        body = {"joint": joint, **{name: getattr(mark, name) for name in ("name", "start_ns", "end_ns")}}
+        data = json.dumps(body | {"details": dict(mark.details)}).encode()
+        at_ns = mark.start_ns
+        self._marks.append(Message(_MARKS_CHANNEL, at_ns, data, publish_time=at_ns, sequence=len(self._marks)))
 
     def metadata(self, name: str, values: Mapping[str, Any]) -> None:
         """Write provenance at once: ``recording`` for all joints, ``joint/<name>`` for one."""

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from frictid_hil.columns import ColumnMap
 from frictid_hil.errors import InputFileError
+from frictid_hil.recording.array_files import is_lerobot, open_hdf5, open_lerobot, open_npz, open_parquet
 from frictid_hil.recording.bus_log import LOG_SUFFIXES
 from frictid_hil.recording.csv import CsvTable, read_csv
 from frictid_hil.recording.mat import open_mat
 from frictid_hil.recording.mcap_reader import NO_SAMPLES, is_ours, read_mcap
-from frictid_hil.recording.numpy_files import open_hdf5, open_npz
-from frictid_hil.recording.parquet import is_lerobot, open_lerobot, open_parquet
 from frictid_hil.recording.ros import is_bag, open_bag
 from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.servo_logs import open_bam, open_pace

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
 
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 
 STATES: Mapping[str, tuple[str, str]] = {
     "promoted": ("\u2713", "promoted"),

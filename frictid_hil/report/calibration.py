@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -132,20 +133,17 @@ def axes_of(joint: JointProfile) -> tuple[str, str, float]:
 
 def _overview(joints: Mapping[str, JointProfile], previous: FrictionProfile | None) -> Figure:
     """Every joint's curve with its interval, one small panel each, and whether its gates passed."""
-    first = next(iter(joints.values()))
-    unit, force, _ = axes_of(first)
-    traces: list[Mapping[str, Any]] = []
-    for number, (name, joint) in enumerate(joints.items()):
-        traces += [{**trace, "panel": number} for trace in _curves(name, joint, previous)]
-    return Figure(
-        "All joints: friction over speed",
-        tuple(traces),
-        f"speed [{unit}]",
-        f"friction [{force}]",
-        caption="Solid where measured, dotted where extrapolated; the band is the 95 % interval, the dashed line the "
-        "profile that was active before. A tick says that all gates passed.",
-        panels=tuple(f"{_light(joint)} joint {name}" for name, joint in joints.items()),
+    traces = [
+        {**trace, "panel": number}
+        for number, (name, joint) in enumerate(joints.items())
+        for trace in _curves(name, joint, previous)
+    ]
+    caption = (
+        "Solid where measured, dotted where extrapolated; the band is the 95 % interval, the dashed line the profile "
+        "that was active before. A tick says that all gates passed."
     )
+    panels = tuple(f"{_light(joint)} joint {name}" for name, joint in joints.items())
+    return replace(over_speed("All joints", next(iter(joints.values())), traces, caption), panels=panels)
 
 
 def _light(joint: JointProfile) -> str:
@@ -175,6 +173,12 @@ def _curves(name: str, joint: JointProfile, previous: FrictionProfile | None) ->
     return traces
 
 
+def over_speed(title: str, joint: JointProfile, traces: Sequence[Mapping[str, Any]], caption: str) -> Figure:
+    """Friction over speed, in the units of a joint."""
+    unit, force, _ = axes_of(joint)
+    return Figure(f"{title}: friction over speed", tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption)
+
+
 def pairs_of(joint: JointProfile) -> dict[str, Any]:
     """The pairs of a joint, with their intervals where known."""
     x, y = np.array(joint.velocity_rad_s) * axes_of(joint)[2], np.array(joint.torque_nm)
@@ -188,21 +192,18 @@ def _half_width(joint: JointProfile) -> Array:
 
 def _curve_figure(name: str, joint: JointProfile, previous: FrictionProfile | None) -> Figure:
     """The curve alone, close enough to see its intervals."""
-    unit, force, scale = axes_of(joint)
+    unit, _, scale = axes_of(joint)
     traces = _curves(name, joint, previous) + _one_way(joint, scale)
     if joint.published is not None:
         velocity, torque = np.array(joint.published.velocity_rad_s), np.array(joint.published.torque_nm)
         traces.append(points("as published (Function A)", velocity * scale, torque, PUBLISHED, symbol="x-thin-open"))
     traces.append(pairs_of(joint))
     low, high = joint.curve().measured_range_rad_s
-    return Figure(
-        f"Joint {name}: friction over speed",
-        tuple(traces),
-        f"speed [{unit}]",
-        f"friction [{force}]",
-        caption=f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}, extrapolated where dotted. The "
-        "curve is the mean of both directions.",
+    caption = (
+        f"Measured from {low * scale:.3g} to {high * scale:.3g} {unit}, extrapolated where dotted. The curve is the "
+        "mean of both directions."
     )
+    return over_speed(f"Joint {name}", joint, traces, caption)
 
 
 def _one_way(joint: JointProfile, scale: float) -> list[Mapping[str, Any]]:

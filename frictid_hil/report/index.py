@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from frictid_hil.profiles.promotions import Attempt, Promotion
-from frictid_hil.profiles.summary import TrendPoint
+from frictid_hil.profiles.records import Attempt, Promotion, TrendPoint
 from frictid_hil.report.calendar import STATES, calendar, state_of
 from frictid_hil.report.pages import Link, Page, Section, Table
 from frictid_hil.report.trends import trend_figures

@@ -9,8 +9,8 @@ import numpy as np
 
 from frictid_hil.config.policy import Policy
 from frictid_hil.config.profile import FrictionProfile, JointProfile
-from frictid_hil.profiles.summary import TrendPoint
-from frictid_hil.report.calibration import axes_of, pairs_of
+from frictid_hil.profiles.records import TrendPoint
+from frictid_hil.report.calibration import axes_of, over_speed, pairs_of
 from frictid_hil.report.figures import IDENTIFIED, PUBLISHED, REFERENCE, Figure, line
 from frictid_hil.report.pages import Page, Section, Table
 from frictid_hil.report.trends import trend_figures
@@ -117,7 +117,7 @@ def _drift(result: Mapping[str, Any], newer: FrictionProfile) -> Table:
 
 
 def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, baseline: FrictionProfile | None) -> Figure:
-    unit, force, scale = axes_of(joint)
+    scale = axes_of(joint)[2]
     speeds = np.linspace(0.0, joint.velocity_rad_s[-1], 200)[1:]
     traces = []
     for title, other, color in (("active before", active, REFERENCE), ("baseline", baseline, PUBLISHED)):
@@ -128,8 +128,7 @@ def _curves(name: str, joint: JointProfile, active: FrictionProfile | None, base
         line("measured now", speeds * scale, joint.curve().magnitude(speeds), IDENTIFIED),
         pairs_of(joint),
     ]
-    title, caption = f"Joint {name}: friction over speed", "Bars are 95 % intervals."
-    return Figure(title, tuple(traces), f"speed [{unit}]", f"friction [{force}]", caption=caption)
+    return over_speed(f"Joint {name}", joint, traces, "Bars are 95 % intervals.")
 
 
 def _number(value: float | None) -> str:

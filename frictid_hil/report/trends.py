@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from frictid_hil.profiles.summary import TrendPoint
+from frictid_hil.profiles.records import TrendPoint
 from frictid_hil.report.figures import Figure, rounded, scatter
 
 _COLORS = ("#1f6fb2", "#c07a2c", "#3a9a5b", "#b2477f", "#7a6cc0", "#6b7785", "#b5a11f", "#2aa3a3")

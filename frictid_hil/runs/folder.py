@@ -308,23 +308,10 @@ def samples_from_rows(
     joint: str, rows: Rows, marks: tuple[Mark, ...], identity: Mapping[str, Any], robot: str
 ) -> Samples:
     """Rows of ``ring.SAMPLE_ROW`` of one joint as samples, with what its drive says of itself as meta."""
-
-    def optional(name: str) -> Any:
-        column = rows[name]
-        return column.copy() if np.isfinite(column).any() else None
-
-    return Samples(
-        joint=joint,
-        time_ns=rows["t_ns"].copy(),
-        position_rad=rows["position_rad"].copy(),
-        velocity_rad_s=rows["velocity_rad_s"].copy(),
-        torque_nm=rows["torque_nm"].copy(),
-        position_command_rad=rows["position_command_rad"].copy(),
-        external_torque_nm=optional("external_torque_nm"),
-        temperature_c=optional("temperature_c"),
-        marks=marks,
-        meta={"robot": robot, **identity},
-    )
+    known = ["position_rad", "velocity_rad_s", "torque_nm", "position_command_rad"]
+    known += [name for name in ("external_torque_nm", "temperature_c") if np.isfinite(rows[name]).any()]
+    columns: dict[str, Any] = {name: rows[name].copy() for name in known}
+    return Samples(joint=joint, time_ns=rows["t_ns"].copy(), marks=marks, meta={"robot": robot, **identity}, **columns)
 
 
 def _finite(value: Any) -> Any:

@@ -18,7 +18,7 @@ from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.profiles import index as index_module
 from frictid_hil.profiles import store as store_module
 from frictid_hil.profiles.drift import drift
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 
 V = (0.2, 0.4, 0.6, 1.9)

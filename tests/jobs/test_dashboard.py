@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from frictid_hil.config.profile import Estimate, FrictionProfile, JointProfile
 from frictid_hil.config.provenance import Provenance
 from frictid_hil.jobs.dashboard import application
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.recording.samples import Samples

@@ -25,8 +25,7 @@ from frictid_hil.jobs.bus_logs import lost_rows
 from frictid_hil.jobs.calibrate import CalibrateOptions, calibrate
 from frictid_hil.jobs.replay import ReplayOptions, replay
 from frictid_hil.jobs.watch import Silent
-from frictid_hil.recording.bus_log import BusLogWriter, read_frames
-from frictid_hil.recording.playback import LogBus, logged
+from frictid_hil.recording.bus_log import BusLogWriter, LogBus, logged, read_frames
 
 pytestmark = pytest.mark.slow
 

@@ -15,7 +15,7 @@ from frictid_hil.config.robot import load_robot
 from frictid_hil.config.write import dump
 from frictid_hil.errors import UsageError
 from frictid_hil.jobs.report import report
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.report.calibration import calibration_page
 

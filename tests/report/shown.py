@@ -24,7 +24,7 @@ from frictid_hil.gap.diagnosis import Cause, Diagnosis, Figures, NextExperiment,
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.profiles import missing_torque
 from frictid_hil.profiles.judgement import judge
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.report.arm import JointRun, arm_page

@@ -33,7 +33,7 @@ from shown import (
 )
 
 from frictid_hil.jobs.dashboard import application
-from frictid_hil.profiles.promotions import Attempt
+from frictid_hil.profiles.records import Attempt
 from frictid_hil.profiles.store import ProfileStore
 from frictid_hil.recording.mcap import write_samples
 from frictid_hil.report.calendar import calendar
