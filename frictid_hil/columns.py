@@ -30,20 +30,14 @@ TIME_UNITS_NS: dict[str, float] = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where one column comes from: the product of some columns of the file, times a scale.
+    """Where one column comes from: the product of some columns of the file, times a scale."""
 
-    Attributes:
-        columns: names in the file; more than one are multiplied (a constant counts as a column of equal values).
-        scale: factor to the product's SI value, unit and sign included.
-        offset: added after scaling, SI.
-        index: for cells that hold a list, which of its values.
-        file: for recordings spread over files, the name of the other file, beside the first and with equal rows.
-    """
-
+    # Names in the file; more than one are multiplied (a constant counts as a column of equal values).
     columns: tuple[str, ...]
-    scale: float = 1.0
-    offset: float = 0.0
-    index: int | None = None
+    scale: float = 1.0  # factor to the product's SI value, unit and sign included
+    offset: float = 0.0  # added after scaling, SI
+    index: int | None = None  # for cells that hold a list, which of its values
+    # For recordings spread over files, the name of the other file, beside the first and with equal rows.
     file: str | None = None
 
 
@@ -63,19 +57,14 @@ class JointColumns:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """A foreign file's columns.
+    """A foreign file's columns."""
 
-    Attributes:
-        name: of the map.
-        time: source of the time; its scale is to nanoseconds. Without a column rows are equally spaced by the scale.
-        joints: by name, in order; ``{joint}`` in a name and its columns stands for every joint that the file has.
-        topic: of a ROS bag that has several.
-    """
-
-    name: str
+    name: str  # of the map
+    # Source of the time; its scale is to nanoseconds. Without a column rows are equally spaced by the scale.
     time: Source
+    # By name, in order; ``{joint}`` in a name and its columns stands for every joint that the file has.
     joints: Mapping[str, JointColumns]
-    topic: str | None = None
+    topic: str | None = None  # of a ROS bag that has several
 
 
 def si_factor(unit: str, column: str, *, prismatic: bool) -> float:

@@ -37,17 +37,11 @@ NEWEST = 1
 
 
 class TimeFile(Strict):
-    """The column of time, or the rate at which rows were taken where there is none.
+    """The column of time, or the rate at which rows were taken where there is none."""
 
-    Attributes:
-        column: its name.
-        unit: of the column.
-        rate_hz: rows a second, in place of a column.
-    """
-
-    column: str | None = None
-    unit: Literal["s", "ms", "us", "ns"] = "s"
-    rate_hz: float | None = Field(default=None, gt=0)
+    column: str | None = None  # its name
+    unit: Literal["s", "ms", "us", "ns"] = "s"  # of the column
+    rate_hz: float | None = Field(default=None, gt=0)  # rows a second, in place of a column
 
     @model_validator(mode="after")
     def _one_way(self) -> TimeFile:
@@ -64,33 +58,20 @@ class TimeFile(Strict):
 
 
 class SourceFile(Strict):
-    """Where one quantity comes from.
+    """Where one quantity comes from."""
 
-    Attributes:
-        column: name of the only column.
-        product: names of columns (or constants) to be multiplied.
-        unit: of the column or product, before ``scale``.
-        scale: further factor; -1 turns the sign.
-        offset: added last, in the SI unit.
-        index: for cells that hold a list, which of its values, from 0.
-        file: name of the file beside the first that has this column; at other times, its last value before each counts.
-        shift_s: of a command that is stamped too early, how much later it was.
-        torque_constant_nm_per_a: of the motor, for a torque in A.
-        torque_constant_sigma: one standard deviation of it, relative.
-        gear_ratio: between that motor and the joint.
-    """
-
-    column: str | None = None
-    product: Names | None = Field(default=None, min_length=2)
-    unit: str
-    scale: float = 1.0
-    offset: float = 0.0
-    index: int | None = Field(default=None, ge=0)
+    column: str | None = None  # name of the only column
+    product: Names | None = Field(default=None, min_length=2)  # names of columns (or constants) to be multiplied
+    unit: str  # of the column or product, before ``scale``
+    scale: float = 1.0  # further factor; -1 turns the sign
+    offset: float = 0.0  # added last, in the SI unit
+    index: int | None = Field(default=None, ge=0)  # for cells that hold a list, which of its values, from 0
+    # name of the file beside the first that has this column; at other times, its last value before each counts
     file: str | None = Field(default=None, pattern=r"^[^/\\]+$")
-    shift_s: float = 0.0
-    torque_constant_nm_per_a: float | None = Field(default=None, gt=0)
-    torque_constant_sigma: float | None = Field(default=None, gt=0, lt=1)
-    gear_ratio: float = Field(default=1.0, gt=0)
+    shift_s: float = 0.0  # of a command that is stamped too early, how much later it was
+    torque_constant_nm_per_a: float | None = Field(default=None, gt=0)  # of the motor, for a torque in A
+    torque_constant_sigma: float | None = Field(default=None, gt=0, lt=1)  # one standard deviation of it, relative
+    gear_ratio: float = Field(default=1.0, gt=0)  # between that motor and the joint
 
     @model_validator(mode="after")
     def _one_way(self) -> SourceFile:
@@ -106,29 +87,17 @@ class SourceFile(Strict):
 
 
 class JointFile(Strict):
-    """One joint's columns. Each says its own unit. ``torque`` or ``position_command`` is required.
+    """One joint's columns. Each says its own unit. ``torque`` or ``position_command`` is required."""
 
-    Attributes:
-        prismatic: a linear axis, in m and N.
-        meta: remarks for the profile, such as ``torque_source``.
-        position: measured.
-        velocity: measured; without it the position is differenced.
-        torque: measured or commanded, or a motor current.
-        position_command: what the position loop was told.
-        external_torque: of a force sensor.
-        rigid_body_torque: what your own model of the rigid bodies explains.
-        torque_demand: what the controller demanded, for the diagnosis.
-    """
-
-    prismatic: bool = False
-    meta: dict[str, str | float] = Field(default_factory=dict)
-    position: SourceFile
-    velocity: SourceFile | None = None
-    torque: SourceFile | None = None
-    position_command: SourceFile | None = None
-    external_torque: SourceFile | None = None
-    rigid_body_torque: SourceFile | None = None
-    torque_demand: SourceFile | None = None
+    prismatic: bool = False  # a linear axis, in m and N
+    meta: dict[str, str | float] = Field(default_factory=dict)  # remarks for the profile, such as ``torque_source``
+    position: SourceFile  # measured
+    velocity: SourceFile | None = None  # measured; without it the position is differenced
+    torque: SourceFile | None = None  # measured or commanded, or a motor current
+    position_command: SourceFile | None = None  # what the position loop was told
+    external_torque: SourceFile | None = None  # of a force sensor
+    rigid_body_torque: SourceFile | None = None  # what your own model of the rigid bodies explains
+    torque_demand: SourceFile | None = None  # what the controller demanded, for the diagnosis
 
     @model_validator(mode="after")
     def _something_to_explain(self) -> JointFile:
@@ -138,20 +107,13 @@ class JointFile(Strict):
 
 
 class ColumnsFile(Strict):
-    """Which column of a foreign recording is which.
+    """Which column of a foreign recording is which."""
 
-    Attributes:
-        schema: ``frictid.columns/1``.
-        name: of the map.
-        topic: of a bag in which several hold joint states.
-        time: the column of time, or the rate.
-        joints: by name; ``"{joint}"`` stands for all whose columns follow one form.
-    """
-
-    schema_: str = Field(alias="schema")
-    name: str
-    topic: str | None = None
-    time: TimeFile
+    schema_: str = Field(alias="schema")  # ``frictid.columns/1``
+    name: str  # of the map
+    topic: str | None = None  # of a bag in which several hold joint states
+    time: TimeFile  # the column of time, or the rate
+    # by name; ``"{joint}"`` stands for all whose columns follow one form
     joints: dict[str, JointFile] = Field(min_length=1)
 
 

@@ -29,23 +29,16 @@ class Open(Strict):
 
 
 class Friction(Open):
-    """Either pairs of the sliding curve, or Coulomb level and viscosity.
+    """Either pairs of the sliding curve, or Coulomb level and viscosity."""
 
-    Attributes:
-        velocity_rad_s: speeds of the pairs, positive.
-        torque_nm: friction at these speeds.
-        coulomb_nm: level, in place of pairs.
-        viscous_nm_s_per_rad: slope over speed, beside ``coulomb_nm``.
-        presliding_stiffness_nm_per_rad: slope of friction over position where friction passes zero.
-        presliding_yields: ``at once`` as a spring that slips, ``gradually`` as Dahl's and the LuGre model; read off the
-            recordings unless stated.
-    """
-
-    velocity_rad_s: Numbers | None = None
-    torque_nm: Numbers | None = None
-    coulomb_nm: float | None = None
-    viscous_nm_s_per_rad: float | None = None
+    velocity_rad_s: Numbers | None = None  # speeds of the pairs, positive
+    torque_nm: Numbers | None = None  # friction at these speeds
+    coulomb_nm: float | None = None  # level, in place of pairs
+    viscous_nm_s_per_rad: float | None = None  # slope over speed, beside ``coulomb_nm``
+    # slope of friction over position where friction passes zero
     presliding_stiffness_nm_per_rad: Positive | None = None
+    # ``at once`` as a spring that slips, ``gradually`` as Dahl's and the LuGre model; read off the recordings unless
+    # stated
     presliding_yields: Literal["at once", "gradually"] | None = None
 
     @model_validator(mode="after")
@@ -65,29 +58,18 @@ class Friction(Open):
 
 
 class Joint(Open):
-    """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's.
+    """``tau = inertia*acc + gravity_cos*cos(q) + gravity_sin*sin(q) + friction``; gravity_torque_nm is the cosine's."""
 
-    Attributes:
-        inertia_kg_m2: of the whole joint; 0 says that the logs contain it in ``rigid_body_torque_nm``.
-        motor_inertia_share: part of the inertia in front of the gear.
-        gravity_torque_nm: another name of ``gravity_cos_nm``.
-        gravity_cos_nm: gravity torque at q = 0.
-        gravity_sin_nm: gravity torque at q = 90 deg.
-        gear_ratio: motor revolutions per joint revolution.
-        gear: remark.
-        continuous: the joint turns without end.
-        friction: the believed friction.
-    """
-
+    # of the whole joint; 0 says that the logs contain it in ``rigid_body_torque_nm``
     inertia_kg_m2: NotNegative | None = None
-    motor_inertia_share: float | None = Field(default=None, ge=0, le=1)
-    gravity_torque_nm: float | None = None
-    gravity_cos_nm: float | None = None
-    gravity_sin_nm: float | None = None
-    gear_ratio: Positive | None = None
-    gear: str | None = None
-    continuous: bool = False
-    friction: Friction | None = None
+    motor_inertia_share: float | None = Field(default=None, ge=0, le=1)  # part of the inertia in front of the gear
+    gravity_torque_nm: float | None = None  # another name of ``gravity_cos_nm``
+    gravity_cos_nm: float | None = None  # gravity torque at q = 0
+    gravity_sin_nm: float | None = None  # gravity torque at q = 90 deg
+    gear_ratio: Positive | None = None  # motor revolutions per joint revolution
+    gear: str | None = None  # remark
+    continuous: bool = False  # the joint turns without end
+    friction: Friction | None = None  # the believed friction
 
     @model_validator(mode="after")
     def _one_cosine(self) -> Joint:
@@ -97,33 +79,20 @@ class Joint(Open):
 
 
 class PayloadFile(Open):
-    """What is mounted on the link where an experiment says so.
+    """What is mounted on the link where an experiment says so."""
 
-    Attributes:
-        inertia_kg_m2: that it adds.
-        gravity_torque_nm: that it adds, at q = 0.
-    """
-
-    inertia_kg_m2: NotNegative | None = None
-    gravity_torque_nm: float | None = None
+    inertia_kg_m2: NotNegative | None = None  # that it adds
+    gravity_torque_nm: float | None = None  # that it adds, at q = 0
 
 
 class FeedForward(Strict):
-    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``.
+    """What a controller adds along its command: ``inertia*acc + gravity(cmd) + coulomb*sign(v) + viscous*v``."""
 
-    Attributes:
-        inertia_kg_m2: that multiplies the command's acceleration.
-        gravity_cos_nm: at the command's cosine.
-        gravity_sin_nm: at the command's sine.
-        coulomb_nm: in the direction of the command's velocity.
-        viscous_nm_s_per_rad: that multiplies the command's velocity.
-    """
-
-    inertia_kg_m2: float = 0.0
-    gravity_cos_nm: float = 0.0
-    gravity_sin_nm: float = 0.0
-    coulomb_nm: float = 0.0
-    viscous_nm_s_per_rad: float = 0.0
+    inertia_kg_m2: float = 0.0  # that multiplies the command's acceleration
+    gravity_cos_nm: float = 0.0  # at the command's cosine
+    gravity_sin_nm: float = 0.0  # at the command's sine
+    coulomb_nm: float = 0.0  # in the direction of the command's velocity
+    viscous_nm_s_per_rad: float = 0.0  # that multiplies the command's velocity
 
 
 def _law(name: Any) -> Any:
@@ -138,32 +107,19 @@ class ControllerFile(Open):
     ``pid``: ``kp*e + integral(ki*e) + kd*(dcommand/dt - v)``. ``cascade``: ``kv*w + integral(ki*w)`` with ``w = kp*e +
     velocity_feedforward*dcommand/dt - v``. ``columns``: each log brings its demand as ``torque_demand_nm``.
     ``unknown``: like no controller at all.
-
-    Attributes:
-        type: the law.
-        rate_hz: at which it is computed; ``pid`` and ``cascade`` need it.
-        kp: gain of the position error.
-        ki: gain of the integral.
-        kd: gain of the velocity error, ``pid``.
-        kv: gain of the inner loop, ``cascade``.
-        velocity_feedforward: share of the command's velocity, ``cascade``.
-        velocity_filter_s: time constant of the low-pass on the velocity that it uses.
-        torque_limit_nm: of its demand.
-        command_rate: difference of the command that makes dcommand/dt.
-        feedforward: what it adds along its command.
     """
 
-    type: Annotated[Literal["pid", "cascade", "columns", "unknown"], BeforeValidator(_law)] = "pid"
-    rate_hz: Positive | None = None
-    kp: NotNegative | None = None
-    ki: NotNegative | None = None
-    kd: NotNegative | None = None
-    kv: NotNegative | None = None
-    velocity_feedforward: NotNegative = 0.0
-    velocity_filter_s: NotNegative | None = None
-    torque_limit_nm: Positive | None = None
-    command_rate: Literal["central", "backward"] | None = None
-    feedforward: FeedForward | None = None
+    type: Annotated[Literal["pid", "cascade", "columns", "unknown"], BeforeValidator(_law)] = "pid"  # the law
+    rate_hz: Positive | None = None  # at which it is computed; ``pid`` and ``cascade`` need it
+    kp: NotNegative | None = None  # gain of the position error
+    ki: NotNegative | None = None  # gain of the integral
+    kd: NotNegative | None = None  # gain of the velocity error, ``pid``
+    kv: NotNegative | None = None  # gain of the inner loop, ``cascade``
+    velocity_feedforward: NotNegative = 0.0  # share of the command's velocity, ``cascade``
+    velocity_filter_s: NotNegative | None = None  # time constant of the low-pass on the velocity that it uses
+    torque_limit_nm: Positive | None = None  # of its demand
+    command_rate: Literal["central", "backward"] | None = None  # difference of the command that makes dcommand/dt
+    feedforward: FeedForward | None = None  # what it adds along its command
 
     @model_validator(mode="after")
     def _whole(self) -> ControllerFile:
@@ -179,49 +135,29 @@ class ControllerFile(Open):
 
 
 class ReportFilter(Strict):
-    """A low-pass that the drive's reported torque has passed.
+    """A low-pass that the drive's reported torque has passed."""
 
-    Attributes:
-        order: first-order lags in a row.
-        time_constant_s: of each lag; 0 is no filter.
-    """
-
-    order: Annotated[int, Field(ge=1, le=8)] = 1
-    time_constant_s: NotNegative
+    order: Annotated[int, Field(ge=1, le=8)] = 1  # first-order lags in a row
+    time_constant_s: NotNegative  # of each lag; 0 is no filter
 
 
 class Drive(Open):
-    """What the drive is known to do.
+    """What the drive is known to do."""
 
-    Attributes:
-        rated_torque_nm: at the joint.
-        torque_quantum_nm: step of the reported torque.
-        torque_delay_s: from demand to torque.
-        current_lag_s: time constant from demand to current.
-        torque_report_filter: low-pass on the reported torque.
-    """
-
-    rated_torque_nm: Positive | None = None
-    torque_quantum_nm: NotNegative | None = None
-    torque_delay_s: NotNegative | None = None
-    current_lag_s: NotNegative | None = None
-    torque_report_filter: ReportFilter | None = None
+    rated_torque_nm: Positive | None = None  # at the joint
+    torque_quantum_nm: NotNegative | None = None  # step of the reported torque
+    torque_delay_s: NotNegative | None = None  # from demand to torque
+    current_lag_s: NotNegative | None = None  # time constant from demand to current
+    torque_report_filter: ReportFilter | None = None  # low-pass on the reported torque
 
 
 class Encoder(Open):
-    """What the encoder is known to do.
+    """What the encoder is known to do."""
 
-    Attributes:
-        side: ``motor`` or ``link``.
-        resolution_rad: its step, at the joint.
-        zero_offset_rad: of its zero.
-        velocity_filter_s: time constant of the low-pass on the reported velocity.
-    """
-
-    side: str | None = None
-    resolution_rad: NotNegative | None = None
-    zero_offset_rad: float | None = None
-    velocity_filter_s: NotNegative | None = None
+    side: str | None = None  # ``motor`` or ``link``
+    resolution_rad: NotNegative | None = None  # its step, at the joint
+    zero_offset_rad: float | None = None  # of its zero
+    velocity_filter_s: NotNegative | None = None  # time constant of the low-pass on the reported velocity
 
 
 ABSOLUTE_ONLY = ("zero_offset_rad", "torque_delay_s", "current_lag_s", "velocity_filter_s")
@@ -232,28 +168,17 @@ Share = NotNegative | Literal["data_sheet", "cad", "profile"]
 
 
 class Tolerance(Strict):
-    """One-sigma beliefs: relative here, in the number's own unit under ``absolute``.
+    """One-sigma beliefs: relative here, in the number's own unit under ``absolute``."""
 
-    Attributes:
-        inertia_kg_m2: of the joint's inertia.
-        gravity_torque_nm: of the gravity torque.
-        friction_torque: of the whole friction curve.
-        viscous: of the part of friction that depends on speed.
-        presliding_stiffness: of the stiffness before friction slips.
-        torque_constant: of the torque that the drive reports.
-        controller_gains: of each gain.
-        rigid_body_torque: of the column that the logs bring.
-        absolute: the same, and those of zero offset, delay, lag and filter, in N m, kg m2, rad and s.
-    """
-
-    inertia_kg_m2: Share | None = None
-    gravity_torque_nm: Share | None = None
-    friction_torque: Share | None = None
-    viscous: Share | None = None
-    presliding_stiffness: Share | None = None
-    torque_constant: Share | None = None
-    controller_gains: Share | None = None
-    rigid_body_torque: Share | None = None
+    inertia_kg_m2: Share | None = None  # of the joint's inertia
+    gravity_torque_nm: Share | None = None  # of the gravity torque
+    friction_torque: Share | None = None  # of the whole friction curve
+    viscous: Share | None = None  # of the part of friction that depends on speed
+    presliding_stiffness: Share | None = None  # of the stiffness before friction slips
+    torque_constant: Share | None = None  # of the torque that the drive reports
+    controller_gains: Share | None = None  # of each gain
+    rigid_body_torque: Share | None = None  # of the column that the logs bring
+    # the same, and those of zero offset, delay, lag and filter, in N m, kg m2, rad and s
     absolute: Mapping[str, NotNegative] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -267,45 +192,26 @@ class Tolerance(Strict):
 
 
 class ExperimentFile(Open):
-    """One recording.
+    """One recording."""
 
-    Attributes:
-        name: of the experiment.
-        file: beside ``nominal.yaml``; the name with ``.csv`` unless given.
-        role: whether it is fitted or judged on.
-        payload: whether the payload was mounted.
-        run_order: place in the sequence, for effects of time.
-        duration_s: remark.
-    """
-
-    name: str = Field(min_length=1)
-    file: str | None = None
-    role: Literal["identification", "validation"] = "identification"
-    payload: bool = False
-    run_order: int | None = None
-    duration_s: NotNegative | None = None
+    name: str = Field(min_length=1)  # of the experiment
+    file: str | None = None  # beside ``nominal.yaml``; the name with ``.csv`` unless given
+    role: Literal["identification", "validation"] = "identification"  # whether it is fitted or judged on
+    payload: bool = False  # whether the payload was mounted
+    run_order: int | None = None  # place in the sequence, for effects of time
+    duration_s: NotNegative | None = None  # remark
 
 
 class NominalFile(Open):
-    """What a simulator believes of one joint, and which recordings test it.
+    """What a simulator believes of one joint, and which recordings test it."""
 
-    Attributes:
-        joint: the rigid body and its friction.
-        payload: what some experiments mount.
-        controller: the position loop.
-        drive: what is known of it.
-        encoder: what is known of it.
-        tolerance: how sure the numbers are.
-        experiments: the recordings.
-    """
-
-    joint: Joint
-    payload: PayloadFile | None = None
-    controller: ControllerFile | None = None
-    drive: Drive | None = None
-    encoder: Encoder | None = None
-    tolerance: Tolerance | None = None
-    experiments: Annotated[tuple[ExperimentFile, ...], BeforeValidator(as_tuple)] = ()
+    joint: Joint  # the rigid body and its friction
+    payload: PayloadFile | None = None  # what some experiments mount
+    controller: ControllerFile | None = None  # the position loop
+    drive: Drive | None = None  # what is known of it
+    encoder: Encoder | None = None  # what is known of it
+    tolerance: Tolerance | None = None  # how sure the numbers are
+    experiments: Annotated[tuple[ExperimentFile, ...], BeforeValidator(as_tuple)] = ()  # the recordings
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,45 +11,29 @@ from frictid_hil.config.schema import Strict
 
 
 class WarmUpPolicy(Strict):
-    """How a joint is brought to its working temperature before it is measured.
+    """How a joint is brought to its working temperature before it is measured."""
 
-    Attributes:
-        settled_percent_per_min: one cycle is repeated until its friction changes by less than this.
-        max_s: give up waiting for that after this time, and say so.
-        fixed_s: warm up for exactly this long instead; 0 for not at all.
-    """
-
+    # one cycle is repeated until its friction changes by less than this
     settled_percent_per_min: float = Field(default=1.0, gt=0)
-    max_s: float = Field(default=900.0, ge=0)
-    fixed_s: float | None = Field(default=None, ge=0)
+    max_s: float = Field(default=900.0, ge=0)  # give up waiting for that after this time, and say so
+    fixed_s: float | None = Field(default=None, ge=0)  # warm up for exactly this long instead; 0 for not at all
 
 
 class InterlockInput(Strict):
-    """The digital input that says the robot's cell is closed and empty.
+    """The digital input that says the robot's cell is closed and empty."""
 
-    Attributes:
-        joint: whose drive carries the input.
-        bit: of the drive's digital inputs (object 60FD), or the number of the controller's input.
-        closed_when: level of that bit when the interlock is closed.
-    """
-
-    joint: str
+    joint: str  # whose drive carries the input
+    # of the drive's digital inputs (object 60FD), or the number of the controller's input
     bit: int = Field(ge=0, le=31)
-    closed_when: Literal[0, 1] = 1
+    closed_when: Literal[0, 1] = 1  # level of that bit when the interlock is closed
 
 
 class Unattended(Strict):
-    """The permission to move a real robot with nobody asked.
+    """The permission to move a real robot with nobody asked."""
 
-    Attributes:
-        allowed_by: the person who takes the responsibility.
-        date: when, YYYY-MM-DD.
-        interlock_input: must be closed before and during motion.
-    """
-
-    allowed_by: str = Field(min_length=1)
-    date: str
-    interlock_input: InterlockInput
+    allowed_by: str = Field(min_length=1)  # the person who takes the responsibility
+    date: str  # when, YYYY-MM-DD
+    interlock_input: InterlockInput  # must be closed before and during motion
 
     @field_validator("date")
     @classmethod
@@ -62,30 +46,24 @@ class Unattended(Strict):
 
 
 class Policy(Strict):
-    """Limits are distances (15) between curves in percent of the reference curve's mean.
+    """Limits are distances (15) between curves in percent of the reference curve's mean."""
 
-    Attributes:
-        drift_percent: a joint further than this from the reference has drifted; reported, not refused.
-        drift_reference: ``baseline`` (the first profile promoted, or the one pinned since) sees slow drift that
-            night-by-night comparison with the ``active`` profile would not.
-        on_drift: ``report`` leaves a night on which a joint drifted at exit code 0; ``alarm`` ends it with 6.
-        refuse_percent: a joint further than this from the active profile is taken as broken: nothing is promoted.
-        promotion: ``automatic`` within these limits, or only ``by_person``.
-        max_age_days: an older profile is not used for compensation unless forced.
-        max_temperature_difference_c: nor one identified at a temperature further away than this.
-        warm_up: before measuring.
-        unattended: absent, a real robot is moved only after a person said yes.
-    """
-
+    # a joint further than this from the reference has drifted; reported, not refused
     drift_percent: float = Field(default=10.0, gt=0)
+    # ``baseline`` (the first profile promoted, or the one pinned since) sees slow drift that night-by-night comparison
+    # with the ``active`` profile would not
     drift_reference: Literal["baseline", "active"] = "baseline"
+    # ``report`` leaves a night on which a joint drifted at exit code 0; ``alarm`` ends it with 6
     on_drift: Literal["report", "alarm"] = "report"
+    # a joint further than this from the active profile is taken as broken: nothing is promoted
     refuse_percent: float = Field(default=30.0, gt=0)
+    # ``automatic`` within these limits, or only ``by_person``
     promotion: Literal["automatic", "by_person"] = "automatic"
-    max_age_days: float = Field(default=180.0, gt=0)
+    max_age_days: float = Field(default=180.0, gt=0)  # an older profile is not used for compensation unless forced
+    # nor one identified at a temperature further away than this
     max_temperature_difference_c: float = Field(default=20.0, gt=0)
-    warm_up: WarmUpPolicy = WarmUpPolicy()
-    unattended: Unattended | None = None
+    warm_up: WarmUpPolicy = WarmUpPolicy()  # before measuring
+    unattended: Unattended | None = None  # absent, a real robot is moved only after a person said yes
 
     @property
     def drift_limit_percent(self) -> float | None:

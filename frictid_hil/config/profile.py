@@ -66,19 +66,12 @@ MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 
 
 class Estimate(Strict):
-    """A figure with its 95 % interval, or the reason why there is none.
+    """A figure with its 95 % interval, or the reason why there is none."""
 
-    Attributes:
-        value: None where it could not be formed.
-        low: lower end of the interval, None where unknown.
-        high: upper end.
-        reason: why ``value`` is None, or why the interval is.
-    """
-
-    value: Number | None
-    low: Number | None = None
-    high: Number | None = None
-    reason: str = ""
+    value: Number | None  # None where it could not be formed
+    low: Number | None = None  # lower end of the interval, None where unknown
+    high: Number | None = None  # upper end
+    reason: str = ""  # why ``value`` is None, or why the interval is
 
     @model_validator(mode="before")
     @classmethod
@@ -117,15 +110,10 @@ def _not_identified() -> Estimate:
 
 
 class PairList(Strict):
-    """Velocities and torques, shape (N,) each; in the order of the cycles.
+    """Velocities and torques, shape (N,) each; in the order of the cycles."""
 
-    Attributes:
-        velocity_rad_s: with their sign.
-        torque_nm: with their sign.
-    """
-
-    velocity_rad_s: Numbers
-    torque_nm: Numbers
+    velocity_rad_s: Numbers  # with their sign
+    torque_nm: Numbers  # with their sign
 
     @model_validator(mode="after")
     def _equal_lengths(self) -> PairList:
@@ -134,21 +122,13 @@ class PairList(Strict):
 
 
 class Ripple(Strict):
-    """Torque that depends on where the motor stands, repeating over ``period_rad`` of the joint.
+    """Torque that depends on where the motor stands, repeating over ``period_rad`` of the joint."""
 
-    Attributes:
-        period_rad: joint travel after which it repeats.
-        orders: waves per period, shape (k,).
-        cos_nm: amplitude of each wave's cosine of the position, shape (k,).
-        sin_nm: of its sine.
-        torque_nm: instead of waves, at equal steps over one period, the first at position 0.
-    """
-
-    period_rad: Number = Field(gt=0)
-    orders: Annotated[tuple[int, ...], BeforeValidator(as_tuple)] = ()
-    cos_nm: Shortened = ()
-    sin_nm: Shortened = ()
-    torque_nm: Numbers = ()
+    period_rad: Number = Field(gt=0)  # joint travel after which it repeats
+    orders: Annotated[tuple[int, ...], BeforeValidator(as_tuple)] = ()  # waves per period, shape (k,)
+    cos_nm: Shortened = ()  # amplitude of each wave's cosine of the position, shape (k,)
+    sin_nm: Shortened = ()  # of its sine
+    torque_nm: Numbers = ()  # instead of waves, at equal steps over one period, the first at position 0
 
     @model_validator(mode="after")
     def _sound(self) -> Ripple:
@@ -183,77 +163,45 @@ class Ripple(Strict):
 
 
 class ProcedureUsed(Strict):
-    """The motion that the curve was measured with; None for recordings that followed no procedure.
+    """The motion that the curve was measured with; None for recordings that followed no procedure."""
 
-    Attributes:
-        amplitude_rad: travel A, peak-to-peak.
-        velocity_rad_s: highest peak speed V.
-        cycles: number of cycles N.
-        ratio: share c of a cycle's peak speed, above which its samples count.
-        shares: peak speeds over V, of a short programme.
-        together: joints that moved in phase with this one, itself among them; None where all others were locked.
-    """
-
-    amplitude_rad: Number = Field(gt=0)
-    velocity_rad_s: Number = Field(gt=0)
-    cycles: int = Field(ge=1)
-    ratio: Number = Field(ge=0, lt=1)
-    shares: Numbers | None = None
+    amplitude_rad: Number = Field(gt=0)  # travel A, peak-to-peak
+    velocity_rad_s: Number = Field(gt=0)  # highest peak speed V
+    cycles: int = Field(ge=1)  # number of cycles N
+    ratio: Number = Field(ge=0, lt=1)  # share c of a cycle's peak speed, above which its samples count
+    shares: Numbers | None = None  # peak speeds over V, of a short programme
+    # joints that moved in phase with this one, itself among them; None where all others were locked
     together: Names | None = None
 
 
 class TimeSkew(Strict):
-    """By how much torque lags position, where it was measured: each with one standard deviation.
+    """By how much torque lags position, where it was measured: each with one standard deviation."""
 
-    Attributes:
-        declared_s: by the drive or its robot file.
-        declared_deviation_s: of it.
-        measured_s: by the shaking.
-        measured_deviation_s: of it.
-        used_s: of both, weighed by their precision; the measured one alone where they disagree.
-        used_deviation_s: of it.
-    """
-
-    declared_s: Number
-    declared_deviation_s: Number = Field(ge=0)
-    measured_s: Number
-    measured_deviation_s: Number = Field(ge=0)
-    used_s: Number
-    used_deviation_s: Number = Field(ge=0)
+    declared_s: Number  # by the drive or its robot file
+    declared_deviation_s: Number = Field(ge=0)  # of it
+    measured_s: Number  # by the shaking
+    measured_deviation_s: Number = Field(ge=0)  # of it
+    used_s: Number  # of both, weighed by their precision; the measured one alone where they disagree
+    used_deviation_s: Number = Field(ge=0)  # of it
 
 
 class DriveIdentity(Strict):
-    """The drive the torque was read from: a curve is good only with the same one.
+    """The drive the torque was read from: a curve is good only with the same one."""
 
-    Attributes:
-        serial: serial number.
-        firmware: version.
-        product: vendor and product.
-        rated_torque_nm: joint side, what the drive calls 1000 per mille.
-        gear_ratio: motor revolutions per joint revolution.
-        settings: friction compensation, feed-forward, filters as read.
-    """
-
-    serial: str = ""
-    firmware: str = ""
-    product: str = ""
-    rated_torque_nm: Number | None = None
-    gear_ratio: Number | None = None
-    settings: dict[str, Any] = Field(default_factory=dict)
+    serial: str = ""  # serial number
+    firmware: str = ""  # version
+    product: str = ""  # vendor and product
+    rated_torque_nm: Number | None = None  # joint side, what the drive calls 1000 per mille
+    gear_ratio: Number | None = None  # motor revolutions per joint revolution
+    settings: dict[str, Any] = Field(default_factory=dict)  # friction compensation, feed-forward, filters as read
 
 
 class JudgedGate(Strict):
-    """One question asked of a measurement, and its answer in plain words.
+    """One question asked of a measurement, and its answer in plain words."""
 
-    Attributes:
-        name: of the gate.
-        passed: whether the measurement may be used.
-        message: the figure and its limit, in words.
-    """
-
-    name: str
-    passed: bool
-    message: str
+    name: str  # of the gate
+    passed: bool  # whether the measurement may be used
+    message: str  # the figure and its limit, in words
 
 
 def _gates(value: Any) -> Any:
@@ -294,72 +242,46 @@ LOOP_STIFFNESS = "loop_stiffness_nm_per_rad"
 
 
 class JointProfile(Strict):
-    """One joint; on a linear axis the file says m, m/s, N (see ``linear_axis``) and these names hold them.
+    """One joint; on a linear axis the file says m, m/s, N (see ``linear_axis``) and these names hold them."""
 
-    Attributes:
-        method: estimator (``function-a``, ``aligned``, ``least-squares``).
-        prismatic: a linear axis.
-        velocity_rad_s: V_1..V_N, positive, increasing, shape (N,).
-        torque_nm: F_1..F_N, shape (N,).
-        torque_plus_minus_nm: half the width of each F_n's 95 % interval, shape (N,); None without intervals, or where
-            they are not symmetric.
-        torque_interval_nm: 95 % interval of each F_n, shape (N, 2), or None; not in the file where the former is.
-        measured_range_rad_s: from V_1 to V_N; outside it the curve is an extrapolation.
-        slopes_nm_s_per_rad: of the lines that join the pairs.
-        coulomb_nm: F_0.
-        presliding_stiffness_nm_per_rad: from a slow small reversal.
-        presliding_level_nm: friction of creeping motion, from the same: where presliding yields.
-        presliding_yields: how, from the same; ``at once`` also where it was not plain to see. ``unseen``: the encoder
-            hides it, and the stiffness is the least that is possible.
-        inertia_kg_m2: of the whole joint.
-        gravity_cos_nm: of ``gravity_cos * cos(q) + gravity_sin * sin(q)``.
-        gravity_sin_nm: see there.
-        bias_nm: constant torque.
-        forward: pairs of positive motion as averaged, gravity and bias included; mean speeds within 0.1 % of V_n are
-            taken as V_n.
-        backward: of negative motion.
-        published: what Function A gives untouched, beside the chosen method; not in the file (``identify --method
-            function-a`` gives it again).
-        ripple: by position, where identified.
-        torque_source: what the torque is (``6077 actual torque``).
-        time_skew_s: by which torque was taken to lag position.
-        time_skew: where that was measured: declared, measured and used, with their uncertainty.
-        temperature_c: during the cycles.
-        procedure: V, A, N, c.
-        drive: that measured.
-        quality: figures of quality by name.
-        gates: questions and answers.
-        identified_utc: when, where that is not when the profile was made: joints taken over from an older profile.
-    """
-
-    method: str
-    prismatic: bool = False
-    velocity_rad_s: Numbers = Field(min_length=2)
-    torque_nm: Numbers = Field(min_length=2)
+    method: str  # estimator (``function-a``, ``aligned``, ``least-squares``)
+    prismatic: bool = False  # a linear axis
+    velocity_rad_s: Numbers = Field(min_length=2)  # V_1..V_N, positive, increasing, shape (N,)
+    torque_nm: Numbers = Field(min_length=2)  # F_1..F_N, shape (N,)
+    # half the width of each F_n's 95 % interval, shape (N,); None without intervals, or where they are not symmetric
     torque_plus_minus_nm: Numbers | None = None
+    # 95 % interval of each F_n, shape (N, 2), or None; not in the file where the former is
     torque_interval_nm: Pairs | None = None
-    measured_range_rad_s: Pair | None = None
-    slopes_nm_s_per_rad: Numbers | None = None
-    coulomb_nm: Estimate
-    presliding_stiffness_nm_per_rad: Estimate = Field(default_factory=_not_identified)
+    measured_range_rad_s: Pair | None = None  # from V_1 to V_N; outside it the curve is an extrapolation
+    slopes_nm_s_per_rad: Numbers | None = None  # of the lines that join the pairs
+    coulomb_nm: Estimate  # F_0
+    presliding_stiffness_nm_per_rad: Estimate = Field(default_factory=_not_identified)  # from a slow small reversal
+    # friction of creeping motion, from the same: where presliding yields
     presliding_level_nm: Estimate = Field(default_factory=_not_identified)
+    # how, from the same; ``at once`` also where it was not plain to see. ``unseen``: the encoder hides it, and the
+    # stiffness is the least that is possible.
     presliding_yields: Literal["at once", "gradually", "unseen"] = "at once"
-    inertia_kg_m2: Estimate = Field(default_factory=_not_identified)
+    inertia_kg_m2: Estimate = Field(default_factory=_not_identified)  # of the whole joint
+    # of ``gravity_cos * cos(q) + gravity_sin * sin(q)``
     gravity_cos_nm: Estimate = Field(default_factory=_not_identified)
-    gravity_sin_nm: Estimate = Field(default_factory=_not_identified)
-    bias_nm: Estimate = Field(default_factory=_not_identified)
+    gravity_sin_nm: Estimate = Field(default_factory=_not_identified)  # see there
+    bias_nm: Estimate = Field(default_factory=_not_identified)  # constant torque
+    # pairs of positive motion as averaged, gravity and bias included; mean speeds within 0.1 % of V_n are taken as V_n
     forward: PairList | None = None
-    backward: PairList | None = None
+    backward: PairList | None = None  # of negative motion
+    # what Function A gives untouched, beside the chosen method; not in the file (``identify --method function-a`` gives
+    # it again)
     published: PairList | None = None
-    ripple: Ripple | None = None
-    torque_source: str = ""
-    time_skew_s: Number = 0.0
-    time_skew: TimeSkew | None = None
-    temperature_c: Number | None = None
-    procedure: ProcedureUsed | None = None
-    drive: DriveIdentity = DriveIdentity()
-    quality: Figures = Field(default_factory=dict)
-    gates: Annotated[tuple[JudgedGate, ...], BeforeValidator(_gates)] = ()
+    ripple: Ripple | None = None  # by position, where identified
+    torque_source: str = ""  # what the torque is (``6077 actual torque``)
+    time_skew_s: Number = 0.0  # by which torque was taken to lag position
+    time_skew: TimeSkew | None = None  # where that was measured: declared, measured and used, with their uncertainty
+    temperature_c: Number | None = None  # during the cycles
+    procedure: ProcedureUsed | None = None  # V, A, N, c
+    drive: DriveIdentity = DriveIdentity()  # that measured
+    quality: Figures = Field(default_factory=dict)  # figures of quality by name
+    gates: Annotated[tuple[JudgedGate, ...], BeforeValidator(_gates)] = ()  # questions and answers
+    # when, where that is not when the profile was made: joints taken over from an older profile
     identified_utc: str = ""
 
     @model_validator(mode="before")
@@ -472,17 +394,11 @@ _IN_A_ROW = ("procedure", "time_skew", "ripple", "forward", "backward", "drive",
 
 
 class FrictionProfile(Strict):
-    """All joints of one robot, as identified by one run.
+    """All joints of one robot, as identified by one run."""
 
-    Attributes:
-        robot: name.
-        joints: by name.
-        provenance: where it comes from.
-    """
-
-    robot: str
-    joints: dict[str, JointProfile] = Field(min_length=1)
-    provenance: Provenance
+    robot: str  # name
+    joints: dict[str, JointProfile] = Field(min_length=1)  # by name
+    provenance: Provenance  # where it comes from
 
     def joint(self, name: str) -> JointProfile:
         """The joint of that name.

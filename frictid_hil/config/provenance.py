@@ -15,41 +15,23 @@ from frictid_hil.version import __version__
 
 
 class Provenance(Strict):
-    """Of one profile.
+    """Of one profile."""
 
-    Attributes:
-        created_utc: ``2026-11-21T05:15:00Z``.
-        tool_version: of frictid-hil; "" in a profile that was not written by it.
-        git_revision: of the checkout it ran from; "" from an installed wheel.
-        robot_file: name of the robot file.
-        config_sha256: ``Robot.digest``.
-        driver: name.
-        bus: ``interface:channel``; "" where a recording was identified.
-        settings: of driver and bus (bitrate, cycle rate, time-outs, ...).
-        realtime: wall clock.
-        seed: of simulated noise; None on real hardware.
-        run: the run folder, or the recordings.
-        log_sha256: of each recording, by file name.
-        temperatures_c: by name of the place measured.
-        command: the command line.
-        notes: anything else worth a line.
-    """
-
-    created_utc: str = Field(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")
-    tool_version: str = ""
-    git_revision: str = ""
-    robot_file: str = ""
-    config_sha256: str = ""
-    driver: str = ""
-    bus: str = ""
-    settings: dict[str, Any] = Field(default_factory=dict)
-    realtime: bool = False
-    seed: int | None = None
-    run: str = ""
-    log_sha256: dict[str, str] = Field(default_factory=dict)
-    temperatures_c: dict[str, float] = Field(default_factory=dict)
-    command: str = ""
-    notes: list[str] = Field(default_factory=list)
+    created_utc: str = Field(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ$")  # ``2026-11-21T05:15:00Z``
+    tool_version: str = ""  # of frictid-hil; "" in a profile that was not written by it
+    git_revision: str = ""  # of the checkout it ran from; "" from an installed wheel
+    robot_file: str = ""  # name of the robot file
+    config_sha256: str = ""  # ``Robot.digest``
+    driver: str = ""  # name
+    bus: str = ""  # ``interface:channel``; "" where a recording was identified
+    settings: dict[str, Any] = Field(default_factory=dict)  # of driver and bus (bitrate, cycle rate, time-outs, ...)
+    realtime: bool = False  # wall clock
+    seed: int | None = None  # of simulated noise; None on real hardware
+    run: str = ""  # the run folder, or the recordings
+    log_sha256: dict[str, str] = Field(default_factory=dict)  # of each recording, by file name
+    temperatures_c: dict[str, float] = Field(default_factory=dict)  # by name of the place measured
+    command: str = ""  # the command line
+    notes: list[str] = Field(default_factory=list)  # anything else worth a line
 
     @classmethod
     def now(cls, **facts: Any) -> Provenance:

@@ -1,7 +1,8 @@
 """Every file's keys as a page: ``python -m frictid_hil.config.reference docs/reference`` writes it from the schemas.
 
-The lists hold what the loaders enforce: types, limits and defaults come from the models, the words from their
-docstrings. The same models give JSON schemas, with which an editor completes and checks a file while it is typed.
+The lists hold what the loaders enforce: types, limits and defaults come from the models, the words from what is said
+beside their fields. The same models give JSON schemas, with which an editor completes and checks a file while it is
+typed.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def page() -> str:
 
 
 def schema(model: type[BaseModel]) -> dict[str, Any]:
-    """JSON schema of a file, with what its docstrings say of each model and key: an editor shows it."""
+    """JSON schema of a file, with what is said of each model and key: an editor shows it."""
     whole = model.model_json_schema(by_alias=True)
     classes = _classes(model)
     for name, definition in ((model.__name__, whole), *whole.get("$defs", {}).items()):
@@ -114,12 +115,21 @@ def _default(value: Any) -> str:
 
 
 def _documented(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
-    """A model's docstring: its opening words, and what it says of each attribute."""
-    text = inspect.getdoc(model) or ""
-    opening, _, listed = text.partition("\nAttributes:\n")
-    entries = re.findall(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", listed, flags=re.MULTILINE)
-    plain = re.sub(r"``([^`]*)``", r"`\1`", " ".join(opening.split()))
-    return plain, {name: re.sub(r"``([^`]*)``", r"`\1`", " ".join(words.split())) for name, words in entries}
+    """A model's docstring, and what is said of each field: beside it, or in the lines above it where it is long."""
+    said: dict[str, str] = {}
+    above: list[str] = []
+    for line in inspect.getsource(model).splitlines():
+        if line.startswith("    # "):
+            above.append(line[6:])
+        elif field := re.match(r"    (\w+): .*?(?:  # (.*))?$", line):
+            words = " ".join(above) or field[2] or ""
+            said[field[1].rstrip("_")] = _as_markdown(words if words.endswith(".") else f"{words}." if words else "")
+            above = []
+    return _as_markdown(" ".join((inspect.getdoc(model) or "").split())), said
+
+
+def _as_markdown(words: str) -> str:
+    return re.sub(r"``([^`]*)``", r"`\1`", words)
 
 
 def _classes(kind: Any) -> dict[str, type[BaseModel]]:

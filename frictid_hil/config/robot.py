@@ -51,134 +51,81 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class ProcedureFile(Strict):
-    """The motion of a calibration.
+    """The motion of a calibration."""
 
-    Attributes:
-        amplitude_rad: travel A of a cycle, peak-to-peak; 20 deg unless given.
-        velocity_rad_s: peak speed V of the fastest cycle; 115 deg/s unless given.
-        cycles: number of cycles N.
-        ratio: share c of a cycle's peak speed, above which its samples count.
-        measure_skew: measure the delay of the torque in every calibration, as ``calibrate --measure-skew`` does.
-    """
-
-    amplitude_rad: Positive = 0.3490658503988659
-    velocity_rad_s: Positive = 2.007128639793479
-    cycles: int = Field(default=10, ge=2, le=1000)
-    ratio: float = Field(default=0.8, ge=0, lt=1)
+    amplitude_rad: Positive = 0.3490658503988659  # travel A of a cycle, peak-to-peak; 20 deg unless given
+    velocity_rad_s: Positive = 2.007128639793479  # peak speed V of the fastest cycle; 115 deg/s unless given
+    cycles: int = Field(default=10, ge=2, le=1000)  # number of cycles N
+    ratio: float = Field(default=0.8, ge=0, lt=1)  # share c of a cycle's peak speed, above which its samples count
+    # measure the delay of the torque in every calibration, as ``calibrate --measure-skew`` does
     measure_skew: bool = False
 
 
 class JointProcedureFile(Strict):
-    """What differs for one joint.
+    """What differs for one joint."""
 
-    Attributes:
-        amplitude_rad: travel A of a cycle, peak-to-peak.
-        velocity_rad_s: peak speed V of the fastest cycle.
-        cycles: number of cycles N.
-        ratio: share c of a cycle's peak speed, above which its samples count.
-    """
-
-    amplitude_rad: Positive | None = None
-    velocity_rad_s: Positive | None = None
-    cycles: int | None = Field(default=None, ge=2, le=1000)
+    amplitude_rad: Positive | None = None  # travel A of a cycle, peak-to-peak
+    velocity_rad_s: Positive | None = None  # peak speed V of the fastest cycle
+    cycles: int | None = Field(default=None, ge=2, le=1000)  # number of cycles N
+    # share c of a cycle's peak speed, above which its samples count
     ratio: float | None = Field(default=None, ge=0, lt=1)
 
 
 class ExpectedFile(Strict):
-    """What is expected of a joint before it was measured; predicts the peak torque of a plan.
+    """What is expected of a joint before it was measured; predicts the peak torque of a plan."""
 
-    Attributes:
-        inertia_kg_m2: in the posture of the run.
-        gravity_nm: largest holding torque over the travel.
-        friction_nm: at the highest planned speed.
-        link_inertia_kg_m2: the part of the inertia behind the gear; bounds what other joints' accelerations cost this
-            one when all move together. All of it where not given.
-    """
-
-    inertia_kg_m2: float = Field(ge=0)
-    gravity_nm: float = Field(ge=0)
-    friction_nm: float = Field(ge=0)
+    inertia_kg_m2: float = Field(ge=0)  # in the posture of the run
+    gravity_nm: float = Field(ge=0)  # largest holding torque over the travel
+    friction_nm: float = Field(ge=0)  # at the highest planned speed
+    # the part of the inertia behind the gear; bounds what other joints' accelerations cost this one when all move
+    # together. All of it where not given.
     link_inertia_kg_m2: float | None = Field(default=None, ge=0)
 
 
 class DhFile(Strict):
-    """Where the next joint is: the joint's Denavit-Hartenberg row, as the robot's manual prints it.
+    """Where the next joint is: the joint's Denavit-Hartenberg row, as the robot's manual prints it."""
 
-    Attributes:
-        d_m: along this joint's axis.
-        a_m: along the common normal.
-        alpha_rad: twist to the next joint's axis.
-        theta_rad: angle at joint position 0.
-    """
-
-    d_m: float = 0.0
-    a_m: float = 0.0
-    alpha_rad: float = 0.0
-    theta_rad: float = 0.0
+    d_m: float = 0.0  # along this joint's axis
+    a_m: float = 0.0  # along the common normal
+    alpha_rad: float = 0.0  # twist to the next joint's axis
+    theta_rad: float = 0.0  # angle at joint position 0
 
 
 class JointFile(Strict):
-    """One joint; torque and position on the joint side of the gear.
+    """One joint; torque and position on the joint side of the gear."""
 
-    Attributes:
-        node: CANopen node id.
-        axis: number of the axis in a serial controller, from 0.
-        id: of an MIT-mode actuator or a servo on its bus.
-        gear_ratio: motor revolutions per joint revolution.
-        max_velocity_rad_s: highest speed that any plan may ask for.
-        max_torque_nm: highest torque that any plan may ask for.
-        rated_torque_nm: the motor's rated torque times the gear ratio; drives report torque in shares of it.
-        position_min_rad: lower end of the free travel.
-        position_max_rad: upper end of the free travel.
-        start_position_rad: where the travel of the cycles begins; it runs to start + A.
-        locked_position_rad: where the joint stands while others move.
-        continuous: the axis turns without end, or faster than any robot's joint, and that is meant.
-        direction: -1 turns position, velocity and torque of a drive that counts the other way.
-        expected: rough guess of the load, for the plan.
-        procedure: what differs from the robot's procedure.
-        loop_stiffness_nm_per_rad: what a servo's own proportional position loop gives per rad of following error.
-        options: settings of the driver for this joint; see the page of the driver.
-        simulated: the joint that simulated drives move.
-        dh: geometry, for the workspace and for an arm of rigid bodies.
-    """
-
-    node: int | None = Field(default=None, ge=0)
-    axis: int | None = Field(default=None, ge=0)
-    id: int | None = Field(default=None, ge=0)
-    gear_ratio: Positive
-    max_velocity_rad_s: Positive
-    max_torque_nm: Positive
-    rated_torque_nm: Positive
-    position_min_rad: float
-    position_max_rad: float
-    start_position_rad: float
-    locked_position_rad: float
-    continuous: bool = False
-    direction: Literal[-1, 1] = 1
-    expected: ExpectedFile | None = None
-    procedure: JointProcedureFile = JointProcedureFile()
+    node: int | None = Field(default=None, ge=0)  # CANopen node id
+    axis: int | None = Field(default=None, ge=0)  # number of the axis in a serial controller, from 0
+    id: int | None = Field(default=None, ge=0)  # of an MIT-mode actuator or a servo on its bus
+    gear_ratio: Positive  # motor revolutions per joint revolution
+    max_velocity_rad_s: Positive  # highest speed that any plan may ask for
+    max_torque_nm: Positive  # highest torque that any plan may ask for
+    rated_torque_nm: Positive  # the motor's rated torque times the gear ratio; drives report torque in shares of it
+    position_min_rad: float  # lower end of the free travel
+    position_max_rad: float  # upper end of the free travel
+    start_position_rad: float  # where the travel of the cycles begins; it runs to start + A
+    locked_position_rad: float  # where the joint stands while others move
+    continuous: bool = False  # the axis turns without end, or faster than any robot's joint, and that is meant
+    direction: Literal[-1, 1] = 1  # -1 turns position, velocity and torque of a drive that counts the other way
+    expected: ExpectedFile | None = None  # rough guess of the load, for the plan
+    procedure: JointProcedureFile = JointProcedureFile()  # what differs from the robot's procedure
+    # what a servo's own proportional position loop gives per rad of following error
     loop_stiffness_nm_per_rad: float = Field(default=0.0, ge=0)
+    # settings of the driver for this joint; see the page of the driver
     options: dict[str, Any] = Field(default_factory=dict)
-    simulated: dict[str, Any] = Field(default_factory=dict)
-    dh: DhFile | None = None
+    simulated: dict[str, Any] = Field(default_factory=dict)  # the joint that simulated drives move
+    dh: DhFile | None = None  # geometry, for the workspace and for an arm of rigid bodies
 
 
 class WorkspaceFile(Strict):
-    """A box in the robot's base frame that the arm may not leave; needs ``dh`` of every joint.
+    """A box in the robot's base frame that the arm may not leave; needs ``dh`` of every joint."""
 
-    Attributes:
-        x_m: from and to.
-        y_m: from and to.
-        z_m: from and to.
-        clearance_m: kept from every face: as much as the links are thicker than lines from joint to joint.
-        tool_m: tool point in the last joint's frame.
-    """
-
-    x_m: Pair
-    y_m: Pair
-    z_m: Pair
+    x_m: Pair  # from and to
+    y_m: Pair  # from and to
+    z_m: Pair  # from and to
+    # kept from every face: as much as the links are thicker than lines from joint to joint
     clearance_m: float = Field(default=0.0, ge=0)
-    tool_m: Triple = (0.0, 0.0, 0.0)
+    tool_m: Triple = (0.0, 0.0, 0.0)  # tool point in the last joint's frame
 
     @field_validator("x_m", "y_m", "z_m")
     @classmethod
@@ -189,96 +136,64 @@ class WorkspaceFile(Strict):
 
 
 class CareFile(Strict):
-    """Bounds of the supervisor where this robot needs others than usual. A plan prints them beside the usual ones.
+    """Bounds of the supervisor where this robot needs others than usual. A plan prints them beside the usual ones."""
 
-    Attributes:
-        reference_tolerance_rad: a joint further than this from its planned locked position is refused; usually 10 deg.
-        approach_rad_s: speed of moves to locked and start positions; usually 20 deg/s.
-        still_rad: how far a joint may move from where it was locked; usually 0.25 deg.
-        still_rad_s: speed below which a joint stands; usually 0.5 deg/s.
-        following_error_rad: largest following error, beyond what the driver's own delay makes; usually 5 deg,
-            and no more than the joint covers in 15 ms at its highest speed.
-        velocity_margin: measured speed may exceed the planned peak by this factor; usually 1.25 ...
-        velocity_slack_rad_s: ... plus this; usually 10 deg/s.
-        travel_slack_rad: measured position may leave the planned travel by this; usually 2 deg.
-        silence_s: how long the moving joint may go without a report, never less than three cycles; usually 0.02 s.
-    """
-
+    # a joint further than this from its planned locked position is refused; usually 10 deg
     reference_tolerance_rad: Positive | None = None
-    approach_rad_s: Positive | None = None
-    still_rad: Positive | None = None
-    still_rad_s: Positive | None = None
+    approach_rad_s: Positive | None = None  # speed of moves to locked and start positions; usually 20 deg/s
+    still_rad: Positive | None = None  # how far a joint may move from where it was locked; usually 0.25 deg
+    still_rad_s: Positive | None = None  # speed below which a joint stands; usually 0.5 deg/s
+    # largest following error, beyond what the driver's own delay makes; usually 5 deg, and no more than the joint
+    # covers in 15 ms at its highest speed
     following_error_rad: Positive | None = None
+    # measured speed may exceed the planned peak by this factor; usually 1.25 ...
     velocity_margin: float | None = Field(default=None, ge=1)
-    velocity_slack_rad_s: Positive | None = None
-    travel_slack_rad: Positive | None = None
+    velocity_slack_rad_s: Positive | None = None  # ... plus this; usually 10 deg/s.
+    travel_slack_rad: Positive | None = None  # measured position may leave the planned travel by this; usually 2 deg
+    # how long the moving joint may go without a report, never less than three cycles; usually 0.02 s
     silence_s: Positive | None = None
 
 
 class GatesFile(Strict):
-    """What quality gates allow where this robot needs other limits than usual; plan and profile name them.
+    """What quality gates allow where this robot needs other limits than usual; plan and profile name them."""
 
-    Attributes:
-        tracking_least: least peak speed of a cycle over the commanded one; usually 0.95.
-        tracking_most: the same, at most; usually 1.3.
-        high_frequency_torque: jitter of the torque over the friction; usually 0.25.
-        samples_per_window: fewest samples that a pair may be the mean of; usually 8.
-        late_cycles: share of control cycles that were late or missed; usually 0.02.
-        direction_asymmetry: how far either direction may lie from the mean of both, over that mean; usually 0.3.
-        straightness: how far a pair may leave the line through its neighbours, over the mean friction; usually 0.1.
-        saturation: share of the samples with torque at its limit; usually 0.005.
-        drift: change of the friction over the run; usually 0.05.
-        link_resonance: frequency of the fastest cycle over the link's resonance; usually 0.2.
-        other_stretches: change of the friction in other stretches of the run, against the curve; usually 0.15.
-    """
-
+    # least peak speed of a cycle over the commanded one; usually 0.95
     tracking_least: float | None = Field(default=None, gt=0, le=1)
-    tracking_most: float | None = Field(default=None, ge=1)
-    high_frequency_torque: Share | None = None
+    tracking_most: float | None = Field(default=None, ge=1)  # the same, at most; usually 1.3
+    high_frequency_torque: Share | None = None  # jitter of the torque over the friction; usually 0.25
+    # fewest samples that a pair may be the mean of; usually 8
     samples_per_window: int | None = Field(default=None, ge=1)
-    late_cycles: Share | None = None
+    late_cycles: Share | None = None  # share of control cycles that were late or missed; usually 0.02
+    # how far either direction may lie from the mean of both, over that mean; usually 0.3
     direction_asymmetry: Share | None = None
+    # how far a pair may leave the line through its neighbours, over the mean friction; usually 0.1
     straightness: Share | None = None
-    saturation: Share | None = None
-    drift: Share | None = None
-    link_resonance: Share | None = None
+    saturation: Share | None = None  # share of the samples with torque at its limit; usually 0.005
+    drift: Share | None = None  # change of the friction over the run; usually 0.05
+    link_resonance: Share | None = None  # frequency of the fastest cycle over the link's resonance; usually 0.2
+    # change of the friction in other stretches of the run, against the curve; usually 0.15
     other_stretches: Share | None = None
 
 
 class RobotFile(Strict):
-    """What the robot is, where it is reached, and what may be done with it.
+    """What the robot is, where it is reached, and what may be done with it."""
 
-    Attributes:
-        schema: ``frictid.robot/1``.
-        extends: another robot file; this one says only what differs.
-        name: of the robot, and of its folder in the profile store.
-        driver: ``cia402``, ``mit``, ``motoman``, ``servos``, ``virtual``, or one that is installed.
-        bus: ``interface:channel``, such as ``socketcan:can0``, ``serial:/dev/ttyUSB0``, ``virtual:NAME``.
-        cycle_hz: set-points a second.
-        options: settings of the driver for the whole bus; see the page of the driver.
-        procedure: the motion of a calibration.
-        policy: what may happen with nobody there.
-        care: bounds of the supervisor.
-        gates: limits of the quality gates.
-        workspace: a box that the arm may not leave.
-        simulated_arm: masses of the links, for simulated drives that move one arm.
-        joints: by name.
-    """
-
-    schema_: str = Field(alias="schema")
-    extends: str | None = None
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-    driver: str
-    bus: str
-    cycle_hz: float = Field(gt=0, le=20_000)
+    schema_: str = Field(alias="schema")  # ``frictid.robot/1``
+    extends: str | None = None  # another robot file; this one says only what differs
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")  # of the robot, and of its folder in the profile store
+    driver: str  # ``cia402``, ``mit``, ``motoman``, ``servos``, ``virtual``, or one that is installed
+    bus: str  # ``interface:channel``, such as ``socketcan:can0``, ``serial:/dev/ttyUSB0``, ``virtual:NAME``
+    cycle_hz: float = Field(gt=0, le=20_000)  # set-points a second
+    # settings of the driver for the whole bus; see the page of the driver
     options: dict[str, Any] = Field(default_factory=dict)
-    procedure: ProcedureFile = ProcedureFile()
-    policy: Policy = Policy()
-    care: CareFile = CareFile()
-    gates: GatesFile = GatesFile()
-    workspace: WorkspaceFile | None = None
+    procedure: ProcedureFile = ProcedureFile()  # the motion of a calibration
+    policy: Policy = Policy()  # what may happen with nobody there
+    care: CareFile = CareFile()  # bounds of the supervisor
+    gates: GatesFile = GatesFile()  # limits of the quality gates
+    workspace: WorkspaceFile | None = None  # a box that the arm may not leave
+    # masses of the links, for simulated drives that move one arm
     simulated_arm: dict[str, Any] = Field(default_factory=dict)
-    joints: dict[str, JointFile] = Field(min_length=1)
+    joints: dict[str, JointFile] = Field(min_length=1)  # by name
 
     @field_validator("bus")
     @classmethod

@@ -43,19 +43,13 @@ class Place(NamedTuple):
 
 
 class Node(NamedTuple):
-    """One value of the file with its place, and that of the key that names it (its own in a list and at the root).
-
-    Attributes:
-        content: a scalar, or the children by key or index.
-        is_list: tells lists from mappings; both keep their children in ``content``.
-        size: number of nodes, aliases counted as often as they are used.
-    """
+    """One value of the file with its place, and that of the key that names it (its own in a list and at the root)."""
 
     place: Place
     key_place: Place
-    content: Any
-    is_list: bool = False
-    size: int = 1
+    content: Any  # a scalar, or the children by key or index
+    is_list: bool = False  # tells lists from mappings; both keep their children in ``content``
+    size: int = 1  # number of nodes, aliases counted as often as they are used
 
     @property
     def is_mapping(self) -> bool:
@@ -73,15 +67,11 @@ class Node(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A file read: its values, and where each stands.
-
-    Attributes:
-        root: its values; always a mapping.
-        spelled: from a path of ``root`` to the keys as the file spells them, where the loader renamed some.
-    """
+    """A file read: its values, and where each stands."""
 
     path: Path
-    root: Node
+    root: Node  # its values; always a mapping
+    # from a path of ``root`` to the keys as the file spells them, where the loader renamed some
     spelled: Callable[[KeyPath], KeyPath] = tuple
 
     @property

@@ -30,19 +30,12 @@ its magnitude. More is found all the same where a recording shows it."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Beside:
-    """Effects outside the model.
+    """Effects outside the model."""
 
-    Attributes:
-        columns: torque per one of each, shape (n, m).
-        values: how much of each there is, shape (m,).
-        covariance: of the values, shape (m, m).
-        on_knots: what one of each makes of the model's odd part, shape (K, m).
-    """
-
-    columns: Array
-    values: Array
-    covariance: Array
-    on_knots: Array
+    columns: Array  # torque per one of each, shape (n, m)
+    values: Array  # how much of each there is, shape (m,)
+    covariance: Array  # of the values, shape (m, m)
+    on_knots: Array  # what one of each makes of the model's odd part, shape (K, m)
 
     def moved(self, weights: Array) -> Array:
         """What they explain of an average with these weights, shape (N,) for weights of shape (N, m)."""

@@ -39,24 +39,16 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cleaned:
-    """A recording brought to one instant, freed of what is no friction of this joint.
+    """A recording brought to one instant, freed of what is no friction of this joint."""
 
-    Attributes:
-        recording: with the time skew that is used, and what remains open of it.
-        motion: synchronised columns, torque of link or other joints taken off.
-        level_nm: typical friction torque.
-        time_skew: where it was measured.
-        seen: what delay the cycles would ask for.
-    """
-
-    recording: CycleRecording
-    motion: Motion
+    recording: CycleRecording  # with the time skew that is used, and what remains open of it
+    motion: Motion  # synchronised columns, torque of link or other joints taken off
     windows: IdentifiedPairs
-    level_nm: float
+    level_nm: float  # typical friction torque
     link: Link | None
     others: Pull | None
-    time_skew: TimeSkew | None
-    seen: Delay | None
+    time_skew: TimeSkew | None  # where it was measured
+    seen: Delay | None  # what delay the cycles would ask for
 
     @property
     def taken(self) -> Link | Pull | None:

@@ -18,36 +18,22 @@ from frictid_hil.friction.trajectory import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """``weights @ coefficients`` is expected within ``deviation`` of zero.
+    """``weights @ coefficients`` is expected within ``deviation`` of zero."""
 
-    Attributes:
-        weights: shape (size,).
-        deviation: N m.
-        rows_alike: rows of data that count as one independent piece of evidence against it (0: a quarter cycle).
-    """
-
-    weights: Array
-    deviation: float
-    rows_alike: float
+    weights: Array  # shape (size,)
+    deviation: float  # N m
+    rows_alike: float  # rows of data that count as one independent piece of evidence against it (0: a quarter cycle)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:
-    """Coefficients and what is known of them.
+    """Coefficients and what is known of them."""
 
-    Attributes:
-        values: of the first target, shape (size,).
-        covariance: of the values, shape (size, size).
-        freedom: degrees of freedom behind each variance, shape (size,).
-        others: coefficients of the other targets, shape (size, m).
-        residual_rms: of what remains of the first target, in its unit.
-    """
-
-    values: Array
-    covariance: Array
-    freedom: Array
-    others: Array
-    residual_rms: float
+    values: Array  # of the first target, shape (size,)
+    covariance: Array  # of the values, shape (size, size)
+    freedom: Array  # degrees of freedom behind each variance, shape (size,)
+    others: Array  # coefficients of the other targets, shape (size, m)
+    residual_rms: float  # of what remains of the first target, in its unit
 
 
 def solve(x: Array, targets: Array, bunch: NDArray[np.int64], priors: list[Prior], where: str) -> Solved:

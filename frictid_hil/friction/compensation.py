@@ -67,27 +67,17 @@ def stiffness_with_margin(
 
 @dataclass(frozen=True, slots=True)
 class CompensationSettings:
-    """What one joint is given back, as plain values.
+    """What one joint is given back, as plain values."""
 
-    Attributes:
-        form: ``mo``, ``mol`` or ``mop``.
-        coulomb_nm: F_0.
-        stiffness_nm_per_rad: K.
-        ratio: R.
-        speed_rad_s: knots of phi_0, first 0, increasing, shape (k,); extended with the last slope.
-        forward_nm: phi_0 at the knots for positive motion, first 0, shape (k,).
-        backward_nm: its magnitude for negative motion, shape (k,).
-        gradual: the spring yields gradually, not at once.
-    """
-
-    form: str
-    coulomb_nm: float
-    stiffness_nm_per_rad: float
-    ratio: float
+    form: str  # ``mo``, ``mol`` or ``mop``
+    coulomb_nm: float  # F_0
+    stiffness_nm_per_rad: float  # K
+    ratio: float  # R
+    # Knots of phi_0, first 0, increasing, shape (k,); extended with the last slope.
     speed_rad_s: tuple[float, ...] = (0.0, 1.0)
-    forward_nm: tuple[float, ...] = (0.0, 0.0)
-    backward_nm: tuple[float, ...] = (0.0, 0.0)
-    gradual: bool = False
+    forward_nm: tuple[float, ...] = (0.0, 0.0)  # phi_0 at the knots for positive motion, first 0, shape (k,)
+    backward_nm: tuple[float, ...] = (0.0, 0.0)  # its magnitude for negative motion, shape (k,)
+    gradual: bool = False  # the spring yields gradually, not at once
 
     @staticmethod
     def of(

@@ -42,17 +42,11 @@ _POSTURE = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pull:
-    """What the other joints' accelerations take of this joint's torque, and gravity where it was taken off, too.
+    """What the other joints' accelerations take of this joint's torque, and gravity where it was taken off, too."""
 
-    Attributes:
-        inertia_kg_m2: M_ij of every other joint (then gravity, N m), shape (m,).
-        columns: their accelerations at the instants of the motion, rad/s2 (then cos q and sin q), shape (n, m).
-        covariance: of these, shape (m, m).
-    """
-
-    inertia_kg_m2: Array
-    columns: Array
-    covariance: Array
+    inertia_kg_m2: Array  # M_ij of every other joint (then gravity, N m), shape (m,)
+    columns: Array  # their accelerations at the instants of the motion, rad/s2 (then cos q and sin q), shape (n, m)
+    covariance: Array  # of these, shape (m, m)
 
     @property
     def torque_nm(self) -> Array:

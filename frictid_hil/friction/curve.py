@@ -16,15 +16,10 @@ from frictid_hil.friction.trajectory import Array
 
 @dataclass(frozen=True, slots=True)
 class FrictionCurve:
-    """An identified curve, built by ``FrictionCurve.through``.
+    """An identified curve, built by ``FrictionCurve.through``."""
 
-    Attributes:
-        velocity_rad_s: V_1..V_N, strictly increasing, positive, shape (N,).
-        torque_nm: F_1..F_N, shape (N,).
-    """
-
-    velocity_rad_s: tuple[float, ...]
-    torque_nm: tuple[float, ...]
+    velocity_rad_s: tuple[float, ...]  # V_1..V_N, strictly increasing, positive, shape (N,)
+    torque_nm: tuple[float, ...]  # F_1..F_N, shape (N,)
 
     @staticmethod
     def through(velocity_rad_s: Array, torque_nm: Array, *, where: str = "") -> FrictionCurve:

@@ -38,38 +38,28 @@ DEFAULT_METHOD = "aligned"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """What one recording says of one joint.
+    """What one recording says of one joint."""
 
-    Attributes:
-        method: one of METHODS, or ``plateaus``.
-        half_width_nm: half of the 95 % interval at each knot of the curve, shape (K,).
-        coulomb_nm: F_0 with its interval.
-        asymmetry_nm: half the difference of forward and backward friction at each knot, its constant part left to
-            the bias, shape (K,). phi + asymmetry forwards, phi - asymmetry backwards. Zero where other joints moved
-            too: the velocity products of the arm look the same.
-        pairs: window averages: of the drive's columns for ``function-a``, else of the synchronised ones.
-        published: Function A as published; None where its windows are empty or there is no drive velocity.
-        rigid_body: inertia, gravity, bias; None where they could not be separated, or are not of this joint alone.
-        ripple: over one motor revolution; None where it is unknown or lost in its uncertainty.
-        time_skew: declared, measured and used; None where the joint did not shake.
-        figures: further numbers by name, units in the names.
-    """
-
-    method: str
+    method: str  # one of METHODS, or ``plateaus``
     curve: FrictionCurve
-    half_width_nm: Array
-    coulomb_nm: Measured
+    half_width_nm: Array  # half of the 95 % interval at each knot of the curve, shape (K,)
+    coulomb_nm: Measured  # F_0 with its interval
+    # Half the difference of forward and backward friction at each knot, its constant part left to the bias, shape (K,).
+    # phi + asymmetry forwards, phi - asymmetry backwards. Zero where other joints moved too: the velocity products of
+    # the arm look the same.
     asymmetry_nm: Array
-    pairs: IdentifiedPairs
+    pairs: IdentifiedPairs  # window averages: of the drive's columns for ``function-a``, else of the synchronised ones
+    # Function A as published; None where its windows are empty or there is no drive velocity.
     published: IdentifiedPairs | None = None
+    # Inertia, gravity, bias; None where they could not be separated, or are not of this joint alone.
     rigid_body: RigidBody | None = None
-    ripple: RippleTable | None = None
+    ripple: RippleTable | None = None  # over one motor revolution; None where it is unknown or lost in its uncertainty
     link_resonance_hz: Measured | None = None
-    time_skew: TimeSkew | None = None
+    time_skew: TimeSkew | None = None  # declared, measured and used; None where the joint did not shake
     drift: intervals.Drift | None = None
     terms: intervals.Terms | None = None
     notes: tuple[str, ...] = ()
-    figures: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, float] = field(default_factory=dict)  # further numbers by name, units in the names
 
 
 def estimate(recording: CycleRecording, method: str = DEFAULT_METHOD) -> Estimate:

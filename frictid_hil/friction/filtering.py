@@ -22,15 +22,10 @@ _REACH = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Gaussian:
-    """A smoothing kernel on a uniform grid.
+    """A smoothing kernel on a uniform grid."""
 
-    Attributes:
-        step_s: of the grid.
-        width_s: standard deviation; at least one step. Half power at 0.133 / width.
-    """
-
-    step_s: float
-    width_s: float
+    step_s: float  # of the grid
+    width_s: float  # standard deviation; at least one step. Half power at 0.133 / width.
 
     def __post_init__(self) -> None:
         if not self.width_s >= 0.999 * self.step_s > 0:

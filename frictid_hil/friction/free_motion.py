@@ -44,27 +44,18 @@ MOST_APART = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMotion:
-    """What any motion says of one joint; figures of the rigid body are None where the motion cannot tell.
-
-    Attributes:
-        half_width_nm: half of the 95 % interval at each knot of the curve.
-        coulomb_nm: F_0.
-        bias_nm: a constant direction asymmetry of friction is in it.
-        untold: why a figure is None, by its name.
-        residual_rms_nm: what the model leaves.
-        torque_rms_nm: of the torque without its mean.
-    """
+    """What any motion says of one joint; figures of the rigid body are None where the motion cannot tell."""
 
     curve: FrictionCurve
-    half_width_nm: Array
-    coulomb_nm: Measured
+    half_width_nm: Array  # half of the 95 % interval at each knot of the curve
+    coulomb_nm: Measured  # F_0
     inertia_kg_m2: Measured | None
     gravity_cos_nm: Measured | None
     gravity_sin_nm: Measured | None
-    bias_nm: Measured | None
-    untold: Mapping[str, str]
-    residual_rms_nm: float
-    torque_rms_nm: float
+    bias_nm: Measured | None  # a constant direction asymmetry of friction is in it
+    untold: Mapping[str, str]  # why a figure is None, by its name
+    residual_rms_nm: float  # what the model leaves
+    torque_rms_nm: float  # of the torque without its mean
     gates: tuple[Gate, ...]
 
 

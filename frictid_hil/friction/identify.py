@@ -27,23 +27,14 @@ from frictid_hil.friction.trajectory import Array, Procedure
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IdentifiedPairs:
-    """The set S of (1) with both directions kept; every array has shape (N,), order of the cycles.
+    """The set S of (1) with both directions kept; every array has shape (N,), order of the cycles."""
 
-    Attributes:
-        velocity_rad_s: V_n of (7f): mean of the positive velocities.
-        torque_nm: F_n of (7i): half the difference of the two mean torques.
-        velocity_minus_rad_s: mean speed of the backward window, as a positive number.
-        torque_plus_nm: F_sn+ of (7g), gravity and bias included.
-        torque_minus_nm: F_sn- of (7h), signed as measured.
-        samples_plus: samples in the forward window; ``samples_minus`` in the backward one.
-    """
-
-    velocity_rad_s: Array
-    torque_nm: Array
-    velocity_minus_rad_s: Array
-    torque_plus_nm: Array
-    torque_minus_nm: Array
-    samples_plus: NDArray[np.int64]
+    velocity_rad_s: Array  # V_n of (7f): mean of the positive velocities
+    torque_nm: Array  # F_n of (7i): half the difference of the two mean torques
+    velocity_minus_rad_s: Array  # mean speed of the backward window, as a positive number
+    torque_plus_nm: Array  # F_sn+ of (7g), gravity and bias included
+    torque_minus_nm: Array  # F_sn- of (7h), signed as measured
+    samples_plus: NDArray[np.int64]  # samples in the forward window; ``samples_minus`` in the backward one
     samples_minus: NDArray[np.int64]
 
     @property

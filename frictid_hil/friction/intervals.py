@@ -175,21 +175,13 @@ def coulomb_half_width_nm(curve: FrictionCurve, half_width_nm: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Friction of the same cycle, run twice.
+    """Friction of the same cycle, run twice."""
 
-    Attributes:
-        cycle: which, 1..N.
-        first_nm: F_n of the first run.
-        change: relative change to the second run.
-        apart_s: time between the two.
-        chance: standard deviation of ``change`` where friction did not change at all.
-    """
-
-    cycle: int
-    first_nm: float
-    change: float
-    apart_s: float
-    chance: float
+    cycle: int  # which, 1..N
+    first_nm: float  # F_n of the first run
+    change: float  # relative change to the second run
+    apart_s: float  # time between the two
+    chance: float  # standard deviation of ``change`` where friction did not change at all
 
     def over(self, duration_s: float, change: float | None = None) -> float:
         """Relative change over a whole run, had it gone on evenly; continued to three times the time seen at most.

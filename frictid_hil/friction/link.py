@@ -48,23 +48,14 @@ soft joint that shows it least, whose spring hardens, 3.2."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """What swings behind the gear.
+    """What swings behind the gear."""
 
-    Attributes:
-        frequency_hz: with the motor held.
-        damping: share of the critical damping.
-        inertia_kg_m2: of the link, J_l.
-        resonance_hz: of motor and link free of each other's support, with its 95 % interval.
-        columns: J_l (a_l - a_m) by how it changes with J_l, log w and log z, shape (n, 3).
-        covariance: of J_l, log w and log z, shape (3, 3).
-    """
-
-    frequency_hz: float
-    damping: float
-    inertia_kg_m2: float
-    resonance_hz: Measured
-    columns: Array
-    covariance: Array
+    frequency_hz: float  # with the motor held
+    damping: float  # share of the critical damping
+    inertia_kg_m2: float  # of the link, J_l
+    resonance_hz: Measured  # of motor and link free of each other's support, with its 95 % interval
+    columns: Array  # J_l (a_l - a_m) by how it changes with J_l, log w and log z, shape (n, 3)
+    covariance: Array  # of J_l, log w and log z, shape (3, 3)
 
     @property
     def torque_nm(self) -> Array:

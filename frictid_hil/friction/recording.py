@@ -20,21 +20,13 @@ from frictid_hil.friction.trajectory import Array, Procedure
 
 @dataclass(frozen=True, slots=True)
 class Skew:
-    """By how much each column is late: a delay of 2 ms says that the value reported at t was true at t - 2 ms.
+    """By how much each column is late: a delay of 2 ms says that the value reported at t was true at t - 2 ms."""
 
-    Attributes:
-        position_delay_s: of the position.
-        velocity_delay_s: of the drive's own velocity, filters included.
-        torque_delay_s: of the torque, filters and half a step of zero-order hold included.
-        torque_lag_s: the part of it that is a first-order low-pass.
-        uncertainty_s: one standard deviation of torque delay minus position delay.
-    """
-
-    position_delay_s: float = 0.0
-    velocity_delay_s: float = 0.0
-    torque_delay_s: float = 0.0
-    torque_lag_s: float = 0.0
-    uncertainty_s: float = 0.0002
+    position_delay_s: float = 0.0  # of the position
+    velocity_delay_s: float = 0.0  # of the drive's own velocity, filters included
+    torque_delay_s: float = 0.0  # of the torque, filters and half a step of zero-order hold included
+    torque_lag_s: float = 0.0  # the part of it that is a first-order low-pass
+    uncertainty_s: float = 0.0002  # one standard deviation of torque delay minus position delay
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,70 +39,49 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Companion:
-    """Another joint that moved at the same time; columns of shape (n,).
-
-    Attributes:
-        time_s: on the clock of the joint that it went along with.
-        position_delay_s: declared, see ``Skew``.
-        inertia_kg_m2: M_ij, torque of the joint per acceleration of this one.
-        deviation_kg_m2: one standard deviation of it.
-    """
+    """Another joint that moved at the same time; columns of shape (n,)."""
 
     name: str
-    time_s: Array
+    time_s: Array  # on the clock of the joint that it went along with
     position_rad: Array
-    position_delay_s: float = 0.0
-    inertia_kg_m2: float = 0.0
-    deviation_kg_m2: float = 0.0
+    position_delay_s: float = 0.0  # declared, see ``Skew``
+    inertia_kg_m2: float = 0.0  # M_ij, torque of the joint per acceleration of this one
+    deviation_kg_m2: float = 0.0  # one standard deviation of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleRecording:
-    """One joint's recording of the procedure; every column has shape (n,).
+    """One joint's recording of the procedure; every column has shape (n,)."""
 
-    Attributes:
-        time_s: strictly increasing, 0 at the start of cycle 1.
-        position_rad: measured; radians or metres.
-        torque_nm: as the drive reports it.
-        velocity_rad_s: the drive's own velocity, where it has one.
-        gear_ratio: motor revolutions per joint revolution; NaN where unknown (torque ripple is then not modelled).
-        prismatic: a linear axis: gravity does not depend on the position.
-        limited_share: share of the recording in which the drive said that one of its limits was active.
-        torque_quantum_nm: one step of the reported torque.
-        repeat: the repeated cycle, where there is one.
-        coupled: other joints moved in phase with this one: inertia, gravity and velocity products are then those of the
-            combined motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
-        companions: those joints, as far as it is known how much they take.
-        stops_s: where reports are missing, or the path stood still for missed set-points; shape (k,).
-        stopped_s: how long it stood still where ``time_s`` leaves those moments out, shape (j,).
-        shaken: the stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
-        expected_inertia: what the robot file expects of the joint, kg m^2; 0 where it does not say.
-        elsewhere: other stretches of the run that go both ways: name, velocity (rad/s) and torque (N m).
-        where: what to name in errors (``joint 1``).
-    """
-
-    time_s: Array
-    position_rad: Array
-    torque_nm: Array
+    time_s: Array  # strictly increasing, 0 at the start of cycle 1
+    position_rad: Array  # measured; radians or metres
+    torque_nm: Array  # as the drive reports it
     procedure: Procedure
-    velocity_rad_s: Array | None = None
+    velocity_rad_s: Array | None = None  # the drive's own velocity, where it has one
     command_rad: Array | None = None
     skew: Skew = Skew()
+    # Motor revolutions per joint revolution; NaN where unknown (torque ripple is then not modelled).
     gear_ratio: float = math.nan
-    prismatic: bool = False
+    prismatic: bool = False  # a linear axis: gravity does not depend on the position
     torque_limit_nm: float = math.inf
-    limited_share: float = 0.0
-    torque_quantum_nm: float = 0.0
-    repeat: Repeat | None = None
+    limited_share: float = 0.0  # share of the recording in which the drive said that one of its limits was active
+    torque_quantum_nm: float = 0.0  # one step of the reported torque
+    repeat: Repeat | None = None  # the repeated cycle, where there is one
     late_cycles: int = 0
+    # Other joints moved in phase with this one: inertia, gravity and velocity products are then those of the combined
+    # motion. They are the same both ways and leave the curve alone, but for unlike servo lags.
     coupled: bool = False
-    companions: tuple[Companion, ...] = ()
+    companions: tuple[Companion, ...] = ()  # those joints, as far as it is known how much they take
+    # Where reports are missing, or the path stood still for missed set-points; shape (k,).
     stops_s: Array = field(default_factory=lambda: np.zeros(0))
+    # How long it stood still where ``time_s`` leaves those moments out, shape (j,).
     stopped_s: Array = field(default_factory=lambda: np.zeros(0))
+    # The stretch in which the joint shook to show its torque's delay (``skew``), on its own time.
     shaken: CycleRecording | None = None
-    expected_inertia: float = 0.0
+    expected_inertia: float = 0.0  # what the robot file expects of the joint, kg m^2; 0 where it does not say
+    # Other stretches of the run that go both ways: name, velocity (rad/s) and torque (N m).
     elsewhere: tuple[tuple[str, Array, Array], ...] = ()
-    where: str = ""
+    where: str = ""  # what to name in errors (``joint 1``)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,54 +41,31 @@ _REACH = 4.5
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """Which columns of the model mean what.
+    """Which columns of the model mean what."""
 
-    Attributes:
-        inertia: index of I.
-        gravity: index of g_c; g_s follows (None on a prismatic axis).
-        bias: index.
-        odd: F_k at the knots.
-        even: E_k at EVEN_KNOTS but the first, times the highest knot.
-        ripple: cos of every order, sin of every order; plain, times direction, times velocity.
-        extra: further columns that the caller brought.
-        size: number of columns.
-    """
-
-    inertia: int
-    gravity: int | None
-    bias: int
-    odd: slice
-    even: slice
-    ripple: slice
-    extra: slice
-    size: int
+    inertia: int  # index of I
+    gravity: int | None  # index of g_c; g_s follows (None on a prismatic axis)
+    bias: int  # index
+    odd: slice  # F_k at the knots
+    even: slice  # E_k at EVEN_KNOTS but the first, times the highest knot
+    ripple: slice  # cos of every order, sin of every order; plain, times direction, times velocity
+    extra: slice  # further columns that the caller brought
+    size: int  # number of columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The solved model.
+    """The solved model."""
 
-    Attributes:
-        blocks: meaning of the coefficients.
-        knots: speeds of the odd hats that were observed, shape (K,).
-        values: coefficients, shape (size,).
-        covariance: from the misfit of every quarter cycle, shape (size, size).
-        freedom: degrees of freedom behind each variance, shape (size,).
-        per_second_of_skew: change of the coefficients per second of undeclared torque delay, shape (size,).
-        per_doubt: change of the coefficients for one of each doubtful column less in the torque, shape (size, m).
-        unobserved: speeds of the hats that too few samples saw; they were left out.
-        residual_rms_nm: of the filtered torque.
-    """
-
-    blocks: Blocks
-    knots: Array
-    values: Array
-    covariance: Array
-    freedom: Array
-    per_second_of_skew: Array
-    per_doubt: Array
-    unobserved: Array
-    residual_rms_nm: float
+    blocks: Blocks  # meaning of the coefficients
+    knots: Array  # speeds of the odd hats that were observed, shape (K,)
+    values: Array  # coefficients, shape (size,)
+    covariance: Array  # from the misfit of every quarter cycle, shape (size, size)
+    freedom: Array  # degrees of freedom behind each variance, shape (size,)
+    per_second_of_skew: Array  # change of the coefficients per second of undeclared torque delay, shape (size,)
+    per_doubt: Array  # change of the coefficients for one of each doubtful column less in the torque, shape (size, m)
+    unobserved: Array  # speeds of the hats that too few samples saw; they were left out
+    residual_rms_nm: float  # of the filtered torque
 
     @property
     def odd_nm(self) -> Array:

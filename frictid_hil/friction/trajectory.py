@@ -20,20 +20,13 @@ Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Procedure:
-    """The three parameters of the paper's procedure and its window ratio.
+    """The three parameters of the paper's procedure and its window ratio."""
 
-    Attributes:
-        amplitude_rad: A, peak-to-peak travel.
-        velocity_rad_s: V, peak speed of the last cycle.
-        cycles: N, number of cycles and of identified pairs; at least 2.
-        ratio: c, samples with abs(v) >= c times the cycle's peak speed count; 0 <= c < 1.
-        shares: peak speed of every cycle as a share of V, rising to 1; empty for the paper's n / N.
-    """
-
-    amplitude_rad: float
-    velocity_rad_s: float
-    cycles: int = 10
-    ratio: float = 0.8
+    amplitude_rad: float  # A, peak-to-peak travel
+    velocity_rad_s: float  # V, peak speed of the last cycle
+    cycles: int = 10  # N, number of cycles and of identified pairs; at least 2
+    ratio: float = 0.8  # c, samples with abs(v) >= c times the cycle's peak speed count; 0 <= c < 1
+    # Peak speed of every cycle as a share of V, rising to 1; empty for the paper's n / N.
     shares: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

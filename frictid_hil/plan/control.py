@@ -23,20 +23,14 @@ from frictid_hil.plan.plan import Motion, Sine
 
 @dataclass(frozen=True, slots=True)
 class Gravity:
-    """Torque that holds the joint where it stands, as identified: ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``.
-
-    Attributes:
-        centre_rad: middle of the travel over which it was identified.
-        spread_rad: rms distance from there, over that travel.
-        unsure_nm: half of the 95 % interval of the bias.
-    """
+    """Torque that holds the joint where it stands, as identified: ``cos_nm * cos(q) + sin_nm * sin(q) + bias_nm``."""
 
     cos_nm: float = 0.0
     sin_nm: float = 0.0
     bias_nm: float = 0.0
-    centre_rad: float = 0.0
-    spread_rad: float = 0.0
-    unsure_nm: float = 0.0
+    centre_rad: float = 0.0  # middle of the travel over which it was identified
+    spread_rad: float = 0.0  # rms distance from there, over that travel
+    unsure_nm: float = 0.0  # half of the 95 % interval of the bias
 
     def torque_nm(self, position_rad: float) -> float:
         """Torque that holds the joint at one position."""
@@ -92,24 +86,15 @@ class PositionGains:
 
 @dataclass(frozen=True, slots=True)
 class ControlLaw:
-    """All that decides the torque of one joint; gravity is always compensated.
+    """All that decides the torque of one joint; gravity is always compensated."""
 
-    Attributes:
-        mode: ``nc``, ``mo``, ``mol``, ``mop`` or ``mop-reference``.
-        gains: None where a person moves the joint.
-        friction: None for ``nc``.
-        ripple: None where it is not compensated.
-        follows_reference: friction is that of the reference velocity instead of the measured one.
-        torque_limit_nm: no more is ever commanded, nor changed faster than ``slew_nm_per_s``.
-    """
-
-    mode: str
+    mode: str  # ``nc``, ``mo``, ``mol``, ``mop`` or ``mop-reference``
     gravity: Gravity
-    gains: PositionGains | None
-    friction: CompensationSettings | None
-    ripple: RippleTorque | None
-    follows_reference: bool
-    torque_limit_nm: float
+    gains: PositionGains | None  # None where a person moves the joint
+    friction: CompensationSettings | None  # None for ``nc``
+    ripple: RippleTorque | None  # None where it is not compensated
+    follows_reference: bool  # friction is that of the reference velocity instead of the measured one
+    torque_limit_nm: float  # no more is ever commanded, nor changed faster than ``slew_nm_per_s``
     slew_nm_per_s: float
 
     def friction_share(self, position_rad: float) -> float:
@@ -127,21 +112,15 @@ class ControlLaw:
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A slow sine that asks whether a profile still describes the joint, before anything is compensated with it.
-
-    Attributes:
-        tolerance: largest deviation of friction, and of gravity as a share of F_0.
-        temperature_c: at which it was identified, None where unknown.
-        enforced: False only tells.
-    """
+    """A slow sine that asks whether a profile still describes the joint, before anything is compensated with it."""
 
     sine: Sine
     curve: FrictionCurve
     gravity: Gravity
-    tolerance: float
-    temperature_c: float | None = None
+    tolerance: float  # largest deviation of friction, and of gravity as a share of F_0
+    temperature_c: float | None = None  # at which it was identified, None where unknown
     temperature_tolerance_c: float = math.inf
-    enforced: bool = True
+    enforced: bool = True  # False only tells
     name: str = "probe"
 
     @property
@@ -188,36 +167,27 @@ class Swing:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What the supervisor allows while a control law commands the joint: measured position and speed, mechanical power.
-
-    Attributes:
-        growth_s: speed that grows for longer than this is a runaway; see ``runner.runaway``.
-        withstands_nm: commanded torque that changes by more than this moves the joint.
-    """
+    """What the supervisor allows while a control law commands the joint; position, speed, power are measured."""
 
     position_min_rad: float
     position_max_rad: float
     velocity_rad_s: float
     power_w: float
-    growth_s: float = math.inf
-    withstands_nm: float = math.inf
+    growth_s: float = math.inf  # speed that grows for longer than this is a runaway; see ``runner.runaway``
+    withstands_nm: float = math.inf  # commanded torque that changes by more than this moves the joint
 
 
 @dataclass(frozen=True, slots=True)
 class Compensated:
-    """A stretch in which a control law commands the joint from the feedback of the joint.
+    """A stretch in which a control law commands the joint from the feedback of the joint."""
 
-    Attributes:
-        name: ``stand``, ``hand``, ``track``, ... with the mode behind it.
-        path: the reference, or where a person is expected to guide the joint; endless where its duration is infinite.
-        drive_mode: TORQUE: the law commands all torque; POSITION, VELOCITY: the drive follows the path by its own
-            loop, and the law's torque is an offset (60B2).
-    """
-
-    name: str
+    name: str  # ``stand``, ``hand``, ``track``, ... with the mode behind it.
+    # The reference, or where a person is expected to guide the joint; endless where its duration is infinite.
     path: Motion
     law: ControlLaw
     bounds: Bounds
+    # TORQUE: the law commands all torque; POSITION, VELOCITY: the drive follows the path by its own loop, and the law's
+    # torque is an offset (60B2).
     drive_mode: Mode = Mode.TORQUE
 
     @property

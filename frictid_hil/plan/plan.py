@@ -141,19 +141,15 @@ class Shake:
     """Slow cycles from ``start_rad`` to start + A and back, shaking most in the middle of the travel.
 
     Shaking never reverses the motion nor leaves the travel.
-
-    Attributes:
-        shake_rad: zero-to-peak; negative shakes in antiphase.
-        turns: slow cycles within the duration.
     """
 
     start_rad: float
     amplitude_rad: float
     duration_s: float
     periods: int
-    shake_rad: float
+    shake_rad: float  # zero-to-peak; negative shakes in antiphase
     name: str = COUPLING
-    turns: int = 1
+    turns: int = 1  # slow cycles within the duration
 
     @staticmethod
     def beside(start_rad: float, procedure: Procedure, place: int) -> Shake:
@@ -188,17 +184,13 @@ _SLOWEST_SHAKE_HZ = 4.0
 
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """One cycle repeated until friction has settled, or for the whole duration.
-
-    Attributes:
-        longest_s: at most; rounded up to whole cycles.
-        settled_percent_per_min: it ends earlier once friction changes by less than this; None: never earlier.
-    """
+    """One cycle repeated until friction has settled, or for the whole duration."""
 
     start_rad: float
     amplitude_rad: float
     peak_velocity_rad_s: float
-    longest_s: float
+    longest_s: float  # at most; rounded up to whole cycles
+    # It ends earlier once friction changes by less than this; None: never earlier.
     settled_percent_per_min: float | None = None
     name: str = "warm_up"
 
@@ -249,22 +241,15 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class JointPlan:
-    """What one joint will do while the others are locked or move in step with it.
-
-    Attributes:
-        motions: in order; the first starts where ``approach_from_rad`` ends.
-        locked: planned position of every joint that is locked meanwhile, rad.
-        predicted_torque_nm: largest torque expected, by the best model at hand (0 where none is).
-        travel_rad: (lowest, highest) commanded position.
-        max_deceleration_rad_s2: highest of a stop on request: what its torque allows, or what the plan asks for itself.
-    """
+    """What one joint will do while the others are locked or move in step with it."""
 
     joint: str
-    motions: tuple[Motion, ...]
-    locked: Mapping[str, float]
+    motions: tuple[Motion, ...]  # in order; the first starts where ``approach_from_rad`` ends
+    locked: Mapping[str, float]  # planned position of every joint that is locked meanwhile, rad
     peak_velocity_rad_s: float = 0.0
-    predicted_torque_nm: float = 0.0
-    travel_rad: tuple[float, float] = (0.0, 0.0)
+    predicted_torque_nm: float = 0.0  # largest torque expected, by the best model at hand (0 where none is)
+    travel_rad: tuple[float, float] = (0.0, 0.0)  # (lowest, highest) commanded position
+    # Highest of a stop on request: what its torque allows, or what the plan asks for itself.
     max_deceleration_rad_s2: float = math.inf
 
     @property
@@ -275,19 +260,13 @@ class JointPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The whole run, joint by joint.
-
-    Attributes:
-        joints: in order of execution.
-        notes: sentences a person should read before saying yes.
-        together: all joints move at once, motion by motion, each as long for one as for the other.
-    """
+    """The whole run, joint by joint."""
 
     robot: str
     cycle_hz: float
-    joints: tuple[JointPlan, ...]
-    notes: tuple[str, ...] = field(default=())
-    together: bool = False
+    joints: tuple[JointPlan, ...]  # in order of execution
+    notes: tuple[str, ...] = field(default=())  # sentences a person should read before saying yes
+    together: bool = False  # all joints move at once, motion by motion, each as long for one as for the other
 
     @property
     def duration_s(self) -> float:
@@ -337,20 +316,13 @@ def described(plan: Plan) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What is expected of a joint before it was measured; enough to predict its peak torque.
+    """What is expected of a joint before it was measured; enough to predict its peak torque."""
 
-    Attributes:
-        inertia_kg_m2: in the posture of the run.
-        gravity_nm: largest holding torque over the travel.
-        friction_nm: at the highest planned speed.
-        source: where these figures come from (``robot file``, ``active profile``), named in a refusal.
-        link_inertia_kg_m2: the part behind the gear, through which other joints' accelerations are felt; None: all.
-    """
-
-    inertia_kg_m2: float
-    gravity_nm: float
-    friction_nm: float
-    source: str = "robot file"
+    inertia_kg_m2: float  # in the posture of the run
+    gravity_nm: float  # largest holding torque over the travel
+    friction_nm: float  # at the highest planned speed
+    source: str = "robot file"  # where these figures come from (``robot file``, ``active profile``), named in a refusal
+    # The part behind the gear, through which other joints' accelerations are felt; None: all.
     link_inertia_kg_m2: float | None = None
 
     @property

@@ -13,69 +13,53 @@ from frictid_hil.plan.workspace import Workspace
 
 @dataclass(frozen=True, slots=True)
 class JointSetup:
-    """One joint as a driver needs to know it; values of the robot file, joint side of the gear.
-
-    Attributes:
-        address: node id, axis index or id, as the driver's ``kind`` says.
-        direction: +1 or -1, sign of joint motion for positive motor motion.
-        rated_torque_nm: joint-side torque that the drive calls 1000 per mille (motor rated torque times gear ratio).
-        start_position_rad: where its identification starts; the travel goes to start + A.
-        options: driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
-        simulated: the robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
-        expected_inertia_kg_m2: of the whole joint, as the robot file expects it; 0 where it does not say.
-        gates: what quality gates allow here, where other than usual; see ``friction.gate.GateLimits``.
-        loop_stiffness_nm_per_rad: torque that the drive's own position loop gives per rad of following error, where
-            that loop is proportional alone; 0 where it is not known.
-        dh: the joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
-    """
+    """One joint as a driver needs to know it; values of the robot file, joint side of the gear."""
 
     name: str
-    address: int
+    address: int  # node id, axis index or id, as the driver's ``kind`` says
     gear_ratio: float
-    direction: int
+    direction: int  # +1 or -1, sign of joint motion for positive motor motion
     max_velocity_rad_s: float
     max_torque_nm: float
+    # Joint-side torque that the drive calls 1000 per mille (motor rated torque times gear ratio).
     rated_torque_nm: float
     position_min_rad: float
     position_max_rad: float
-    start_position_rad: float
+    start_position_rad: float  # where its identification starts; the travel goes to start + A
     locked_position_rad: float
+    # Driver-specific settings of the robot file (``pulses_per_degree``, ``parity``, object overrides, ...).
     options: Mapping[str, Any] = field(default_factory=dict)
+    # The robot file's ``simulated`` mapping, unread; only simulated hardware looks at it.
     simulated: Mapping[str, Any] = field(default_factory=dict)
-    expected_inertia_kg_m2: float = 0.0
+    expected_inertia_kg_m2: float = 0.0  # of the whole joint, as the robot file expects it; 0 where it does not say
+    # What quality gates allow here, where other than usual; see ``friction.gate.GateLimits``.
     gates: Mapping[str, float] = field(default_factory=dict)
+    # Torque that the drive's own position loop gives per rad of following error, where that loop is proportional alone;
+    # 0 where it is not known.
     loop_stiffness_nm_per_rad: float = 0.0
+    # The joint's Denavit-Hartenberg row (``kinematics.DhRow``) as plain values; empty where not given.
     dh: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class RobotSetup:
-    """A robot as a driver needs to know it.
-
-    Attributes:
-        bus: ``interface:channel`` as typed (``socketcan:can0``, ``virtual:hp3j``, ``serial:/dev/ttyUSB0``).
-        cycle_hz: requested cycle rate.
-        options: driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
-        realtime: run on the wall clock even where lock-step is possible.
-        seed: seed of every simulated noise; ignored by real hardware.
-        simulated_arm: the robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
-        simulated: nothing real moves; a setup that says nothing of it is taken for a real robot's.
-        care: bounds of the supervisor that robot file or driver set, by name; see ``runner.care.Care``.
-        folder: of the robot file; file names in options count from there.
-    """
+    """A robot as a driver needs to know it."""
 
     name: str
-    bus: str
-    cycle_hz: float
+    bus: str  # ``interface:channel`` as typed (``socketcan:can0``, ``virtual:hp3j``, ``serial:/dev/ttyUSB0``)
+    cycle_hz: float  # requested cycle rate
     joints: tuple[JointSetup, ...]
+    # Driver-specific settings of the robot file (``bitrate``, ``baud``, ``heartbeat_ms``, ...).
     options: Mapping[str, Any] = field(default_factory=dict)
-    realtime: bool = False
-    seed: int = 0
+    realtime: bool = False  # run on the wall clock even where lock-step is possible
+    seed: int = 0  # seed of every simulated noise; ignored by real hardware
+    # The robot file's ``simulated_arm`` mapping, unread; only simulated hardware looks at it.
     simulated_arm: Mapping[str, Any] = field(default_factory=dict)
-    simulated: bool = False
+    simulated: bool = False  # nothing real moves; a setup that says nothing of it is taken for a real robot's
     workspace: Workspace | None = None
+    # Bounds of the supervisor that robot file or driver set, by name; see ``runner.care.Care``.
     care: Mapping[str, float] = field(default_factory=dict)
-    folder: Path | None = None
+    folder: Path | None = None  # of the robot file; file names in options count from there
 
     @property
     def lock_step(self) -> bool:

@@ -21,22 +21,14 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """The point that is furthest beyond a face of the box.
+    """The point that is furthest beyond a face of the box."""
 
-    Attributes:
-        moment: index of the posture, with the positions of all joints then, in the order of the chain.
-        link: index of the joint that carries the point; the number of joints for the tool.
-        point_m: in the base frame.
-        axis: of the face, 0..2.
-        bound_m: the face, clearance taken off.
-    """
-
-    moment: int
+    moment: int  # index of the posture, with the positions of all joints then, in the order of the chain
     positions_rad: tuple[float, ...]
-    link: int
-    point_m: tuple[float, float, float]
-    axis: int
-    bound_m: float
+    link: int  # index of the joint that carries the point; the number of joints for the tool
+    point_m: tuple[float, float, float]  # in the base frame
+    axis: int  # of the face, 0..2
+    bound_m: float  # the face, clearance taken off
 
     def described(self, names: Sequence[str]) -> str:
         """Say which point is how far beyond which side, and at which angles of the joints, named along the chain."""

@@ -14,21 +14,15 @@ from frictid_hil.friction.metrics import rms_and_mean
 
 @dataclass(frozen=True, slots=True)
 class JointDrift:
-    """The newer profile of one joint against the older one.
+    """The newer profile of one joint against the older one."""
 
-    Attributes:
-        distance_nm: E of (15) over [0, V], V the highest measured speed of both.
-        distance_percent: of the older curve's mean.
-        coulomb_change_percent: of F_0; None where one of them has none.
-        overlap_share: share of the newer pairs whose interval meets the older curve's; None without intervals.
-        other_changes: what else differs and could explain it (estimator, drive, gear, torque source), old -> new.
-    """
-
-    distance_nm: float
-    distance_percent: float
-    coulomb_change_percent: float | None
+    distance_nm: float  # E of (15) over [0, V], V the highest measured speed of both
+    distance_percent: float  # of the older curve's mean
+    coulomb_change_percent: float | None  # of F_0; None where one of them has none
+    # Share of the newer pairs whose interval meets the older curve's; None without intervals.
     overlap_share: float | None
     temperature_change_c: float | None
+    # What else differs and could explain it (estimator, drive, gear, torque source), old -> new.
     other_changes: Mapping[str, str]
 
 

@@ -12,47 +12,33 @@ from frictid_hil.profiles.drift import distance_and_mean_nm
 
 @dataclass(frozen=True, slots=True)
 class Promotion:
-    """A file of ``promotions/``; they count in the order of their numbers.
+    """A file of ``promotions/``; they count in the order of their numbers."""
 
-    Attributes:
-        action: ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from).
-        id: the profile that is active, or the baseline, from here on.
-        sha256: of its file.
-        by: person or job.
-    """
-
-    action: str
-    id: str
-    sha256: str
+    action: str  # ``promote``, ``rollback`` (to the one active before), ``baseline`` (pins what drift is measured from)
+    id: str  # the profile that is active, or the baseline, from here on
+    sha256: str  # of its file
     utc: str
-    by: str = ""
+    by: str = ""  # person or job
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A file of ``recalibrations/``: how one that began at ``utc`` ended; its reason says why it was promoted or not.
-
-    Attributes:
-        outcome: word of its JSON.
-        profile: id in the store; "" where nothing was identified.
-        drift_percent: distance (15) from the reference by joint; None where there was none.
-        drift_limit_percent: of the distance from the baseline, by the policy; None where drift is measured otherwise.
-        drifted: joints beyond the policy's limit.
-        run: folder; "" where none was kept.
-    """
+    """A file of ``recalibrations/``: how one that began at ``utc`` ended; its reason says why it was promoted."""
 
     utc: str
-    outcome: str
+    outcome: str  # word of its JSON
     exit_code: int
     promoted: bool = False
-    profile: str = ""
+    profile: str = ""  # id in the store; "" where nothing was identified
+    # Distance (15) from the reference by joint; None where there was none.
     drift_percent: Mapping[str, float | None] = field(default_factory=dict)
+    # Of the distance from the baseline, by the policy; None where drift is measured otherwise.
     drift_limit_percent: float | None = None
-    drifted: Sequence[str] = ()
+    drifted: Sequence[str] = ()  # joints beyond the policy's limit
     reason: str = ""
     next_step: str = ""
-    run: str = ""
+    run: str = ""  # folder; "" where none was kept
 
 
 def active_stack(promotions: Sequence[Promotion]) -> list[Promotion]:

@@ -27,23 +27,17 @@ MAX_COLUMNS = 128
 
 @dataclass(frozen=True, slots=True)
 class ArrayTable:
-    """Named arrays of one file; a ``Table``.
-
-    Attributes:
-        labels: names of the columns of a matrix, by the matrix' name.
-        standard: what the columns mean, where the format says so.
-        sparse: rows in which a column holds NaN say nothing of it.
-        read: arrays that were asked for, kept.
-    """
+    """Named arrays of one file; a ``Table``."""
 
     path: Path
     shapes: Mapping[str, Shape]
     load: Callable[[str], NDArray[Any]]
+    # Names of the columns of a matrix, by the matrix' name.
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    standard: ColumnMap | None = None
-    sparse: bool = False
+    standard: ColumnMap | None = None  # what the columns mean, where the format says so
+    sparse: bool = False  # rows in which a column holds NaN say nothing of it
     told: tuple[str, ...] = ()
-    read: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+    read: dict[str, NDArray[Any]] = field(default_factory=dict, repr=False)  # arrays that were asked for, kept
 
     @staticmethod
     def of(path: Path, values: Mapping[str, NDArray[Any]], **more: Any) -> ArrayTable:

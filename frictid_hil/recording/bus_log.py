@@ -45,24 +45,16 @@ _EPOCH_S = 1e8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """The frames of a log, in the order of the file.
+    """The frames of a log, in the order of the file."""
 
-    Attributes:
-        t_ns: run time (since the start of the log, where it tells the time of day), shape (n,).
-        can_id: bit 31 set for extended ids, bit 29 (``driver.FD_FRAME``) for CAN FD frames, shape (n,).
-        data: as many bytes as ``length`` of shape (n, 8), or (n, 64) where a frame is a CAN FD one.
-        sent: by the host; False throughout where the format does not tell, shape (n,).
-        skipped: error and remote frames, which carry no data, and what no wire can carry.
-        damage: where the log ends before its end ("" for a whole one).
-    """
-
-    t_ns: NDArray[np.int64]
+    t_ns: NDArray[np.int64]  # run time (since the start of the log, where it tells the time of day), shape (n,)
+    # Bit 31 set for extended ids, bit 29 (``driver.FD_FRAME``) for CAN FD frames, shape (n,).
     can_id: NDArray[np.uint32]
     length: NDArray[np.uint8]
-    data: NDArray[np.uint8]
-    sent: NDArray[np.bool_]
-    skipped: int = 0
-    damage: str = ""
+    data: NDArray[np.uint8]  # shape (n, 8), or (n, 64) where a frame is a CAN FD one
+    sent: NDArray[np.bool_]  # by the host; False throughout where the format does not tell, shape (n,)
+    skipped: int = 0  # error and remote frames, which carry no data, and what no wire can carry
+    damage: str = ""  # where the log ends before its end ("" for a whole one)
 
     def __len__(self) -> int:
         return int(self.t_ns.size)

@@ -35,32 +35,21 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """One joint's recording; every column has shape (n,), absent optional columns are None.
-
-    Attributes:
-        time_ns: run time, integer nanoseconds, strictly increasing.
-        velocity_rad_s: the drive's own velocity.
-        torque_nm: the drive's own torque, or None (position-only recordings).
-        external_torque_nm: force sensor.
-        temperature_c: motor or gear.
-        rigid_body_torque_nm: the part of the torque that the user's own rigid-body model explains.
-        torque_demand_nm: the controller's own demand.
-        prismatic: the axis is linear: m, m/s, N instead of rad, rad/s, N m.
-        meta: provenance that travels with the columns (torque_source, timing, robot, ...); plain values only.
-    """
+    """One joint's recording; every column has shape (n,), absent optional columns are None."""
 
     joint: str
-    time_ns: Nanoseconds
+    time_ns: Nanoseconds  # run time, integer nanoseconds, strictly increasing
     position_rad: Array
-    velocity_rad_s: Array | None = None
-    torque_nm: Array | None = None
+    velocity_rad_s: Array | None = None  # the drive's own velocity
+    torque_nm: Array | None = None  # the drive's own torque, or None (position-only recordings)
     position_command_rad: Array | None = None
-    external_torque_nm: Array | None = None
-    temperature_c: Array | None = None
-    rigid_body_torque_nm: Array | None = None
-    torque_demand_nm: Array | None = None
+    external_torque_nm: Array | None = None  # force sensor
+    temperature_c: Array | None = None  # motor or gear
+    rigid_body_torque_nm: Array | None = None  # the part of the torque that the user's own rigid-body model explains
+    torque_demand_nm: Array | None = None  # the controller's own demand
     marks: tuple[Mark, ...] = ()
-    prismatic: bool = False
+    prismatic: bool = False  # the axis is linear: m, m/s, N instead of rad, rad/s, N m
+    # Provenance that travels with the columns (torque_source, timing, robot, ...); plain values only.
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     COLUMNS = (

@@ -20,20 +20,16 @@ _COLUMNS = 3
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure of a page.
-
-    Attributes:
-        panels: titles of panels side by side, all over one range of x; the key ``panel`` of a trace says where it goes.
-        stacked: bars of one label stand one behind the other, the first label on top.
-    """
+    """One figure of a page."""
 
     title: str
     traces: tuple[Mapping[str, Any], ...]
     x_title: str
     y_title: str
     caption: str = ""
+    # Titles of panels side by side, all over one range of x; the key ``panel`` of a trace says where it goes.
     panels: tuple[str, ...] = ()
-    stacked: bool = False
+    stacked: bool = False  # bars of one label stand one behind the other, the first label on top
 
     def spec(self) -> dict[str, Any]:
         """What ``Plotly.newPlot`` takes; the title stands above it on the page."""

@@ -64,26 +64,18 @@ class Follower(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What shall be run, and where it is kept.
-
-    Attributes:
-        bus: ``interface:channel`` as typed; None for the robot file's own.
-        options: what was asked for, plain values, for the manifest.
-        out: folder to use; None for a new one below ``runs/``.
-        resume: folder of an earlier run to go on with instead.
-        outputs: further folders that a result will be written to; seen to take files before anything moves.
-        continued_by: command that goes on with an interrupted run, without its folder; "" where none does.
-    """
+    """What shall be run, and where it is kept."""
 
     verb: str
     robot: Robot
     setup: RobotSetup
-    bus: str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-    out: Path | None = None
-    resume: Path | None = None
+    bus: str | None = None  # ``interface:channel`` as typed; None for the robot file's own
+    options: Mapping[str, Any] = field(default_factory=dict)  # what was asked for, plain values, for the manifest
+    out: Path | None = None  # folder to use; None for a new one below ``runs/``
+    resume: Path | None = None  # folder of an earlier run to go on with instead
+    # Further folders that a result will be written to; seen to take files before anything moves.
     outputs: tuple[Path, ...] = ()
-    continued_by: str = ""
+    continued_by: str = ""  # command that goes on with an interrupted run, without its folder; "" where none does
 
     @property
     def driver(self) -> str:

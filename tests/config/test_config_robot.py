@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from frictid_drivers.mit.simulated import VirtualMitDriver
 from frictid_drivers.motoman import MotomanDriver
+from frictid_hil.config.reference import schema
 from frictid_hil.config.robot import CareFile, GatesFile, Robot, load_robot
 from frictid_hil.config.search import available, find, shipped_dir
 from frictid_hil.config.write import dump
@@ -337,7 +338,8 @@ def test_the_shipped_folder_exists() -> None:
 
 @pytest.mark.parametrize(("file", "usual"), [(CareFile, Care()), (GatesFile, GateLimits())])
 def test_the_usual_bounds_that_the_reference_tells_are_those_in_force(file: type[BaseModel], usual: object) -> None:
-    told = dict(re.findall(r"^ +(\w+):.*usually (.+?)(?: \.\.\.)?[.]?$", file.__doc__ or "", re.MULTILINE))
+    said = {key: field["description"] for key, field in schema(file)["properties"].items()}
+    told = {key: found[1] for key, words in said.items() if (found := re.search(r"usually ([\d.]*\d(?: \S+)?)", words))}
     assert set(told) == set(file.model_fields)
     for key, text in told.items():
         number, _, unit = text.partition(" ")
