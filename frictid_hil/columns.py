@@ -43,16 +43,12 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class JointColumns:
-    """The columns of one joint, by the names of ``Samples`` (``position_rad``, ...); m, m/s, N on a prismatic one.
+    """The columns of one joint."""
 
-    What else is known (torque_source, ...) travels with the samples. The command is brought ``command_shift_s`` later,
-    where the log stamps it too early.
-    """
-
-    sources: Mapping[str, Source]
-    prismatic: bool = False
-    meta: Mapping[str, str | float] = field(default_factory=dict)
-    command_shift_s: float = 0.0
+    sources: Mapping[str, Source]  # by the names of ``Samples`` (``position_rad``, ...)
+    prismatic: bool = False  # the values are m, m/s, N
+    meta: Mapping[str, str | float] = field(default_factory=dict)  # travels with the samples (torque_source, ...)
+    command_shift_s: float = 0.0  # later, where the log stamps it too early
 
 
 @dataclass(frozen=True, slots=True)

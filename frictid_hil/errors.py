@@ -130,13 +130,10 @@ class Defect(FrictidError):
 
 @dataclass(frozen=True, slots=True)
 class FieldProblem:
-    """One thing wrong with one field of a mapping; the loader adds file:line:column.
+    """One thing wrong with one field of a mapping; the loader adds file:line:column."""
 
-    The path are keys and indices from the root of the mapping, e.g. ``("joints", "1", "gear_ratio")``.
-    """
-
-    path: tuple[str | int, ...]
-    message: str
+    path: tuple[str | int, ...]  # from the root of the mapping, e.g. ``("joints", "1", "gear_ratio")``
+    message: str  # what was expected and what was found
 
 
 class InvalidFields(UsageError):

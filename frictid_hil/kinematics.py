@@ -18,15 +18,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class DhRow:
-    """One joint's Denavit-Hartenberg parameters: along its axis, along the common normal, twist to the next axis.
+    """One joint's Denavit-Hartenberg parameters."""
 
-    ``theta_rad`` is the angle at joint position 0.
-    """
-
-    d_m: float = 0.0
-    a_m: float = 0.0
-    alpha_rad: float = 0.0
-    theta_rad: float = 0.0
+    d_m: float = 0.0  # along this joint's axis
+    a_m: float = 0.0  # along the common normal
+    alpha_rad: float = 0.0  # twist to the next joint's axis
+    theta_rad: float = 0.0  # angle at joint position 0
 
 
 def chain_points_m(

@@ -24,9 +24,8 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class GateLimits:
-    """What the gates allow where it is a matter of the machine; the defaults suit a geared joint with a usual servo.
+    """What the gates allow where it is a matter of the machine; ``config.robot.GatesFile`` says what each means.
 
-    ``config.robot.GatesFile``, by which a robot file changes them, says what each means. Shares are fractions of one.
     The gates that find wrong columns (delays, scales, torque that is cut off) have the same limits for every machine.
     """
 

@@ -19,15 +19,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.special import stdtrit
 
 from frictid_hil.friction.beside import Beside
+from frictid_hil.friction.coupling import Pull
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.friction.filtering import Gaussian
 from frictid_hil.friction.identify import IdentifiedPairs, function_a
+from frictid_hil.friction.link import Link
 from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
@@ -39,18 +40,6 @@ STEADY = 0.28
 """Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
 _ENOUGH = 6
 """Cycles from which on two parameters can be told from the scatter of so many differences."""
-
-
-class TakenOff(Protocol):
-    """What was taken off the torque because it is no friction, and how well it is known."""
-
-    @property
-    def columns(self) -> Array:
-        """By how the torque changes with each of its parameters, shape (n, m)."""
-
-    @property
-    def covariance(self) -> Array:
-        """Of these parameters, shape (m, m)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +89,7 @@ def window_terms(
     solved: Fit | None,
     drift: Drift | None,
     others: Beside | None,
-    link: TakenOff | None,
+    link: Link | Pull | None,
 ) -> Terms:
     """Terms of the aligned Function A: its pairs, the least-squares model of the same columns, what stands beside it.
 
@@ -142,7 +131,7 @@ def least_squares_terms(
     kept: slice,
     drift: Drift | None,
     others: Beside | None,
-    link: TakenOff | None,
+    link: Link | Pull | None,
 ) -> Terms:
     """Terms of the global least squares at its trusted knots."""
     odd, knots = solved.odd_nm, solved.knots

@@ -17,15 +17,12 @@ from frictid_hil.friction.trajectory import Array
 
 @dataclass(frozen=True, slots=True)
 class CurveDistance:
-    """How far a curve is from a reference: E of (15), and in percent of the reference's mean.
+    """How far a curve is from a reference."""
 
-    Over [0, V], and over the curve's own measured range [V_1, V_N].
-    """
-
-    e_nm: float
-    e_percent: float
-    e_measured_nm: float
-    e_percent_measured_range: float
+    e_nm: float  # E of (15) over [0, V]
+    e_percent: float  # of the reference's mean over [0, V]
+    e_measured_nm: float  # over the measured range [V_1, V_N] of the curve
+    e_percent_measured_range: float  # of the reference's mean over it
 
 
 def curve_distance(curve: FrictionCurve, reference: FrictionCurve, velocity_rad_s: float) -> CurveDistance:

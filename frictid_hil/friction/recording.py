@@ -86,17 +86,14 @@ class CycleRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Position, its derivatives and the torque, all true at the same instants, shape (n,) each.
+    """Position, its derivatives and the torque, all true at the same instants, shape (n,) each."""
 
-    The time is a uniform grid on the clock of the cycles. All four columns went through the smoother.
-    """
-
-    time_s: Array
+    time_s: Array  # uniform grid, time of the cycles
     position_rad: Array
     velocity_rad_s: Array
     acceleration_rad_s2: Array
     torque_nm: Array
-    smoother: Gaussian
+    smoother: Gaussian  # the kernel that all four columns went through
 
 
 def passes(motion: Motion, *, slowest_share: float, guard_rad: float) -> NDArray[np.int64]:

@@ -39,15 +39,12 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class RigidBody:
-    """Inertia, gravity and bias of one joint (kg and N on a prismatic axis, where gravity is part of the bias).
+    """Inertia, gravity and bias of one joint (kg and N on a prismatic axis, where gravity is part of the bias)."""
 
-    Inertia is that of all that moves, joint side. The bias holds half of what the directions' friction differs by.
-    """
-
-    inertia_kg_m2: Measured
+    inertia_kg_m2: Measured  # of everything that moves, joint side
     gravity_cos_nm: Measured
     gravity_sin_nm: Measured
-    bias_nm: Measured
+    bias_nm: Measured  # half of what the directions' friction differs by included
 
     def torque_nm(self, position_rad: Array, acceleration_rad_s2: Array) -> Array:
         """Torque that this body needs without friction, same shape as the arguments."""

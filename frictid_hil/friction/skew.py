@@ -80,17 +80,13 @@ class Delay:
 
 @dataclass(frozen=True, slots=True)
 class TimeSkew:
-    """Torque delay minus position delay: what is declared, what the excitation measured, and what was used of both.
+    """Torque delay minus position delay, each with one standard deviation."""
 
-    Each with one standard deviation. Used is the mean of both, weighed by their precision; the measured one alone where
-    they disagree.
-    """
-
-    declared_s: float
+    declared_s: float  # by the drive or its robot file
     declared_deviation_s: float
-    measured_s: float
+    measured_s: float  # by the excitation
     measured_deviation_s: float
-    used_s: float
+    used_s: float  # mean of both, weighed by their precision; the measured one alone where they disagree
     used_deviation_s: float
 
     @staticmethod

@@ -53,13 +53,10 @@ class Gravity:
 
 @dataclass(frozen=True, slots=True)
 class RippleTorque:
-    """Torque that repeats over a stretch of joint travel, as identified.
-
-    It is told at equal steps over one period, the first at position 0, shape (k,).
-    """
+    """Torque that repeats over a stretch of joint travel, as identified."""
 
     period_rad: float
-    torque_nm: tuple[float, ...]
+    torque_nm: tuple[float, ...]  # at equal steps over one period, the first at position 0, shape (k,)
 
     def torque_at_nm(self, position_rad: float) -> float:
         """Linear between the steps."""
@@ -139,15 +136,12 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """Where a person is expected to guide a joint: centre + amplitude sin(2 pi f t) (section 5.1).
-
-    The frequency is that of the metronome; the duration is infinite for a service.
-    """
+    """Where a person is expected to guide a joint: centre + amplitude sin(2 pi f t) (section 5.1)."""
 
     centre_rad: float
     amplitude_rad: float
-    frequency_hz: float
-    duration_s: float
+    frequency_hz: float  # of the metronome
+    duration_s: float  # infinite for a service
     name: str = "swing"
 
     @property

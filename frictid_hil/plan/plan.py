@@ -216,14 +216,11 @@ class WarmUp:
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Set-points through given corners, joined by straight lines of constant speed (triangles, dwells, steps).
-
-    Times and positions have shape (k,); times increase from 0.
-    """
+    """Set-points through given corners, joined by straight lines of constant speed (triangles, dwells, steps)."""
 
     name: str
-    times_s: tuple[float, ...]
-    positions_rad: tuple[float, ...]
+    times_s: tuple[float, ...]  # increasing, first 0, shape (k,)
+    positions_rad: tuple[float, ...]  # shape (k,)
 
     @property
     def duration_s(self) -> float:

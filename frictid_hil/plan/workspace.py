@@ -47,15 +47,12 @@ class Outside:
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """A box in the base frame, from and to along x, y, z, and the chain that must stay inside, clear of every face.
-
-    The tool point is in the last joint's frame.
-    """
+    """A box in the base frame, and the chain that must stay inside."""
 
     rows: tuple[DhRow, ...]
-    box_m: tuple[Range, Range, Range]
-    clearance_m: float = 0.0
-    tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    box_m: tuple[Range, Range, Range]  # from and to along x, y, z
+    clearance_m: float = 0.0  # kept from every face
+    tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the last joint's frame
 
     def outside(self, positions_rad: Array) -> Outside | None:
         """Where the arm is furthest outside in postures of shape (k, n), None where it stays inside.

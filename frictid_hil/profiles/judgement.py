@@ -24,18 +24,14 @@ _NEVER_SILENTLY = ("drive serial", "gear_ratio", "rated_torque_nm", "torque_sour
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is to be done with a new profile, why in a sentence, and the next step for the person who reads it.
+    """What is to be done with a new profile."""
 
-    It is promoted, or refused until a person has looked. ``drifted`` are joints beyond the policy's limit; ``joints``
-    hold the figures behind it, plain values.
-    """
-
-    promote: bool
-    refused: bool
-    drifted: tuple[str, ...]
-    joints: Mapping[str, Mapping[str, Any]]
-    reason: str
-    next_step: str
+    promote: bool  # it becomes the active one
+    refused: bool  # it must not, until a person has looked
+    drifted: tuple[str, ...]  # joints beyond the policy's limit
+    joints: Mapping[str, Mapping[str, Any]]  # the figures behind it, plain values
+    reason: str  # in a sentence
+    next_step: str  # for the person who reads it
 
 
 def judge(

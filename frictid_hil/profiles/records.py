@@ -60,19 +60,15 @@ def baseline_of(promotions: Sequence[Promotion]) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class JointSummary:
-    """One joint of one profile, as far as history shows it; a figure is None where it could not be formed.
+    """One joint of one profile, as far as history shows it; a figure is None where it could not be formed."""
 
-    F_0 has its interval. The distance is (15) from the baseline's curve, in percent of its mean. On a linear axis N
-    stands instead of N m.
-    """
-
-    coulomb_nm: float | None
+    coulomb_nm: float | None  # F_0, with its interval
     coulomb_low_nm: float | None
     coulomb_high_nm: float | None
     temperature_c: float | None
     gates_failed: Sequence[str]
-    distance_percent: float | None
-    prismatic: bool = False
+    distance_percent: float | None  # (15) from the baseline's curve, in percent of its mean
+    prismatic: bool = False  # N instead of N m
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,16 +21,12 @@ Nanoseconds = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A named stretch of run time, half-open: ``[start_ns, end_ns)``.
+    """A named stretch of run time, half-open: ``[start_ns, end_ns)``."""
 
-    Names are ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``coupling``, ``reversal``, an experiment's
-    name, ...; details are parameters of the stretch (for ``cycles``: amplitude_rad, velocity_rad_s, cycles, ratio).
-    """
-
-    name: str
+    name: str  # ``rehearsal``, ``move``, ``hold``, ``cycles``, ``drift``, ``coupling``, an experiment's name, ...
     start_ns: int
     end_ns: int
-    details: Mapping[str, Any] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)  # plain parameters
 
 
 @dataclass(frozen=True, slots=True)

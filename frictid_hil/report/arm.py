@@ -23,18 +23,15 @@ _SHOWN = 0.03
 
 @dataclass(frozen=True, slots=True)
 class JointRun:
-    """One joint along a log that was not fitted: measured, and the user's model in closed loop; arrays (n,).
-
-    ``quantity`` is what is drawn, with its unit; ``improved`` is None where nothing was added to the model.
-    """
+    """One joint along a log that was not fitted: measured, and the user's model in closed loop; arrays (n,)."""
 
     joint: str
     log: str
-    quantity: str
+    quantity: str  # what is drawn, with its unit
     time_s: Array
     measured: Array
     nominal: Array
-    improved: Array | None
+    improved: Array | None  # of the model with the causes; None where nothing was added
 
 
 def arm_page(

@@ -21,15 +21,12 @@ _WEEKS = 53
 
 @dataclass(frozen=True, slots=True)
 class Day:
-    """One square, of a date ``2026-03-01``; the words are for pointer and screen reader.
+    """One square."""
 
-    The state is a key of ``STATES``, "" for a day without a recalibration; the address is of the night's page, if any.
-    """
-
-    date: str
-    state: str = ""
-    words: str = ""
-    address: str = ""
+    date: str  # ``2026-03-01``
+    state: str = ""  # key of ``STATES``; "" for a day without a recalibration
+    words: str = ""  # for pointer and screen reader
+    address: str = ""  # of the night's page; "" where there is none
 
     @property
     def sign(self) -> str:

@@ -20,18 +20,15 @@ from frictid_hil.units import degrees
 
 @dataclass(frozen=True, slots=True)
 class SideBySide:
-    """One validation log, measured and simulated by the nominal and the improved joint; every column has shape (n,).
-
-    The improved ones are None where nothing was applied. Position errors are simulated minus measured.
-    """
+    """One validation log, measured and simulated by the nominal and the improved joint; columns of shape (n,)."""
 
     log: str
     time_s: Array
     torque_nm: Array
     nominal_torque_nm: Array
-    improved_torque_nm: Array | None
-    nominal_position_error_rad: Array
-    improved_position_error_rad: Array | None
+    improved_torque_nm: Array | None  # None where nothing was applied
+    nominal_position_error_rad: Array  # simulated minus measured
+    improved_position_error_rad: Array | None  # None where nothing was applied
 
 
 def gap_page(found: Diagnosis, side_by_side: tuple[SideBySide, ...] = (), profiles: tuple[Profile, ...] = ()) -> Page:

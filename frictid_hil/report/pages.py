@@ -37,18 +37,14 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a page, in reading order: words, verdicts, tables, figures.
-
-    In words, what stands between backquotes is set as code. Checks are (passed, sentence) pairs, links (title, relative
-    address) of pages that lie beside this one.
-    """
+    """A part of a page, in reading order: words, verdicts, tables, figures."""
 
     title: str
-    words: tuple[str, ...] = ()
-    checks: tuple[tuple[bool, str], ...] = ()
+    words: tuple[str, ...] = ()  # what stands between backquotes is set as code
+    checks: tuple[tuple[bool, str], ...] = ()  # (passed, sentence) pairs
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
-    links: tuple[tuple[str, str], ...] = ()
+    links: tuple[tuple[str, str], ...] = ()  # title and relative address of pages that lie beside this one
     calendar: Calendar | None = None
 
 

@@ -28,18 +28,15 @@ _KEPT = 200
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """One joint's travel, seen slowly, by the digest of the robot file, the bus and the drive's serial number.
+    """One joint's travel, seen slowly."""
 
-    ``moving`` are joints that moved with it, itself included, sorted.
-    """
-
-    config_sha256: str
+    config_sha256: str  # of the robot file
     bus: str
     joint: str
-    moving: tuple[str, ...]
+    moving: tuple[str, ...]  # joints that moved with it, itself included, sorted
     low_rad: float
     high_rad: float
-    serial: str = ""
+    serial: str = ""  # of the drive
 
 
 class Rehearsals:
