@@ -81,25 +81,17 @@ class CompensationSettings:
 
     @staticmethod
     def of(
-        curve: FrictionCurve,
-        form: str,
+        curve: FrictionCurve,  # phi
+        form: str,  # one of FORMS
         *,
-        stiffness_nm_per_rad: float,
-        ratio: float,
+        stiffness_nm_per_rad: float,  # K
+        ratio: float,  # R
+        # Half the difference of forward and backward friction at the curve's pairs, 0 at rest.
         asymmetry_nm: tuple[float, ...] | None = None,
-        viscous_nm_s_per_rad: float | None = None,
-        gradual: bool = False,
+        viscous_nm_s_per_rad: float | None = None,  # B_c for ``mol``; least squares on phi - F_0 unless given
+        gradual: bool = False,  # see ``CompensationSettings``
     ) -> CompensationSettings:
         """From an identified curve.
-
-        Args:
-            curve: phi.
-            form: one of FORMS.
-            stiffness_nm_per_rad: K.
-            ratio: R.
-            asymmetry_nm: half the difference of forward and backward friction at the curve's pairs, 0 at rest.
-            viscous_nm_s_per_rad: B_c for ``mol``; least squares on phi - F_0 unless given.
-            gradual: see ``CompensationSettings``.
 
         Raises:
             UsageError: no such form.

@@ -71,23 +71,15 @@ class _Rows:
 
 
 def free_motion(
-    time_s: Array,
-    position_rad: Array,
-    torque_nm: Array,
+    time_s: Array,  # strictly increasing, any rate, shape (n,) as the other columns
+    position_rad: Array,  # measured
+    torque_nm: Array,  # what a rigid-body model explains may be taken off before
     *,
-    torque_delay_s: float = 0.0,
-    prismatic: bool = False,
-    where: str = "",
+    torque_delay_s: float = 0.0,  # by which the torque lags the position
+    prismatic: bool = False,  # gravity does not turn
+    where: str = "",  # for errors
 ) -> FreeMotion:
     """Identify friction, inertia and gravity from any motion.
-
-    Args:
-        time_s: strictly increasing, any rate, shape (n,) as the other columns.
-        position_rad: measured.
-        torque_nm: what a rigid-body model explains may be taken off before.
-        torque_delay_s: by which the torque lags the position.
-        prismatic: gravity does not turn.
-        where: for errors.
 
     Raises:
         IdentificationError: one direction only, too little motion, or parts that cannot be told apart.

@@ -59,23 +59,15 @@ class _Plateau:
 
 
 def plateaus(
-    time_s: Array,
-    position_rad: Array,
-    torque_nm: Array,
+    time_s: Array,  # strictly increasing, shape (n,) as the other columns
+    position_rad: Array,  # measured (m on a prismatic axis)
+    torque_nm: Array,  # applied (N on a prismatic axis)
     *,
-    command_rad: Array | None = None,
-    torque_delay_s: float = 0.0,
-    where: str = "",
+    command_rad: Array | None = None,  # position set-points, where recorded: they show the plateaus without noise
+    torque_delay_s: float = 0.0,  # torque delay minus position delay
+    where: str = "",  # what to name in an error
 ) -> PlateauEstimate:
     """Pairs of every speed that the recording holds in both directions, slowest first, and their intervals.
-
-    Args:
-        time_s: strictly increasing, shape (n,) as the other columns.
-        position_rad: measured (m on a prismatic axis).
-        torque_nm: applied (N on a prismatic axis).
-        command_rad: position set-points, where recorded: they show the plateaus without noise.
-        torque_delay_s: torque delay minus position delay.
-        where: what to name in an error.
 
     Raises:
         IdentificationError: no plateau at all, fewer than two speeds, or a speed held in one direction only.

@@ -84,27 +84,18 @@ class Fit:
 
 
 def fit(
-    recording: CycleRecording,
-    motion: Motion,
-    knots: Array,
-    level_nm: float,
+    recording: CycleRecording,  # for its procedure, gear ratio, kind of axis and declared skew
+    motion: Motion,  # its synchronised columns
+    knots: Array,  # speeds of the odd hats, increasing, the first may be 0, shape (k,)
+    level_nm: float,  # typical friction torque; scale of the prior on the bias
     *,
-    width_rad: float = FINE,
-    extra: Array | None = None,
+    width_rad: float = FINE,  # of the kernel, in radians of the fastest cycle
+    extra: Array | None = None,  # further columns of the model, shape (n, m)
+    # Within how much of zero each of their coefficients is expected; empty: nothing is.
     expected: tuple[float, ...] = (),
-    doubtful: Array | None = None,
+    doubtful: Array | None = None,  # columns of which the torque may hold more or less than was taken off, shape (n, m)
 ) -> Fit:
     """Solve the model on every sample of the cycles that is not guarded.
-
-    Args:
-        recording: for its procedure, gear ratio, kind of axis and declared skew.
-        motion: its synchronised columns.
-        knots: speeds of the odd hats, increasing, the first may be 0, shape (k,).
-        level_nm: typical friction torque; scale of the prior on the bias.
-        width_rad: of the kernel, in radians of the fastest cycle.
-        extra: further columns of the model, shape (n, m).
-        expected: within how much of zero each of their coefficients is expected; empty: nothing is.
-        doubtful: columns of which the torque may hold more or less than was taken off, shape (n, m).
 
     Raises:
         IdentificationError: too few samples remain, or the columns are linearly dependent.

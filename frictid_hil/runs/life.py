@@ -140,25 +140,17 @@ class Run:
 
     def move(
         self,
-        plan: Plan,
+        plan: Plan,  # to be shown and done
         *,
-        each: Callable[[JointRun], None],
+        each: Callable[[JointRun], None],  # given every joint's run when it is over, before the next one begins
+        # Told the preflight before the person is asked; refuses by raising.
         asked: Callable[[Preflight], None] = lambda _: None,
-        noticed: Callable[[Event], None] = lambda _: None,
-        through: Callable[[RowKeeper], Keeper] = lambda keeper: keeper,
-        prepare: Callable[[Driver], None] | None = None,
-        care: Care | None = None,
+        noticed: Callable[[Event], None] = lambda _: None,  # told everything that happens
+        through: Callable[[RowKeeper], Keeper] = lambda keeper: keeper,  # what stands between the rows and their keeper
+        prepare: Callable[[Driver], None] | None = None,  # see ``run_plan``
+        care: Care | None = None,  # bounds
     ) -> FrictidError | None:
         """Show a plan within every limit, open the files, read the hardware, ask, and move.
-
-        Args:
-            plan: to be shown and done.
-            each: given every joint's run when it is over, before the next one begins.
-            asked: told the preflight before the person is asked; refuses by raising.
-            noticed: told everything that happens.
-            through: what stands between the rows and their keeper.
-            prepare: see ``run_plan``.
-            care: bounds.
 
         Raises:
             FrictidError: refused, unreachable or interrupted before anything could move; nothing of it is left.

@@ -31,28 +31,19 @@ class Keeper(Protocol):
 
 
 def run_plan(
-    driver_name: str,
-    setup: RobotSetup,
-    plan: Plan,
-    keeper: Keeper,
+    driver_name: str,  # entry-point name of the driver
+    setup: RobotSetup,  # the robot as the driver knows it
+    plan: Plan,  # what moves
+    keeper: Keeper,  # given every row, also after an error
     *,
-    notify: Callable[[Event], None],
-    proceed: Callable[[Preflight], bool],
-    care: Care | None = None,
+    notify: Callable[[Event], None],  # told what happens
+    proceed: Callable[[Preflight], bool],  # asked once, after the preflight and before anything moves
+    care: Care | None = None,  # bounds
+    # Called with the driver before it is opened, for what only a simulated robot can do (hands, payloads); on the wall
+    # clock with a twin of the driver, since the one that runs is in another process.
     prepare: Callable[[Driver], None] | None = None,
 ) -> int:
     """Run a plan, checked against limits, to its end.
-
-    Args:
-        driver_name: entry-point name of the driver.
-        setup: the robot as the driver knows it.
-        plan: what moves.
-        keeper: given every row, also after an error.
-        notify: told what happens.
-        proceed: asked once, after the preflight and before anything moves.
-        care: bounds.
-        prepare: called with the driver before it is opened, for what only a simulated robot can do (hands, payloads);
-            on the wall clock with a twin of the driver, since the one that runs is in another process.
 
     Returns:
         Rows that were lost because files were written too slowly (0 in a healthy run).
