@@ -20,12 +20,13 @@ A torque of ``unit: A`` is a motor current: ``torque_constant_nm_per_a`` (times 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, model_validator
 
-from frictid_hil.columns import TIME_UNITS_NS, ColumnMap, JointColumns, Source, si_factor
+from frictid_hil.columns import QUANTITIES, TIME_UNITS_NS, ColumnMap, JointColumns, Source, si_factor
 from frictid_hil.config.schema import Names, Strict, schema_version, validated
 from frictid_hil.config.search import find
 from frictid_hil.config.yaml import read
@@ -117,15 +118,8 @@ class ColumnsFile(Strict):
     joints: dict[str, JointFile] = Field(min_length=1)
 
 
-_QUANTITY_OF = {
-    "position": "position_rad",
-    "velocity": "velocity_rad_s",
-    "torque": "torque_nm",
-    "position_command": "position_command_rad",
-    "external_torque": "external_torque_nm",
-    "rigid_body_torque": "rigid_body_torque_nm",
-    "torque_demand": "torque_demand_nm",
-}
+_QUANTITY_OF = {re.sub("_(rad|rad_s|nm)$", "", quantity): quantity for quantity in QUANTITIES}
+"""By the name in the file, which leaves out the unit."""
 
 
 def load_columns(name: str | Path) -> ColumnMap:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, overload
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -324,21 +324,9 @@ class JointProfile(Strict):
                 raise ValueError(f"the {name} do not follow from the pairs; delete them, or undo the edit of the pairs")
         return self
 
-    @overload
-    def curve(self) -> FrictionCurve: ...
-
-    @overload
-    def curve(self, velocity_rad_s: ArrayLike) -> NDArray[np.float64]: ...
-
-    def curve(self, velocity_rad_s: ArrayLike | None = None) -> FrictionCurve | NDArray[np.float64]:
-        """phi of (8) through the pairs: the curve itself, or its torque, N m (N on a linear axis), at velocities.
-
-        They may have any shape and both directions; beyond the measured range the curve goes on straight.
-        """
-        curve = FrictionCurve(self.velocity_rad_s, self.torque_nm)
-        if velocity_rad_s is None:
-            return curve
-        return np.asarray(curve.torque(np.asarray(velocity_rad_s, dtype=np.float64)), dtype=np.float64)
+    def curve(self) -> FrictionCurve:
+        """phi of (8) through the pairs; beyond the measured range it goes on straight."""
+        return FrictionCurve(self.velocity_rad_s, self.torque_nm)
 
     def interval_nm(self, velocity_rad_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper end of the curve's 95 % interval at velocities of any shape, both directions, N m each.

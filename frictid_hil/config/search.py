@@ -49,8 +49,7 @@ def find(name: str | Path, *, folder: str = "", what: str = "robot file", beside
     if not str(name):
         raise ConfigError(f"no {what} named")
     literal = Path(name).expanduser()
-    candidates = [] if beside is None else [beside / literal]
-    candidates.append(literal)
+    candidates = [literal] if beside is None else [beside / literal, literal]
     if len(literal.parts) == 1:
         candidates += [place / literal for place in places(folder)]
     for candidate in candidates:

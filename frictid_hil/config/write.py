@@ -47,10 +47,8 @@ def dump(values: Mapping[str, Any]) -> str:
     Raises:
         ValueError: a number that is not finite, or a value that is no mapping, list, text, number, truth or None.
     """
-    text: str = yaml.dump(
-        plain(values), Dumper=_Writer, sort_keys=False, allow_unicode=True, width=120, default_flow_style=False
-    )
-    return text
+    style: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "width": 120, "default_flow_style": False}
+    return str(yaml.dump(plain(values), Dumper=_Writer, **style))
 
 
 def plain(value: Any) -> Any:

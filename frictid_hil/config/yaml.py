@@ -77,8 +77,7 @@ class Document:
     @property
     def data(self) -> dict[str, Any]:
         """The values alone, in a fresh mapping."""
-        plain: dict[str, Any] = self.root.plain()
-        return plain
+        return dict(self.root.plain())
 
     def deepest(self, path: KeyPath) -> tuple[Node, KeyPath]:
         """The node at ``path``, or the deepest that exists on the way there, and the path to it."""

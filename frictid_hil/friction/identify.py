@@ -131,17 +131,13 @@ def _means(
 def _empty_window(
     velocity: Array, bounds: NDArray[np.int64], thresholds: Array, n_plus: NDArray[np.int64], where: str
 ) -> IdentificationError:
-    cycles = len(thresholds)
-    peaks = [velocity[a:b] for a, b in pairwise(bounds)]
-    for n in range(cycles):
-        forward, backward = float(peaks[n].max()), float(-peaks[n].min())
-        for direction, reached, empty in (
-            ("forward", forward, n_plus[n] == 0),
-            ("backward", backward, backward < thresholds[n]),
-        ):
+    for n, (begin, end) in enumerate(pairwise(bounds)):
+        forward, backward = float(velocity[begin:end].max()), float(-velocity[begin:end].min())
+        ways = ("forward", forward, n_plus[n] == 0), ("backward", backward, backward < thresholds[n])
+        for direction, reached, empty in ways:
             if empty:
                 return IdentificationError(
-                    f"cycle {n + 1} of {cycles} has no sample in its {direction} window: the speed reached "
+                    f"cycle {n + 1} of {len(thresholds)} has no sample in its {direction} window: the speed reached "
                     f"{max(reached, 0.0):.4g} and the window begins at {thresholds[n]:.4g} rad/s",
                     where=where,
                     cause="poor tracking or torque saturation",

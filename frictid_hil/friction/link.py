@@ -72,8 +72,7 @@ def swinging(motion: Motion, frequency_hz: float, damping: float) -> Array:
     from scipy.signal import cont2discrete, lfilter
 
     numerator, denominator, _ = cont2discrete(through, step_s, method="foh")
-    moved: Array = lfilter(numerator.ravel(), denominator, motion.acceleration_rad_s2)
-    return moved
+    return np.asarray(lfilter(numerator.ravel(), denominator, motion.acceleration_rad_s2))
 
 
 def by_parameter(motion: Motion, frequency_hz: float, damping: float) -> Array:

@@ -89,10 +89,9 @@ def presliding(time_s: Array, position_rad: Array, torque_nm: Array, *, where: s
             "the slow reversal holds fewer than two turning points, so presliding cannot be seen", where=where
         )
     bounds = [*turns, smooth.size - 1]
-    passages = [
-        _passage(smooth, np.asarray(torque_nm, dtype=np.float64), start, stop) for start, stop in pairwise(bounds)
-    ]
-    passages = [passage for passage in passages if passage.travel.size >= _LEAST_ROWS]
+    torque = np.asarray(torque_nm, dtype=np.float64)
+    every = [_passage(smooth, torque, start, stop) for start, stop in pairwise(bounds)]
+    passages = [passage for passage in every if passage.travel.size >= _LEAST_ROWS]
     at_once, gradually = (_fit_all(shape, passages) for shape in (_at_once, _gradually))
     shapes = [fitted for fitted in (at_once, gradually) if fitted is not None]
     if not shapes:
@@ -174,8 +173,7 @@ def _gradually(travel: Array, start: float, stiffness: float, change: float) -> 
 
 def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> _Fitted | None:
     """None where fewer than two passages could be fitted."""
-    found: list[tuple[float, float]] = []
-    squares, misfits = [], []
+    found: list[tuple[float, float, float, float]] = []
     for passage in passages:
         travel, drop = passage.travel, passage.drop
         top, bottom = np.quantile(drop, 0.98), np.quantile(drop, 0.1)
@@ -193,13 +191,12 @@ def _fit_all(shape: Callable[..., Array], passages: list[_Passage]) -> _Fitted |
         rest = drop - shape(travel, *values)
         mean_square = float(np.mean(rest**2))
         if np.sqrt(spread[1, 1]) < 0.5 * values[1] and values[2] > _LEAST_CLARITY * np.sqrt(mean_square):
-            found.append((float(values[1]), float(values[2])))
-            squares.append(mean_square)
-            misfits.append(_largest_misfit(travel * values[1] / values[2], rest / values[2]))
+            misfit = _largest_misfit(travel * values[1] / values[2], rest / values[2])
+            found.append((float(values[1]), float(values[2]), mean_square, misfit))
     if len(found) < 2:
         return None
-    stiffness, changes = np.array(found).T
-    return _Fitted(stiffness, changes, float(np.mean(squares)), max(misfits))
+    stiffness, changes, squares, misfits = np.array(found).T
+    return _Fitted(stiffness, changes, float(np.mean(squares)), float(misfits.max()))
 
 
 def _largest_misfit(travel: Array, rest: Array) -> float:

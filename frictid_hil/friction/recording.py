@@ -150,8 +150,7 @@ def _without_lag(smoother: Gaussian, torque_nm: Array, advance_s: float, lag_s: 
 def around(time_s: Array, stops_s: Array) -> NDArray[np.int64]:
     """Rows on either side of every stop of the path: the joint went on or slowed down where its time did not."""
     after = np.searchsorted(time_s, stops_s, side="right")
-    rows: NDArray[np.int64] = np.clip(np.concatenate([after - 1, after]), 0, time_s.size - 1)
-    return rows
+    return np.asarray(np.clip(np.concatenate([after - 1, after]), 0, time_s.size - 1))
 
 
 def _check(recording: CycleRecording) -> None:

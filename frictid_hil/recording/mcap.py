@@ -70,7 +70,12 @@ class SampleWriter(GrowingLog):
         self._counts: dict[int, int] = {}
         self._index: list[ChunkIndex] = []
         self._metadata_index: list[MetadataIndex] = []
-        self._head = [*_schemas(), *self._channel_records(prismatic)]
+        self._head = [
+            Schema(_ROTARY_SCHEMA, layout.schema_text(prismatic=False).encode(), "ros2msg", layout.ROTARY),
+            Schema(_LINEAR_SCHEMA, layout.schema_text(prismatic=True).encode(), "ros2msg", layout.LINEAR),
+            Schema(_MARK_SCHEMA, layout.MARK_SCHEMA.encode(), "jsonschema", "frictid.Mark"),
+            *self._channel_records(prismatic),
+        ]
         self._file.write(MAGIC + _bytes(Header("", f"frictid-hil {__version__}"), *self._head))
         if meta:
             self.metadata("recording", meta)
@@ -233,14 +238,6 @@ def write_samples(path: Path, recordings: Sequence[Samples]) -> None:
             writer.metadata(f"joint/{samples.joint}", samples.meta)
             for mark in samples.marks:
                 writer.mark(samples.joint, mark)
-
-
-def _schemas() -> list[McapRecord]:
-    return [
-        Schema(_ROTARY_SCHEMA, layout.schema_text(prismatic=False).encode(), "ros2msg", layout.ROTARY),
-        Schema(_LINEAR_SCHEMA, layout.schema_text(prismatic=True).encode(), "ros2msg", layout.LINEAR),
-        Schema(_MARK_SCHEMA, layout.MARK_SCHEMA.encode(), "jsonschema", "frictid.Mark"),
-    ]
 
 
 def _message_index(channel: int, entries: NDArray[np.uint64]) -> bytes:

@@ -72,17 +72,7 @@ def schema_text(*, prismatic: bool) -> str:
     return "\n".join(lines)
 
 
-MARK_SCHEMA = json.dumps(
-    {
-        "title": "frictid.Mark",
-        "type": "object",
-        "properties": {
-            "joint": {"type": "string"},
-            "name": {"type": "string"},
-            "start_ns": {"type": "integer"},
-            "end_ns": {"type": "integer"},
-            "details": {"type": "object"},
-        },
-    }
-)
+_MARK = {"joint": "string", "name": "string", "start_ns": "integer", "end_ns": "integer", "details": "object"}
+_PROPERTIES = {name: {"type": kind} for name, kind in _MARK.items()}
+MARK_SCHEMA = json.dumps({"title": "frictid.Mark", "type": "object", "properties": _PROPERTIES})
 """JSON schema of the messages on ``/marks``."""

@@ -71,8 +71,7 @@ class RowKeeper:
         every = np.concatenate(self._kept) if self._kept else np.empty(0, SAMPLE_ROW)
         self._kept = [every[every["t_ns"] >= start_ns]]
         index = self._joints.index(joint)
-        taken: Rows = every[(every["joint"] == index) & (every["t_ns"] >= start_ns) & (every["t_ns"] < end_ns)]
-        return taken
+        return np.asarray(every[(every["joint"] == index) & (every["t_ns"] >= start_ns) & (every["t_ns"] < end_ns)])
 
     def close(self) -> None:
         """Finish both files, the second one also where the first cannot be finished.

@@ -87,16 +87,11 @@ class Rehearsals:
             )
 
     def _keep(self, entry: JointPlan, plan: Plan) -> None:
-        low_rad, high_rad = _rehearsed_travel_rad(entry)
-        seen = Rehearsal(
-            config_sha256=self._robot.digest,
-            bus=self._bus,
-            joint=entry.joint,
-            moving=_together(entry.joint, [one.joint for one in plan.joints] if plan.together else []),
-            low_rad=low_rad,
-            high_rad=high_rad,
-            serial=self._serials.get(entry.joint, ""),
-        )
+        (motion,) = (motion for motion in entry.motions if motion.name == REHEARSAL)
+        positions = motion.position_rad(np.linspace(0.0, motion.duration_s, 2001))
+        moving = _together(entry.joint, [one.joint for one in plan.joints] if plan.together else [])
+        travel, serial = (float(positions.min()), float(positions.max())), self._serials.get(entry.joint, "")
+        seen = Rehearsal(self._robot.digest, self._bus, entry.joint, moving, *travel, serial)
         self._write([*self._all(), seen])
 
     def _seen(self, joint: str) -> list[Rehearsal]:
@@ -125,12 +120,6 @@ class Rehearsals:
     @property
     def _path(self) -> Path:
         return user_state_path("frictid-hil") / "rehearsed" / f"{self._robot.name}.json"
-
-
-def _rehearsed_travel_rad(entry: JointPlan) -> tuple[float, float]:
-    (motion,) = (motion for motion in entry.motions if motion.name == REHEARSAL)
-    positions = motion.position_rad(np.linspace(0.0, motion.duration_s, 2001))
-    return float(positions.min()), float(positions.max())
 
 
 def _together(joint: str, moving: Sequence[str]) -> tuple[str, ...]:

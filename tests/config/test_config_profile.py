@@ -318,8 +318,8 @@ def test_rounding_an_estimate_again_changes_nothing(value: float, width: float) 
 def test_a_joint_is_a_function_of_velocity(tmp_path: Path) -> None:
     one = joint()
     velocity = np.linspace(-2.0, 2.0, 9).reshape(3, 3)
-    assert np.array_equal(one.curve(velocity), one.curve().torque(velocity))
-    assert one.curve([0.374, -0.374]).tolist() == [9.25, -9.25]
+    assert np.array_equal(one(velocity), one.curve().torque(velocity))
+    assert one([0.374, -0.374]).tolist() == [9.25, -9.25]
     low, high = one.interval_nm([0.187, -1.87, 0.0, 5.0])
     assert np.allclose(low[:2], [8.4, -12.1]) and np.allclose(high[:2], [8.6, -11.9])
     assert np.isnan(low[2:]).all() and np.isnan(high[2:]).all()
