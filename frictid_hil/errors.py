@@ -1,18 +1,7 @@
 """Every error a user can meet: what went wrong, where, the likely cause, the next step.
 
-Each branch of the tree carries the exit code of the command line and the ``outcome`` word of its JSON:
-
-==================  ====  ===========  ==========================================================
-branch              exit  outcome      meaning
-==================  ====  ===========  ==========================================================
-FrictidError        1     aborted      the run failed
-UsageError          2     refused      arguments, configuration, or an unusable input file
-HardwareError       3     aborted      hardware unreachable or held by another process
-SafetyAbort         4     aborted      motion was stopped because something unexpected happened
-GateFailed          5     gate_failed  measured, but not good enough to be promoted
-(recalibrate)       6     ok           done, but a joint has drifted; only where ``policy.on_drift`` is ``alarm``
-Interrupted         130   interrupted  a person or the system asked to stop
-==================  ====  ===========  ==========================================================
+Each branch of the tree carries the exit code of the command line and the ``outcome`` word of its JSON. ``recalibrate``
+alone ends with 6, too: done, but a joint has drifted; only where ``policy.on_drift`` is ``alarm``.
 """
 
 from __future__ import annotations

@@ -11,6 +11,10 @@ where friction passes zero: the stiffness of a joint at rest. Right after the tu
 stiff, but only until it has moved; a compensation spring that stays as stiff as that would give back more than the
 joint takes. D / 2 is the friction of a joint that creeps, static friction included: the level at which the spring of a
 joint at rest yields.
+
+Where no reversal shows the passage, the turning points of the cycles bound it. A position loop that is proportional
+alone is a spring, too, with damping: torque = k (command - position) - d velocity + constant. A wrong scale of the
+torque is in k as well, and falls out where a torque of the same recording is divided by k.
 """
 
 from __future__ import annotations
@@ -46,6 +50,11 @@ _LOOKED_AT = 20
 _LEAST_IN_TENTH = 10
 _LEAST_CLARITY = 4.0
 """The passage is larger than what the fitted shape leaves by at least this factor."""
+_BESIDE = 4
+"""Samples to either side over which position is differenced, for the stiffness of a loop."""
+_LEAST_LOOP_ROWS = 400
+_EXPLAINED = 0.9
+"""Share of the torque's variance below which it is no such loop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +141,27 @@ def least_stiffness(recording: CycleRecording, body: RigidBody, coulomb_nm: floa
     if len(travels) < 2 or not np.isfinite(step_rad):
         return None
     return 2.0 * _SLID * coulomb_nm / float(np.median(travels))
+
+
+def loop_stiffness(time_s: Array, command_rad: Array, position_rad: Array, torque_nm: Array) -> float | None:
+    """k of a proportional position loop, N m/rad, to a few per cent, from columns of shape (n,); None where it is none.
+
+    The torque is that of the loop, the command the one in force.
+    """
+    inside = slice(_BESIDE, -_BESIDE)
+    span_s = time_s[2 * _BESIDE :] - time_s[: -2 * _BESIDE]
+    velocity = (position_rad[2 * _BESIDE :] - position_rad[: -2 * _BESIDE]) / span_s
+    told = np.column_stack([(command_rad - position_rad)[inside], velocity, np.ones(len(velocity))])
+    torque = torque_nm[inside]
+    known = np.isfinite(told).all(axis=1) & np.isfinite(torque)
+    told, torque = told[known], torque[known]
+    if len(torque) < _LEAST_LOOP_ROWS:
+        return None
+    solved = np.linalg.lstsq(told, torque)[0]
+    left = torque - told @ solved
+    if not (float(solved[0]) > 0.0 and float(left.var()) <= (1.0 - _EXPLAINED) * float(torque.var())):
+        return None
+    return float(solved[0])
 
 
 def _mean(values: Array) -> Measured:

@@ -7,24 +7,23 @@ from pathlib import Path
 
 from frictid_hil.columns import ColumnMap
 from frictid_hil.errors import InputFileError
-from frictid_hil.recording.array_files import is_lerobot, open_hdf5, open_lerobot, open_npz, open_parquet
+from frictid_hil.recording import array_files
 from frictid_hil.recording.bus_log import LOG_SUFFIXES
 from frictid_hil.recording.csv import CsvTable, read_csv
 from frictid_hil.recording.mat import open_mat
 from frictid_hil.recording.mcap_reader import NO_SAMPLES, is_ours, read_mcap
 from frictid_hil.recording.ros import is_bag, open_bag
 from frictid_hil.recording.samples import Samples
-from frictid_hil.recording.servo_logs import open_bam, open_pace
 from frictid_hil.recording.table import Table, mapped, own_names
 
 _TABLES: dict[tuple[str, ...], Callable[[Path], Table]] = {
     (".csv", ".csv.gz", ".txt", ".txt.gz", ".tsv", ".tsv.gz"): CsvTable,
     (".mat",): open_mat,
-    (".npz",): open_npz,
-    (".h5", ".hdf5"): open_hdf5,
-    (".parquet",): open_parquet,
-    (".json",): open_bam,
-    (".pt",): open_pace,
+    (".npz",): array_files.open_npz,
+    (".h5", ".hdf5"): array_files.open_hdf5,
+    (".parquet",): array_files.open_parquet,
+    (".json",): array_files.open_bam,
+    (".pt",): array_files.open_pace,
     (".mcap", ".bag", ".db3"): open_bag,
 }
 READABLE = tuple(suffix for suffixes in _TABLES for suffix in suffixes)
@@ -43,7 +42,7 @@ def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None =
         InputFileError: unreadable, unusable, of an unknown kind, or without that joint.
     """
     path = Path(path)
-    if path.is_dir() and not is_lerobot(path) and not is_bag(path):
+    if path.is_dir() and not array_files.is_lerobot(path) and not is_bag(path):
         return _run_folder(path, joint)
     if path.name.lower().endswith(".mcap") and columns is None:
         ours = is_ours(path)
@@ -71,8 +70,8 @@ def open_table(path: Path, topic: str | None = None) -> Table:
     name = path.name.lower()
     if not path.exists() and not name.endswith(LOG_SUFFIXES):
         raise InputFileError("cannot be read: no such file", where=str(path))
-    if is_lerobot(path):
-        return open_lerobot(path)
+    if array_files.is_lerobot(path):
+        return array_files.open_lerobot(path)
     if is_bag(path) or name.endswith((".mcap", ".db3")):
         return open_bag(path, topic)
     for suffixes, opener in _TABLES.items():

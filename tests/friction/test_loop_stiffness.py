@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frictid_hil.friction.loop_stiffness import loop_stiffness
-from frictid_hil.friction.presliding import least_stiffness
+from frictid_hil.friction.presliding import least_stiffness, loop_stiffness
 from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Procedure, position

@@ -30,10 +30,9 @@ from frictid_hil.friction.estimate import Estimate as Estimated
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.free_motion import free_motion
 from frictid_hil.friction.gate import Gate, GateLimits, beside_usual
-from frictid_hil.friction.loop_stiffness import loop_stiffness
 from frictid_hil.friction.onset import cycles_start_s
 from frictid_hil.friction.plateaus import plateaus
-from frictid_hil.friction.presliding import least_stiffness, presliding
+from frictid_hil.friction.presliding import least_stiffness, loop_stiffness, presliding
 from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Array, Procedure
