@@ -15,19 +15,17 @@ from typing import Protocol
 
 import can
 
+from frictid_drivers.mit import faulty_motors
 from frictid_drivers.mit.driver import MitDriver
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings, read_settings
-from frictid_drivers.virtual.faults import HOST_KINDS
+from frictid_drivers.virtual.devices import Device, without_faults
+from frictid_drivers.virtual.faults import HOST_KINDS, faults_of
 from frictid_drivers.virtual.faulty_bus import FaultyBus
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import FD_FRAME, Clock, WallClock
-from frictid_hil.simulation.joint import JointModel
-from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.testing.wire import Devices, FakeCanBus, Frame, ManualClock
 
-_LOOP_NS = 500_000
-_TORQUE_MODE = 10
 _LONG_ID = 1 << 31
 _SERVICE_PORT = 0x7FF
 
@@ -38,16 +36,13 @@ class VirtualMitDriver(MitDriver):
     kind = replace(MitDriver.kind, simulated=True, line="virtual", elsewhere={"can": "mit"})
 
     def __init__(self, setup: RobotSetup) -> None:
-        # Late, because faulty motors are motors of this file.
-        from frictid_drivers.mit.faulty_motors import FaultyMotors, motor_faults
-
-        faults = motor_faults(setup)
-        healthy = replace(setup, options={name: value for name, value in setup.options.items() if name != "faults"})
-        self.rack = Rack(healthy)
+        faults = faults_of(setup, kinds=faulty_motors.KINDS, frames=faulty_motors.FRAMES)
+        setup = without_faults(setup)
+        self.rack = Rack(setup)
         self._begin: list[Callable[[], None]] = []
         motors: Devices = self.rack
         if faults:
-            motors = faulty = FaultyMotors(self.rack, faults)
+            motors = faulty = faulty_motors.FaultyMotors(self.rack, faults)
             self._begin.append(faulty.begin)
         clock: Clock = WallClock() if setup.realtime else ManualClock(motors.advance)
 
@@ -65,7 +60,7 @@ class VirtualMitDriver(MitDriver):
             self._begin.append(spoilt.begin)
             return spoilt
 
-        super().__init__(healthy, bus_factory=open_bus, clock=clock)
+        super().__init__(setup, bus_factory=open_bus, clock=clock)
 
     def start_cycling(self) -> None:
         """As ``MitDriver``; times of faults count from here."""
@@ -78,35 +73,25 @@ class VirtualMitDriver(MitDriver):
         self.rack.actuators[joint].plant.mount_payload(mounted)
 
 
-class Actuator:
+class Actuator(Device):
     """One motor: its control law, its plant, its memory and its watchdog.
 
     Args:
         joint: of the robot file.
-        seed: of the noise.
+        setup: the robot.
         ranges: of its frames.
-        id: its own.
 
     Attributes:
-        on: under power.
         fault: code that it shows; 0 when healthy.
         timeout_ns: without a command for so long it lets go; 0 for never.
         asked: position, velocity, kp, kd, torque in force.
     """
 
-    def __init__(self, joint: JointSetup, seed: int, ranges: Ranges, id: int) -> None:
-        self.plant = ServoLoop(
-            JointModel.of(joint, joint.name),
-            period_s=_LOOP_NS * 1e-9,
-            seed=seed,
-            position_rad=joint.locked_position_rad,
-        )
-        self.plant.set_mode(_TORQUE_MODE)
-        self.plant.brake(False)
-        self.id, self.ranges, self.direction = id, ranges, joint.direction
-        self.on, self.fault, self.timeout_ns = False, 0, 0
+    def __init__(self, joint: JointSetup, setup: RobotSetup, ranges: Ranges) -> None:
+        super().__init__(joint, setup)
+        self.ranges, self.direction = ranges, joint.direction
+        self.fault, self.timeout_ns = 0, 0
         self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)
-        self._now_ns = self._heard_ns = 0
 
     def switch(self, on: bool) -> None:
         """Power; a fault keeps it off."""
@@ -114,21 +99,15 @@ class Actuator:
         self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)
         self.plant.power(self.on)
 
-    def heard(self) -> None:
-        """Somebody talks to it."""
-        self._heard_ns = self._now_ns
+    def _watch_host(self) -> None:
+        if self.on and self.timeout_ns and self._now_ns - self._heard_ns > self.timeout_ns:
+            self.fault = 0xD
+            self.switch(False)
 
-    def advance(self, to_ns: int) -> None:
-        """Its own loop, period by period."""
-        while self._now_ns + _LOOP_NS <= to_ns:
-            if self.on and self.timeout_ns and self._now_ns - self._heard_ns > self.timeout_ns:
-                self.fault = 0xD
-                self.switch(False)
-            p, v, kp, kd, t = self.asked
-            torque = kp * (p - self.position) + kd * (v - self.velocity) + t if self.on else 0.0
-            most = self.ranges.torque_nm
-            self.plant.advance(_LOOP_NS * 1e-9, torque_nm=self.direction * min(max(torque, -most), most))
-            self._now_ns += _LOOP_NS
+    def _asked_nm(self) -> float:
+        p, v, kp, kd, t = self.asked
+        torque, most = kp * (p - self.position) + kd * (v - self.velocity) + t, self.ranges.torque_nm
+        return self.direction * min(max(torque, -most), most)
 
     @property
     def position(self) -> float:
@@ -146,7 +125,7 @@ class Actuator:
         return self.direction * self.plant.torque_nm
 
     def told(self, quantity: str) -> float:
-        """``position``, ``velocity`` or ``torque`` as its reports say."""
+        """As ``Device.told``, in the motor's direction."""
         value: float = getattr(self, quantity)
         return value
 
@@ -172,9 +151,7 @@ class Rack:
         bus, settings = read_settings(setup)
         for joint in setup.joints:
             mine = settings[joint.name]
-            seed = zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode())
-            actuator = Actuator(joint, seed, mine.motor.ranges, joint.address)
-            self.actuators[joint.name] = actuator
+            self.actuators[joint.name] = actuator = Actuator(joint, setup, mine.motor.ranges)
             serial = zlib.crc32(f"{setup.name}/{joint.name}".encode())
             self._wires.append((actuator, _wire_of(mine, serial, bus.data_bitrate)))
 

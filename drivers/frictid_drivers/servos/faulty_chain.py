@@ -10,18 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import serial
 
-from frictid_drivers.servos.simulated import Chain, Servo
-from frictid_drivers.virtual.faults import FOREVER_S, FRAME_KINDS, QUANTITIES, REPORT_KINDS, Fault, faults_of
-from frictid_drivers.virtual.wire_faults import FaultAtWork, Late, WrongFigure, spoil
-from frictid_hil.plan.setup import RobotSetup
+from frictid_drivers.virtual.devices import DEVICE_KINDS, DeviceFaults
+from frictid_drivers.virtual.faults import FRAME_KINDS, Fault
+from frictid_drivers.virtual.wire_faults import FaultAtWork
+
+if TYPE_CHECKING:
+    from frictid_drivers.servos.simulated import Chain
 
 FRAMES = ("write", "request", "report")
-SWITCHED = ("mute", "reset", "fault", "blocked")
 HOST_KINDS = ("send_error", "receive_error", "stall")
-KINDS = (*FRAME_KINDS, *(kind for kind in REPORT_KINDS if kind != "flap"), *HOST_KINDS, *SWITCHED)
+KINDS = (*DEVICE_KINDS, *HOST_KINDS)
 _READS = (0x02, 0x82)
 _ERRORS: Mapping[str, Callable[[], Exception]] = {
     "can": lambda: serial.SerialException("injected: the adapter refuses"),
@@ -31,68 +33,30 @@ _ERRORS: Mapping[str, Callable[[], Exception]] = {
 }
 
 
-def servo_faults(setup: RobotSetup) -> tuple[Fault, ...]:
-    """The faults of a robot of simulated servos.
-
-    Raises:
-        InvalidFields: what is wrong with the robot file's.
-        UsageError: the environment's are not JSON.
-    """
-    return faults_of(setup, kinds=KINDS, frames=FRAMES)
-
-
-class FaultyChain:
+class FaultyChain(DeviceFaults):
     """As ``frictid_drivers.servos.line.BytePort``.
 
     Args:
         chain: the servos.
         faults: what goes wrong.
-        stand_still: lets so many seconds pass.
     """
 
-    def __init__(self, chain: Chain, faults: Sequence[Fault], stand_still: Callable[[float], None]) -> None:
-        self._chain, self._faults, self._stand_still = chain, tuple(faults), stand_still
-        self._at_work = {
-            kind: [FaultAtWork(fault) for fault in faults if fault.kind == kind] for kind in (*FRAME_KINDS, *HOST_KINDS)
-        }
-        self._late, self._arrived = Late(), bytearray()
-        self._now_ns, self._start_ns = 0, -1
+    def __init__(self, chain: Chain, faults: Sequence[Fault]) -> None:
+        super().__init__(faults, chain.servos, chain.advance)
+        self._frame_faults.sort(key=lambda state: FRAME_KINDS.index(state.fault.kind))
+        self._host = {kind: [FaultAtWork(fault) for fault in faults if fault.kind == kind] for kind in HOST_KINDS}
+        self._chain, self._arrived = chain, bytearray()
         chain.fault = self._answered
-        for fault in faults:
-            if fault.kind in REPORT_KINDS:
-                for name in fault.joints:
-                    self._spoil_reports(chain.servos[name], fault)
-
-    def begin(self) -> None:
-        """The first cycle: times of faults count from here."""
-        self._start_ns = self._now_ns
-        for fault in self._faults:
-            for name in fault.joints if fault.kind in SWITCHED else ():
-                begin_ns = self._start_ns + round(fault.begin_s * 1e9)
-                self._late.put(begin_ns, partial(self._switch, fault.kind, name, True))
-                if fault.for_s < FOREVER_S:
-                    end_ns = self._start_ns + round((fault.begin_s + fault.for_s) * 1e9)
-                    self._late.put(end_ns, partial(self._switch, fault.kind, name, False))
-        self._late.run(self._now_ns)
-
-    def advance(self, to_ns: int) -> None:
-        """Run time goes on."""
-        while self._late.next_ns <= to_ns:
-            self._now_ns = round(max(self._now_ns, self._late.next_ns))
-            self._chain.advance(self._now_ns)
-            self._late.run(self._now_ns)
-        self._now_ns = to_ns
-        self._chain.advance(to_ns)
 
     def write(self, data: bytes) -> None:
         """The host's packet."""
         self._fail("send_error")
-        for stall in self._at_work["stall"]:
+        for stall in self._host["stall"]:
             if stall.strikes(self._elapsed_ns()):
-                self._stand_still(stall.fault.delay_s)
+                clock = self._chain.clock
+                clock.wait_until(clock.now_ns() + round(stall.fault.delay_s * 1e9))
         code = next((packet.instruction for packet in self._chain.wire.parse(bytearray(data), answers=False)), 0)
-        service = "request" if code in _READS else "write"
-        for due_ns, _, out in self._spoilt(service, "", 0, data):
+        for due_ns, _, out in self._spoilt("request" if code in _READS else "write", "", 0, data):
             self._at(due_ns, partial(self._chain.write, out))
 
     def read(self, timeout_s: float) -> bytes:
@@ -107,63 +71,31 @@ class FaultyChain:
         """The host is gone."""
         self._chain.close()
 
-    # -- packets -------------------------------------------------------------------------------------------------------
-
     def _answered(self, packet: bytes, to_host: bool) -> bytes:
         """What is on the line of an answer at once; what is late comes by itself."""
         if not to_host:
             return packet
         (answer,) = self._chain.wire.parse(bytearray(packet), answers=True)
-        joint = next(name for name, servo in self._chain.servos.items() if servo.mine.id == answer.id)
-        at_once = b""
+        joint = next(name for name, servo in self._chain.servos.items() if servo.id == answer.id)
+        at_once = bytearray()
         for due_ns, servo, out in self._spoilt("report", joint, answer.id, packet):
             out = out if servo == answer.id else self._chain.wire.answer(servo, answer.error, answer.data)
-            if due_ns <= self._now_ns:
-                at_once += out
-            else:
-                self._at(due_ns, partial(self._arrived.extend, out))
-        return at_once
-
-    def _spoilt(self, service: str, joint: str, servo: int, packet: bytes) -> list[tuple[int, int, bytes]]:
-        packets = [(self._now_ns, servo, packet)]
-        for kind in FRAME_KINDS:
-            for state in self._at_work[kind]:
-                if state.fault.frames == service and (not joint or joint in state.fault.joints):
-                    packets = [out for one in packets for out in spoil(state, self._elapsed_ns(), one)]
-        return packets
-
-    def _at(self, due_ns: int, deliver: Callable[[], None]) -> None:
-        if due_ns <= self._now_ns:
-            deliver()
-        else:
-            self._late.put(due_ns, deliver)
+            self._at(due_ns, partial((at_once if due_ns <= self._now_ns else self._arrived).extend, out))
+        return bytes(at_once)
 
     def _fail(self, kind: str) -> None:
-        for work in self._at_work[kind]:
+        for work in self._host[kind]:
             if work.strikes(self._elapsed_ns()):
                 raise _ERRORS[work.fault.error]()
 
-    def _elapsed_ns(self) -> int:
-        return -1 if self._start_ns < 0 else self._now_ns - self._start_ns
-
-    # -- servos --------------------------------------------------------------------------------------------------------
-
-    def _spoil_reports(self, servo: Servo, fault: Fault) -> None:
-        wrong, before = WrongFigure(fault), servo.told
-
-        def told(quantity: str) -> float:
-            value = before(quantity)
-            if QUANTITIES[quantity] != fault.quantity:
-                return value
-            return wrong.applied(servo.mine.id, self._now_ns, self._elapsed_ns(), value)
-
-        servo.told = told  # type: ignore[method-assign]  # what it says from now on
-
-    def _switch(self, kind: str, joint: str, on: bool) -> None:
+    def _switch(self, fault: Fault, joint: str, on: bool) -> None:
         servo = self._chain.servos[joint]
-        if kind == "mute":
-            self._chain.connect(joint, not on)
-        elif kind == "blocked":
-            servo.plant.brake(on)
-        elif on:
-            (servo.fail if kind == "fault" else servo.reboot)()
+        match fault.kind:
+            case "mute":
+                self._chain.connect(joint, not on)
+            case "blocked":
+                servo.plant.brake(on)
+            case "reset" if on:
+                servo.reboot()
+            case "fault" if on:
+                servo.fail()

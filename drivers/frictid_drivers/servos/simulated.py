@@ -6,22 +6,20 @@ Written against the makers' control tables; packets are taken apart here by othe
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
+from frictid_drivers.servos import faulty_chain
 from frictid_drivers.servos.driver import ServoDriver
 from frictid_drivers.servos.packets import WIRES
 from frictid_drivers.servos.settings import JointSettings, read_settings
+from frictid_drivers.virtual.devices import LOOP_S, Device, without_faults
+from frictid_drivers.virtual.faults import faults_of
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.protocol.driver import Clock, WallClock
-from frictid_hil.simulation.joint import JointModel
-from frictid_hil.simulation.servo_loop import ServoLoop
 from frictid_hil.testing.wire import ManualClock
 
-_LOOP_NS = 500_000
-_TORQUE_MODE = 10
 _EEPROM_END = 64
 _PROFILE, _PROFILE_RAD_S = 112, 0.023981
 """Of a Dynamixel: speed of the way to a goal; 0 is at once."""
@@ -37,26 +35,19 @@ class VirtualServoDriver(ServoDriver):
     kind = replace(ServoDriver.kind, simulated=True, line="virtual", elsewhere={"serial": "servos"})
 
     def __init__(self, setup: RobotSetup) -> None:
-        # Late, because faulty servos are servos of this file.
-        from frictid_drivers.servos.faulty_chain import FaultyChain, servo_faults
-
-        faults = servo_faults(setup)
-        healthy = replace(setup, options={name: value for name, value in setup.options.items() if name != "faults"})
-        self.chain = Chain(healthy)
-        self._faulty = FaultyChain(self.chain, faults, self._stand_still) if faults else None
+        faults = faults_of(setup, kinds=faulty_chain.KINDS, frames=faulty_chain.FRAMES)
+        setup = without_faults(setup)
+        self.chain = Chain(setup)
+        self._faulty = faulty_chain.FaultyChain(self.chain, faults) if faults else None
         port = self._faulty or self.chain
-        clock: Clock = WallClock() if setup.realtime else ManualClock(port.advance)
-        self.chain.clock = clock
-        super().__init__(healthy, port_factory=lambda: port, clock=clock)
+        self.chain.clock = WallClock() if setup.realtime else ManualClock(port.advance)
+        super().__init__(setup, port_factory=lambda: port, clock=self.chain.clock)
 
     def start_cycling(self) -> None:
         """As ``ServoDriver``; times of faults count from here."""
         super().start_cycling()
         if self._faulty is not None:
             self._faulty.begin()
-
-    def _stand_still(self, lasts_s: float) -> None:
-        self.clock.wait_until(self.clock.now_ns() + round(lasts_s * 1e9))
 
     def simulate_hand(self, joint: str, centre_rad: float, amplitude_rad: float, frequency_hz: float) -> None:
         """Let a person guide a joint along centre + amplitude sin(2 pi f t), t from now; frequency 0 lets go."""
@@ -69,28 +60,21 @@ class VirtualServoDriver(ServoDriver):
         )
 
 
-class Servo:
+class Servo(Device):
     """One servo: memory, loop and plant.
 
     Args:
         joint: of the robot file.
+        setup: the robot.
         mine: its options.
-        seed: of the noise.
 
     Attributes:
         error: bits that it shows.
     """
 
-    def __init__(self, joint: JointSetup, mine: JointSettings, seed: int) -> None:
+    def __init__(self, joint: JointSetup, setup: RobotSetup, mine: JointSettings) -> None:
+        super().__init__(joint, setup)
         self.mine = mine
-        self.plant = ServoLoop(
-            JointModel.of(joint, joint.name),
-            period_s=_LOOP_NS * 1e-9,
-            seed=seed,
-            position_rad=joint.locked_position_rad,
-        )
-        self.plant.set_mode(_TORQUE_MODE)
-        self.plant.brake(False)
         self.memory = bytearray(256)
         registers = mine.model.registers
         self.memory[registers.model : registers.model + 2] = (777).to_bytes(2, "little")
@@ -99,9 +83,7 @@ class Servo:
         if registers.goal_current:
             self._number((registers.current_limit, 2), 1750 if mine.model.current_a < 0.002 else 1193)
         self.error = 0
-        self.on = False
         self._goal_rad = self._way_rad = joint.locked_position_rad
-        self._now_ns = self._heard_ns = 0
         self._delivered = bytes(self.memory)
 
     def told(self, quantity: str) -> float:
@@ -162,17 +144,9 @@ class Servo:
         at = self.mine.model.registers.current_limit
         return bytes(self.memory[at : at + 2])
 
-    def heard(self) -> None:
-        """A packet on the line."""
-        self._heard_ns = self._now_ns
-
-    def advance(self, to_ns: int) -> None:
-        """Its own loop, period by period."""
-        while self._now_ns + _LOOP_NS <= to_ns:
-            if self._tripped() and self.on:
-                self._switch(False)
-            self.plant.advance(_LOOP_NS * 1e-9, torque_nm=self._asked_nm() if self.on else 0.0)
-            self._now_ns += _LOOP_NS
+    def _watch_host(self) -> None:
+        if self._tripped() and self.on:
+            self._switch(False)
 
     def _asked_nm(self) -> float:
         """Its current times its constant in current mode, else what its position loop wants."""
@@ -191,7 +165,7 @@ class Servo:
         rest_rad, steps = self._goal_rad - self._way_rad, 0
         if self.mine.model.wire == "dynamixel":
             steps = int.from_bytes(self.memory[_PROFILE : _PROFILE + 4], self._order)
-        most_rad = steps * _PROFILE_RAD_S * _LOOP_NS * 1e-9 if steps else math.inf
+        most_rad = steps * _PROFILE_RAD_S * LOOP_S if steps else math.inf
         self._way_rad += min(max(rest_rad, -most_rad), most_rad)
         return self._way_rad
 
@@ -264,10 +238,9 @@ class Chain:
         self._dynamixel = settings[0].model.wire == "dynamixel"
         self.clock: Clock = WallClock()
         self.servos = {
-            joint.name: Servo(joint, mine, zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode()))
-            for joint, mine in zip(setup.joints, settings, strict=True)
+            joint.name: Servo(joint, setup, mine) for joint, mine in zip(setup.joints, settings, strict=True)
         }
-        self._by_id = {servo.mine.id: servo for servo in self.servos.values()}
+        self._by_id = {servo.id: servo for servo in self.servos.values()}
         self._out = bytearray()
         self.fault: Callable[[bytes, bool], bytes] | None = None
 
@@ -280,9 +253,9 @@ class Chain:
         """Put a servo on the line, or take it off; it goes on either way."""
         servo = self.servos[joint]
         if there:
-            self._by_id[servo.mine.id] = servo
+            self._by_id[servo.id] = servo
         else:
-            self._by_id.pop(servo.mine.id, None)
+            self._by_id.pop(servo.id, None)
 
     def write(self, data: bytes) -> None:
         """The host's bytes: one packet at a time, as on a half-duplex line."""

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
-from frictid_drivers.virtual.faults import FOREVER_S, Fault
+from frictid_drivers.virtual.devices import FaultSchedule
+from frictid_drivers.virtual.faults import Fault
 from frictid_drivers.virtual.rack import Rack, Transmit
-from frictid_drivers.virtual.servo import Servo
-from frictid_drivers.virtual.wire_faults import SYNC_ID, Late, WireFaults
-
-_SWITCHED = ("mute", "reset", "emcy", "fault", "stuck_encoder", "blocked", "interlock_open")
+from frictid_drivers.virtual.wire_faults import SYNC_ID, WireFaults
 
 
-class FaultyRack:
+class FaultyRack(FaultSchedule):
     """See ``Rack`` for what its members mean."""
 
+    SWITCHED = (*FaultSchedule.SWITCHED, "emcy", "stuck_encoder", "interlock_open")
+
     def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
+        super().__init__(faults)
         self.transmit: Transmit = lambda can_id, data: None  # no bus yet
         self._rack = rack
-        self._faults = tuple(faults)
         self._frames = WireFaults(faults)
-        self._late = Late()
-        self._start_ns: int | None = None
         self._muted: set[int] = set()
         self._pace = math.prod(fault.factor for fault in faults if fault.kind == "drift")
         self._host_ns, self._drives_ns = 0, 0
@@ -47,21 +45,14 @@ class FaultyRack:
     def process(self, can_id: int, data: bytes, *, remote: bool = False) -> None:
         """A frame of the host."""
         if can_id == SYNC_ID and self._start_ns is None:
-            self._start()
+            self.begin()
         if can_id not in self._frames.cob_ids:
             self._to_drives(can_id, data, remote)
             return
         for due_ns, out_id, out in self._frames.through(self.now_ns, self._elapsed_ns(), can_id, data):
             self._at(due_ns, partial(self._to_drives, out_id, out, remote))
 
-    def advance(self, to_ns: int) -> None:
-        """Let run time go on."""
-        while self._late.next_ns <= to_ns:
-            self._advance_drives(round(self._late.next_ns))
-            self._late.run(self.now_ns)
-        self._advance_drives(to_ns)
-
-    def _advance_drives(self, to_ns: int) -> None:
+    def _advance_devices(self, to_ns: int) -> None:
         drives_ns = self._drives_ns + round((to_ns - self._host_ns) * self._pace)
         self._rack.advance(drives_ns)
         if self._pace != 1.0 and to_ns > self._host_ns:
@@ -94,34 +85,10 @@ class FaultyRack:
     def _to_host(self, can_id: int, data: bytes) -> None:
         self.transmit(can_id, data)
 
-    def _at(self, due_ns: int, action: Callable[[], None]) -> None:
-        """Now where it is due, else later."""
-        if due_ns <= self.now_ns:
-            action()
-        else:
-            self._late.put(due_ns, action)
-
-    def _elapsed_ns(self) -> int:
-        return -1 if self._start_ns is None else self.now_ns - self._start_ns
-
     # -- drives --------------------------------------------------------------------------------------------------------
 
-    def _start(self) -> None:
-        self._start_ns = self.now_ns
-        for fault in self._faults:
-            for joint in fault.joints if fault.kind in _SWITCHED else ():
-                servo = self._rack.servos.get(joint)
-                if servo is None:
-                    continue
-                begin_ns = self._start_ns + round(fault.begin_s * 1e9)
-                self._late.put(begin_ns, partial(self._switch, fault, servo, True))
-                if fault.for_s < FOREVER_S:
-                    end_ns = self._start_ns + round((fault.begin_s + fault.for_s) * 1e9)
-                    self._late.put(end_ns, partial(self._switch, fault, servo, False))
-        self._late.run(self.now_ns)
-
-    def _switch(self, fault: Fault, servo: Servo, on: bool) -> None:
-        """Turn a drive's fault on and off."""
+    def _switch(self, fault: Fault, joint: str, on: bool) -> None:
+        servo = self._rack.servos[joint]
         match fault.kind:
             case "mute":
                 (self._muted.add if on else self._muted.discard)(servo.node_id)
