@@ -47,7 +47,7 @@ class LogDecoder(Protocol):
 
 
 class FrameDecoders(Protocol):
-    """What an entry point of the group gives; a class or module with these three."""
+    """What an entry point of the group gives: a class or module; ``map_from_eds`` where its drives have EDS files."""
 
     schema: str  # of the frame maps it understands
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from frictid_drivers.mit.actuator import Reader
 from frictid_drivers.mit.families import FAMILIES, Motor
 from frictid_drivers.mit.frames import Ranges
 from frictid_drivers.mit.settings import JointSettings
-from frictid_hil.errors import FieldProblem, InputFileError, InvalidFields
+from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.rows import Command, Report, RowDecoder, RowLog, Service
 
@@ -56,20 +55,9 @@ def decoder(frame_map: Mapping[str, Any]) -> RowLog:
         readers = []
         for at, joint in enumerate(frame_map["joints"].values()):
             motor = joint["motor"]
-            where = Motor(
-                int(motor["id"]), int(motor["reply_id"]), Ranges(**motor["ranges"]), int(motor.get("flags", 0))
-            )
-            settings = JointSettings("", FAMILIES[joint["family"]], where, 0.0, 0.0, 0.0, 0.0)
+            numbers = int(motor["id"]), int(motor["reply_id"]), Ranges(**motor["ranges"]), int(motor.get("flags", 0))
+            settings = JointSettings("", FAMILIES[joint["family"]], Motor(*numbers), 0.0, 0.0, 0.0, 0.0)
             readers.append(Reader(at, int(joint["direction"]), settings))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InvalidFields([FieldProblem(("joints",), f"not a frame map of MIT-mode actuators: {error!r}")]) from None
     return RowLog(row_decoder(readers))
-
-
-def map_from_eds(path: Path, setup: RobotSetup) -> Mapping[str, Any]:
-    """These actuators have no EDS files.
-
-    Raises:
-        InputFileError: always.
-    """
-    raise InputFileError("MIT-mode actuators have no EDS file", where=str(path))

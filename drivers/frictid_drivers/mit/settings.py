@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from frictid_drivers.mit.families import FAMILIES, Damiao, Family, Motor
@@ -43,9 +44,7 @@ class BusSettings:
     """Of the whole bus.
 
     Attributes:
-        bitrate: bit/s.
-        data_bitrate: bit/s of the data of CAN FD frames; None on a classical bus.
-        watchdog_s: without a command for so long, a motor that has a watchdog lets go.
+        data_bitrate: of the data of CAN FD frames, bit/s; None on a classical bus.
         allow_torque_without_watchdog: torque mode also where nothing stops the motor when the host dies.
         reply_window: share of a cycle that answers are waited for.
         tty_baudrate: of a serial adapter's real UART; 0 where there is none.
@@ -70,8 +69,6 @@ class JointSettings:
 
     Attributes:
         model: as the catalogue has it.
-        family: what it speaks.
-        motor: where it is.
         kp: stiffness of position control, N m/rad.
         kd: damping of position and velocity control, N m s/rad.
         brake_kd: damping of a quick stop.
@@ -98,17 +95,16 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
     joints: dict[str, JointSettings] = {}
     for joint in setup.joints:
         problems += unknown_options(joint.options, JOINT_OPTIONS, ("joints", joint.name, "options"), "mit")
-        settings = _joint(joint, problems, fd=data_bitrate is not None)
-        if settings is not None:
+        if (settings := _joint(joint, problems, fd=data_bitrate is not None)) is not None:
             joints[joint.name] = settings
-    options, at = setup.options, ("options",)
+    number = partial(number_option, setup.options, path=("options",), problems=problems)
     bus = BusSettings(
-        bitrate=int(number_option(options, "bitrate", 1_000_000, 10_000, 1_000_000, at, problems)),
+        bitrate=int(number("bitrate", 1_000_000, 10_000, 1_000_000)),
         data_bitrate=data_bitrate,
-        watchdog_s=number_option(options, "watchdog_ms", 100.0, 5.0, 10_000.0, at, problems) / 1000.0,
-        allow_torque_without_watchdog=options.get("allow_torque_without_watchdog") is True,
-        reply_window=number_option(options, "reply_window", 0.8, 0.1, 0.95, at, problems),
-        tty_baudrate=int(number_option(options, "tty_baudrate", 0, 0, 10_000_000, at, problems)),
+        watchdog_s=number("watchdog_ms", 100.0, 5.0, 10_000.0) / 1000.0,
+        allow_torque_without_watchdog=setup.options.get("allow_torque_without_watchdog") is True,
+        reply_window=number("reply_window", 0.8, 0.1, 0.95),
+        tty_baudrate=int(number("tty_baudrate", 0, 0, 10_000_000)),
     )
     if problems:
         raise InvalidFields(problems)
@@ -131,8 +127,7 @@ def _data_bitrate(options: Mapping[str, Any], problems: list[FieldProblem]) -> i
 
 
 def _joint(joint: JointSetup, problems: list[FieldProblem], *, fd: bool) -> JointSettings | None:
-    at = ("joints", joint.name, "options")
-    options = joint.options
+    at, options = ("joints", joint.name, "options"), joint.options
     model = MODELS.get(str(options.get("model")))
     if model is None:
         known = ", ".join(MODELS)
@@ -147,23 +142,20 @@ def _joint(joint: JointSetup, problems: list[FieldProblem], *, fd: bool) -> Join
     family, ranges = FAMILIES[protocol], model.ranges
     if fd and not isinstance(family, Damiao):
         problems.append(FieldProblem(("options", "fd"), f"a {options['model']} speaks classical CAN ({protocol})"))
-    usual_reply = joint.address + 0x10 if family.reply_id is None else family.reply_id
-    reply_id = int(number_option(options, "reply_id", usual_reply, 0, 0x7FF, at, problems))
+    number = partial(number_option, options, path=at, problems=problems)
+    reply_id = int(number("reply_id", joint.address + 0x10 if family.reply_id is None else family.reply_id, 0, 0x7FF))
     if reply_id == joint.address:
         problems.append(FieldProblem((*at, "reply_id"), "must differ from the motor's own id"))
     if joint.max_torque_nm > ranges.torque_nm:
-        problems.append(
-            FieldProblem(
-                ("joints", joint.name, "max_torque_nm"), f"a {options['model']} tells {ranges.torque_nm:g} N m"
-            )
-        )
-    kd = number_option(options, "kd", min(1.0, ranges.kd_nm_s_per_rad), 0.0, ranges.kd_nm_s_per_rad, at, problems)
+        where = ("joints", joint.name, "max_torque_nm")
+        problems.append(FieldProblem(where, f"a {options['model']} tells {ranges.torque_nm:g} N m"))
+    kd = number("kd", min(1.0, ranges.kd_nm_s_per_rad), 0.0, ranges.kd_nm_s_per_rad)
     return JointSettings(
         model=str(options["model"]),
         family=family,
         motor=Motor(joint.address, reply_id, ranges, FD_FRAME if fd else 0),
-        kp=number_option(options, "kp", 50.0, 0.0, ranges.kp_nm_per_rad, at, problems) or math.nan,
+        kp=number("kp", 50.0, 0.0, ranges.kp_nm_per_rad) or math.nan,
         kd=kd,
-        brake_kd=number_option(options, "brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad, at, problems),
-        torque_delay_s=number_option(options, "torque_delay_s", 0.0, 0.0, 0.1, at, problems),
+        brake_kd=number("brake_kd", kd, 0.0, ranges.kd_nm_s_per_rad),
+        torque_delay_s=number("torque_delay_s", 0.0, 0.0, 0.1),
     )

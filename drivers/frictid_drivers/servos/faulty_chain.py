@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import serial
 
+from frictid_drivers.servos.packets import READ, SYNC_READ
 from frictid_drivers.virtual.devices import DEVICE_KINDS, DeviceFaults
 from frictid_drivers.virtual.faults import FRAME_KINDS, Fault
 from frictid_drivers.virtual.wire_faults import FaultAtWork
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 FRAMES = ("write", "request", "report")
 HOST_KINDS = ("send_error", "receive_error", "stall")
 KINDS = (*DEVICE_KINDS, *HOST_KINDS)
-_READS = (0x02, 0x82)
 _ERRORS: Mapping[str, Callable[[], Exception]] = {
     "can": lambda: serial.SerialException("injected: the adapter refuses"),
     "os": lambda: OSError(5, "injected: input/output error"),
@@ -56,7 +56,7 @@ class FaultyChain(DeviceFaults):
                 clock = self._chain.clock
                 clock.wait_until(clock.now_ns() + round(stall.fault.delay_s * 1e9))
         code = next((packet.instruction for packet in self._chain.wire.parse(bytearray(data), answers=False)), 0)
-        for due_ns, _, out in self._spoilt("request" if code in _READS else "write", "", 0, data):
+        for due_ns, _, out in self._spoilt("request" if code in (READ, SYNC_READ) else "write", "", 0, data):
             self._at(due_ns, partial(self._chain.write, out))
 
     def read(self, timeout_s: float) -> bytes:

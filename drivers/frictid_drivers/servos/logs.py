@@ -11,13 +11,12 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from frictid_drivers.servos.models import Model, Registers
-from frictid_drivers.servos.packets import WIRES, Packet
+from frictid_drivers.servos.packets import SYNC_READ, SYNC_WRITE, WIRES, Packet
 from frictid_drivers.servos.settings import JointSettings
-from frictid_hil.errors import FieldProblem, InputFileError, InvalidFields
+from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import Feedback, JointState
@@ -27,7 +26,6 @@ schema = "frictid.servo-packets/1"
 SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11
 """Identifiers of packets in a bus log."""
 
-_SYNC_READ, _SYNC_WRITE = 0x82, 0x83
 _SPEED_CYCLES, _SPEED_S = 8, 0.04
 
 
@@ -41,12 +39,7 @@ def speed_cycles(period_s: float) -> int:
 
 
 class Reader:
-    """Packets of one line to figures of its joints.
-
-    Args:
-        joints: in order.
-        period_s: of the cycle.
-    """
+    """Packets of one line to figures of its joints."""
 
     def __init__(self, joints: Sequence[JointSettings], period_s: float) -> None:
         self._joints = list(joints)
@@ -79,14 +72,13 @@ class Reader:
         return None
 
     def _told(self, packet: Packet) -> Command | Service:
-        registers = self._registers
-        size = 1 if self._wire.name == "feetech" else 2
+        registers, size = self._registers, self._wire.word
         address = int.from_bytes(packet.data[:size], "little")
-        if packet.instruction == _SYNC_READ and address == registers.block:
+        if packet.instruction == SYNC_READ and address == registers.block:
             self._cycle += 1
             others = tuple((at, goal) for at, goal in enumerate(self._goals_rad) if at)
             return Command(0, self._goals_rad[0], others)
-        if packet.instruction == _SYNC_WRITE and address in (registers.goal, registers.torque, registers.mode):
+        if packet.instruction == SYNC_WRITE and address in (registers.goal, registers.torque, registers.mode):
             each = int.from_bytes(packet.data[size : 2 * size], "little") + 1
             told = packet.data[2 * size :]
             for k in range(0, len(told) - each + 1, each):
@@ -194,12 +186,3 @@ def decoder(frame_map: Mapping[str, Any]) -> RowLog:
         return RowLog(Reader(joints, float(frame_map["period_s"])).rows())
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InvalidFields([FieldProblem(("joints",), f"not a frame map of serial servos: {error!r}")]) from None
-
-
-def map_from_eds(path: Path, setup: RobotSetup) -> Mapping[str, Any]:
-    """Servos have no EDS files.
-
-    Raises:
-        InputFileError: always.
-    """
-    raise InputFileError("serial servos have no EDS file", where=str(path))

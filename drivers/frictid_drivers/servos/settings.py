@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from frictid_drivers.servos.models import MODELS, Model
 from frictid_hil.errors import FieldProblem, InvalidFields
@@ -34,7 +35,6 @@ class LineSettings:
 
     Attributes:
         baud: bit/s.
-        watchdog_s: bus watchdog of servos that have one.
         answer_s: how long an answer may take outside the cycle.
         allow_torque_without_watchdog: a person takes the place of a bus watchdog that is not there.
     """
@@ -52,9 +52,7 @@ class JointSettings:
     Attributes:
         name: of the model.
         model: with the torque constants of the robot file.
-        id: of the servo.
         zero_counts: position 0 of the joint.
-        direction: +1 or -1.
     """
 
     name: str
@@ -85,10 +83,11 @@ def read_settings(setup: RobotSetup) -> tuple[LineSettings, list[JointSettings]]
         InvalidFields: every option that is unknown or impossible; two makers on one line; too many servos.
     """
     problems = unknown_options(setup.options, BUS_OPTIONS, ("options",), "servos")
+    number = partial(number_option, setup.options, path=("options",), problems=problems)
     line = LineSettings(
-        baud=int(number_option(setup.options, "baud", 1_000_000, 9600, 4_500_000, ("options",), problems)),
-        watchdog_s=number_option(setup.options, "watchdog_ms", 200, 20, 2540, ("options",), problems) / 1000.0,
-        answer_s=number_option(setup.options, "answer_ms", 20, 1, 1000, ("options",), problems) / 1000.0,
+        baud=int(number("baud", 1_000_000, 9600, 4_500_000)),
+        watchdog_s=number("watchdog_ms", 200, 20, 2540) / 1000.0,
+        answer_s=number("answer_ms", 20, 1, 1000) / 1000.0,
         allow_torque_without_watchdog=setup.options.get("allow_torque_without_watchdog") is True,
     )
     joints = [settings for joint in setup.joints if (settings := _joint(joint, problems)) is not None]
@@ -108,21 +107,17 @@ def _joint(joint: JointSetup, problems: list[FieldProblem]) -> JointSettings | N
     if model is None:
         problems.append(FieldProblem((*at, "model"), f"expected one of {', '.join(MODELS)}"))
         return None
-    most = model.counts_per_turn - 1
+    most, number = model.counts_per_turn - 1, partial(number_option, options, path=at, problems=problems)
     settings = JointSettings(
         name=str(options["model"]),
         model=replace(
             model,
-            torque_constant_nm_per_a=number_option(
-                options, "torque_constant_nm_per_a", model.torque_constant_nm_per_a, 0, 100, at, problems
-            ),
-            stall_nm=number_option(options, "stall_nm", model.stall_nm, 0, 100, at, problems),
-            uncertainty_percent=number_option(
-                options, "torque_uncertainty_percent", model.uncertainty_percent, 0, 100, at, problems
-            ),
+            torque_constant_nm_per_a=number("torque_constant_nm_per_a", model.torque_constant_nm_per_a, 0, 100),
+            stall_nm=number("stall_nm", model.stall_nm, 0, 100),
+            uncertainty_percent=number("torque_uncertainty_percent", model.uncertainty_percent, 0, 100),
         ),
         id=joint.address,
-        zero_counts=int(number_option(options, "zero_counts", model.counts_per_turn // 2, 0, most, at, problems)),
+        zero_counts=int(number("zero_counts", model.counts_per_turn // 2, 0, most)),
         direction=joint.direction,
     )
     for name in ("position_min_rad", "position_max_rad"):
