@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from frictid_drivers.mit import adapters
 from frictid_drivers.mit.actuator import Actuator, Reader
-from frictid_drivers.mit.families import Damiao, Motor, Parameter, RobStride
+from frictid_drivers.mit.families import WATCHDOG_PER_S, Damiao, Frame, Parameter, RobStride
 from frictid_drivers.mit.frames import FULL, TWELVE, Motion, step
 from frictid_drivers.mit.logs import frame_map_values, row_decoder
 from frictid_drivers.mit.models import MODELS
@@ -58,9 +59,6 @@ class MitDriver:
         bus_factory: opens the bus instead of python-can (a simulated one).
         clock: run time.
 
-    Attributes:
-        may_be_powered: joints that were not seen to be off after the end.
-
     Raises:
         InvalidFields: an option of the robot file is wrong.
     """
@@ -81,7 +79,6 @@ class MitDriver:
         self._line: CanLine | None = None
         self._figures: dict[str, dict[str, float]] = {}
         self._restore: list[tuple[str, Parameter, float]] = []
-        self._watched: set[str] = set()
         self._actuators: list[Actuator] = []
         self._cycle: CanCycle | None = None
         self.may_be_powered: tuple[str, ...] = ()
@@ -126,21 +123,17 @@ class MitDriver:
     def check(self, plan: Plan | None) -> list[Finding]:
         """Everything that can be said without moving or writing."""
         self._open_line()
-        cycle_hz = self.setup.cycle_hz if plan is None else plan.cycle_hz
-        most_hz = self._highest_rate_hz()
-        severity = Severity.OK if cycle_hz <= most_hz else Severity.ERROR
-        count = len(self.setup.joints)
-        findings = [
-            Finding(
-                severity,
-                "bus load",
-                f"{count} motors, one frame out and one back each: at most {most_hz:g} Hz within {BUSIEST:.0%} of "
-                f"{self._bus_settings.rates}, {cycle_hz:g} Hz asked",
-                "" if severity is Severity.OK else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz`)",
-            )
-        ]
+        cycle_hz, most_hz = (plan or self.setup).cycle_hz, self._highest_rate_hz()
+        fits = cycle_hz <= most_hz
+        load = (
+            f"{len(self.setup.joints)} motors, one frame out and one back each: at most {most_hz:g} Hz within "
+            f"{BUSIEST:.0%} of {self._bus_settings.rates}, {cycle_hz:g} Hz asked"
+        )
+        slower = "" if fits else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz`)"
+        findings = [Finding(Severity.OK if fits else Severity.ERROR, "bus load", load, slower)]
         for joint in self.setup.joints:
-            findings += self._joint_findings(joint, plan)
+            subject = f"joint {joint.name}"
+            findings += [Finding(severity, subject, *said) for severity, *said in self._joint_findings(joint)]
         return findings
 
     # -- configuring --------------------------------------------------------------------------------------------
@@ -168,10 +161,8 @@ class MitDriver:
             for what, (parameter, value) in family.settings.items():
                 self._set(joint, parameter, value, what)
             if family.watchdog is not None:
-                shortest_s = 3.0 / cycle_hz
-                value = round(max(self._bus_settings.watchdog_s, shortest_s) * family.watchdog_per_s)
+                value = round(max(self._bus_settings.watchdog_s, 3.0 / cycle_hz) * WATCHDOG_PER_S)
                 self._set(joint, family.watchdog, value, "watchdog")
-                self._watched.add(joint.name)
         readers = [
             Reader(at, joint.direction, self._settings[joint.name]) for at, joint in enumerate(self.setup.joints)
         ]
@@ -217,9 +208,7 @@ class MitDriver:
         self._cycling()
         for _ in line.received():
             pass
-        restart: Callable[[], None] | None = getattr(self.clock, "restart", None)
-        if restart is not None:
-            restart()
+        getattr(self.clock, "restart", lambda: None)()
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power; progress is in the feedback.
@@ -285,7 +274,7 @@ class MitDriver:
             if name in self.may_be_powered and parameter == settings.family.watchdog:
                 continue
             with contextlib.suppress(FrictidError):
-                self._line.send(*settings.family.write(settings.motor, parameter, value))
+                self._line.send(*settings.family.parameter(settings.motor, parameter, value))
         self._restore.clear()
         self._line.close()
         self._line = None
@@ -318,22 +307,14 @@ class MitDriver:
         elif any("range" in name for name in figures):
             raise HardwareError(f"its ranges read {told}", where=_where(joint), cause="not a motor of this family")
         position_rad = self._answer(
-            joint,
-            settings.family.poll(settings.motor),
-            lambda can_id, data: _position(settings, settings.motor, can_id, data),
-            "a report",
+            joint, settings.family.poll(settings.motor), partial(_position, settings), "a report"
         )
         self._figures[joint.name] = {**figures, "reported position": position_rad}
 
     def _ask(self, joint: JointSetup, parameter: Parameter) -> float:
-        settings = self._settings[joint.name]
-        family, motor = settings.family, settings.motor
-        return self._answer(
-            joint,
-            family.read(motor, parameter),
-            lambda can_id, data: family.told(motor, parameter, can_id, data),
-            f"parameter {parameter.index:#x}",
-        )
+        family, motor = self._settings[joint.name].family, self._settings[joint.name].motor
+        asked, match = family.parameter(motor, parameter), partial(family.told, motor, parameter)
+        return self._answer(joint, asked, match, f"parameter {parameter.index:#x}")
 
     def _set(self, joint: JointSetup, parameter: Parameter, value: float, what: str) -> None:
         """Write where it differs, read back, and remember what to restore.
@@ -345,7 +326,7 @@ class MitDriver:
         before = self._ask(joint, parameter)
         if before == value:
             return
-        self._open_line().send(*settings.family.write(settings.motor, parameter, value))
+        self._open_line().send(*settings.family.parameter(settings.motor, parameter, value))
         after = self._ask(joint, parameter)
         if after != value:
             raise HardwareError(
@@ -356,9 +337,7 @@ class MitDriver:
             )
         self._restore.append((joint.name, parameter, before))
 
-    def _answer(
-        self, joint: JointSetup, frame: tuple[int, bytes], match: Callable[[int, bytes], float | None], what: str
-    ) -> float:
+    def _answer(self, joint: JointSetup, frame: Frame, match: Callable[[int, bytes], float | None], what: str) -> float:
         line, other_kind = self._open_line(), False
         for _ in range(_TRIES):
             line.send(*frame)
@@ -386,11 +365,11 @@ class MitDriver:
     def _identity(self, joint: JointSetup) -> JointIdentity:
         settings, figures = self._settings[joint.name], self._figures[joint.name]
         ranges, sixteen = settings.motor.ranges, isinstance(settings.family, RobStride)
-        serial, firmware = figures.get("serial"), figures.get("firmware")
+        serial, firmware = (f"{int(figures[name])}" if name in figures else "" for name in ("serial", "firmware"))
         return JointIdentity(
             joint=joint.name,
-            serial="" if serial is None else f"{int(serial)}",
-            firmware="" if firmware is None else f"{int(firmware)}",
+            serial=serial,
+            firmware=firmware,
             product=f"{settings.model} ({settings.family.name})",
             rated_torque_nm=joint.rated_torque_nm,
             gear_ratio=joint.gear_ratio,
@@ -410,54 +389,52 @@ class MitDriver:
             },
         )
 
-    def _joint_findings(self, joint: JointSetup, plan: Plan | None) -> list[Finding]:
+    def _joint_findings(self, joint: JointSetup) -> Iterator[tuple[Severity, str] | tuple[Severity, str, str]]:
+        """How bad, what, and what to do about it."""
         settings, figures = self._settings[joint.name], self._figures[joint.name]
-        subject, ranges = f"joint {joint.name}", settings.motor.ranges
-        findings = [Finding(Severity.OK, subject, f"{settings.model} answers ({settings.family.name})")]
-
-        def say(severity: Severity, message: str, next_step: str = "") -> None:
-            findings.append(Finding(severity, subject, message, next_step))
-
-        say(
+        ranges, table = settings.motor.ranges, MODELS[settings.model].ranges
+        yield Severity.OK, f"{settings.model} answers ({settings.family.name})"
+        droop = format_angle(self._droop_rad(joint))
+        yield (
             Severity.OK,
-            f"its spring (kp {settings.kp:g}) leaves up to {format_angle(self._droop_rad(joint))} at rated torque; "
-            "bounds of care count that",
+            f"its spring (kp {settings.kp:g}) leaves up to {droop} at rated torque; bounds of care count that",
         )
         end_rad = self._usable_rad(joint.name)
         if max(abs(joint.position_min_rad), abs(joint.position_max_rad)) > end_rad:
-            say(Severity.ERROR, f"its limits reach beyond {end_rad:.3g} rad, {_USABLE:.0%} of what its frames can say")
+            yield Severity.ERROR, f"its limits reach beyond {end_rad:.3g} rad, {_USABLE:.0%} of what its frames can say"
         if joint.max_torque_nm > ranges.torque_nm:
-            say(Severity.ERROR, f"its frames end at {ranges.torque_nm:g} N m, max_torque_nm is {joint.max_torque_nm:g}")
+            yield (
+                Severity.ERROR,
+                f"its frames end at {ranges.torque_nm:g} N m, max_torque_nm is {joint.max_torque_nm:g}",
+            )
         exact = figures.get("position")
         if exact is not None and abs(exact - figures["reported position"]) > 0.002 + 0.004 * abs(exact):
-            say(
+            yield (
                 Severity.ERROR,
                 f"frames of a {settings.model} would say {figures['reported position']:.4f} rad, "
                 f"its own parameter says {exact:.4f} rad",
                 "correct `model`: ranges that do not fit make every torque wrong",
             )
-        table = MODELS[settings.model].ranges
         if (ranges.velocity_rad_s, ranges.torque_nm) != (table.velocity_rad_s, table.torque_nm):
-            say(
+            yield (
                 Severity.WARNING,
                 f"it says {ranges.velocity_rad_s:g} rad/s and {ranges.torque_nm:g} N m where a {settings.model} "
                 f"usually has {table.velocity_rad_s:g} and {table.torque_nm:g}; its own figures are used",
             )
         code, wanted = figures.get("bit rate", math.nan), self._bus_settings.data_bitrate
         if code in range(len(Damiao.RATES)) and (rate := Damiao.RATES[int(code)]) != (wanted or 1_000_000):
-            say(
+            yield (
                 Severity.ERROR if wanted or rate > 1_000_000 else Severity.WARNING,
                 f"its register 35 says {rate / 1e6:g} Mbit/s, the robot file {(wanted or 1_000_000) / 1e6:g} Mbit/s",
                 "set the motor's rate with the maker's tool, or `fd` and `data_bitrate` in options",
             )
         if settings.family.watchdog is None:
-            say(
+            yield (
                 Severity.WARNING,
                 "this family has no watchdog that is known: if this program or its computer dies, the motor keeps what "
                 "it was told last",
                 "keep the emergency stop in your hand",
             )
-        return findings
 
     def _droop_rad(self, joint: JointSetup) -> float:
         return joint.rated_torque_nm / self._settings[joint.name].kp
@@ -487,6 +464,6 @@ def _where(joint: JointSetup) -> str:
     return f"joint {joint.name} (id {joint.address})"
 
 
-def _position(settings: JointSettings, motor: Motor, can_id: int, data: bytes) -> float | None:
-    answer = settings.family.answered(motor, can_id, data)
+def _position(settings: JointSettings, can_id: int, data: bytes) -> float | None:
+    answer = settings.family.answered(settings.motor, can_id, data)
     return None if answer is None else answer.position_rad

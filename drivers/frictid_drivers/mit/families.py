@@ -14,9 +14,10 @@ cubemars           11 bit  error in byte 7        none documented               
 from __future__ import annotations
 
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 from frictid_drivers.mit import frames
 from frictid_drivers.mit.frames import FULL, Motion, Ranges
@@ -25,6 +26,8 @@ from frictid_hil.protocol.driver import EXTENDED, JointState
 Frame = tuple[int, bytes]
 """Identifier with its flags, and data."""
 
+WATCHDOG_PER_S = 20_000.0
+"""One second's worth of the parameter, in every family that has a watchdog."""
 ON, OFF, CLEAR = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd", b"\xff" * 7 + b"\xfb"
 
 
@@ -33,9 +36,7 @@ class Motor:
     """Where one actuator is and what its numbers mean.
 
     Attributes:
-        id: its own.
         reply_id: identifier (11 bit) or host id (29 bit) that its answers carry.
-        ranges: of its frames.
         flags: of all its identifiers: ``FD_FRAME`` where it speaks CAN FD.
     """
 
@@ -60,67 +61,10 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number in the motor's memory.
-
-    Attributes:
-        index: register or parameter index.
-        layout: ``struct`` code of its four bytes, little endian.
-    """
+    """One number in the motor's memory: its index, and the ``struct`` code of its four bytes, little endian."""
 
     index: int
     layout: str = "I"
-
-
-class Family(Protocol):
-    """One kind of actuator on the wire.
-
-    Attributes:
-        name: as the robot file has it.
-        reply_id: usual ``Motor.reply_id``; None for the motor's id + 10h.
-        watchdog: the parameter that makes the motor let go without its host; None where there is none.
-        watchdog_per_s: its worth of one second.
-        settings: what must be set before power, by name of what it is.
-        figures: what it can tell of itself, by name.
-    """
-
-    name: ClassVar[str]
-    reply_id: ClassVar[int | None]
-    watchdog: ClassVar[Parameter | None]
-    watchdog_per_s: ClassVar[float]
-    settings: ClassVar[Mapping[str, tuple[Parameter, int]]]
-    figures: ClassVar[Mapping[str, Parameter]]
-
-    def command(self, motor: Motor, motion: Motion) -> Frame:
-        """The frame of one cycle."""
-        ...
-
-    def special(self, motor: Motor, what: bytes) -> Frame:
-        """``ON``, ``OFF`` or ``CLEAR``."""
-        ...
-
-    def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
-        """What a frame tells this motor: a motion, one of the specials, or nothing."""
-        ...
-
-    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
-        """What a frame says of this motor."""
-        ...
-
-    def poll(self, motor: Motor) -> Frame:
-        """Ask for an answer before anything is to move: without effect where the family has such a frame, else OFF."""
-        ...
-
-    def read(self, motor: Motor, parameter: Parameter) -> Frame:
-        """Ask for a parameter."""
-        ...
-
-    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
-        """Set a parameter until power is lost."""
-        ...
-
-    def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
-        """The parameter's value, where a frame answers ``read`` or ``write`` of it."""
-        ...
 
 
 def _packed(parameter: Parameter, value: float) -> bytes:
@@ -131,51 +75,58 @@ def _unpacked(parameter: Parameter, data: bytes) -> float:
     return float(struct.unpack(f"<{parameter.layout}", data[: struct.calcsize(parameter.layout)])[0])
 
 
-class _ElevenBit:
-    """What the families with Mini Cheetah's frames share."""
+class Family(ABC):
+    """One kind of actuator on the wire; what this class says is true of those with Mini Cheetah's frames.
+
+    Attributes:
+        name: as the robot file has it.
+        reply_id: usual ``Motor.reply_id``; None for the motor's id + 10h.
+        watchdog: the parameter that makes the motor let go without its host; None where there is none.
+        settings: what must be set before power, by name of what it is.
+        figures: what it can tell of itself, by name.
+    """
 
     name: ClassVar[str]
-    reply_id: ClassVar[int | None]
+    reply_id: ClassVar[int | None] = 0xFD
     watchdog: ClassVar[Parameter | None] = None
-    watchdog_per_s: ClassVar[float] = 0.0
     settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {}
     figures: ClassVar[Mapping[str, Parameter]] = {}
 
     def command(self, motor: Motor, motion: Motion) -> Frame:
-        """As ``Family.command``."""
+        """The frame of one cycle."""
         return motor.id | motor.flags, frames.pack_motion(motion, motor.ranges)
 
     def special(self, motor: Motor, what: bytes) -> Frame:
-        """As ``Family.special``."""
+        """``ON``, ``OFF`` or ``CLEAR``."""
         return motor.id | motor.flags, what
 
     def poll(self, motor: Motor) -> Frame:
-        """As ``Family.poll``."""
+        """Ask for an answer before anything is to move: without effect where the family has such a frame, else OFF."""
         return self.special(motor, OFF)
 
     def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
-        """As ``Family.commanded``."""
+        """What a frame tells this motor: a motion, one of the specials, or nothing."""
         if can_id != motor.id | motor.flags or len(data) != 8:
             return None
         return data if data in (ON, OFF, CLEAR) else frames.unpack_motion(data, motor.ranges)
 
-    def read(self, motor: Motor, parameter: Parameter) -> Frame:
-        """As ``Family.read``."""
-        raise NotImplementedError("this family tells no parameters")
+    @abstractmethod
+    def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
+        """What a frame says of this motor."""
 
-    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
-        """As ``Family.write``."""
-        raise NotImplementedError("this family takes no parameters")
+    def parameter(self, motor: Motor, parameter: Parameter, value: float | None = None) -> Frame:
+        """Ask for a parameter; with a value, set it until power is lost. A motor confirms by what it then tells."""
+        raise NotImplementedError("this family has no parameters")
 
     def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
-        """As ``Family.told``."""
+        """The parameter's value, where a frame answers for it."""
         return None
 
 
 _DAMIAO_PORT = 0x7FF
 
 
-class Damiao(_ElevenBit):
+class Damiao(Family):
     """DM-J motors. Register answers share the identifier of the cyclic ones: they are read before and after only.
 
     CAN FD changes the frames' kind and nothing in them. Above 1 Mbit/s (register 35, ``RATES``) a motor answers in FD
@@ -189,9 +140,8 @@ class Damiao(_ElevenBit):
     """What the codes of register 35 say, bit/s; above 1 Mbit/s, of the data of FD frames."""
 
     name = "damiao"
-    reply_id: ClassVar[int | None] = None
-    watchdog: ClassVar[Parameter | None] = Parameter(9)
-    watchdog_per_s = 20_000.0
+    reply_id = None
+    watchdog = Parameter(9)
     settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {"MIT mode": (Parameter(10), 1)}
     figures: ClassVar[Mapping[str, Parameter]] = {
         "position range": Parameter(21, "f"),
@@ -204,7 +154,7 @@ class Damiao(_ElevenBit):
 
     def poll(self, motor: Motor) -> Frame:
         """As ``Family.poll``."""
-        return _DAMIAO_PORT | motor.flags, motor.id.to_bytes(2, "little") + bytes([0xCC, 0, 0, 0, 0, 0])
+        return self._service(motor, bytes([0xCC, 0, 0, 0, 0, 0]))
 
     def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
         """Status in the high nibble of byte 0: 0 off, 1 on, 8 and more are faults."""
@@ -215,14 +165,11 @@ class Damiao(_ElevenBit):
         figures = frames.unpack_report(data[1:6], motor.ranges)
         return Answer(*figures, float(data[7]), state, status, status if status >= 8 else 0)
 
-    def read(self, motor: Motor, parameter: Parameter) -> Frame:
-        """As ``Family.read``."""
-        return _DAMIAO_PORT | motor.flags, motor.id.to_bytes(2, "little") + bytes([0x33, parameter.index, 0, 0, 0, 0])
-
-    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
-        """As ``Family.write``."""
-        head = motor.id.to_bytes(2, "little") + bytes([0x55, parameter.index])
-        return _DAMIAO_PORT | motor.flags, head + _packed(parameter, value)
+    def parameter(self, motor: Motor, parameter: Parameter, value: float | None = None) -> Frame:
+        """As ``Family.parameter``."""
+        if value is None:
+            return self._service(motor, bytes([0x33, parameter.index, 0, 0, 0, 0]))
+        return self._service(motor, bytes([0x55, parameter.index]) + _packed(parameter, value))
 
     def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
         """As ``Family.told``."""
@@ -231,38 +178,27 @@ class Damiao(_ElevenBit):
             return None
         return _unpacked(parameter, data[4:])
 
+    def _service(self, motor: Motor, said: bytes) -> Frame:
+        return _DAMIAO_PORT | motor.flags, motor.id.to_bytes(2, "little") + said
 
-class RobStride:
+
+class RobStride(Family):
     """RobStride's own protocol with 29-bit identifiers: type in bits 28-24, content in 23-8, target in 7-0."""
 
-    name: ClassVar[str] = "robstride"
-    reply_id: ClassVar[int | None] = 0xFD
+    name = "robstride"
     watchdog: ClassVar[Parameter | None] = Parameter(0x7028)
-    watchdog_per_s: ClassVar[float] = 20_000.0
     settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {"motion control mode": (Parameter(0x7005, "B"), 0)}
     figures: ClassVar[Mapping[str, Parameter]] = {"position": Parameter(0x7019, "f")}
 
     def command(self, motor: Motor, motion: Motion) -> Frame:
         """As ``Family.command``."""
-        ranges = motor.ranges
-        torque = frames.symmetric(motion.torque_nm, ranges.torque_nm, FULL)
-        data = struct.pack(
-            ">4H",
-            frames.symmetric(motion.position_rad, ranges.position_rad, FULL),
-            frames.symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, FULL),
-            frames.to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, FULL),
-            frames.to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, FULL),
-        )
-        return _id(1, torque, motor.id), data
+        *numbers, torque = frames.command_numbers(motion, motor.ranges, FULL)
+        return _id(1, torque, motor.id), struct.pack(">4H", *numbers)
 
     def special(self, motor: Motor, what: bytes) -> Frame:
         """As ``Family.special``."""
         kind, data = (3, bytes(8)) if what == ON else (4, bytes([what == CLEAR, *bytes(7)]))
         return _id(kind, motor.reply_id, motor.id), data
-
-    def poll(self, motor: Motor) -> Frame:
-        """As ``Family.poll``."""
-        return self.special(motor, OFF)
 
     def commanded(self, motor: Motor, can_id: int, data: bytes) -> Motion | bytes | None:
         """As ``Family.commanded``."""
@@ -271,14 +207,7 @@ class RobStride:
             return None
         if kind == 1:
             p, v, kp, kd = struct.unpack(">4H", data)
-            ranges = motor.ranges
-            return Motion(
-                frames.from_symmetric(p, ranges.position_rad, FULL),
-                frames.from_symmetric(v, ranges.velocity_rad_s, FULL),
-                frames.to_value(kp, 0.0, ranges.kp_nm_per_rad, FULL),
-                frames.to_value(kd, 0.0, ranges.kd_nm_s_per_rad, FULL),
-                frames.from_symmetric(content, ranges.torque_nm, FULL),
-            )
+            return frames.motion_of(p, v, kp, kd, content, motor.ranges, FULL)
         return {3: ON, 4: CLEAR if data[0] else OFF}.get(kind)
 
     def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
@@ -289,24 +218,13 @@ class RobStride:
         faults, mode = content >> 8 & 0x3F, content >> 14 & 3
         state = JointState.FAULT if faults else JointState.ENABLED if mode == 2 else JointState.DISABLED
         p, v, t, temperature = struct.unpack(">4H", data)
-        ranges = motor.ranges
-        return Answer(
-            frames.from_symmetric(p, ranges.position_rad, FULL),
-            frames.from_symmetric(v, ranges.velocity_rad_s, FULL),
-            frames.from_symmetric(t, ranges.torque_nm, FULL),
-            temperature / 10.0,
-            state,
-            content >> 8,
-            faults,
-        )
+        figures = frames.report_of(p, v, t, motor.ranges, FULL)
+        return Answer(*figures, temperature / 10.0, state, content >> 8, faults)
 
-    def read(self, motor: Motor, parameter: Parameter) -> Frame:
-        """As ``Family.read``."""
-        return _id(17, motor.reply_id, motor.id), parameter.index.to_bytes(2, "little") + bytes(6)
-
-    def write(self, motor: Motor, parameter: Parameter, value: float) -> Frame:
-        """Not confirmed on the wire but by an answer of type 2: read it back."""
-        return _id(18, motor.reply_id, motor.id), struct.pack("<HH", parameter.index, 0) + _packed(parameter, value)
+    def parameter(self, motor: Motor, parameter: Parameter, value: float | None = None) -> Frame:
+        """As ``Family.parameter``; a written one is answered by a frame of type 2."""
+        data = bytes(4) if value is None else _packed(parameter, value)
+        return _id(17 if value is None else 18, motor.reply_id, motor.id), struct.pack("<HH", parameter.index, 0) + data
 
     def told(self, motor: Motor, parameter: Parameter, can_id: int, data: bytes) -> float | None:
         """As ``Family.told``."""
@@ -321,14 +239,13 @@ class CyberGear(RobStride):
     """Xiaomi's motor speaks the same protocol; its watchdog has another index (one source)."""
 
     name = "cybergear"
-    watchdog: ClassVar[Parameter | None] = Parameter(0x200C)
+    watchdog = Parameter(0x200C)
 
 
-class RobStrideMit(_ElevenBit):
+class RobStrideMit(Family):
     """RobStride in MIT mode: no state and no parameters in what every firmware answers."""
 
     name = "robstride-mit"
-    reply_id: ClassVar[int | None] = 0xFD
 
     def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
         """As ``Family.answered``."""
@@ -338,11 +255,11 @@ class RobStrideMit(_ElevenBit):
         return Answer(*figures, int.from_bytes(data[6:8], "big") / 10.0, None, 0, 0)
 
 
-class CubeMars(_ElevenBit):
+class CubeMars(Family):
     """AK motors with V2 firmware in MIT mode; answers of 6 bytes (old) or of 8 with temperature and error."""
 
     name = "cubemars"
-    reply_id: ClassVar[int | None] = 0
+    reply_id = 0
 
     def answered(self, motor: Motor, can_id: int, data: bytes) -> Answer | None:
         """As ``Family.answered``."""
@@ -354,8 +271,9 @@ class CubeMars(_ElevenBit):
         return Answer(*frames.unpack_report(data[1:6], motor.ranges), temperature, state, error, error)
 
 
-_ALL: tuple[Family, ...] = (Damiao(), RobStride(), CyberGear(), RobStrideMit(), CubeMars())
-FAMILIES: Mapping[str, Family] = {family.name: family for family in _ALL}
+FAMILIES: Mapping[str, Family] = {
+    family.name: family for family in (Damiao(), RobStride(), CyberGear(), RobStrideMit(), CubeMars())
+}
 
 
 def _id(kind: int, content: int, target: int) -> int:

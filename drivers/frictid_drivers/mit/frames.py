@@ -59,26 +59,48 @@ def step(end: float, most: int) -> float:
     return 2.0 * end / most
 
 
+def command_numbers(motion: Motion, ranges: Ranges, most: int) -> tuple[int, int, int, int, int]:
+    """The numbers of position (16 bits), velocity, kp, kd and torque (0..most)."""
+    return (
+        symmetric(motion.position_rad, ranges.position_rad, FULL),
+        symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, most),
+        to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, most),
+        to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, most),
+        symmetric(motion.torque_nm, ranges.torque_nm, most),
+    )
+
+
+def motion_of(p: int, v: int, kp: int, kd: int, t: int, ranges: Ranges, most: int) -> Motion:
+    """The reverse of ``command_numbers``."""
+    return Motion(
+        from_symmetric(p, ranges.position_rad, FULL),
+        from_symmetric(v, ranges.velocity_rad_s, most),
+        to_value(kp, 0.0, ranges.kp_nm_per_rad, most),
+        to_value(kd, 0.0, ranges.kd_nm_s_per_rad, most),
+        from_symmetric(t, ranges.torque_nm, most),
+    )
+
+
+def report_of(p: int, v: int, t: int, ranges: Ranges, most: int) -> tuple[float, float, float]:
+    """Position, velocity and torque that an answer's numbers stand for."""
+    return (
+        from_symmetric(p, ranges.position_rad, FULL),
+        from_symmetric(v, ranges.velocity_rad_s, most),
+        from_symmetric(t, ranges.torque_nm, most),
+    )
+
+
 def pack_motion(motion: Motion, ranges: Ranges) -> bytes:
     """The eight bytes of a command."""
-    p = symmetric(motion.position_rad, ranges.position_rad, FULL)
-    v = symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, TWELVE)
-    kp = to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, TWELVE)
-    kd = to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, TWELVE)
-    t = symmetric(motion.torque_nm, ranges.torque_nm, TWELVE)
+    p, v, kp, kd, t = command_numbers(motion, ranges, TWELVE)
     return (p << 48 | v << 36 | kp << 24 | kd << 12 | t).to_bytes(8, "big")
 
 
 def unpack_motion(data: bytes, ranges: Ranges) -> Motion:
     """The command in eight bytes."""
     word = int.from_bytes(data, "big")
-    return Motion(
-        from_symmetric(word >> 48, ranges.position_rad, FULL),
-        from_symmetric(word >> 36 & TWELVE, ranges.velocity_rad_s, TWELVE),
-        to_value(word >> 24 & TWELVE, 0.0, ranges.kp_nm_per_rad, TWELVE),
-        to_value(word >> 12 & TWELVE, 0.0, ranges.kd_nm_s_per_rad, TWELVE),
-        from_symmetric(word & TWELVE, ranges.torque_nm, TWELVE),
-    )
+    velocity, kp, kd, torque = (word >> at & TWELVE for at in (36, 24, 12, 0))
+    return motion_of(word >> 48, velocity, kp, kd, torque, ranges, TWELVE)
 
 
 def pack_report(position_rad: float, velocity_rad_s: float, torque_nm: float, ranges: Ranges) -> bytes:
@@ -91,8 +113,4 @@ def pack_report(position_rad: float, velocity_rad_s: float, torque_nm: float, ra
 def unpack_report(data: bytes, ranges: Ranges) -> tuple[float, float, float]:
     """Position, velocity and torque of five bytes."""
     word = int.from_bytes(data[:5], "big")
-    return (
-        from_symmetric(word >> 24, ranges.position_rad, FULL),
-        from_symmetric(word >> 12 & TWELVE, ranges.velocity_rad_s, TWELVE),
-        from_symmetric(word & TWELVE, ranges.torque_nm, TWELVE),
-    )
+    return report_of(word >> 24, word >> 12 & TWELVE, word & TWELVE, ranges, TWELVE)
