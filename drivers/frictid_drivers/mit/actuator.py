@@ -18,13 +18,7 @@ _WIRE_SHARE = 0.02
 
 
 class Reader:
-    """Frames to figures of one joint, live and in replay.
-
-    Args:
-        index: of the joint.
-        direction: +1 or -1.
-        settings: of the joint.
-    """
+    """Frames to figures of one joint, live and in replay."""
 
     def __init__(self, index: int, direction: int, settings: JointSettings) -> None:
         self._index = index
@@ -60,14 +54,7 @@ class Reader:
 
 
 class Actuator:
-    """Orders of one joint to frames.
-
-    Args:
-        joint: of the robot.
-        settings: of the joint.
-        reader: of the joint.
-        period_s: of the cycle.
-    """
+    """Orders of one joint to frames."""
 
     def __init__(self, joint: JointSetup, settings: JointSettings, reader: Reader, period_s: float) -> None:
         self._period_s = period_s
@@ -102,9 +89,7 @@ class Actuator:
         if order.mode is Mode.TORQUE:
             return self._motion(torque_nm=order.torque_nm)
         if order.mode is Mode.VELOCITY:
-            return self._motion(
-                velocity_rad_s=order.velocity_rad_s, kd_nm_s_per_rad=settings.kd, torque_nm=order.torque_nm
-            )
+            return self._motion(0.0, order.velocity_rad_s, 0.0, settings.kd, order.torque_nm)
         return self._hold(order)
 
     def _hold(self, order: Order) -> Frame:

@@ -11,7 +11,6 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Protocol
 
 import can
 
@@ -76,11 +75,6 @@ class VirtualMitDriver(MitDriver):
 class Actuator(Device):
     """One motor: its control law, its plant, its memory and its watchdog.
 
-    Args:
-        joint: of the robot file.
-        setup: the robot.
-        ranges: of its frames.
-
     Attributes:
         fault: code that it shows; 0 when healthy.
         timeout_ns: without a command for so long it lets go; 0 for never.
@@ -130,20 +124,12 @@ class Actuator(Device):
         return value
 
 
-class Wire(Protocol):
-    """How one family speaks; returns None for a frame that is not meant for this motor."""
-
-    def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
-        """A frame arrives."""
-        ...
+Wire = Callable[[Actuator, int, bytes], list[Frame] | None]
+"""How one family speaks: what a motor answers to a frame; None where it is not meant for this motor."""
 
 
 class Rack:
-    """All actuators of a robot on one bus.
-
-    Args:
-        setup: with ``simulated`` of every joint.
-    """
+    """All actuators of a robot on one bus."""
 
     def __init__(self, setup: RobotSetup) -> None:
         self.actuators: dict[str, Actuator] = {}
@@ -204,21 +190,31 @@ def _mit_command(motor: Actuator, data: bytes) -> None:
         else:
             motor.switch(data[7] == 0xFC)
         return
+    word = int.from_bytes(data, "big")
+    _ask(motor, word >> 48, *(word >> at & 0xFFF for at in (36, 24, 12, 0)), bits=12)
+
+
+def _ask(motor: Actuator, p: int, v: int, kp: int, kd: int, t: int, *, bits: int) -> None:
     r = motor.ranges
     motor.asked = (
-        _from_bits(data[0] << 8 | data[1], -r.position_rad, r.position_rad, 16),
-        _from_bits(data[2] << 4 | data[3] >> 4, -r.velocity_rad_s, r.velocity_rad_s, 12),
-        _from_bits((data[3] & 15) << 8 | data[4], 0.0, r.kp_nm_per_rad, 12),
-        _from_bits(data[5] << 4 | data[6] >> 4, 0.0, r.kd_nm_s_per_rad, 12),
-        _from_bits((data[6] & 15) << 8 | data[7], -r.torque_nm, r.torque_nm, 12),
+        _from_bits(p, -r.position_rad, r.position_rad, 16),
+        _from_bits(v, -r.velocity_rad_s, r.velocity_rad_s, bits),
+        _from_bits(kp, 0.0, r.kp_nm_per_rad, bits),
+        _from_bits(kd, 0.0, r.kd_nm_s_per_rad, bits),
+        _from_bits(t, -r.torque_nm, r.torque_nm, bits),
+    )
+
+
+def _told(motor: Actuator, bits: int) -> tuple[int, int, int]:
+    return (
+        _to_bits(motor.told("position"), motor.ranges.position_rad, 16),
+        _to_bits(motor.told("velocity"), motor.ranges.velocity_rad_s, bits),
+        _to_bits(motor.told("torque"), motor.ranges.torque_nm, bits),
     )
 
 
 def _mit_report(motor: Actuator, first: int) -> bytes:
-    r = motor.ranges
-    p = _to_bits(motor.told("position"), r.position_rad, 16)
-    v = _to_bits(motor.told("velocity"), r.velocity_rad_s, 12)
-    t = _to_bits(motor.told("torque"), r.torque_nm, 12)
+    p, v, t = _told(motor, 12)
     return bytes([first, p >> 8, p & 255, v >> 4, (v & 15) << 4 | t >> 8, t & 255])
 
 
@@ -293,15 +289,8 @@ class _RobStrideWire:
             return None
         kind = can_id >> 24 & 0x1F
         if kind == 1 and self._words[0x7005] == 0:
-            r = motor.ranges
-            p, v, kp, kd = (data[k] << 8 | data[k + 1] for k in (0, 2, 4, 6))
-            motor.asked = (
-                _from_bits(p, -r.position_rad, r.position_rad, 16),
-                _from_bits(v, -r.velocity_rad_s, r.velocity_rad_s, 16),
-                _from_bits(kp, 0.0, r.kp_nm_per_rad, 16),
-                _from_bits(kd, 0.0, r.kd_nm_s_per_rad, 16),
-                _from_bits(can_id >> 8 & 0xFFFF, -r.torque_nm, r.torque_nm, 16),
-            )
+            p, v, kp, kd = struct.unpack(">4H", data)
+            _ask(motor, p, v, kp, kd, can_id >> 8 & 0xFFFF, bits=16)
         elif kind == 3:
             motor.switch(True)
         elif kind == 4:
@@ -321,14 +310,8 @@ class _RobStrideWire:
         return self._id(17, motor, unknown), bytes([data[0], data[1], 0, 0]) + value
 
     def _report(self, motor: Actuator) -> Frame:
-        r, state = motor.ranges, (2 if motor.on else 0) << 6 | (1 if motor.fault else 0)
-        figures = (
-            _to_bits(motor.told("position"), r.position_rad, 16),
-            _to_bits(motor.told("velocity"), r.velocity_rad_s, 16),
-            _to_bits(motor.told("torque"), r.torque_nm, 16),
-            285,
-        )
-        return self._id(2, motor, state), struct.pack(">4H", *figures)
+        state = (2 if motor.on else 0) << 6 | (1 if motor.fault else 0)
+        return self._id(2, motor, state), struct.pack(">4H", *_told(motor, 16), 285)
 
     def _id(self, kind: int, motor: Actuator, content: int) -> int:
         return _LONG_ID | kind << 24 | content << 16 | motor.id << 8 | self._host
