@@ -163,12 +163,10 @@ class MitDriver:
             if family.watchdog is not None:
                 value = round(max(self._bus_settings.watchdog_s, 3.0 / cycle_hz) * WATCHDOG_PER_S)
                 self._set(joint, family.watchdog, value, "watchdog")
-        readers = [
-            Reader(at, joint.direction, self._settings[joint.name]) for at, joint in enumerate(self.setup.joints)
-        ]
+        joints = [(joint, self._settings[joint.name]) for joint in self.setup.joints]
+        readers = [Reader(at, joint.direction, settings) for at, (joint, settings) in enumerate(joints)]
         self._actuators = [
-            Actuator(joint, self._settings[joint.name], reader, 1.0 / cycle_hz)
-            for joint, reader in zip(self.setup.joints, readers, strict=True)
+            Actuator(*joint, reader, 1.0 / cycle_hz) for joint, reader in zip(joints, readers, strict=True)
         ]
         self._cycle = CanCycle(
             line,
@@ -292,8 +290,7 @@ class MitDriver:
         return self._cycle
 
     def _actuator(self, joint: str) -> Actuator:
-        self._cycling()
-        return self._actuators[[one.name for one in self.setup.joints].index(self.setup.joint(joint).name)]
+        return self._actuators[self._cycling().wishes.index(self._cycling().wish(joint))]
 
     def _meet(self, joint: JointSetup) -> None:
         """Read what the motor can tell; where it tells its ranges, they are taken."""
@@ -347,7 +344,7 @@ class MitDriver:
                     return value
                 other_kind = other_kind or match(can_id ^ FD_FRAME, data) is not None
         if other_kind:
-            kinds = ("CAN FD", "classical") if self._bus_settings.data_bitrate is None else ("classical", "CAN FD")
+            kinds = ("CAN FD", "classical") if self._bus_settings.rates.data is None else ("classical", "CAN FD")
             raise HardwareError(
                 f"answers in {kinds[0]} frames, the robot file has {kinds[1]} ones",
                 where=_where(joint),
@@ -421,7 +418,7 @@ class MitDriver:
                 f"it says {ranges.velocity_rad_s:g} rad/s and {ranges.torque_nm:g} N m where a {settings.model} "
                 f"usually has {table.velocity_rad_s:g} and {table.torque_nm:g}; its own figures are used",
             )
-        code, wanted = figures.get("bit rate", math.nan), self._bus_settings.data_bitrate
+        code, wanted = figures.get("bit rate", math.nan), self._bus_settings.rates.data
         if code in range(len(Damiao.RATES)) and (rate := Damiao.RATES[int(code)]) != (wanted or 1_000_000):
             yield (
                 Severity.ERROR if wanted or rate > 1_000_000 else Severity.WARNING,

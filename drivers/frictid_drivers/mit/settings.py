@@ -44,23 +44,16 @@ class BusSettings:
     """Of the whole bus.
 
     Attributes:
-        data_bitrate: of the data of CAN FD frames, bit/s; None on a classical bus.
         allow_torque_without_watchdog: torque mode also where nothing stops the motor when the host dies.
         reply_window: share of a cycle that answers are waited for.
         tty_baudrate: of a serial adapter's real UART; 0 where there is none.
     """
 
-    bitrate: int
-    data_bitrate: int | None
+    rates: BitRates
     watchdog_s: float
     allow_torque_without_watchdog: bool
     reply_window: float
     tty_baudrate: int
-
-    @property
-    def rates(self) -> BitRates:
-        """What the wire does."""
-        return BitRates(self.bitrate, self.data_bitrate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +92,7 @@ def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettin
             joints[joint.name] = settings
     number = partial(number_option, setup.options, path=("options",), problems=problems)
     bus = BusSettings(
-        bitrate=int(number("bitrate", 1_000_000, 10_000, 1_000_000)),
-        data_bitrate=data_bitrate,
+        rates=BitRates(int(number("bitrate", 1_000_000, 10_000, 1_000_000)), data_bitrate),
         watchdog_s=number("watchdog_ms", 100.0, 5.0, 10_000.0) / 1000.0,
         allow_torque_without_watchdog=setup.options.get("allow_torque_without_watchdog") is True,
         reply_window=number("reply_window", 0.8, 0.1, 0.95),

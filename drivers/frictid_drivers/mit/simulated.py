@@ -139,7 +139,7 @@ class Rack:
             mine = settings[joint.name]
             self.actuators[joint.name] = actuator = Actuator(joint, setup, mine.motor.ranges)
             serial = zlib.crc32(f"{setup.name}/{joint.name}".encode())
-            self._wires.append((actuator, _wire_of(mine, serial, bus.data_bitrate)))
+            self._wires.append((actuator, _wire_of(mine, serial, bus.rates.data)))
 
     def receive(self, can_id: int, data: bytes) -> Iterable[Frame]:
         """A frame of the host; the answer of the motor that it is meant for."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from frictid_drivers.servos.inspection import Told, joint_findings, meet, torque_source
@@ -60,9 +60,6 @@ class ServoDriver:
         setup: the robot; ``settings`` lists the options it may carry.
         port_factory: opens the port (a simulated one).
         clock: run time.
-
-    Attributes:
-        may_be_powered: joints that were not seen to be off after the end.
 
     Raises:
         InvalidFields: an option of the robot file is wrong.
@@ -163,38 +160,26 @@ class ServoDriver:
     def check(self, plan: Plan | None) -> list[Finding]:
         """Everything that can be said without moving or writing."""
         self._open_line()
-        cycle_hz, most_hz = self.setup.cycle_hz if plan is None else plan.cycle_hz, self._highest_rate_hz()
+        cycle_hz, most_hz = (plan or self.setup).cycle_hz, self._highest_rate_hz()
         fits = cycle_hz <= most_hz
-        findings = [
-            Finding(
-                Severity.OK if fits else Severity.ERROR,
-                "bus load",
-                f"{len(self._joints)} servos at {self._line_settings.baud} bit/s: at most {most_hz:g} Hz, "
-                f"{cycle_hz:g} Hz asked",
-                "" if fits else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz` in the robot file)",
-            )
-        ]
+        load = (
+            f"{len(self._joints)} servos at {self._line_settings.baud} bit/s: at most {most_hz:g} Hz, "
+            f"{cycle_hz:g} Hz asked"
+        )
+        slower = "" if fits else f"use a rate of at most {most_hz:g} Hz (`--rate`, or `cycle_hz` in the robot file)"
+        findings = [Finding(Severity.OK if fits else Severity.ERROR, "bus load", load, slower)]
         if cycle_hz < LEAST_HZ:
-            findings.append(
-                Finding(
-                    Severity.ERROR,
-                    "rate",
-                    f"{cycle_hz:g} Hz: so rarely read, the current of a servo that follows goal by goal is not its "
-                    "mean, and a healthy joint's curve may be 5 % outside its interval",
-                    f"use {LEAST_HZ:g} Hz or more (`--rate`, or `cycle_hz` in the robot file), and a baud for it",
-                )
+            rare = (
+                f"{cycle_hz:g} Hz: so rarely read, the current of a servo that follows goal by goal is not its mean, "
+                "and a healthy joint's curve may be 5 % outside its interval"
             )
+            faster = f"use {LEAST_HZ:g} Hz or more (`--rate`, or `cycle_hz` in the robot file), and a baud for it"
+            findings.append(Finding(Severity.ERROR, "rate", rare, faster))
         for joint, mine in zip(self.setup.joints, self._joints, strict=True):
             findings += joint_findings(joint, mine, self._told[joint.name], plan)
         if not self._registers.watchdog:
-            findings.append(
-                Finding(
-                    Severity.WARNING,
-                    "bus",
-                    "these servos have no watchdog: if this program dies they hold their last goal under power",
-                    "keep the switch of their supply at hand",
-                )
-            )
+            alone = "these servos have no watchdog: if this program dies they hold their last goal under power"
+            findings.append(Finding(Severity.WARNING, "bus", alone, "keep the switch of their supply at hand"))
         return findings
 
     # -- configuring --------------------------------------------------------------------------------------------
@@ -255,9 +240,7 @@ class ServoDriver:
         line, rows = self._open_line(), self._rows
         if rows is None:
             raise HardwareError("start_cycling before configure")
-        restart: Callable[[], None] | None = getattr(self.clock, "restart", None)
-        if restart is not None:
-            restart()
+        getattr(self.clock, "restart", lambda: None)()
         line.heard = rows.feed
         self._arm_watchdog(self._line_settings.watchdog_s, range(len(self._joints)))
 

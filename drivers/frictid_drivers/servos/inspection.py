@@ -20,10 +20,7 @@ class Told:
 
     Attributes:
         model: number.
-        mode: operating mode.
         delay_s: of its answers.
-        p_gain: of its position loop.
-        i_gain: of its position loop.
         current_limit: largest goal current, 0 where it takes none.
     """
 
@@ -66,29 +63,48 @@ def torque_source(mine: JointSettings) -> str:
 
 def joint_findings(joint: JointSetup, mine: JointSettings, told: Told, plan: Plan | None) -> Iterator[Finding]:
     """About one servo."""
-    subject, registers = f"joint {joint.name}", mine.model.registers
-    yield Finding(Severity.OK, subject, f"{mine.name} answers")
-    yield Finding(
+    for severity, *said in _findings(joint, mine, told, plan):
+        yield Finding(severity, f"joint {joint.name}", *said)
+
+
+_Said = tuple[Severity, str] | tuple[Severity, str, str]
+"""How bad, what, and what to do about it."""
+
+
+def _findings(joint: JointSetup, mine: JointSettings, told: Told, plan: Plan | None) -> Iterator[_Said]:
+    registers = mine.model.registers
+    yield Severity.OK, f"{mine.name} answers"
+    yield (
         Severity.WARNING,
-        subject,
         f"torque is {torque_source(mine)}: every torque of this joint shares a scale error of up to "
         f"{mine.model.uncertainty_percent:g} %, which no interval contains",
         "weigh it: hang a known mass on a lever and set `torque_constant_nm_per_a` or `stall_nm`",
     )
     if registers.goal_current and told.mode == registers.current_mode:
-        yield Finding(
+        yield (
             Severity.WARNING,
-            subject,
             f"operating mode is {told.mode} (current), as after a run that was cut off",
             "a run puts it back into position mode; gains other than the maker's have to be set again",
         )
     elif told.mode != registers.position_mode:
-        yield Finding(Severity.ERROR, subject, f"operating mode is {told.mode}", "set position mode with its tool")
+        yield Severity.ERROR, f"operating mode is {told.mode}", "set position mode with its tool"
     if registers.goal_current:
         most_nm = told.current_limit * mine.torque_nm_per_unit
-        yield Finding(Severity.OK, subject, f"takes currents up to its current limit, {most_nm:.3g} N m")
-    if plan is not None and _shifts_goals(plan, joint.name):
-        yield from _spring_findings(subject, joint, told)
+        yield Severity.OK, f"takes currents up to its current limit, {most_nm:.3g} N m"
+    if plan is None or not _shifts_goals(plan, joint.name):
+        return
+    if told.i_gain:
+        yield (
+            Severity.ERROR,
+            f"its position loop has an integral part (I gain {told.i_gain}), which takes away what a moved goal adds",
+            "set the I gain to 0 with its tool, and calibrate the joint again",
+        )
+    if not joint.loop_stiffness_nm_per_rad:
+        yield (
+            Severity.ERROR,
+            "the stiffness of its position loop is not known, so that no torque can be given by moving its goal",
+            "calibrate the joint at this P gain, which measures it; or state `loop_stiffness_nm_per_rad`",
+        )
 
 
 def _shifts_goals(plan: Plan, joint: str) -> bool:
@@ -99,20 +115,3 @@ def _shifts_goals(plan: Plan, joint: str) -> bool:
         if entry.joint == joint
         for motion in entry.motions
     )
-
-
-def _spring_findings(subject: str, joint: JointSetup, told: Told) -> Iterator[Finding]:
-    if told.i_gain:
-        yield Finding(
-            Severity.ERROR,
-            subject,
-            f"its position loop has an integral part (I gain {told.i_gain}), which takes away what a moved goal adds",
-            "set the I gain to 0 with its tool, and calibrate the joint again",
-        )
-    if not joint.loop_stiffness_nm_per_rad:
-        yield Finding(
-            Severity.ERROR,
-            subject,
-            "the stiffness of its position loop is not known, so that no torque can be given by moving its goal",
-            "calibrate the joint at this P gain, which measures it; or state `loop_stiffness_nm_per_rad`",
-        )
