@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 from frictid_hil.errors import SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import Move
 from frictid_hil.plan.setup import JointSetup
-from frictid_hil.protocol.driver import Driver, Feedback, JointState
+from frictid_hil.protocol.driver import Feedback, JointState
 from frictid_hil.protocol.error_words import told_error
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.motions import AT_RAD, stream
 from frictid_hil.runner.reference import verify_reference
-from frictid_hil.runner.supervisor import Supervisor
 from frictid_hil.runner.unit_proof import UnitProof
 
 _POWER_TIMEOUT_S = 15.0
@@ -24,25 +24,17 @@ _STOPPING_S = 0.3
 _DISABLING_S = 0.1
 
 
+@dataclass(frozen=True)
 class Arm:
     """All joints of one stretch of cyclic traffic.
 
-    Args:
-        driver: cycling.
-        joints: order of set-points and reports.
-        loop: of the stretch.
-        supervisor: of the loop.
-        care: tolerances.
+    Attributes:
+        joints: in the order of set-points and reports.
     """
 
-    def __init__(
-        self, driver: Driver, joints: Sequence[JointSetup], loop: CyclicLoop, supervisor: Supervisor, care: Care
-    ) -> None:
-        self._driver = driver
-        self._joints = joints
-        self._loop = loop
-        self._supervisor = supervisor
-        self._care = care
+    joints: Sequence[JointSetup]
+    loop: CyclicLoop
+    care: Care
 
     def verify(self, planned_rad: Mapping[str, float]) -> None:
         """Check, before anything gets power, that every joint stands where it should and that the interlock is closed.
@@ -50,9 +42,9 @@ class Arm:
         Raises:
             SafetyAbort: naming the joint.
         """
-        loop = self._loop
+        loop = self.loop
         loop.wait_for(lambda feedback: all(report.valid for report in feedback), 1.0, "a first report of every joint")
-        verify_reference(self._joints, loop.feedback, planned_rad, self._care.reference_tolerance_rad)
+        verify_reference(self.joints, loop.feedback, planned_rad, self.care.reference_tolerance_rad)
         self._aim_where_it_stands()
         self._verify_interlock()
 
@@ -63,14 +55,14 @@ class Arm:
             SafetyAbort: a joint does not take it.
         """
         self._settling()
-        for joint in self._joints:
-            self._driver.enable(joint.name, Mode.POSITION)
-        self._loop.wait_for(
+        for joint in self.joints:
+            self.loop.driver.enable(joint.name, Mode.POSITION)
+        self.loop.wait_for(
             lambda feedback: all(report.state is JointState.ENABLED or report.error_code for report in feedback),
             _POWER_TIMEOUT_S,
             "power on every joint",
         )
-        for joint, report in zip(self._joints, self._loop.feedback, strict=True):
+        for joint, report in zip(self.joints, self.loop.feedback, strict=True):
             if report.error_code or report.state is not JointState.ENABLED:
                 raise SafetyAbort(
                     f"could not be enabled: state {report.state.value}, error {told_error(report.error_code)}",
@@ -89,13 +81,13 @@ class Arm:
         Raises:
             SafetyAbort: command, position and velocity of a joint tell of different motions.
         """
-        loop = self._loop
-        for index, joint in enumerate(self._joints):
+        loop = self.loop
+        for index, joint in enumerate(self.joints):
             here_rad = loop.set_points[index].position_rad
             if index not in moving and abs(planned_rad.get(joint.name, here_rad) - here_rad) <= AT_RAD:
                 continue
-            self._supervisor.watch(index, Mode.POSITION, self._lock([index]))
-            resolution, droop = resolution_rad.get(joint.name, math.nan), self._care.droop_rad.get(joint.name, 0.0)
+            self.loop.supervisor.watch(index, Mode.POSITION, self._lock([index]))
+            resolution, droop = resolution_rad.get(joint.name, math.nan), self.care.droop_of(joint.name)
             loop.run({index: UnitProof(joint, here_rad, resolution, droop, loop.period_s)})
 
     def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
@@ -105,25 +97,25 @@ class Arm:
             SafetyAbort: one does not come to rest.
         """
         # Joints that are near, but not at, their planned locked position are brought there one by one.
-        for index, joint in enumerate(self._joints):
+        for index, joint in enumerate(self.joints):
             target_rad = planned_rad.get(joint.name)
-            here_rad = self._loop.set_points[index].position_rad
+            here_rad = self.loop.set_points[index].position_rad
             if index not in moving and target_rad is not None and abs(target_rad - here_rad) > AT_RAD:
-                self._supervisor.watch(index, Mode.POSITION, self._lock([index]))
-                approach = Move.within(here_rad, target_rad, self._care.approach_rad_s, name="approach")
-                stream(self._loop, index, approach)
+                self.loop.supervisor.watch(index, Mode.POSITION, self._lock([index]))
+                approach = Move.within(here_rad, target_rad, self.care.approach_rad_s, name="approach")
+                stream(self.loop, index, approach)
         locked_at = self._lock(moving)
         self._settling()
         self._see_standstill()
-        self._supervisor.watch(list(moving), Mode.POSITION, locked_at)
+        self.loop.supervisor.watch(list(moving), Mode.POSITION, locked_at)
 
     def power_off(self) -> None:
         """Switch off the power of every joint, and wait until the drives report it."""
         self._settling()
-        for joint in self._joints:
-            self._driver.unlock(joint.name)
-            self._driver.disable(joint.name)
-        self._loop.wait_for(
+        for joint in self.joints:
+            self.loop.driver.unlock(joint.name)
+            self.loop.driver.disable(joint.name)
+        self.loop.wait_for(
             lambda feedback: all(report.state is JointState.DISABLED for report in feedback),
             _POWER_TIMEOUT_S,
             "power off on every joint",
@@ -131,54 +123,54 @@ class Arm:
 
     def stop(self) -> None:
         """Stop quickly, cycle until the drives have followed, switch off. The error that led here is never hidden."""
-        loop = self._loop
-        self._driver.quick_stop()
+        loop = self.loop
+        self.loop.driver.quick_stop()
         try:
             loop.settle(_STOPPING_S)
-            for joint in self._joints:
-                self._driver.disable(joint.name)
+            for joint in self.joints:
+                self.loop.driver.disable(joint.name)
             loop.settle(_DISABLING_S)
         except Exception:  # whatever it is, it is not what the person must hear of
             # The wire itself failed: the drives' own watchdogs finish what the quick stop began.
-            self._driver.quick_stop()
+            self.loop.driver.quick_stop()
 
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _aim_where_it_stands(self) -> None:
-        for set_point, report in zip(self._loop.set_points, self._loop.feedback, strict=True):
+        for set_point, report in zip(self.loop.set_points, self.loop.feedback, strict=True):
             set_point.position_rad = report.position_rad
 
     def _verify_interlock(self) -> None:
         """The interlock must be closed now, and is watched in every cycle from here on."""
-        interlock = self._care.interlock
+        interlock = self.care.interlock
         if interlock is None:
             return
-        index = next(index for index, joint in enumerate(self._joints) if joint.name == interlock.joint)
-        self._loop.wait_for(
+        index = next(index for index, joint in enumerate(self.joints) if joint.name == interlock.joint)
+        self.loop.wait_for(
             lambda feedback: feedback[index].digital_inputs is not None, 1.0, f"the inputs of joint {interlock.joint}"
         )
-        self._supervisor.arm_interlock(self._loop.feedback)
+        self.loop.supervisor.arm_interlock(self.loop.feedback)
 
     def _settling(self) -> None:
         """Watch all joints as ones that must stand near their set-points, with or without power."""
-        at_rad = {index: set_point.position_rad for index, set_point in enumerate(self._loop.set_points)}
-        self._supervisor.watch(None, Mode.POSITION, {}, at_rad)
+        at_rad = {index: set_point.position_rad for index, set_point in enumerate(self.loop.set_points)}
+        self.loop.supervisor.watch(None, Mode.POSITION, {}, at_rad)
 
     def _lock(self, moving: Collection[int]) -> dict[int, float]:
         """Lock all joints but these; returns where each of them is locked, by index."""
         locked_at: dict[int, float] = {}
-        for index, joint in enumerate(self._joints):
+        for index, joint in enumerate(self.joints):
             if index in moving:
-                self._driver.unlock(joint.name)
+                self.loop.driver.unlock(joint.name)
             else:
-                self._driver.lock(joint.name)
-                locked_at[index] = self._loop.set_points[index].position_rad
+                self.loop.driver.lock(joint.name)
+                locked_at[index] = self.loop.set_points[index].position_rad
         return locked_at
 
     def _see_standstill(self) -> None:
-        loop, care = self._loop, self._care
+        loop, care = self.loop, self.care
         need = max(2, round(_STANDSTILL_S / loop.period_s))
-        bounds_rad = [care.still_of(joint.name) for joint in self._joints]
+        bounds_rad = [care.still_of(joint.name) for joint in self.joints]
         still = 0
 
         def standing(feedback: Sequence[Feedback]) -> bool:

@@ -16,14 +16,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Protocol
 
 from frictid_hil.errors import Interrupted, SafetyAbort
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move
-from frictid_hil.plan.setup import RobotSetup
+from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Batched, Driver, Feedback, JointState, SetPoint
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.care import Care
@@ -43,48 +43,35 @@ class BatchDriver(Batched, Driver, Protocol):
     """The parts of a driver that this module calls."""
 
 
+@dataclass
 class BatchRunner:
     """Runs one joint's plan; power comes on and goes off again in here.
 
-    Args:
+    Attributes:
         driver: configured, limits set, not yet under power.
-        setup: the robot.
-        supervisor: knows the limits of every joint.
-        limits: of every joint, same order.
+        limits: of every joint, in the order of ``joints``.
         samples: ring for every fetched sample.
         offset_ns: added to run time.
-        care: tolerances.
         notify: told what happens.
         stop: asked often.
         pump: called to empty the rings where this process writes the files.
     """
 
-    def __init__(
-        self,
-        driver: BatchDriver,
-        setup: RobotSetup,
-        supervisor: Supervisor,
-        limits: Sequence[JointLimits],
-        samples: Ring,
-        *,
-        offset_ns: int,
-        care: Care,
-        notify: Callable[[Event], None],
-        stop: StopRequest,
-        pump: Callable[[], None] | None,
-    ) -> None:
-        self._driver = driver
-        self._joints = setup.joints
-        self._names = [joint.name for joint in setup.joints]
-        self._supervisor = supervisor
-        self._limits = list(limits)
-        self._samples = samples
-        self._offset_ns = offset_ns
-        self._care = care
-        self._notify = notify
-        self._stop = stop
-        self._pump = pump or (lambda: None)
-        self._count = 0
+    driver: BatchDriver
+    joints: Sequence[JointSetup]
+    supervisor: Supervisor
+    limits: Sequence[JointLimits]
+    samples: Ring
+    offset_ns: int
+    care: Care
+    notify: Callable[[Event], None]
+    stop: StopRequest
+    pump: Callable[[], None]
+    _count: int = 0
+
+    @property
+    def _names(self) -> list[str]:
+        return [joint.name for joint in self.joints]
 
     def run(self, session: int, plan: JointPlan) -> tuple[JointRun, int]:
         """Run the whole plan of one joint; returns its run, and the run time at its end in ns.
@@ -94,24 +81,24 @@ class BatchRunner:
             Interrupted: asked to stop; the joint stands.
             HardwareError: the line failed, or a transfer broke for good.
         """
-        driver, moving = self._driver, self._names.index(plan.joint)
-        self._notify(PhaseStarted(plan.joint, "reference", 0.0))
-        verify_reference(self._joints, driver.standing(), plan.locked, self._care.reference_tolerance_rad)
-        self._notify(PhaseStarted(plan.joint, "enable", 0.0))
+        driver, moving = self.driver, self._names.index(plan.joint)
+        self.notify(PhaseStarted(plan.joint, "reference", 0.0))
+        verify_reference(self.joints, driver.standing(), plan.locked, self.care.reference_tolerance_rad)
+        self.notify(PhaseStarted(plan.joint, "enable", 0.0))
         driver.start_cycling()
         self._see_power()
         at_rad = self._see_standstill()
         for index, name in enumerate(self._names):
             target_rad = plan.locked.get(name)
             if index != moving and target_rad is not None and abs(target_rad - at_rad[index]) > AT_RAD:
-                approach = Move.within(at_rad[index], target_rad, self._care.approach_rad_s, name="approach")
+                approach = Move.within(at_rad[index], target_rad, self.care.approach_rad_s, name="approach")
                 self._job(index, [approach], at_rad)
                 at_rad[index] = target_rad
         marks: list[Mark] = []
         self._count = 0
         for motions in self._jobs(at_rad[moving], plan.motions):
             marks += self._job(moving, motions, at_rad)
-        end_ns = driver.clock.now_ns() + self._offset_ns
+        end_ns = driver.clock.now_ns() + self.offset_ns
         driver.stop_cycling()
         run = JointRun(
             joint=plan.joint,
@@ -133,15 +120,15 @@ class BatchRunner:
 
         Everything that is measured stays in one job, so that neither a transfer nor a pause comes in between.
         """
-        every = from_here(here_rad, motions, self._care.approach_rad_s)
+        every = from_here(here_rad, motions, self.care.approach_rad_s)
         cut = max((k + 1 for k, motion in enumerate(every) if motion.name == REHEARSAL), default=0)
         return [job for job in (every[:cut], every[cut:]) if job]
 
     def _job(self, index: int, motions: Sequence[Motion], at_rad: Sequence[float]) -> list[Mark]:
         """Run a job, keep what it recorded, and judge the samples; returns the marks of its motions."""
-        if self._stop.level:
+        if self.stop.level:
             raise Interrupted("stopped on request before the motion began")
-        driver, joint, normal = self._driver, self._joints[index], self._limits[index]
+        driver, joint, normal = self.driver, self.joints[index], self.limits[index]
         rehearsing = motions[-1].name == REHEARSAL
         share = REHEARSAL_TORQUE if rehearsing else 1.0
         driver.set_limits(
@@ -153,13 +140,13 @@ class BatchRunner:
         held = {k: rad for k, rad in enumerate(at_rad) if k != index}
         self._look(held, driver.standing())
         longest = max(motions, key=lambda motion: motion.duration_s)
-        self._notify(PhaseStarted(joint.name, longest.name, sum(motion.duration_s for motion in motions)))
+        self.notify(PhaseStarted(joint.name, longest.name, sum(motion.duration_s for motion in motions)))
         marks: list[Mark] = []
         try:
             driver.run_batch(
                 JointPlan(joint.name, tuple(motions), {}),
-                stop=lambda: self._stop.level > 0,
-                progress=_EverySecond(lambda stage, done: self._notify(JobProgress(joint.name, stage, done))),
+                stop=lambda: self.stop.level > 0,
+                progress=_EverySecond(lambda stage, done: self.notify(JobProgress(joint.name, stage, done))),
                 look=lambda reports: self._look(held, reports),
                 arrived=lambda samples: self._keep(index, samples),
             )
@@ -167,33 +154,33 @@ class BatchRunner:
             # Also where the job was stopped, or its transfer broke for good.
             marks = self._marks(motions, driver.batch_columns)
             for mark in marks:
-                self._notify(Marked(joint.name, mark))
+                self.notify(Marked(joint.name, mark))
         columns = driver.batch_columns
-        self._supervisor.set_limits(index, replace(normal, torque_nm=share * normal.torque_nm))
+        self.supervisor.set_limits(index, replace(normal, torque_nm=share * normal.torque_nm))
         self._pass_on(index, columns)
-        self._supervisor.set_limits(index, normal)
+        self.supervisor.set_limits(index, normal)
         if rehearsing:
             self._judge_signs(joint.name, columns, marks[-1])
         self._look(held, driver.standing())
         if columns["dropped_pulses"]:
             dropped = int(columns["dropped_pulses"])
-            self._notify(Warned(f"joint {joint.name}: the controller's speed limiter dropped {dropped} pulses"))
+            self.notify(Warned(f"joint {joint.name}: the controller's speed limiter dropped {dropped} pulses"))
         return marks
 
     def _keep(self, index: int, samples: Mapping[str, Any]) -> None:
         """Write the samples to disk before anything else is asked of the controller."""
-        times_ns, nan = samples["time_ns"] + self._offset_ns, float("nan")
+        times_ns, nan = samples["time_ns"] + self.offset_ns, float("nan")
         for time_ns, position, velocity, torque, command in zip(times_ns.tolist(), *_rows(samples), strict=True):
-            self._samples.append(time_ns, position, velocity, torque, command, 0.0, nan, nan, 0, index, 0)
-        self._pump()
+            self.samples.append(time_ns, position, velocity, torque, command, 0.0, nan, nan, 0, index, 0)
+        self.pump()
         self._count += len(times_ns)
 
     def _marks(self, motions: Sequence[Motion], columns: Mapping[str, Any]) -> list[Mark]:
         """The marks of the motions that were recorded from beginning to end."""
         if not columns:
             return []
-        end_of_all_ns = int(columns["time_ns"][-1]) + self._offset_ns
-        bounds_ns = (columns["motion_starts_ns"] + self._offset_ns).tolist()
+        end_of_all_ns = int(columns["time_ns"][-1]) + self.offset_ns
+        bounds_ns = (columns["motion_starts_ns"] + self.offset_ns).tolist()
         return [
             Mark(motion.name, start_ns, end_ns, motion.details())
             for motion, (start_ns, end_ns) in zip(motions, pairwise(bounds_ns), strict=True)
@@ -202,41 +189,34 @@ class BatchRunner:
 
     def _pass_on(self, index: int, columns: Mapping[str, Any]) -> None:
         """Show every fetched sample to the supervisor."""
-        self._supervisor.watch(index, Mode.POSITION, {})
+        self.supervisor.watch(index, Mode.POSITION, {})
         report = Feedback(state=JointState.ENABLED, mode=Mode.POSITION, valid=True)
         reports, set_points = [report for _ in self._names], [SetPoint() for _ in self._names]
-        for time_ns, position, velocity, torque, command in zip(
-            columns["time_ns"].tolist(), *_rows(columns), strict=True
-        ):
-            report.t_ns, report.position_rad, report.velocity_rad_s, report.torque_nm = (
-                time_ns,
-                position,
-                velocity,
-                torque,
-            )
-            report.position_command_rad = command
-            self._supervisor.check(set_points, reports)
+        times_ns = columns["time_ns"].tolist()
+        for time_ns, position, velocity, torque, command in zip(times_ns, *_rows(columns), strict=True):
+            report.t_ns, report.position_command_rad = time_ns, command
+            report.position_rad, report.velocity_rad_s, report.torque_nm = position, velocity, torque
+            self.supervisor.check(set_points, reports)
 
     def _judge_signs(self, name: str, columns: Mapping[str, Any], rehearsal: Mark) -> None:
         """Judge by the rehearsal whether friction opposes motion."""
-        times_ns = columns["time_ns"] + self._offset_ns
+        times_ns = columns["time_ns"] + self.offset_ns
         inside = (times_ns >= rehearsal.start_ns) & (times_ns < rehearsal.end_ns)
         watch, set_point = SignWatch(_Endless(), name, math.inf), SetPoint()
-        for velocity, torque in zip(
-            columns["velocity_rad_s"][inside].tolist(), columns["torque_nm"][inside].tolist(), strict=True
-        ):
+        moved = (columns[column][inside].tolist() for column in ("velocity_rad_s", "torque_nm"))
+        for velocity, torque in zip(*moved, strict=True):
             watch.update(Feedback(velocity_rad_s=velocity, torque_nm=torque), set_point)
         watch.judge()
 
     def _look(self, held: Mapping[int, float], reports: Sequence[Feedback]) -> None:
         """Check that every joint but the one that runs stands under power where it is held."""
-        self._supervisor.watch(None, Mode.POSITION, dict(held))
-        self._supervisor.check([SetPoint() for _ in reports], reports)
+        self.supervisor.watch(None, Mode.POSITION, dict(held))
+        self.supervisor.check([SetPoint() for _ in reports], reports)
 
     # -- before the first job -----------------------------------------------------------------------------------
 
     def _see_power(self) -> None:
-        for name, report in zip(self._names, self._driver.standing(), strict=True):
+        for name, report in zip(self._names, self.driver.standing(), strict=True):
             if report.state is not JointState.ENABLED:
                 raise SafetyAbort(
                     f"could not be enabled: state {report.state.value} (status {report.status_raw:#06x})",
@@ -246,12 +226,12 @@ class BatchRunner:
 
     def _see_standstill(self) -> list[float]:
         """Wait until two readings in a row agree; returns where every joint stands."""
-        before = self._driver.standing()
+        before = self.driver.standing()
         for _ in range(_LOOKS_AT_STANDSTILL):
-            here = self._driver.standing()
+            here = self.driver.standing()
             apart_s = (here[0].t_ns - before[0].t_ns) * 1e-9
             moved_rad = [abs(b.position_rad - a.position_rad) for a, b in zip(before, here, strict=True)]
-            if max(moved_rad) <= self._care.still_rad_s * apart_s:
+            if max(moved_rad) <= self.care.still_rad_s * apart_s:
                 return [report.position_rad for report in here]
             before = here
         raise SafetyAbort(f"standstill of every joint not seen in {_LOOKS_AT_STANDSTILL} looks")

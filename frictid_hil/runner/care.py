@@ -62,9 +62,13 @@ class Care:
         wanted = {"following_error_s": longest_s, "droop_rad": dict(droop_rad), **bounds}
         return replace(self, **cast("dict[str, Any]", wanted))
 
+    def droop_of(self, joint: str) -> float:
+        """How far a joint may stand beside its set-point because its position loop leaves it there."""
+        return self.droop_rad.get(joint, 0.0)
+
     def still_of(self, joint: str) -> float:
         """How far a joint may be from its set-point while it stands."""
-        return self.still_rad + self.droop_rad.get(joint, 0.0)
+        return self.still_rad + self.droop_of(joint)
 
     def limits(self, joint: JointSetup, plan: JointPlan, command_delay_s: float) -> JointLimits:
         """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
@@ -88,9 +92,9 @@ class Care:
             torque_nm=joint.max_torque_nm * _OVER_MAXIMUM,
             following_error_rad=min(self.following_error_rad, self.following_error_s * joint.max_velocity_rad_s)
             + plan.peak_velocity_rad_s * command_delay_s
-            + self.droop_rad.get(joint.name, 0.0),
+            + self.droop_of(joint.name),
             still_rad=self.still_of(joint.name),
-            settling_rad=self.settling_rad + self.droop_rad.get(joint.name, 0.0),
+            settling_rad=self.settling_rad + self.droop_of(joint.name),
             settling_rad_s=self.settling_rad_s,
             silence_s=self.silence_s,
         )

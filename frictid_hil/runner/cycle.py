@@ -44,12 +44,7 @@ class SetPointSource(Protocol):
 
 
 class Stream:
-    """Set-points computed beforehand, one per cycle, with the speed at which they move.
-
-    Args:
-        positions_rad: one per cycle.
-        period_s: of the cycle.
-    """
+    """Set-points computed beforehand, one per cycle, with the speed at which they move."""
 
     def __init__(self, positions_rad: Sequence[float], period_s: float) -> None:
         speeds = np.gradient(positions_rad, period_s).tolist() if len(positions_rad) > 1 else [0.0]
@@ -67,18 +62,18 @@ class Stream:
 
 @dataclass(slots=True)
 class CycleCount:
-    """How well the loop kept its deadlines.
+    """How well the loop kept its deadlines; run time in ns.
 
     Attributes:
         cycles: exchanges made.
         late: cycles that began later than half a period after their deadline.
         missed: deadlines that passed without an exchange.
         worst_ns: largest lateness.
-        first_ns: run time of the first exchange.
-        last_ns: run time of the last exchange.
+        first_ns: of the first exchange.
+        last_ns: of the last exchange.
         streamed: cycles in which a joint was streamed set-points.
         limited: those of them in which a limit of its drive was active.
-        stops: run time of the first deadline that was missed, and for how long the set-points stood still; ns.
+        stops: first deadline that was missed, and for how long the set-points stood still.
     """
 
     cycles: int = 0
@@ -142,8 +137,8 @@ class CyclicLoop:
         offset_ns: int = 0,
         pump: Callable[[], None] | None = None,
     ) -> None:
-        self._driver = driver
-        self._supervisor = supervisor
+        self.driver = driver
+        self.supervisor = supervisor
         self._samples = samples
         self._period_ns = round(1e9 / cycle_hz)
         self._stop = stop
@@ -170,7 +165,7 @@ class CyclicLoop:
         Raises:
             SafetyAbort: by the supervisor.
         """
-        clock, count, deadline_ns = self._driver.clock, self.count, self._deadline_ns
+        clock, count, deadline_ns = self.driver.clock, self.count, self._deadline_ns
         clock.wait_until(deadline_ns)
         late_ns = clock.now_ns() - deadline_ns
         period_ns = self._period_ns
@@ -184,7 +179,7 @@ class CyclicLoop:
                 deadline_ns += skipped * period_ns
         self._deadline_ns = deadline_ns + period_ns
 
-        feedback = self.feedback = self._driver.exchange(self.set_points)
+        feedback = self.feedback = self.driver.exchange(self.set_points)
         append = self._samples.append
         for index, (report, set_point) in enumerate(zip(feedback, self.set_points, strict=True)):
             if report.age_cycles == 0 and report.valid:
@@ -206,7 +201,7 @@ class CyclicLoop:
         count.last_ns = deadline_ns
         count.cycles += 1
         if supervised:
-            self._supervisor.check(self.set_points, feedback)
+            self.supervisor.check(self.set_points, feedback)
         if self._pump is not None and count.cycles % self.PUMP_CYCLES == 0:
             self._pump()
         return feedback
@@ -269,7 +264,7 @@ class CyclicLoop:
         last = (
             f"joint {name} {report.state.value}, mode {report.mode.name.lower() if report.mode else 'not told'}, "
             f"status {report.status_raw:#06x}"
-            for name, report in zip(self._supervisor.names, self.feedback, strict=True)
+            for name, report in zip(self.supervisor.names, self.feedback, strict=True)
         )
         raise SafetyAbort(
             f"{what} not seen within {timeout_s:g} s",

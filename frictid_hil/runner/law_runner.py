@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from frictid_hil.plan.control import Compensated
 from frictid_hil.plan.mode import Mode
 from frictid_hil.plan.setup import JointSetup
-from frictid_hil.protocol.driver import Driver, Feedback
+from frictid_hil.protocol.driver import Feedback
 from frictid_hil.runner.compensation import FadeOut, LawInForce, LawSource
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.runaway import RunawayWatch
-from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.runner.supervisor import JointLimits
 
 _FADE_S = 0.2
 _LISTEN_S = 0.1
@@ -32,35 +32,20 @@ _NOISE_SHARE = 0.05
 """Reported torque may exceed the commanded one by this share of the rated torque."""
 
 
+@dataclass
 class LawRunner:
     """Takes one joint into its ``Compensated`` motions and out of them.
 
-    Args:
-        driver: cycling.
-        loop: of the session.
-        supervisor: watching the joint in position mode.
-        joint: that moves.
-        index: of it.
+    Attributes:
         limits: of the joint in position control.
     """
 
-    def __init__(
-        self,
-        driver: Driver,
-        loop: CyclicLoop,
-        supervisor: Supervisor,
-        joint: JointSetup,
-        index: int,
-        limits: JointLimits,
-    ) -> None:
-        self._driver = driver
-        self._loop = loop
-        self._supervisor = supervisor
-        self._joint = joint
-        self._index = index
-        self._limits = limits
-        self._drive_mode = Mode.POSITION
-        self._source: LawSource | None = None
+    loop: CyclicLoop
+    joint: JointSetup
+    index: int
+    limits: JointLimits
+    _drive_mode: Mode = Mode.POSITION
+    _source: LawSource | None = None
 
     def source(self, motion: Compensated) -> LawSource:
         """The set-points of one stretch. A joint that is not under this law yet is taken into it first.
@@ -69,35 +54,35 @@ class LawRunner:
             SafetyAbort: by the supervisor, or the drive did not take the mode.
             Interrupted: asked to stop.
         """
-        loop = self._loop
+        loop = self.loop
         source = self._source
         if source is None or source.in_force.law != motion.law or self._drive_mode is not motion.drive_mode:
             self.leave()
             in_force = self._enter(motion)
             free = motion.law.gains is None and motion.drive_mode is Mode.TORQUE
-            self._supervisor.watch_runaway(RunawayWatch(loop.period_s, motion.bounds.growth_s) if free else None)
+            self.loop.supervisor.watch_runaway(RunawayWatch(loop.period_s, motion.bounds.growth_s) if free else None)
         else:
             in_force = source.in_force
         self._source = source = LawSource(in_force, motion, loop.period_s)
-        self._supervisor.set_limits(self._index, self._bounds(motion))
+        self.loop.supervisor.set_limits(self.index, self._bounds(motion))
         return source
 
     def fade_out(self, source: LawSource) -> FadeOut:
         """The source of set-points that ends a law."""
-        return FadeOut(source, round(_FADE_S / self._loop.period_s))
+        return FadeOut(source, round(_FADE_S / self.loop.period_s))
 
     def leave(self) -> bool:
         """Return to position control where the joint stands; False if the joint was in position control already."""
         source = self._source
         if source is None:
             return False
-        loop, index = self._loop, self._index
+        loop, index = self.loop, self.index
         self._source = None
         loop.run({index: self.fade_out(source)})
-        self._supervisor.watch_runaway(None)
+        self.loop.supervisor.watch_runaway(None)
         if self._drive_mode is not Mode.POSITION:
             self._take_mode(Mode.POSITION)
-        self._supervisor.set_limits(index, self._limits)
+        self.loop.supervisor.set_limits(index, self.limits)
         set_point = loop.set_points[index]
         set_point.torque_nm = set_point.velocity_rad_s = 0.0
         # What is left of an offset is gravity; the drive's own loop takes it over.
@@ -109,7 +94,7 @@ class LawRunner:
         return True
 
     def _enter(self, motion: Compensated) -> LawInForce:
-        loop, index = self._loop, self._index
+        loop, index = self.loop, self.index
         set_point = loop.set_points[index]
         if motion.drive_mode is not Mode.TORQUE:
             if motion.drive_mode is not Mode.POSITION:
@@ -123,7 +108,7 @@ class LawRunner:
             holding_nm += (torque_nm if math.isfinite(torque_nm) else 0.0) / cycles
         limit_nm = motion.law.torque_limit_nm
         set_point.torque_nm = holding_nm = min(limit_nm, max(-limit_nm, holding_nm))
-        self._supervisor.set_limits(index, self._bounds(motion))
+        self.loop.supervisor.set_limits(index, self._bounds(motion))
         self._take_mode(Mode.TORQUE)
         # What friction holds of it is let go slowly, or the gear's presliding spring would ring.
         steps = round(_LET_GO_S / loop.period_s)
@@ -136,9 +121,9 @@ class LawRunner:
 
     def _take_mode(self, mode: Mode) -> None:
         """Ask for a mode and cycle until the drive shows it; the set-point stays where the joint is."""
-        loop, index = self._loop, self._index
-        self._supervisor.expect_mode(self._drive_mode, mode)
-        self._driver.enable(self._joint.name, mode)
+        loop, index = self.loop, self.index
+        self.loop.supervisor.expect_mode(self._drive_mode, mode)
+        self.loop.driver.enable(self.joint.name, mode)
 
         def shown(feedback: Sequence[Feedback]) -> bool:
             report = feedback[index]
@@ -146,20 +131,20 @@ class LawRunner:
                 loop.set_points[index].position_rad = report.position_rad
             return report.mode is mode
 
-        loop.wait_for(shown, _MODE_TIMEOUT_S, f"mode {mode.name} of joint {self._joint.name}")
+        loop.wait_for(shown, _MODE_TIMEOUT_S, f"mode {mode.name} of joint {self.joint.name}")
         self._drive_mode = mode
-        self._supervisor.expect_mode(mode)
+        self.loop.supervisor.expect_mode(mode)
 
     def _bounds(self, motion: Compensated) -> JointLimits:
-        bounds, limits = motion.bounds, self._limits
+        bounds, limits = motion.bounds, self.limits
         torque_nm = limits.torque_nm
         if motion.drive_mode is Mode.TORQUE:
-            torque_nm = min(torque_nm, motion.law.torque_limit_nm + _NOISE_SHARE * self._joint.rated_torque_nm)
+            torque_nm = min(torque_nm, motion.law.torque_limit_nm + _NOISE_SHARE * self.joint.rated_torque_nm)
         return replace(
             limits,
             position_min_rad=bounds.position_min_rad,
             position_max_rad=bounds.position_max_rad,
-            velocity_rad_s=min(bounds.velocity_rad_s, self._joint.max_velocity_rad_s),
+            velocity_rad_s=min(bounds.velocity_rad_s, self.joint.max_velocity_rad_s),
             torque_nm=torque_nm,
             power_w=bounds.power_w,
             withstands_nm=bounds.withstands_nm,

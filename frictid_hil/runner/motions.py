@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,13 @@ from frictid_hil.errors import ProfileMismatch
 from frictid_hil.plan.control import Compensated, Probe
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move, WarmUp, stretch_name
 from frictid_hil.plan.setup import JointSetup
-from frictid_hil.protocol.driver import Driver
 from frictid_hil.recording.samples import Mark
 from frictid_hil.runner.cycle import CycleCount, CyclicLoop, SetPointSource, Stream
 from frictid_hil.runner.events import Event, Marked, PhaseStarted, Warned
 from frictid_hil.runner.law_runner import LawRunner
 from frictid_hil.runner.probe import ProbeWatch
 from frictid_hil.runner.sign_watch import SignWatch
-from frictid_hil.runner.supervisor import JointLimits, Supervisor
+from frictid_hil.runner.supervisor import JointLimits
 from frictid_hil.runner.warm_up import WarmUpWatch
 
 AT_RAD = 1e-4
@@ -46,40 +46,27 @@ def stream(loop: CyclicLoop, index: int, motion: Motion) -> None:
     loop.run({index: _set_points({index: motion}, loop.period_s)[index]})
 
 
+@dataclass(frozen=True)
 class Motions:
     """The motions of one joint, or of several in step.
 
-    Args:
-        driver: cycling.
+    Attributes:
         loop: of the stretch; these joints follow their set-points, all others are locked.
-        supervisor: of the loop.
         joints: that move, by index.
-        limits: of them while they are in position control, by index.
+        limits: of all joints while they are in position control.
         approach_rad_s: speed of small approaches.
         notify: told what happens.
     """
 
-    def __init__(
-        self,
-        driver: Driver,
-        loop: CyclicLoop,
-        supervisor: Supervisor,
-        joints: Mapping[int, JointSetup],
-        limits: Mapping[int, JointLimits],
-        *,
-        approach_rad_s: float,
-        notify: Callable[[Event], None],
-    ) -> None:
-        self._loop = loop
-        self._supervisor = supervisor
-        self._joints = joints
-        self._limits = limits
-        self._approach_rad_s = approach_rad_s
-        self._notify = notify
-        self._wall_clock = not driver.clock.lock_step
-        self._laws = {
-            index: LawRunner(driver, loop, supervisor, joint, index, limits[index]) for index, joint in joints.items()
-        }
+    loop: CyclicLoop
+    joints: Mapping[int, JointSetup]
+    limits: Sequence[JointLimits]
+    approach_rad_s: float
+    notify: Callable[[Event], None]
+
+    @cached_property
+    def _laws(self) -> dict[int, LawRunner]:
+        return {index: LawRunner(self.loop, joint, index, self.limits[index]) for index, joint in self.joints.items()}
 
     def run(self, plans: Mapping[int, JointPlan]) -> dict[int, list[Mark]]:
         """Run all motions of the plans, in order; returns the marks of each joint.
@@ -88,12 +75,12 @@ class Motions:
             SafetyAbort: by the supervisor, or friction is not what it must be.
             Interrupted: asked to stop; all joints were brought to rest.
         """
-        loop, name = self._loop, stretch_name(list(plans.values()))
+        loop, name = self.loop, stretch_name(list(plans.values()))
         marks: dict[int, list[Mark]] = {index: [] for index in plans}
         for motions in self._from_here({index: plan.motions for index, plan in plans.items()}):
             self._leave_laws(motions)
             first = next(iter(motions.values()))
-            self._notify(PhaseStarted(name, first.name, first.duration_s))
+            self.notify(PhaseStarted(name, first.name, first.duration_s))
             sources, ending = self._sources(motions)
             start_ns, before = loop.now_ns(), replace(loop.count, stops=list(loop.count.stops))
             loop.run(sources, ending=ending)
@@ -102,14 +89,14 @@ class Motions:
                 details = {**motion.details(), **self._told(before), **self._judged(index, motion, sources[index])}
                 marks[index].append(Mark(motion.name, start_ns, end_ns, details))
             for index in motions:
-                self._notify(Marked(self._joints[index].name, marks[index][-1]))
+                self.notify(Marked(self.joints[index].name, marks[index][-1]))
         return marks
 
     def _from_here(self, motions: Mapping[int, Sequence[Motion]]) -> list[dict[int, Motion]]:
         """The stretches, after a small approach where a joint does not stand exactly at its beginning."""
         stretches = [dict(zip(motions, stretch, strict=True)) for stretch in zip(*motions.values(), strict=True)]
         approach = {
-            index: _approach(self._loop.set_points[index].position_rad, own[0], self._approach_rad_s)
+            index: _approach(self.loop.set_points[index].position_rad, own[0], self.approach_rad_s)
             for index, own in motions.items()
         }
         if not any(abs(move.to_rad - move.from_rad) > AT_RAD for move in approach.values()):
@@ -122,7 +109,7 @@ class Motions:
         for index, motion in motions.items():
             if not isinstance(motion, Compensated) and self._laws[index].leave():
                 for back in self._from_here({index: [motion]})[:-1]:
-                    stream(self._loop, index, back[index])
+                    stream(self.loop, index, back[index])
 
     def _sources(self, motions: Mapping[int, Motion]) -> tuple[Mapping[int, SetPointSource], SetPointSource | None]:
         """The set-points of every joint, watched as its motion asks, and the source that ends a control law."""
@@ -130,21 +117,21 @@ class Motions:
         if isinstance(motion, Compensated) and not others:
             law = self._laws[index].source(motion)
             return {index: law}, self._laws[index].fade_out(law)
-        streams = _set_points(motions, self._loop.period_s)
+        streams = _set_points(motions, self.loop.period_s)
         return {index: self._watched(index, motions[index], stream) for index, stream in streams.items()}, None
 
     def _watched(self, index: int, motion: Motion, points: Stream) -> SetPointSource:
-        joint, alone = self._joints[index], len(self._joints) == 1
+        joint, alone = self.joints[index], len(self.joints) == 1
         if isinstance(motion, Probe) and alone:
             return ProbeWatch(points, motion, joint.name)
         if isinstance(motion, WarmUp) and alone:  # of several, one that settles must not end the others' motion
-            return WarmUpWatch(points, motion, self._loop.period_s)
+            return WarmUpWatch(points, motion, self.loop.period_s)
         if motion.name != REHEARSAL:
             return points
         # The full travel, slowly, with the torque bound at half; the sign of friction must be right.
-        slow = replace(self._limits[index], torque_nm=REHEARSAL_TORQUE * joint.max_torque_nm)
-        self._supervisor.set_limits(index, slow)
-        return SignWatch(points, joint.name, self._loop.period_s)
+        slow = replace(self.limits[index], torque_nm=REHEARSAL_TORQUE * joint.max_torque_nm)
+        self.loop.supervisor.set_limits(index, slow)
+        return SignWatch(points, joint.name, self.loop.period_s)
 
     def _judged(self, index: int, motion: Motion, source: SetPointSource) -> dict[str, Any]:
         """Judge a watched motion; returns what its mark tells besides.
@@ -154,7 +141,7 @@ class Motions:
             ProfileMismatch: the profile is not this joint's.
         """
         if isinstance(source, SignWatch):
-            self._supervisor.set_limits(index, self._limits[index])
+            self.loop.supervisor.set_limits(index, self.limits[index])
             source.judge()
         elif isinstance(source, ProbeWatch) and isinstance(motion, Probe):
             try:
@@ -162,23 +149,23 @@ class Motions:
             except ProfileMismatch as mismatch:
                 if motion.enforced:
                     raise
-                self._notify(Warned(f"forced in spite of: {mismatch}"))
+                self.notify(Warned(f"forced in spite of: {mismatch}"))
         elif isinstance(source, WarmUpWatch):
             rate = source.percent_per_min
             if source.settled is False:
                 changing = "could not be told" if rate is None else f"still changed by {rate:.2g} % per minute"
-                name, lasted_s = self._joints[index].name, motion.duration_s
-                self._notify(Warned(f"joint {name}: friction {changing} after {lasted_s:.0f} s of warm-up"))
+                name, lasted_s = self.joints[index].name, motion.duration_s
+                self.notify(Warned(f"joint {name}: friction {changing} after {lasted_s:.0f} s of warm-up"))
             return {"settled": source.settled, "percent_per_min": rate, "cycles": source.cycles}
         return {}
 
     def _told(self, before: CycleCount) -> dict[str, Any]:
         """Of the cycles since: where set-points stood still, how many were limited by the drive, who moved together."""
-        count, told = self._loop.count, dict[str, Any]()
-        if self._wall_clock:
+        count, told = self.loop.count, dict[str, Any]()
+        if not self.loop.driver.clock.lock_step:
             told["stops_ns"] = [list(stop) for stop in count.stops[len(before.stops) :]]
-        if len(self._joints) > 1:
-            return {**told, "together": [joint.name for joint in self._joints.values()]}
+        if len(self.joints) > 1:
+            return {**told, "together": [joint.name for joint in self.joints.values()]}
         limited = count.limited - before.limited
         return {**told, "limited_share": limited / (count.streamed - before.streamed)} if limited else told
 

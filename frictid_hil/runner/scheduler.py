@@ -20,11 +20,12 @@ The order is always the same, and no step of it is optional::
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import cast
 
 from frictid_hil.errors import FrictidError, HardwareError, Interrupted, PlanRefused, SafetyAbort
 from frictid_hil.plan.plan import REHEARSAL, JointPlan, Plan, stretch_name
-from frictid_hil.plan.setup import JointSetup, RobotSetup
+from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Driver, FrameMapped, Remarking, Severity
 from frictid_hil.runner.arm import Arm
 from frictid_hil.runner.batch import BatchDriver, BatchRunner
@@ -42,59 +43,49 @@ _LOCKED_REPORT_S = 0.010
 _SESSION_GAP_NS = 1_000_000_000
 
 
+@dataclass
 class Recorder:
     """The two rings, and the run time that goes on from one stretch of cyclic traffic to the next."""
 
-    def __init__(self, samples: Ring, frames: Ring) -> None:
-        self.samples = samples
-        self.frames = frames
-        self.offset_ns = 0
+    samples: Ring
+    frames: Ring
+    offset_ns: int = 0
 
     def frame(self, t_ns: int, can_id: int, data: bytes, sent: bool) -> None:
         """A frame on the wire (``driver.FrameSink``)."""
         self.frames.append(t_ns + self.offset_ns, can_id, len(data), sent, 0, data)
 
 
+@dataclass
 class Scheduler:
     """Runs one plan on one driver.
 
-    Args:
+    Attributes:
         driver: not yet opened.
         setup: the robot, as the driver knows it.
         plan: checked against limits.
-        recorder: rings.
         notify: told what happens.
         proceed: asked once after the preflight; False ends the run before anything moves.
         stop: read once per cycle.
         pump: see ``CyclicLoop``.
-        care: bounds.
     """
 
-    def __init__(
-        self,
-        driver: Driver,
-        setup: RobotSetup,
-        plan: Plan,
-        recorder: Recorder,
-        *,
-        notify: Callable[[Event], None],
-        proceed: Callable[[Preflight], bool],
-        stop: StopRequest,
-        pump: Callable[[], None] | None = None,
-        care: Care | None = None,
-    ) -> None:
-        self._driver = driver
-        self._setup = setup
-        self._plan = plan
-        self._recorder = recorder
-        self._notify = notify
-        self._proceed = proceed
-        self._stop = stop
-        self._pump = pump
-        self._care = care or Care()
-        self._names = [joint.name for joint in setup.joints]
-        self._command_delay_s = 0.0
-        self._resolution_rad: Mapping[str, float] = {}
+    driver: Driver
+    setup: RobotSetup
+    plan: Plan
+    recorder: Recorder
+    _: KW_ONLY
+    notify: Callable[[Event], None]
+    proceed: Callable[[Preflight], bool]
+    stop: StopRequest
+    pump: Callable[[], None] | None = None
+    care: Care = field(default_factory=Care)
+    _command_delay_s: float = field(default=0.0, init=False)
+    _resolution_rad: Mapping[str, float] = field(default_factory=dict, init=False)
+
+    @property
+    def _names(self) -> list[str]:
+        return [joint.name for joint in self.setup.joints]
 
     def run(self) -> None:
         """Run the whole plan.
@@ -107,37 +98,37 @@ class Scheduler:
         """
         first: FrictidError | None = None
         try:
-            self._driver.open(self._recorder.frame)
+            self.driver.open(self.recorder.frame)
             preflight = self._preflight()
-            self._notify(preflight)
-            if not self._proceed(preflight):
+            self.notify(preflight)
+            if not self.proceed(preflight):
                 raise PlanRefused("not confirmed; nothing has moved")
-            for session, stretch in enumerate(self._plan.stretches):
-                if self._stop.level:
+            for session, stretch in enumerate(self.plan.stretches):
+                if self.stop.level:
                     raise Interrupted("stopped on request before the next joint moved", next_step=GO_ON)
                 for run in self._run_stretch(session, stretch):
-                    self._notify(run)
+                    self.notify(run)
         except FrictidError as error:
             first = error
         except OSError as error:
-            first = HardwareError(f"the bus failed: {error}", where=self._setup.bus)
+            first = HardwareError(f"the bus failed: {error}", where=self.setup.bus)
             first.__cause__ = error
         finally:
-            self._driver.close()
-        powered = getattr(self._driver, "may_be_powered", ())
+            self.driver.close()
+        powered = getattr(self.driver, "may_be_powered", ())
         if powered:
             first = _with_power_left(first, powered)
         if first is not None:
             raise first
 
     def _preflight(self) -> Preflight:
-        identities = self._driver.identify()
+        identities = self.driver.identify()
         self._resolution_rad = {name: one.position_resolution_rad for name, one in identities.items()}
-        findings = self._driver.check(self._plan)
-        capabilities = self._driver.capabilities()
+        findings = self.driver.check(self.plan)
+        capabilities = self.driver.capabilities()
         self._command_delay_s = capabilities.command_delay_s
-        self._care = self._care.of_robot(self._setup.care, capabilities.droop_rad)
-        tolerated = self._care.tolerated
+        self.care = self.care.of_robot(self.setup.care, capabilities.droop_rad)
+        tolerated = self.care.tolerated
         errors = [f for f in findings if f.severity is Severity.ERROR and f.topic not in tolerated]
         if errors:
             # These drives are as the robot file says, and answer: it is the plan that must not run on them so.
@@ -146,30 +137,33 @@ class Scheduler:
                 "; ".join(f"{finding.subject}: {finding.message}" for finding in errors),
                 next_step=errors[0].next_step or "run `frictid-hil check`",
             )
-        if self._care.interlock is not None and not capabilities.digital_inputs:
+        if self.care.interlock is not None and not capabilities.digital_inputs:
             raise HardwareError(
                 "this driver cannot watch a digital input, and the robot file names one as interlock",
-                where=self._setup.bus,
+                where=self.setup.bus,
                 cause="no input reaches the cyclic exchange here; on a serial port none is read while the arm moves",
                 next_step="run `frictid-hil calibrate` with a person watching",
             )
-        if capabilities.batch_only and self._plan.together:
+        if capabilities.batch_only and self.plan.together:
             raise PlanRefused(
                 "this controller runs one joint's job at a time",
                 next_step="leave --together out",
-                where=self._setup.bus,
+                where=self.setup.bus,
             )
         return Preflight(identities, capabilities, tuple(findings))
 
     # -- one joint, or several in step --------------------------------------------------------------------------
 
     def _run_stretch(self, session: int, plans: Sequence[JointPlan]) -> list[JointRun]:
-        driver = self._driver
+        driver = self.driver
         moving = {self._names.index(plan.joint): plan for plan in plans}
         name = stretch_name(plans)
-        self._notify(PhaseStarted(name, "configure", 0.0))
+        self.notify(PhaseStarted(name, "configure", 0.0))
         self._configure(session, plans)
-        limits = [self._limits(joint, moving.get(at, plans[0])) for at, joint in enumerate(self._setup.joints)]
+        limits = [
+            self.care.limits(joint, moving.get(at, plans[0]), self._command_delay_s)
+            for at, joint in enumerate(self.setup.joints)
+        ]
         supervisor = self._supervisor(limits, moving)
         if driver.capabilities().batch_only:
             return [self._run_in_batch(session, plans[0], supervisor, limits)]
@@ -177,44 +171,37 @@ class Scheduler:
         loop = CyclicLoop(
             driver,
             supervisor,
-            self._recorder.samples,
-            self._plan.cycle_hz,
-            self._stop,
+            self.recorder.samples,
+            self.plan.cycle_hz,
+            self.stop,
             joints=len(self._names),
             most_rad_s2={at: plan.max_deceleration_rad_s2 for at, plan in moving.items()},
-            offset_ns=self._recorder.offset_ns,
-            pump=self._pump,
+            offset_ns=self.recorder.offset_ns,
+            pump=self.pump,
         )
-        arm = Arm(driver, self._setup.joints, loop, supervisor, self._care)
+        arm = Arm(self.setup.joints, loop, self.care)
         try:
             self._make_ready(arm, moving, name)
-            marks = Motions(
-                driver,
-                loop,
-                supervisor,
-                {index: self._setup.joints[index] for index in moving},
-                {index: limits[index] for index in moving},
-                approach_rad_s=self._care.approach_rad_s,
-                notify=self._notify,
-            ).run(moving)
+            joints = {index: self.setup.joints[index] for index in moving}
+            marks = Motions(loop, joints, limits, self.care.approach_rad_s, self.notify).run(moving)
             arm.power_off()
         except BaseException:
             arm.stop()
             raise
         driver.stop_cycling()
-        self._recorder.offset_ns = loop.now_ns() + _SESSION_GAP_NS
+        self.recorder.offset_ns = loop.now_ns() + _SESSION_GAP_NS
         return [loop.count.joint_run(plan.joint, session, marks[index]) for index, plan in moving.items()]
 
     def _configure(self, session: int, plans: Sequence[JointPlan]) -> None:
         """Write what the motion needs into the drives, and tell once what they remark."""
-        driver = self._driver
-        driver.configure(self._plan.cycle_hz, [plan.joint for plan in plans])
+        driver = self.driver
+        driver.configure(self.plan.cycle_hz, [plan.joint for plan in plans])
         if session == 0 and isinstance(driver, Remarking):
             for remark in driver.remarks():
-                self._notify(Warned(f"{remark.subject}: {remark.message}"))
+                self.notify(Warned(f"{remark.subject}: {remark.message}"))
         if session == 0 and isinstance(driver, FrameMapped):
-            self._notify(Configured(driver.frame_map_values()))
-        for joint in self._setup.joints:
+            self.notify(Configured(driver.frame_map_values()))
+        for joint in self.setup.joints:
             driver.set_limits(
                 joint.name,
                 torque_nm=joint.max_torque_nm,
@@ -223,50 +210,47 @@ class Scheduler:
             )
 
     def _supervisor(self, limits: Sequence[JointLimits], moving: Collection[int]) -> Supervisor:
-        box, rate_hz = self._setup.workspace, self._plan.cycle_hz
+        box, rate_hz = self.setup.workspace, self.plan.cycle_hz
         watch = None if box is None else WorkspaceWatch(box, self._names, rate_hz)
-        supervisor = Supervisor(self._names, limits, rate_hz, self._care.interlock, watch)
+        supervisor = Supervisor(self._names, limits, rate_hz, self.care.interlock, watch)
         for index in range(len(self._names)):
             if index not in moving:
                 supervisor.set_report_interval(index, round(_LOCKED_REPORT_S * rate_hz))
         return supervisor
 
     def _run_in_batch(
-        self, session: int, plan: JointPlan, supervisor: Supervisor, limits: Sequence[JointLimits]
+        self, session: int, plan: JointPlan, supervisor: Supervisor, limits: list[JointLimits]
     ) -> JointRun:
-        driver = cast(BatchDriver, self._driver)
+        driver = cast(BatchDriver, self.driver)
         runner = BatchRunner(
             driver,
-            self._setup,
+            self.setup.joints,
             supervisor,
             limits,
-            self._recorder.samples,
-            offset_ns=self._recorder.offset_ns,
-            care=self._care,
-            notify=self._notify,
-            stop=self._stop,
-            pump=self._pump,
+            self.recorder.samples,
+            self.recorder.offset_ns,
+            self.care,
+            self.notify,
+            self.stop,
+            self.pump or (lambda: None),
         )
         try:
             run, end_ns = runner.run(session, plan)
         except BaseException:
             driver.quick_stop()
             raise
-        self._recorder.offset_ns = end_ns + _SESSION_GAP_NS
+        self.recorder.offset_ns = end_ns + _SESSION_GAP_NS
         return run
-
-    def _limits(self, joint: JointSetup, plan: JointPlan) -> JointLimits:
-        return self._care.limits(joint, plan, self._command_delay_s)
 
     def _make_ready(self, arm: Arm, moving: Mapping[int, JointPlan], name: str) -> None:
         """Verify and power the arm, prove units where asked, and lock every joint that does not move."""
         planned_rad = next(iter(moving.values())).locked
-        self._notify(PhaseStarted(name, "reference", 0.0))
+        self.notify(PhaseStarted(name, "reference", 0.0))
         arm.verify(planned_rad)
-        self._notify(PhaseStarted(name, "enable", 0.0))
+        self.notify(PhaseStarted(name, "enable", 0.0))
         arm.enable()
         if any(motion.name == REHEARSAL for plan in moving.values() for motion in plan.motions):
-            self._notify(PhaseStarted(name, PROOF, 0.0))
+            self.notify(PhaseStarted(name, PROOF, 0.0))
             arm.prove_units(moving, planned_rad, self._resolution_rad)
         arm.lock_all_but(moving, planned_rad)
 

@@ -231,15 +231,12 @@ def test_joints_that_move_together_do_so_in_step() -> None:
 
 def test_no_joint_that_has_warmed_up_ends_the_motion_of_the_others() -> None:
     """Only a joint alone stops at the end of a cycle: the cycles of others end at other times."""
-    loop: Any = SimpleNamespace(period_s=0.001)
-    driver: Any = SimpleNamespace(clock=SimpleNamespace(lock_step=True))
-    nobody: Any = None
+    loop: Any = SimpleNamespace(period_s=0.001, supervisor=None)
     joints = dict(enumerate(ROBOT.to_setup().joints[:2]))
 
     def sources(*indices: int) -> list[str]:
         mine: Any = {index: joints[index] for index in indices}
-        limits = dict.fromkeys(mine, nobody)
-        motions = Motions(driver, loop, nobody, mine, limits, approach_rad_s=0.1, notify=print)
+        motions = Motions(loop, mine, [], approach_rad_s=0.1, notify=print)
         warm_ups = {index: WarmUp(0.0, 0.1 + 0.1 * index, 1.0, 60.0, 1.0) for index in indices}
         return [type(source).__name__ for source in motions._sources(warm_ups)[0].values()]
 
@@ -388,17 +385,18 @@ class Lost:
 
 def test_what_breaks_while_stopping_never_hides_what_ended_the_run() -> None:
     class Loop:
+        driver = Lost()
+
         def settle(self, duration_s: float) -> None:
             raise ZeroDivisionError("a defect of the driver's library")
 
-    driver = Lost()
-    arm = Arm(driver, (), Loop(), None, Care())  # type: ignore[arg-type]
+    arm = Arm((), Loop(), Care())  # type: ignore[arg-type]
     with pytest.raises(SafetyAbort, match="the first error"):
         try:
             raise SafetyAbort("the first error")
         finally:
             arm.stop()
-    assert driver.stops == 2
+    assert Loop.driver.stops == 2
 
 
 def test_a_joint_that_hears_its_set_points_again_catches_up_no_faster_than_it_may() -> None:
