@@ -81,13 +81,7 @@ class LawInForce:
 
 
 class LawSource:
-    """A law in force along a path, as a source of set-points.
-
-    Args:
-        in_force: of the law.
-        motion: path and drive mode.
-        period_s: of the cycle.
-    """
+    """A law in force along the path of a motion, as a source of set-points."""
 
     def __init__(self, in_force: LawInForce, motion: Compensated, period_s: float) -> None:
         self.in_force = in_force
@@ -120,17 +114,10 @@ class LawSource:
 
 
 class FadeOut:
-    """Ends a law: friction compensation fades to nothing while gravity stays and the reference stands still.
-
-    Args:
-        source: in force until now.
-        cycles: to fade in.
-    """
+    """Ends a law: in so many cycles friction compensation fades while gravity stays and the reference stands still."""
 
     def __init__(self, source: LawSource, cycles: int) -> None:
-        self._source = source
-        self._cycles = cycles
-        self._done = 0
+        self._source, self._cycles, self._done = source, cycles, 0
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Give one step less of the compensation; False once nothing is left of it."""

@@ -12,13 +12,7 @@ from frictid_hil.recording.samples import Mark
 
 @dataclass(frozen=True, slots=True)
 class Preflight:
-    """The hardware was reached and read. Nothing has moved and nothing was written yet.
-
-    Attributes:
-        identities: per joint name.
-        capabilities: of the driver.
-        findings: of ``check``; none is an error, or this event would not have come.
-    """
+    """The hardware was reached and read. Nothing has moved and nothing was written yet; no finding is an error."""
 
     identities: dict[str, JointIdentity]
     capabilities: Capabilities
@@ -27,11 +21,7 @@ class Preflight:
 
 @dataclass(frozen=True, slots=True)
 class Configured:
-    """The drives were configured for the first time in this run; kept so that the log of frames can be decoded again.
-
-    Attributes:
-        frame_map: which frame carries what (``driver.FrameMapped``).
-    """
+    """The drives were configured for the first time in this run; the log of frames is decoded with their frame map."""
 
     frame_map: Mapping[str, Any]
 
@@ -41,7 +31,6 @@ class PhaseStarted:
     """A joint begins a stretch of its plan.
 
     Attributes:
-        joint: name.
         phase: ``configure``, ``enable``, ``move``, ``rehearsal``, ``hold``, ``cycles``, ``drift``, ``reversal``, ...
         duration_s: planned, 0 where not known.
     """
@@ -56,14 +45,11 @@ class JointRun:
     """A joint's motions are over and it is locked again.
 
     Attributes:
-        joint: name.
         session: number of the stretch of cyclic traffic; run time starts at zero in each.
         marks: what it did, on the run time of the samples.
         rate_hz: achieved cycle rate.
-        cycles: exchanges.
         late_cycles: began later than half a period.
         missed_cycles: deadlines without exchange.
-        worst_lateness_s: largest.
         duration_s: run time of the whole session.
     """
 
@@ -80,12 +66,7 @@ class JointRun:
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """A stretch of a joint's plan is over.
-
-    Attributes:
-        joint: name.
-        mark: what it was, on the run time of the samples.
-    """
+    """A stretch of a joint's plan is over."""
 
     joint: str
     mark: Mark
@@ -96,7 +77,6 @@ class JobProgress:
     """How far a job on the controller, or the transfer of its recording, has come; about once a second.
 
     Attributes:
-        joint: name.
         stage: ``motion`` or ``transfer``.
         share: done, 0..1.
     """

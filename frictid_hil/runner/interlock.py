@@ -30,10 +30,6 @@ class Interlock:
     def check(self, report: Feedback, cycle_hz: float) -> None:
         """Pass one report of that joint.
 
-        Args:
-            report: of that joint.
-            cycle_hz: rate of reports.
-
         Raises:
             SafetyAbort: open, or not reported.
         """

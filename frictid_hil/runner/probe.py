@@ -21,13 +21,7 @@ _MOVING_RAD_S = math.radians(4.0)
 
 
 class ProbeWatch:
-    """Passes a stream on and keeps what the joint reports while it moves.
-
-    Args:
-        source: of the probe's sine.
-        probe: what is expected.
-        joint: name.
-    """
+    """Passes a stream on and keeps what the joint reports while it moves."""
 
     def __init__(self, source: SetPointSource, probe: Probe, joint: str) -> None:
         self._source = source
@@ -63,9 +57,8 @@ class ProbeWatch:
         found_nm = 0.5 * float(measured[forward].mean() - measured[backward].mean())
         said_nm = 0.5 * float(friction[forward].mean() - friction[backward].mean())
         if not abs(found_nm - said_nm) <= probe.tolerance * abs(said_nm):
-            raise self._mismatch(
-                "friction at slow motion", found_nm, said_nm, "another joint's profile, a changed gear"
-            )
+            cause = "another joint's profile, a changed gear"
+            raise self._mismatch("friction at slow motion", found_nm, said_nm, cause)
         off_nm = 0.5 * float((measured - friction)[forward].mean() + (measured - friction)[backward].mean())
         if not abs(off_nm) <= probe.tolerance * abs(said_nm):
             middle_nm = float(gravity.mean())

@@ -52,19 +52,6 @@ _WITHOUT_POWER = ("configure", "reference")
 """Phases of a joint in which no drive has power."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Order:
-    """Everything that the child needs to know; it is sent to the child once."""
-
-    driver: str
-    setup: RobotSetup
-    plan: Plan
-    care: Care
-    samples: str
-    frames: str
-    parent_pid: int
-
-
 class _Life:
     """How long the child has been silent. Only time in which this process could have heard the child counts."""
 
@@ -155,8 +142,9 @@ def run_in_own_process(
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     heard, wire = context.Pipe(duplex=False)
-    order = _Order(driver, setup, plan, care, recorder.samples.name, recorder.frames.name, os.getpid())
-    child = context.Process(target=_child, args=(order, theirs, heard), name="frictid-hil-cycle")
+    rings = recorder.samples.name, recorder.frames.name
+    order = (driver, setup, plan, care, rings, os.getpid(), theirs, heard)
+    child = context.Process(target=_child, args=order, name="frictid-hil-cycle")
     listener = _Listener(ours, notify, proceed, stop, drain)
     life, hangs = _Life(), False
     with stop.written_to(wire.fileno()):
@@ -217,10 +205,19 @@ def _unattended() -> SafetyAbort:
     )
 
 
-def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
+def _child(
+    driver: str,
+    setup: RobotSetup,
+    plan: Plan,
+    care: Care,
+    rings: tuple[str, str],
+    parent_pid: int,
+    pipe: Connection,
+    heard: Connection,
+) -> None:
     """The cyclic process."""
-    samples, frames = sample_ring(name=order.samples), frame_ring(name=order.frames)
-    stop = HeardStop(heard.fileno(), order.parent_pid, lambda: samples.half_full or frames.half_full)
+    samples, frames = sample_ring(name=rings[0]), frame_ring(name=rings[1])
+    stop = HeardStop(heard.fileno(), parent_pid, lambda: samples.half_full or frames.half_full)
 
     def terminated(_signal: int, _frame: object) -> None:
         stop.terminated = True
@@ -249,17 +246,17 @@ def _child(order: _Order, pipe: Connection, heard: Connection) -> None:
     try:
         for warning in make_punctual():
             tell(Warned(warning))
-        driver = new_driver(order.driver, order.setup)
+        hardware = new_driver(driver, setup)
         gc.freeze()
         Scheduler(
-            driver,
-            order.setup,
-            order.plan,
+            hardware,
+            setup,
+            plan,
             Recorder(samples, frames),
             notify=lambda event: None if isinstance(event, Preflight) else tell(event),
             proceed=proceed,
             stop=stop,
-            care=order.care,
+            care=care,
         ).run()
     except Interrupted as error:
         outcome = _unattended() if stop.left_alone else error

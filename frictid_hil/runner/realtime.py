@@ -117,14 +117,9 @@ def _allowed(cpu: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How late an empty loop is on this computer.
+    """How late an empty loop is on this computer: percentiles and the latest of the cycles that ``duration_s`` holds.
 
     Attributes:
-        duration_s: measured for so long.
-        p50_s: median lateness.
-        p99_s: 99 %.
-        p999_s: 99.9 %.
-        worst_s: the latest cycle.
         highest_hz: the highest usual rate at which 99.9 % of the cycles begin within half a period; 0 for none.
         told: what was not permitted, and the remedy.
         isolated_cpu: processor that the loop had to itself; None where none is isolated.

@@ -16,7 +16,7 @@ def verify_reference(
     """Compare every joint's position with the plan and with its limits.
 
     Args:
-        joints: order of the reports.
+        joints: in the order of the reports.
         reports: valid.
         planned_rad: where joints are to be locked, by name; others are expected at their own locked position.
         tolerance_rad: a joint further off has lost its reference, or was moved.

@@ -11,13 +11,7 @@ from frictid_hil.runner.unit_proof import Travelled
 
 
 class SignWatch:
-    """Passes a stream on and keeps the mean torque of both directions.
-
-    Args:
-        source: of the set-points.
-        joint: name, for the message.
-        period_s: of the set-points.
-    """
+    """Passes a stream on and keeps the mean torque of both directions."""
 
     _MOVING_RAD_S = math.radians(2.0)
 

@@ -23,15 +23,9 @@ _NEAR_PEAK = 0.7
 class WarmUpWatch:
     """Passes a warm-up's stream on and ends it at the first whole cycle at which friction has settled.
 
-    Args:
-        source: of set-points.
-        motion: its parameters.
-        period_s: of the control cycle.
-
     Attributes:
         settled: friction changed by less than the limit at the end; None where no limit was asked for.
         percent_per_min: last rate of change, None where too few cycles ran.
-        cycles: whole cycles run.
     """
 
     def __init__(self, source: SetPointSource, motion: WarmUp, period_s: float) -> None:

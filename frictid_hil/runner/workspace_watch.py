@@ -18,13 +18,7 @@ SLACK_M = 0.01
 
 
 class WorkspaceWatch:
-    """Compares the place of every joint with the box.
-
-    Args:
-        workspace: the box and the chain.
-        names: of the joints.
-        cycle_hz: rate of ``check``.
-    """
+    """Compares the place of every joint with the box, given that ``check`` is called at ``cycle_hz``."""
 
     def __init__(self, workspace: Workspace, names: Sequence[str], cycle_hz: float) -> None:
         faces = tuple((low - SLACK_M, high + SLACK_M) for low, high in workspace.box_m)
