@@ -16,10 +16,9 @@ from typing import Any
 
 from frictid_drivers.servos.inspection import Told, joint_findings, meet, torque_source
 from frictid_drivers.servos.line import Line, PortFactory, SerialPort
-from frictid_drivers.servos.logs import Reader, frame_map_values, speed_cycles, to_bytes
-from frictid_drivers.servos.operating_mode import OperatingMode
+from frictid_drivers.servos.logs import Reader, frame_map_values, speed_cycles
 from frictid_drivers.servos.packets import WIRES
-from frictid_drivers.servos.place import Place
+from frictid_drivers.servos.servo import Servo
 from frictid_drivers.servos.settings import read_settings
 from frictid_hil.errors import ConfigError, FrictidError, HardwareError, PlanRefused, SafetyAbort
 from frictid_hil.plan.mode import Mode
@@ -41,7 +40,6 @@ from frictid_hil.protocol.driver import (
     WallClock,
 )
 from frictid_hil.protocol.rows import RowDecoder
-from frictid_hil.protocol.wishes import Do, Order, Wish
 
 LEAST_HZ = 200.0
 """Rate below which a healthy joint's curve was called ok and was 3 to 5 % outside its interval (100 Hz)."""
@@ -49,8 +47,6 @@ _SETTLE_S = 1.5
 _BUSIEST = 0.45
 """Share of a cycle that the line may take: the reading begins in its middle."""
 _WATCHDOG_STEP_S = 0.02
-_HOLD_SHARE = 0.5
-"""Of its highest speed: so fast a joint goes to where it shall hold, when its position loop takes it over."""
 
 
 class ServoDriver:
@@ -91,17 +87,10 @@ class ServoDriver:
         self._port_factory = port_factory or (lambda: SerialPort(path, self._line_settings.baud))
         self._line: Line | None = None
         self._told: dict[str, Told] = {}
-        self._reader: Reader | None = None
-        self._modes: dict[int, OperatingMode] = {}
+        self._servos: list[Servo] = []
         self._unwatched: list[str] = []
-        self._ends_rad: dict[str, tuple[float, float]] = {}
         self._rows: RowDecoder | None = None
-        self._wishes: list[Wish] = []
-        self._powered: list[bool] = []
-        self._energised: set[int] = set()
         self.may_be_powered: tuple[str, ...] = ()
-        self._goals: list[int | None] = []
-        self._places: list[Place] = []
         self._cycle_hz = 0.0
 
     # -- reaching them ------------------------------------------------------------------------------------------
@@ -202,32 +191,27 @@ class ServoDriver:
                 next_step=f"use a rate of at most {most_hz:g} Hz, fewer servos, or a higher baud",
             )
         self._cycle_hz = cycle_hz
-        self._reader = Reader(self._joints, 1.0 / cycle_hz)
-        self._rows = self._reader.rows()
-        self._wishes = [
-            Wish(joint, report) for joint, report in zip(self.setup.joints, self._rows.feedback, strict=True)
+        reader = Reader(self._joints, 1.0 / cycle_hz)
+        self._rows = reader.rows()
+        self._servos = [
+            Servo(joint, figures, self._told[joint.name].current_limit)
+            for joint, figures in zip(self.setup.joints, reader.joints, strict=True)
         ]
-        self._powered, self._goals = [False] * len(self._joints), [None] * len(self._joints)
-        self._places = [
-            Place(joint.max_velocity_rad_s, mine.model.count_rad)
-            for joint, mine in zip(self.setup.joints, self._joints, strict=True)
-        ]
-        self._ends_rad = {one.name: (one.position_min_rad, one.position_max_rad) for one in self.setup.joints}
         self._unwatched.clear()
-        self._energised.clear()
-        for at, mine in enumerate(self._joints):
-            if mine.model.registers.goal_current:
-                most_rad_s = _HOLD_SHARE * self.setup.joints[at].max_velocity_rad_s
-                self._modes[at] = OperatingMode(line, mine, most_rad_s)
-                if self._told[self.setup.joints[at].name].mode != self._registers.position_mode:
-                    self._modes[at].take_positions(None, powered=True)
-                if not line.put(mine.id, self._registers.watchdog, self._watchdog(self._line_settings.watchdog_s)):
-                    self._unwatched.append(self.setup.joints[at].name)
+        for servo in self._servos:
+            if not servo.mine.model.registers.goal_current:
+                continue
+            operating = servo.read_mode(line)
+            if self._told[servo.joint.name].mode != self._registers.position_mode:
+                operating.take_positions(None, powered=True)
+            if not line.put(servo.mine.id, self._registers.watchdog, self._watchdog(self._line_settings.watchdog_s)):
+                self._unwatched.append(servo.joint.name)
 
     def set_limits(self, joint: str, *, torque_nm: float, position_min_rad: float, position_max_rad: float) -> None:
         """Kept by the host; a servo's own torque limit stays as its owner set it."""
-        self._wish(joint).limit(torque_nm, position_min_rad, position_max_rad)
-        self._ends_rad[joint] = (position_min_rad, position_max_rad)
+        servo = self._servo(joint)
+        servo.wish.limit(torque_nm, position_min_rad, position_max_rad)
+        servo.ends_rad = (position_min_rad, position_max_rad)
 
     def frame_map_values(self) -> Mapping[str, Any]:
         """As ``driver.FrameMapped``."""
@@ -242,7 +226,7 @@ class ServoDriver:
             raise HardwareError("start_cycling before configure")
         getattr(self.clock, "restart", lambda: None)()
         line.heard = rows.feed
-        self._arm_watchdog(self._line_settings.watchdog_s, range(len(self._joints)))
+        self._arm_watchdog(self._line_settings.watchdog_s, self._servos)
 
     def enable(self, joint: str, mode: Mode) -> None:
         """Ask for power; progress is in the feedback. A change of mode under power begins with the torque of now.
@@ -257,23 +241,23 @@ class ServoDriver:
                 cause=self._why_not(mode),
                 next_step="identify it, and let it track: `compensate --task track --drive-mode position`",
             )
-        wish = self._wish(joint)
-        wish.enable(mode)
-        self._take_mode(self._wishes.index(wish), mode)
+        servo = self._servo(joint)
+        servo.wish.enable(mode)
+        servo.take_mode(mode)
 
     def disable(self, joint: str) -> None:
         """Ask for power off, after standstill."""
-        self._wish(joint).disable()
+        self._servo(joint).wish.disable()
 
     def lock(self, joint: str) -> None:
         """Hold the present goal."""
-        wish = self._wish(joint)
-        wish.lock()
-        self._take_mode(self._wishes.index(wish), Mode.POSITION)
+        servo = self._servo(joint)
+        servo.wish.lock()
+        servo.take_mode(Mode.POSITION)
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
-        self._wish(joint).unlock()
+        self._servo(joint).wish.unlock()
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """One cycle: goals, half a cycle, then the reading.
@@ -283,20 +267,16 @@ class ServoDriver:
             HardwareError: the port is gone.
         """
         line, rows = self._open_line(), self._rows
-        if rows is None or self._reader is None:
+        if rows is None:
             raise HardwareError("exchange before configure")
         begun_ns, period_ns = self.clock.now_ns(), 1e9 / self._cycle_hz
         for _ in line.received(begun_ns):  # late answers
             pass
-        registers, refused = self._registers, None
+        registers = self._registers
         # A goal always comes before power, so that power does not pull.
         told: dict[int, dict[int, bytes]] = {registers.goal: {}, registers.goal_current: {}, registers.torque: {}}
-        for at, (wish, set_point) in enumerate(zip(self._wishes, set_points, strict=True)):
-            try:
-                order = wish.order(set_point)
-            except SafetyAbort as abort:
-                refused, order = abort, wish.order(set_point)
-            self._note(at, order, told)
+        noted = [servo.note(set_point, told) for servo, set_point in zip(self._servos, set_points, strict=True)]
+        refused = [abort for abort in noted if abort is not None]
         for address, each in told.items():
             if each:
                 line.tell(address, each)
@@ -305,36 +285,20 @@ class ServoDriver:
         for _ in line.received(begun_ns + round(0.95 * period_ns)):
             if not rows.waiting():
                 break
-        for place, report, counts in zip(self._places, rows.feedback, self._reader.counts, strict=True):
-            place.see(report, counts)
-        if refused is not None:
-            raise refused
+        for servo in self._servos:
+            servo.see()
+        if refused:
+            raise refused[-1]
         return rows.feedback
 
     def quick_stop(self) -> None:
-        """Every joint holds the goal that it has, or where it was last seen; never raises.
-
-        A goal that goes back to a reading would send the joint wherever a reading that jumped says. One that is far
-        away may not have been heard yet, and would be now: the joint is told half of that way.
-        """
-        line, reader = self._line, self._reader
-        if line is None or reader is None:
+        """Every joint holds the goal that it has, or where it was last seen; never raises."""
+        if self._line is None:
             return
-        goals = {}
-        for at, wish in enumerate(self._wishes):
-            wish.stop()
-            if not self._powered[at]:
-                continue
-            if reader.takes_currents(at):
-                with contextlib.suppress(Exception):
-                    self._modes[at].stop(self._places[at].counts)
-            self._goals[at] = self._places[at].nearer(self._goals[at])
-            counts = self._counts(at, math.nan)
-            if counts is not None:
-                goals[self._joints[at].id] = to_bytes(counts, self._registers.goal_bytes, self._joints[at].model)
+        goals = {servo.mine.id: goal for servo in self._servos if (goal := servo.stop()) is not None}
         with contextlib.suppress(Exception):
             if goals:
-                line.tell(self._registers.goal, goals)
+                self._line.tell(self._registers.goal, goals)
 
     def stop_cycling(self) -> None:
         """Bring every joint to rest and off.
@@ -342,13 +306,13 @@ class ServoDriver:
         Raises:
             SafetyAbort: a joint was not seen to be off; it was told to let go all the same.
         """
-        if not self._wishes:
+        if not self._servos:
             return
         try:
             self._settle()
         finally:
             self._let_go()
-            self._wishes, self._rows, self._reader = [], None, None
+            self._servos, self._rows = [], None
         if self.may_be_powered:
             raise SafetyAbort(
                 "did not say that it has no power any more",
@@ -360,7 +324,7 @@ class ServoDriver:
         """Everything to rest, the port released; safe to call twice and after errors."""
         if self._line is None:
             return
-        if self._wishes:
+        if self._servos:
             self.quick_stop()
             with contextlib.suppress(FrictidError):
                 self.stop_cycling()
@@ -379,72 +343,17 @@ class ServoDriver:
             else "not every servo of this line takes a current"
         )
 
-    def _note(self, at: int, order: Order, told: Mapping[int, dict[int, bytes]]) -> None:
-        """Add what this servo is told in the coming cycle, by register and id."""
-        mine, reader, registers = self._joints[at], self._reader, self._registers
-        assert reader is not None  # configured
-        on = order.do is not Do.REST
-        if on and reader.takes_currents(at):
-            # Whatever else is asked of it in this mode: no current.
-            current = self._current(at, order.torque_nm if order.mode is Mode.TORQUE else 0.0)
-            told[registers.goal_current][mine.id] = to_bytes(current, 2, mine.model)
-        if not on or reader.takes_currents(at):
-            self._goals[at] = None
-        before = self._goals[at]
-        counts = self._counts(at, self._goal_rad(at, order) if order.do is Do.FOLLOW else math.nan)
-        if on and counts is not None and not reader.takes_currents(at):
-            if counts != before and at in self._modes and self._modes[at].slowed:
-                self._modes[at].follow_goals()
-            told[registers.goal][mine.id] = to_bytes(counts, registers.goal_bytes, mine.model)
-        if on is not self._powered[at] and (counts is not None or not on):
-            told[registers.torque][mine.id], self._powered[at] = bytes([on]), on
-            self._energised |= {at} if on else set()
-
-    def _goal_rad(self, at: int, order: Order) -> float:
-        """Where to; a torque that is added is a distance on the spring that the servo's loop is."""
-        joint = self.setup.joints[at]
-        if not order.torque_nm or not joint.loop_stiffness_nm_per_rad or order.mode is not Mode.POSITION:
-            return order.position_rad
-        low_rad, high_rad = self._ends_rad[joint.name]
-        return min(max(order.position_rad + order.torque_nm / joint.loop_stiffness_nm_per_rad, low_rad), high_rad)
-
-    def _current(self, at: int, torque_nm: float) -> int:
-        """The goal current, within the servo's own limit."""
-        mine, most = self._joints[at], self._told[self.setup.joints[at].name].current_limit
-        return min(max(round(mine.direction * torque_nm / mine.torque_nm_per_unit), -most), most)
-
-    def _take_mode(self, at: int, mode: Mode) -> None:
-        """Another operating mode, with the current or at the place of now."""
-        reader, operating = self._reader, self._modes.get(at)
-        if reader is None or operating is None or reader.takes_currents(at) is (mode is Mode.TORQUE):
-            return
-        if mode is Mode.TORQUE:
-            present_nm = reader.feedback[at].torque_nm if self._powered[at] else 0.0
-            operating.take_currents(self._current(at, present_nm), powered=self._powered[at])
-        else:
-            self._goals[at] = self._places[at].counts
-            operating.take_positions(self._goals[at], powered=self._powered[at])
-
     def _open_line(self) -> Line:
         if self._line is None:
             raise HardwareError("the port is not open", where=self.setup.bus)
         return self._line
 
-    def _wish(self, joint: str) -> Wish:
+    def _servo(self, joint: str) -> Servo:
         name = self.setup.joint(joint).name
-        for wish in self._wishes:
-            if wish.joint.name == name:
-                return wish
+        for servo in self._servos:
+            if servo.joint.name == name:
+                return servo
         raise HardwareError("not configured yet", where=f"joint {name}")
-
-    def _counts(self, at: int, position_rad: float) -> int | None:
-        """The goal; where none is asked for, the one in force, and without any where the joint is."""
-        if math.isfinite(position_rad):
-            mine = self._joints[at]
-            self._goals[at] = min(max(mine.counts(position_rad), 0), mine.model.counts_per_turn - 1)
-        elif self._goals[at] is None:
-            self._goals[at] = self._places[at].counts
-        return self._goals[at]
 
     def _highest_rate_hz(self) -> float:
         count, registers, wire = len(self._joints), self._registers, self._wire
@@ -461,17 +370,17 @@ class ServoDriver:
     def _watchdog(self, seconds: float) -> bytes:
         return bytes([min(127, round(seconds / _WATCHDOG_STEP_S))])
 
-    def _arm_watchdog(self, seconds: float, servos: Sequence[int]) -> None:
+    def _arm_watchdog(self, seconds: float, servos: Sequence[Servo]) -> None:
         """0 clears what tripped earlier, and ends it."""
         if self._registers.watchdog and servos:
             for value in dict.fromkeys((b"\0", self._watchdog(seconds))):
-                self._open_line().tell(self._registers.watchdog, {self._joints[at].id: value for at in servos})
+                self._open_line().tell(self._registers.watchdog, {servo.mine.id: value for servo in servos})
 
     def _settle(self) -> None:
         """Cycle until every joint stands and was told to let go."""
-        for wish in self._wishes:
-            wish.disable()
-        set_points = [SetPoint() for _ in self._wishes]
+        for servo in self._servos:
+            servo.wish.disable()
+        set_points = [SetPoint() for _ in self._servos]
         period_ns = round(1e9 / self._cycle_hz)
         begun_ns = self.clock.now_ns()
         for k in range(max(2, math.ceil(_SETTLE_S * self._cycle_hz))):
@@ -488,19 +397,18 @@ class ServoDriver:
         line = self._open_line()
         with contextlib.suppress(FrictidError):
             line.tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
-        off = [at for at in range(len(self._joints)) if self._seen_off(at)]
-        names = [joint.name for joint in self.setup.joints]
-        self.may_be_powered = tuple(names[at] for at in sorted(self._energised - set(off)))
+        off = [servo for servo in self._servos if self._seen_off(servo)]
+        self.may_be_powered = tuple(servo.joint.name for servo in self._servos if servo.energised and servo not in off)
         with contextlib.suppress(FrictidError):
             self._arm_watchdog(0.0, off)
-            for at in off:
-                if at in self._modes and self._reader is not None and self._reader.takes_currents(at):
-                    self._modes[at].take_positions(None, powered=False)
-                elif at in self._modes and self._modes[at].slowed:
-                    self._modes[at].follow_goals()
+            for servo in off:
+                if servo.operating is not None and servo.figures.takes_currents:
+                    servo.operating.take_positions(None, powered=False)
+                elif servo.operating is not None:
+                    servo.operating.follow_goals()
         line.heard = None
 
-    def _seen_off(self, at: int) -> bool:
+    def _seen_off(self, servo: Servo) -> bool:
         with contextlib.suppress(FrictidError):
-            return self._open_line().put(self._joints[at].id, self._registers.torque, b"\0")
+            return self._open_line().put(servo.mine.id, self._registers.torque, b"\0")
         return False

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from frictid_drivers.servos.models import Model, Registers
@@ -38,31 +38,41 @@ def speed_cycles(period_s: float) -> int:
     return min(_SPEED_CYCLES, max(1, round(_SPEED_S / period_s)))
 
 
+@dataclass(slots=True)
+class Figures:
+    """What packets told of one joint.
+
+    Attributes:
+        track: cycle and position of the last readings.
+        counts: position as read; None before.
+        goal_rad: in force; NaN for none.
+        takes_currents: it was put into current mode.
+    """
+
+    settings: JointSettings
+    track: deque[tuple[int, float]]
+    feedback: Feedback = field(default_factory=Feedback)
+    counts: int | None = None
+    goal_rad: float = math.nan
+    powered: bool = False
+    takes_currents: bool = False
+
+
 class Reader:
     """Packets of one line to figures of its joints."""
 
     def __init__(self, joints: Sequence[JointSettings], period_s: float) -> None:
-        self._joints = list(joints)
         self._period_s = period_s
         self._wire = WIRES[joints[0].model.wire]
         self._registers = joints[0].model.registers
         self._at = {joint.id: at for at, joint in enumerate(joints)}
-        self._goals_rad = [math.nan] * len(joints)
-        self._powered = [False] * len(joints)
-        self._takes_currents = [False] * len(joints)
         self._cycle = 0
         rows = speed_cycles(period_s) + 1
-        self._track: list[deque[tuple[int, float]]] = [deque(maxlen=rows) for _ in joints]
-        self.counts: list[int | None] = [None] * len(joints)
-        self.feedback = [Feedback() for _ in joints]
+        self.joints = [Figures(joint, deque(maxlen=rows)) for joint in joints]
 
     def rows(self) -> RowDecoder:
         """A decoder of the log's rows."""
-        return RowDecoder(self.feedback, self._decode)
-
-    def takes_currents(self, at: int) -> bool:
-        """The servo was put into current mode."""
-        return self._takes_currents[at]
+        return RowDecoder([joint.feedback for joint in self.joints], self._decode)
 
     def _decode(self, can_id: int, data: bytes) -> Command | Report | Service | None:
         if can_id not in (SENT_ID, RECEIVED_ID):
@@ -76,8 +86,8 @@ class Reader:
         address = int.from_bytes(packet.data[:size], "little")
         if packet.instruction == SYNC_READ and address == registers.block:
             self._cycle += 1
-            others = tuple((at, goal) for at, goal in enumerate(self._goals_rad) if at)
-            return Command(0, self._goals_rad[0], others)
+            others = tuple((at, joint.goal_rad) for at, joint in enumerate(self.joints) if at)
+            return Command(0, self.joints[0].goal_rad, others)
         if packet.instruction == SYNC_WRITE and address in (registers.goal, registers.torque, registers.mode):
             each = int.from_bytes(packet.data[size : 2 * size], "little") + 1
             told = packet.data[2 * size :]
@@ -89,59 +99,62 @@ class Reader:
         at = self._at.get(servo)
         if at is None:
             return
-        joint = self._joints[at]
-        registers = joint.model.registers
+        joint, settings = self.joints[at], self.joints[at].settings
+        registers = settings.model.registers
         if address == registers.goal:
-            self._goals_rad[at] = joint.position_rad(number(data, joint.model, 15))
+            joint.goal_rad = settings.position_rad(number(data, settings.model, 15))
             return
         if address == registers.mode:
-            self._takes_currents[at] = bool(registers.goal_current) and data[0] == registers.current_mode
+            joint.takes_currents = bool(registers.goal_current) and data[0] == registers.current_mode
         else:
-            self._powered[at] = data[0] == 1
-        if self._takes_currents[at] or not self._powered[at]:
-            self._goals_rad[at] = math.nan
+            joint.powered = data[0] == 1
+        if joint.takes_currents or not joint.powered:
+            joint.goal_rad = math.nan
 
     def _answered(self, packet: Packet) -> Report | Service:
         at, registers = self._at.get(packet.id), self._registers
         if at is None or len(packet.data) != registers.block_bytes:
             return Service("answer")
-        joint, report = self._joints[at], self.feedback[at]
-        model, block = joint.model, packet.data
+        joint, settings, report, block = (
+            self.joints[at],
+            self.joints[at].settings,
+            self.joints[at].feedback,
+            packet.data,
+        )
 
-        def field(offset: int, size: int, sign_bit: int) -> int:
-            return number(block[offset : offset + size], model, sign_bit)
+        def field_of(offset: int, size: int, sign_bit: int) -> int:
+            return number(block[offset : offset + size], settings.model, sign_bit)
 
-        counts = field(*registers.position, 15)
-        self.counts[at] = counts
-        report.position_rad = joint.position_rad(counts)
-        track = self._track[at]
+        joint.counts = field_of(*registers.position, 15)
+        report.position_rad = settings.position_rad(joint.counts)
+        track = joint.track
         track.append((self._cycle, report.position_rad))
         cycles = track[-1][0] - track[0][0]
         report.velocity_rad_s = (track[-1][1] - track[0][1]) / (cycles * self._period_s) if cycles else 0.0
-        report.torque_nm = joint.direction * joint.torque_nm_per_unit * _effort(model, field)
+        report.torque_nm = settings.direction * settings.torque_nm_per_unit * _effort(settings.model, field_of)
         if registers.temperature >= 0:
             report.temperature_c = float(block[registers.temperature])
         # A Dynamixel's error is its alert bit; the others only tell that an instruction was wrong.
         report.error_code = packet.error & (0xFF if self._wire.name == "feetech" else 0x80)
         report.status_raw = packet.error
         report.state = (
-            JointState.FAULT if report.error_code else JointState.ENABLED if self._powered[at] else JointState.DISABLED
+            JointState.FAULT if report.error_code else JointState.ENABLED if joint.powered else JointState.DISABLED
         )
-        mode = Mode.TORQUE if self._takes_currents[at] else Mode.POSITION
+        mode = Mode.TORQUE if joint.takes_currents else Mode.POSITION
         report.mode = mode if report.state is JointState.ENABLED else Mode.NONE
         return Report(at)
 
 
-def _effort(model: Model, field: Any) -> int:
+def _effort(model: Model, field_of: Callable[[int, int, int], int]) -> int:
     """Signed steps of current, or of load where there is no current.
 
     A Feetech's current has no documented sign; its load has.
     """
     registers = model.registers
     if not model.current_a:
-        return int(field(registers.load, 2, 10))
-    current = int(field(registers.current, 2, 15))
-    return current if registers.load < 0 else abs(current) * (-1 if field(registers.load, 2, 10) < 0 else 1)
+        return field_of(registers.load, 2, 10)
+    current = field_of(registers.current, 2, 15)
+    return current if registers.load < 0 else abs(current) * (-1 if field_of(registers.load, 2, 10) < 0 else 1)
 
 
 def number(data: bytes, model: Model, sign_bit: int) -> int:

@@ -34,9 +34,6 @@ class OperatingMode:
         mine: the servo.
         most_rad_s: how fast it may go to where it shall hold.
 
-    Attributes:
-        slowed: its profile is in force.
-
     Raises:
         HardwareError: it does not answer.
     """
@@ -48,7 +45,7 @@ class OperatingMode:
         self._kept = {address: line.ask(mine.id, address, count) for address, count in _RESET}
         by_time = line.ask(mine.id, _DRIVE_MODE, 1)[0] & _BY_TIME
         self._slow = _WAY_MS if by_time else max(1, math.floor(most_rad_s / _PROFILE_RAD_S))
-        self.slowed = False
+        self._slowed = False
 
     def take_currents(self, goal: int, *, powered: bool) -> None:
         """Current mode, beginning with this goal; under power if it was.
@@ -90,15 +87,15 @@ class OperatingMode:
 
     def follow_goals(self) -> None:
         """From now on it goes as fast as its goals, with the profile that its owner gave it."""
-        for address, data in self._kept.items():
+        for address, data in self._kept.items() if self._slowed else ():
             if address <= _PROFILE < address + len(data):
                 self._tell(address, data)
-        self.slowed = False
+        self._slowed = False
 
     def _hold(self, goal: int) -> None:
         """Power at a goal; wherever the joint is, it goes there slowly."""
         self._tell(_PROFILE, self._slow.to_bytes(4, "little"))
-        self.slowed = True
+        self._slowed = True
         self._tell(self._registers.goal, to_bytes(goal, self._registers.goal_bytes, self._mine.model))
         self._tell(self._registers.torque, _ON)
 
@@ -115,7 +112,7 @@ class OperatingMode:
     def _restore(self) -> None:
         for address, data in self._kept.items():
             self._tell(address, data)
-        self.slowed = False
+        self._slowed = False
 
     def _tell(self, address: int, data: bytes) -> None:
         self._line.tell(address, {self._mine.id: data})
