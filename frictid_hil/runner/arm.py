@@ -26,13 +26,9 @@ _DISABLING_S = 0.1
 
 @dataclass(frozen=True)
 class Arm:
-    """All joints of one stretch of cyclic traffic.
+    """All joints of one stretch of cyclic traffic."""
 
-    Attributes:
-        joints: in the order of set-points and reports.
-    """
-
-    joints: Sequence[JointSetup]
+    joints: Sequence[JointSetup]  # in the order of set-points and reports
     loop: CyclicLoop
     care: Care
 

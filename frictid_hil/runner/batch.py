@@ -45,28 +45,18 @@ class BatchDriver(Batched, Driver, Protocol):
 
 @dataclass
 class BatchRunner:
-    """Runs one joint's plan; power comes on and goes off again in here.
+    """Runs one joint's plan; power comes on and goes off again in here."""
 
-    Attributes:
-        driver: configured, limits set, not yet under power.
-        limits: of every joint, in the order of ``joints``.
-        samples: ring for every fetched sample.
-        offset_ns: added to run time.
-        notify: told what happens.
-        stop: asked often.
-        pump: called to empty the rings where this process writes the files.
-    """
-
-    driver: BatchDriver
+    driver: BatchDriver  # configured, limits set, not yet under power
     joints: Sequence[JointSetup]
     supervisor: Supervisor
-    limits: Sequence[JointLimits]
-    samples: Ring
-    offset_ns: int
+    limits: Sequence[JointLimits]  # of every joint, in the order of ``joints``
+    samples: Ring  # ring for every fetched sample
+    offset_ns: int  # added to run time
     care: Care
-    notify: Callable[[Event], None]
-    stop: StopRequest
-    pump: Callable[[], None]
+    notify: Callable[[Event], None]  # told what happens
+    stop: StopRequest  # asked often
+    pump: Callable[[], None]  # called to empty the rings where this process writes the files
     _count: int = 0
 
     @property

@@ -18,43 +18,30 @@ _OVER_MAXIMUM = 1.05
 
 @dataclass(frozen=True, slots=True)
 class Care:
-    """How careful the scheduler is; the defaults suit an arm of a few kilograms.
+    """How careful the scheduler is; the defaults suit an arm of a few kilograms."""
 
-    Attributes:
-        reference_tolerance_rad: a joint further than this from its planned locked position means that the position
-            reference is wrong, or that somebody moved the arm: refused.
-        approach_rad_s: speed of moves to locked and start positions.
-        still_rad: how far a joint may be from where it was locked.
-        still_rad_s: speed below which a joint stands.
-        settling_rad: how far a joint may be from its place while power comes on, or before it is seen to stand.
-        settling_rad_s: its speed meanwhile.
-        following_error_rad: bound on the following error, beyond what the driver's own delay makes at full speed.
-        following_error_s: unless a robot file sets that bound, it is no more than the joint covers in this time at its
-            highest speed: a drive that hears its set-points again after a silence then catches up no faster.
-        velocity_margin: measured speed may exceed the planned peak by this factor ...
-        velocity_slack_rad_s: ... plus this.
-        travel_slack_rad: measured position may leave the planned travel by this.
-        silence_s: how long the moving joint may go without a report; never less than three cycles.
-        interlock: must be closed before and during motion; None where a person watches.
-        tolerated: topics of the driver's findings that the caller judges by itself when asked to proceed.
-        droop_rad: see ``Capabilities.droop_rad``.
-    """
-
+    # A joint further than this from its planned locked position means that the position reference is wrong, or that
+    # somebody moved the arm: refused.
     reference_tolerance_rad: float = math.radians(10.0)
-    approach_rad_s: float = math.radians(20.0)
-    still_rad: float = math.radians(0.25)
-    still_rad_s: float = math.radians(0.5)
+    approach_rad_s: float = math.radians(20.0)  # speed of moves to locked and start positions
+    still_rad: float = math.radians(0.25)  # how far a joint may be from where it was locked
+    still_rad_s: float = math.radians(0.5)  # speed below which a joint stands
+    # How far a joint may be from its place while power comes on, or before it is seen to stand.
     settling_rad: float = math.radians(1.0)
-    settling_rad_s: float = math.radians(15.0)
+    settling_rad_s: float = math.radians(15.0)  # its speed meanwhile
+    # Bound on the following error, beyond what the driver's own delay makes at full speed.
     following_error_rad: float = math.radians(5.0)
+    # Unless a robot file sets that bound, it is no more than the joint covers in this time at its highest speed: a
+    # drive that hears its set-points again after a silence then catches up no faster.
     following_error_s: float = 0.015
-    velocity_margin: float = 1.25
-    velocity_slack_rad_s: float = math.radians(10.0)
-    travel_slack_rad: float = math.radians(2.0)
-    silence_s: float = 0.02
-    interlock: Interlock | None = None
+    velocity_margin: float = 1.25  # measured speed may exceed the planned peak by this factor ...
+    velocity_slack_rad_s: float = math.radians(10.0)  # ... plus this
+    travel_slack_rad: float = math.radians(2.0)  # measured position may leave the planned travel by this
+    silence_s: float = 0.02  # how long the moving joint may go without a report; never less than three cycles
+    interlock: Interlock | None = None  # must be closed before and during motion; None where a person watches
+    # Topics of the driver's findings that the caller judges by itself when asked to proceed.
     tolerated: frozenset[str] = frozenset()
-    droop_rad: Mapping[str, float] = field(default_factory=dict)
+    droop_rad: Mapping[str, float] = field(default_factory=dict)  # see ``Capabilities.droop_rad``
 
     def of_robot(self, bounds: Mapping[str, float], droop_rad: Mapping[str, float]) -> Care:
         """The same care with the bounds that a robot file sets and the droop that its driver declares."""

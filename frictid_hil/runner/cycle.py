@@ -62,28 +62,17 @@ class Stream:
 
 @dataclass(slots=True)
 class CycleCount:
-    """How well the loop kept its deadlines; run time in ns.
+    """How well the loop kept its deadlines; run time in ns."""
 
-    Attributes:
-        cycles: exchanges made.
-        late: cycles that began later than half a period after their deadline.
-        missed: deadlines that passed without an exchange.
-        worst_ns: largest lateness.
-        first_ns: of the first exchange.
-        last_ns: of the last exchange.
-        streamed: cycles in which a joint was streamed set-points.
-        limited: those of them in which a limit of its drive was active.
-        stops: first deadline that was missed, and for how long the set-points stood still.
-    """
-
-    cycles: int = 0
-    late: int = 0
-    missed: int = 0
-    worst_ns: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    streamed: int = 0
-    limited: int = 0
+    cycles: int = 0  # exchanges made
+    late: int = 0  # cycles that began later than half a period after their deadline
+    missed: int = 0  # deadlines that passed without an exchange
+    worst_ns: int = 0  # largest lateness
+    first_ns: int = 0  # of the first exchange
+    last_ns: int = 0  # of the last exchange
+    streamed: int = 0  # cycles in which a joint was streamed set-points
+    limited: int = 0  # those of them in which a limit of its drive was active
+    # First deadline that was missed, and for how long the set-points stood still.
     stops: list[tuple[int, int]] = field(default_factory=list)
 
     @property

@@ -28,40 +28,26 @@ class Configured:
 
 @dataclass(frozen=True, slots=True)
 class PhaseStarted:
-    """A joint begins a stretch of its plan.
-
-    Attributes:
-        phase: ``configure``, ``enable``, ``move``, ``rehearsal``, ``hold``, ``cycles``, ``drift``, ``reversal``, ...
-        duration_s: planned, 0 where not known.
-    """
+    """A joint begins a stretch of its plan."""
 
     joint: str
-    phase: str
-    duration_s: float
+    phase: str  # ``configure``, ``enable``, ``move``, ``rehearsal``, ``hold``, ``cycles``, ``drift``, ``reversal``, ...
+    duration_s: float  # planned, 0 where not known
 
 
 @dataclass(frozen=True, slots=True)
 class JointRun:
-    """A joint's motions are over and it is locked again.
-
-    Attributes:
-        session: number of the stretch of cyclic traffic; run time starts at zero in each.
-        marks: what it did, on the run time of the samples.
-        rate_hz: achieved cycle rate.
-        late_cycles: began later than half a period.
-        missed_cycles: deadlines without exchange.
-        duration_s: run time of the whole session.
-    """
+    """A joint's motions are over and it is locked again."""
 
     joint: str
-    session: int
-    marks: tuple[Mark, ...]
-    rate_hz: float
+    session: int  # number of the stretch of cyclic traffic; run time starts at zero in each
+    marks: tuple[Mark, ...]  # what it did, on the run time of the samples
+    rate_hz: float  # achieved cycle rate
     cycles: int
-    late_cycles: int
-    missed_cycles: int
+    late_cycles: int  # began later than half a period
+    missed_cycles: int  # deadlines without exchange
     worst_lateness_s: float
-    duration_s: float
+    duration_s: float  # run time of the whole session
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +60,11 @@ class Marked:
 
 @dataclass(frozen=True, slots=True)
 class JobProgress:
-    """How far a job on the controller, or the transfer of its recording, has come; about once a second.
-
-    Attributes:
-        stage: ``motion`` or ``transfer``.
-        share: done, 0..1.
-    """
+    """How far a job on the controller, or the transfer of its recording, has come; about once a second."""
 
     joint: str
-    stage: str
-    share: float
+    stage: str  # ``motion`` or ``transfer``
+    share: float  # done, 0..1
 
 
 @dataclass(frozen=True, slots=True)

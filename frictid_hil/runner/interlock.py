@@ -13,19 +13,12 @@ from frictid_hil.protocol.driver import Feedback
 
 @dataclass(frozen=True, slots=True)
 class Interlock:
-    """One bit of one drive's digital inputs.
+    """One bit of one drive's digital inputs."""
 
-    Attributes:
-        joint: whose drive reports it.
-        bit: of 60FD.
-        closed_when: level of the bit when the cell is closed.
-        silence_s: oldest report that still counts.
-    """
-
-    joint: str
-    bit: int
-    closed_when: int = 1
-    silence_s: float = 0.1
+    joint: str  # whose drive reports it
+    bit: int  # of 60FD
+    closed_when: int = 1  # level of the bit when the cell is closed
+    silence_s: float = 0.1  # oldest report that still counts
 
     def check(self, report: Feedback, cycle_hz: float) -> None:
         """Pass one report of that joint.

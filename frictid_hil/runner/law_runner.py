@@ -34,16 +34,12 @@ _NOISE_SHARE = 0.05
 
 @dataclass
 class LawRunner:
-    """Takes one joint into its ``Compensated`` motions and out of them.
-
-    Attributes:
-        limits: of the joint in position control.
-    """
+    """Takes one joint into its ``Compensated`` motions and out of them."""
 
     loop: CyclicLoop
     joint: JointSetup
     index: int
-    limits: JointLimits
+    limits: JointLimits  # of the joint in position control
     _drive_mode: Mode = Mode.POSITION
     _source: LawSource | None = None
 

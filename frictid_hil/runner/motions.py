@@ -48,21 +48,13 @@ def stream(loop: CyclicLoop, index: int, motion: Motion) -> None:
 
 @dataclass(frozen=True)
 class Motions:
-    """The motions of one joint, or of several in step.
+    """The motions of one joint, or of several in step."""
 
-    Attributes:
-        loop: of the stretch; these joints follow their set-points, all others are locked.
-        joints: that move, by index.
-        limits: of all joints while they are in position control.
-        approach_rad_s: speed of small approaches.
-        notify: told what happens.
-    """
-
-    loop: CyclicLoop
-    joints: Mapping[int, JointSetup]
-    limits: Sequence[JointLimits]
-    approach_rad_s: float
-    notify: Callable[[Event], None]
+    loop: CyclicLoop  # of the stretch; these joints follow their set-points, all others are locked
+    joints: Mapping[int, JointSetup]  # that move, by index
+    limits: Sequence[JointLimits]  # of all joints while they are in position control
+    approach_rad_s: float  # speed of small approaches
+    notify: Callable[[Event], None]  # told what happens
 
     @cached_property
     def _laws(self) -> dict[int, LawRunner]:

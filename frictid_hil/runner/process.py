@@ -73,22 +73,16 @@ class _Life:
 
 @dataclass(slots=True)
 class _Listener:
-    """This end of the pipe.
-
-    Attributes:
-        outcome: error that ended the run in the child.
-        finished: the child has said how it ended.
-        powered: drives may have power.
-    """
+    """This end of the pipe."""
 
     pipe: Connection
     notify: Callable[[Event], None]
     proceed: Callable[[Preflight], bool]
     stop: StopSignals
     drain: Callable[[], None]
-    outcome: FrictidError | None = None
-    finished: bool = False
-    powered: bool = False
+    outcome: FrictidError | None = None  # error that ended the run in the child
+    finished: bool = False  # the child has said how it ended
+    powered: bool = False  # drives may have power
 
     def hear(self) -> bool:
         """Deal with one message; False where the child has closed its end."""

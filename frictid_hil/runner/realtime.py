@@ -117,22 +117,16 @@ def _allowed(cpu: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How late an empty loop is on this computer: percentiles and the latest of the cycles that ``duration_s`` holds.
-
-    Attributes:
-        highest_hz: the highest usual rate at which 99.9 % of the cycles begin within half a period; 0 for none.
-        told: what was not permitted, and the remedy.
-        isolated_cpu: processor that the loop had to itself; None where none is isolated.
-    """
+    """How late an empty loop is on this computer: percentiles, and the latest, of the cycles of ``duration_s``."""
 
     duration_s: float
     p50_s: float
     p99_s: float
     p999_s: float
     worst_s: float
-    highest_hz: int
-    told: tuple[str, ...]
-    isolated_cpu: int | None
+    highest_hz: int  # the highest usual rate at which 99.9 % of the cycles begin within half a period; 0 for none
+    told: tuple[str, ...]  # what was not permitted, and the remedy
+    isolated_cpu: int | None  # processor that the loop had to itself; None where none is isolated
 
 
 def judged(late_s: Array, duration_s: float, told: list[str], isolated_cpu: int | None = None) -> Latency:

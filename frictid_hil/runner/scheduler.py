@@ -58,27 +58,17 @@ class Recorder:
 
 @dataclass
 class Scheduler:
-    """Runs one plan on one driver.
+    """Runs one plan on one driver."""
 
-    Attributes:
-        driver: not yet opened.
-        setup: the robot, as the driver knows it.
-        plan: checked against limits.
-        notify: told what happens.
-        proceed: asked once after the preflight; False ends the run before anything moves.
-        stop: read once per cycle.
-        pump: see ``CyclicLoop``.
-    """
-
-    driver: Driver
-    setup: RobotSetup
-    plan: Plan
+    driver: Driver  # not yet opened
+    setup: RobotSetup  # the robot, as the driver knows it
+    plan: Plan  # checked against limits
     recorder: Recorder
     _: KW_ONLY
-    notify: Callable[[Event], None]
-    proceed: Callable[[Preflight], bool]
-    stop: StopRequest
-    pump: Callable[[], None] | None = None
+    notify: Callable[[Event], None]  # told what happens
+    proceed: Callable[[Preflight], bool]  # asked once after the preflight; False ends the run before anything moves
+    stop: StopRequest  # read once per cycle
+    pump: Callable[[], None] | None = None  # see ``CyclicLoop``
     care: Care = field(default_factory=Care)
     _command_delay_s: float = field(default=0.0, init=False)
     _resolution_rad: Mapping[str, float] = field(default_factory=dict, init=False)

@@ -53,23 +53,15 @@ def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, per
 
 
 class _Row(NamedTuple):
-    """One report.
+    """One report."""
 
-    Attributes:
-        t_ns: run time of the row in which it came.
-        position_rad: as reported.
-        velocity_rad_s: as reported.
-        least_rad: the way since the watch began, by the velocity, where the joint stood whenever nobody saw it.
-        most_rad: the same where it went on whenever nobody saw it.
-        late_s: how much older than its row it may be. A report that comes after a silence may be the first one of
-            those that were missed; for as long as the silence was, the next ones may be old as well.
-    """
-
-    t_ns: int
-    position_rad: float
-    velocity_rad_s: float
-    least_rad: float
-    most_rad: float
+    t_ns: int  # run time of the row in which it came
+    position_rad: float  # as reported
+    velocity_rad_s: float  # as reported
+    least_rad: float  # the way since the watch began, by the velocity, where the joint stood whenever nobody saw it
+    most_rad: float  # the same where it went on whenever nobody saw it
+    # How much older than its row it may be. A report that comes after a silence may be the first one of those that were
+    # missed; for as long as the silence was, the next ones may be old as well.
     late_s: float
 
 

@@ -29,34 +29,20 @@ _WITHOUT_POWER = (JointState.DISABLED, JointState.FAULT)
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Bounds of one joint while it moves or stands.
+    """Bounds of one joint while it moves or stands."""
 
-    Attributes:
-        position_min_rad: lowest position, a little outside the planned travel.
-        position_max_rad: highest position.
-        velocity_rad_s: largest measured speed.
-        torque_nm: largest measured torque; exceeding it for ``torque_s`` without a break trips.
-        following_error_rad: largest distance between command and position (position mode only).
-        still_rad: how far a locked joint may be from where it was locked.
-        settling_rad: how far a settling joint may be from its place.
-        settling_rad_s: its speed.
-        power_w: largest mechanical power, torque times speed.
-        torque_s: how long the torque may stay above its limit.
-        silence_s: how old a report may be; never less than three cycles.
-        withstands_nm: under torque control, a joint whose commanded torque changes by more than this does not stand.
-    """
-
-    position_min_rad: float
-    position_max_rad: float
-    velocity_rad_s: float
-    torque_nm: float
-    following_error_rad: float = 0.1
-    still_rad: float = math.radians(0.25)
-    settling_rad: float = math.radians(1.0)
-    settling_rad_s: float = math.radians(15.0)
-    power_w: float = math.inf
-    torque_s: float = 0.02
-    silence_s: float = 0.02
+    position_min_rad: float  # lowest position, a little outside the planned travel
+    position_max_rad: float  # highest position
+    velocity_rad_s: float  # largest measured speed
+    torque_nm: float  # largest measured torque; exceeding it for ``torque_s`` without a break trips
+    following_error_rad: float = 0.1  # largest distance between command and position (position mode only)
+    still_rad: float = math.radians(0.25)  # how far a locked joint may be from where it was locked
+    settling_rad: float = math.radians(1.0)  # how far a settling joint may be from its place
+    settling_rad_s: float = math.radians(15.0)  # its speed
+    power_w: float = math.inf  # largest mechanical power, torque times speed
+    torque_s: float = 0.02  # how long the torque may stay above its limit
+    silence_s: float = 0.02  # how old a report may be; never less than three cycles
+    # Under torque control, a joint whose commanded torque changes by more than this does not stand.
     withstands_nm: float = math.inf
 
 

@@ -33,17 +33,12 @@ ON, OFF, CLEAR = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd", b"\xff" * 7 + b"\
 
 @dataclass(frozen=True, slots=True)
 class Motor:
-    """Where one actuator is and what its numbers mean.
-
-    Attributes:
-        reply_id: identifier (11 bit) or host id (29 bit) that its answers carry.
-        flags: of all its identifiers: ``FD_FRAME`` where it speaks CAN FD.
-    """
+    """Where one actuator is and what its numbers mean."""
 
     id: int
-    reply_id: int
+    reply_id: int  # identifier (11 bit) or host id (29 bit) that its answers carry
     ranges: Ranges
-    flags: int = 0
+    flags: int = 0  # of all its identifiers: ``FD_FRAME`` where it speaks CAN FD
 
 
 @dataclass(frozen=True, slots=True)

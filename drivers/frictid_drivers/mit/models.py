@@ -16,15 +16,10 @@ _FOUR_PI = 12.57
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One motor of a catalogue.
+    """One motor of a catalogue."""
 
-    Attributes:
-        maker: ``damiao``, ``robstride`` or ``cubemars``.
-        ranges: of its frames.
-    """
-
-    maker: str
-    ranges: Ranges
+    maker: str  # ``damiao``, ``robstride`` or ``cubemars``
+    ranges: Ranges  # of its frames
 
 
 def _damiao(velocity: float, torque: float) -> Model:

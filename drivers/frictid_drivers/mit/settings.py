@@ -41,40 +41,26 @@ _PROTOCOLS = {
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """Of the whole bus.
-
-    Attributes:
-        allow_torque_without_watchdog: torque mode also where nothing stops the motor when the host dies.
-        reply_window: share of a cycle that answers are waited for.
-        tty_baudrate: of a serial adapter's real UART; 0 where there is none.
-    """
+    """Of the whole bus."""
 
     rates: BitRates
     watchdog_s: float
-    allow_torque_without_watchdog: bool
-    reply_window: float
-    tty_baudrate: int
+    allow_torque_without_watchdog: bool  # torque mode also where nothing stops the motor when the host dies
+    reply_window: float  # share of a cycle that answers are waited for
+    tty_baudrate: int  # of a serial adapter's real UART; 0 where there is none
 
 
 @dataclass(frozen=True, slots=True)
 class JointSettings:
-    """Of one joint.
+    """Of one joint."""
 
-    Attributes:
-        model: as the catalogue has it.
-        kp: stiffness of position control, N m/rad.
-        kd: damping of position and velocity control, N m s/rad.
-        brake_kd: damping of a quick stop.
-        torque_delay_s: by how much the reported torque is late, where somebody measured it.
-    """
-
-    model: str
+    model: str  # as the catalogue has it
     family: Family
     motor: Motor
-    kp: float
-    kd: float
-    brake_kd: float
-    torque_delay_s: float
+    kp: float  # stiffness of position control, N m/rad
+    kd: float  # damping of position and velocity control, N m s/rad
+    brake_kd: float  # damping of a quick stop
+    torque_delay_s: float  # by how much the reported torque is late, where somebody measured it
 
 
 def read_settings(setup: RobotSetup) -> tuple[BusSettings, dict[str, JointSettings]]:

@@ -16,20 +16,14 @@ from frictid_hil.protocol.driver import Finding, Severity
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What a servo said when it was reached.
+    """What a servo said when it was reached."""
 
-    Attributes:
-        model: number.
-        delay_s: of its answers.
-        current_limit: largest goal current, 0 where it takes none.
-    """
-
-    model: int
+    model: int  # number
     mode: int
-    delay_s: float
+    delay_s: float  # of its answers
     p_gain: int
     i_gain: int
-    current_limit: int
+    current_limit: int  # largest goal current, 0 where it takes none
 
 
 def meet(line: Line, mine: JointSettings) -> Told:

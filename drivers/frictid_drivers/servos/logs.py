@@ -40,22 +40,15 @@ def speed_cycles(period_s: float) -> int:
 
 @dataclass(slots=True)
 class Figures:
-    """What packets told of one joint.
-
-    Attributes:
-        track: cycle and position of the last readings.
-        counts: position as read; None before.
-        goal_rad: in force; NaN for none.
-        takes_currents: it was put into current mode.
-    """
+    """What packets told of one joint."""
 
     settings: JointSettings
-    track: deque[tuple[int, float]]
+    track: deque[tuple[int, float]]  # cycle and position of the last readings
     feedback: Feedback = field(default_factory=Feedback)
-    counts: int | None = None
-    goal_rad: float = math.nan
+    counts: int | None = None  # position as read; None before
+    goal_rad: float = math.nan  # in force; NaN for none
     powered: bool = False
-    takes_currents: bool = False
+    takes_currents: bool = False  # it was put into current mode
 
 
 class Reader:

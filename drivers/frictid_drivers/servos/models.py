@@ -14,49 +14,27 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, slots=True)
 class Registers:
-    """Addresses of one maker's control table; a size in bytes where it differs.
+    """Addresses of one maker's control table; a size in bytes where it differs."""
 
-    Attributes:
-        torque: power.
-        goal: position.
-        goal_bytes: of it.
-        block: first byte of what is read every cycle.
-        block_bytes: of it.
-        position: offset in the block, and bytes.
-        load: offset of duty; -1 where there is none.
-        current: offset; -1 where there is none.
-        temperature: offset; -1 outside the block.
-        watchdog: bus watchdog; 0 where there is none.
-        model: number and firmware are read from here.
-        mode: operating mode.
-        position_mode: its value for position.
-        return_delay: of answers, in steps of 2 us.
-        p_gain: proportional part of its position loop, and bytes.
-        i_gain: integral part.
-        goal_current: where it takes a current; 0 where it takes none.
-        current_limit: no goal beyond it is taken.
-        current_mode: value of ``mode`` in which the goal current rules.
-    """
-
-    torque: int
-    goal: int
-    goal_bytes: int
-    block: int
-    block_bytes: int
-    position: tuple[int, int]
-    load: int
-    current: int
-    temperature: int
-    watchdog: int
-    model: int
-    mode: int
-    position_mode: int
-    return_delay: int
-    p_gain: tuple[int, int] = (0, 0)
-    i_gain: tuple[int, int] = (0, 0)
-    goal_current: int = 0
-    current_limit: int = 0
-    current_mode: int = 0
+    torque: int  # power
+    goal: int  # position
+    goal_bytes: int  # of it
+    block: int  # first byte of what is read every cycle
+    block_bytes: int  # of it
+    position: tuple[int, int]  # offset in the block, and bytes
+    load: int  # offset of duty; -1 where there is none
+    current: int  # offset; -1 where there is none
+    temperature: int  # offset; -1 outside the block
+    watchdog: int  # bus watchdog; 0 where there is none
+    model: int  # number and firmware are read from here
+    mode: int  # operating mode
+    position_mode: int  # its value for position
+    return_delay: int  # of answers, in steps of 2 us
+    p_gain: tuple[int, int] = (0, 0)  # proportional part of its position loop, and bytes
+    i_gain: tuple[int, int] = (0, 0)  # integral part
+    goal_current: int = 0  # where it takes a current; 0 where it takes none
+    current_limit: int = 0  # no goal beyond it is taken
+    current_mode: int = 0  # value of ``mode`` in which the goal current rules
 
 
 FEETECH = Registers(40, 42, 2, 56, 15, (0, 2), 4, 13, 7, 0, 3, 33, 0, 7, (21, 1), (23, 1))
@@ -66,31 +44,18 @@ DYNAMIXEL = replace(DYNAMIXEL_LOAD, load=-1, current=2, goal_current=102, curren
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One servo of a catalogue.
+    """One servo of a catalogue."""
 
-    Attributes:
-        wire: ``feetech`` or ``dynamixel``.
-        registers: its table.
-        counts_per_turn: of position.
-        turn_rad: what these counts span.
-        current_a: one step of current; 0 where only load is told.
-        torque_constant_nm_per_a: joint torque per ampere.
-        stall_nm: torque at full duty, for servos that tell load only.
-        uncertainty_percent: of the torque scale.
-        sign_magnitude: negative numbers have a sign bit instead of two's complement.
-        big_endian: high byte first.
-    """
-
-    wire: str
-    registers: Registers
-    counts_per_turn: int = 4096
-    turn_rad: float = 2 * math.pi
-    current_a: float = 0.0
-    torque_constant_nm_per_a: float = 0.0
-    stall_nm: float = 0.0
-    uncertainty_percent: float = 30.0
-    sign_magnitude: bool = False
-    big_endian: bool = False
+    wire: str  # ``feetech`` or ``dynamixel``
+    registers: Registers  # its table
+    counts_per_turn: int = 4096  # of position
+    turn_rad: float = 2 * math.pi  # what these counts span
+    current_a: float = 0.0  # one step of current; 0 where only load is told
+    torque_constant_nm_per_a: float = 0.0  # joint torque per ampere
+    stall_nm: float = 0.0  # torque at full duty, for servos that tell load only
+    uncertainty_percent: float = 30.0  # of the torque scale
+    sign_magnitude: bool = False  # negative numbers have a sign bit instead of two's complement
+    big_endian: bool = False  # high byte first
 
     @property
     def count_rad(self) -> float:

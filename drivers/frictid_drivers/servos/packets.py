@@ -14,21 +14,13 @@ READ, WRITE, SYNC_READ, SYNC_WRITE = 0x02, 0x03, 0x82, 0x83
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet, checked.
+    """One packet, checked."""
 
-    Attributes:
-        id: of the servo that it is for, or from.
-        instruction: code; -1 in an answer.
-        error: of an answer.
-        data: parameters.
-        raw: as on the wire.
-    """
-
-    id: int
-    instruction: int
-    error: int
-    data: bytes
-    raw: bytes
+    id: int  # of the servo that it is for, or from
+    instruction: int  # code; -1 in an answer
+    error: int  # of an answer
+    data: bytes  # parameters
+    raw: bytes  # as on the wire
 
 
 class Wire(ABC):

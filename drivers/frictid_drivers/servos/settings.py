@@ -31,34 +31,22 @@ MOST_SERVOS = 10
 
 @dataclass(frozen=True, slots=True)
 class LineSettings:
-    """Of the whole line.
+    """Of the whole line."""
 
-    Attributes:
-        baud: bit/s.
-        answer_s: how long an answer may take outside the cycle.
-        allow_torque_without_watchdog: a person takes the place of a bus watchdog that is not there.
-    """
-
-    baud: int
+    baud: int  # bit/s
     watchdog_s: float
-    answer_s: float
-    allow_torque_without_watchdog: bool
+    answer_s: float  # how long an answer may take outside the cycle
+    allow_torque_without_watchdog: bool  # a person takes the place of a bus watchdog that is not there
 
 
 @dataclass(frozen=True, slots=True)
 class JointSettings:
-    """Of one joint.
+    """Of one joint."""
 
-    Attributes:
-        name: of the model.
-        model: with the torque constants of the robot file.
-        zero_counts: position 0 of the joint.
-    """
-
-    name: str
-    model: Model
+    name: str  # of the model
+    model: Model  # with the torque constants of the robot file
     id: int
-    zero_counts: int
+    zero_counts: int  # position 0 of the joint
     direction: int
 
     @property
