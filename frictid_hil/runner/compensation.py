@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import repeat
 
 import numpy as np
@@ -113,20 +114,22 @@ class LawSource:
             set_point.velocity_rad_s += _VELOCITY_LOOP_PER_S * (position_rad - feedback.position_rad)
 
 
+@dataclass
 class FadeOut:
     """Ends a law: in so many cycles friction compensation fades while gravity stays and the reference stands still."""
 
-    def __init__(self, source: LawSource, cycles: int) -> None:
-        self._source, self._cycles, self._done = source, cycles, 0
+    source: LawSource
+    cycles: int
+    _done: int = 0
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Give one step less of the compensation; False once nothing is left of it."""
-        if self._done >= self._cycles:
+        if self._done >= self.cycles:
             return False
         self._done += 1
-        self._source.in_force.friction_share = 1.0 - self._done / self._cycles
-        self._source.reference = (self._source.reference[0], 0.0)
-        self._source.write(feedback, set_point)
+        self.source.in_force.friction_share = 1.0 - self._done / self.cycles
+        self.source.reference = (self.source.reference[0], 0.0)
+        self.source.write(feedback, set_point)
         return True
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NoReturn, Protocol
+from dataclasses import KW_ONLY, InitVar, dataclass, field
+from typing import ClassVar, NoReturn, Protocol
 
 import numpy as np
 
@@ -96,48 +96,31 @@ class CycleCount:
         )
 
 
+@dataclass(eq=False)
 class CyclicLoop:
-    """Exchanges, supervises, records; owns the set-points of all joints.
+    """Exchanges, supervises, records; owns the set-points of all joints."""
 
-    Args:
-        driver: cycling (``start_cycling`` was called).
-        supervisor: passes every cycle.
-        samples: ring for every new report of every joint.
-        cycle_hz: rate.
-        stop: read once per cycle.
-        joints: how many the driver has.
-        most_rad_s2: highest deceleration of a stop on request, by index of the joint; others may have any.
-        offset_ns: added to run time, so that it goes on from one stretch of cyclic traffic to the next.
-        pump: called every ``PUMP_CYCLES`` cycles where files are written by this same process (lock-step).
-    """
+    driver: Driver  # cycling (``start_cycling`` was called)
+    supervisor: Supervisor  # passes every cycle
+    samples: Ring  # for every new report of every joint
+    cycle_hz: float
+    stop: StopRequest  # read once per cycle
+    _: KW_ONLY
+    joints: InitVar[int]  # how many the driver has
+    # Highest deceleration of a stop on request, by index of the joint; others may have any.
+    most_rad_s2: Mapping[int, float] = field(default_factory=dict)
+    offset_ns: int = 0  # added to run time, so that it goes on from one stretch of cyclic traffic to the next
+    # Called every ``PUMP_CYCLES`` cycles where files are written by this same process (lock-step).
+    pump: Callable[[], None] | None = None
+    feedback: Sequence[Feedback] = ()
+    count: CycleCount = field(default_factory=CycleCount)
 
-    PUMP_CYCLES = 2048
+    PUMP_CYCLES: ClassVar[int] = 2048
 
-    def __init__(
-        self,
-        driver: Driver,
-        supervisor: Supervisor,
-        samples: Ring,
-        cycle_hz: float,
-        stop: StopRequest,
-        *,
-        joints: int,
-        most_rad_s2: Mapping[int, float] | None = None,
-        offset_ns: int = 0,
-        pump: Callable[[], None] | None = None,
-    ) -> None:
-        self.driver = driver
-        self.supervisor = supervisor
-        self._samples = samples
-        self._period_ns = round(1e9 / cycle_hz)
-        self._stop = stop
-        self._pump = pump
-        self._most_rad_s2 = most_rad_s2 or {}
-        self._offset_ns = offset_ns
-        self._deadline_ns = driver.clock.now_ns() + self._period_ns
+    def __post_init__(self, joints: int) -> None:
+        self._period_ns = round(1e9 / self.cycle_hz)
+        self._deadline_ns = self.driver.clock.now_ns() + self._period_ns
         self.set_points = [SetPoint() for _ in range(joints)]
-        self.feedback: Sequence[Feedback] = ()
-        self.count = CycleCount()
 
     @property
     def period_s(self) -> float:
@@ -146,7 +129,7 @@ class CyclicLoop:
 
     def now_ns(self) -> int:
         """Run time of the coming exchange."""
-        return self._deadline_ns + self._offset_ns
+        return self._deadline_ns + self.offset_ns
 
     def cycle(self, *, supervised: bool = True) -> Sequence[Feedback]:
         """One exchange at the next deadline.
@@ -164,16 +147,16 @@ class CyclicLoop:
             if late_ns >= period_ns:
                 skipped = late_ns // period_ns
                 count.missed += skipped
-                count.stops.append((deadline_ns + self._offset_ns, skipped * period_ns))
+                count.stops.append((deadline_ns + self.offset_ns, skipped * period_ns))
                 deadline_ns += skipped * period_ns
         self._deadline_ns = deadline_ns + period_ns
 
         feedback = self.feedback = self.driver.exchange(self.set_points)
-        append = self._samples.append
+        append = self.samples.append
         for index, (report, set_point) in enumerate(zip(feedback, self.set_points, strict=True)):
             if report.age_cycles == 0 and report.valid:
                 append(
-                    report.t_ns + self._offset_ns,
+                    report.t_ns + self.offset_ns,
                     report.position_rad,
                     report.velocity_rad_s,
                     report.torque_nm,
@@ -191,8 +174,8 @@ class CyclicLoop:
         count.cycles += 1
         if supervised:
             self.supervisor.check(self.set_points, feedback)
-        if self._pump is not None and count.cycles % self.PUMP_CYCLES == 0:
-            self._pump()
+        if self.pump is not None and count.cycles % self.PUMP_CYCLES == 0:
+            self.pump()
         return feedback
 
     def run(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
@@ -209,7 +192,7 @@ class CyclicLoop:
         moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
         previous_rad = [set_point.position_rad for _, _, set_point in moving]
         while True:
-            if self._stop.level:
+            if self.stop.level:
                 self._end_early(moving, previous_rad, ending)
             for k, (joint, source, set_point) in enumerate(moving):
                 previous_rad[k] = set_point.position_rad
@@ -236,7 +219,7 @@ class CyclicLoop:
         Raises:
             Interrupted: a stop was asked for.
         """
-        if self._stop.level:
+        if self.stop.level:
             raise Interrupted("stopped on request", next_step=GO_ON)
 
     def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
@@ -275,11 +258,11 @@ class CyclicLoop:
         """Bring the commanded positions to rest along their planned path, unless a quick stop is asked for."""
         if ending is not None:
             ((joint, _, set_point),) = moving
-            while self._stop.level < QUICK_STOP and ending.update(self.feedback[joint], set_point):
+            while self.stop.level < QUICK_STOP and ending.update(self.feedback[joint], set_point):
                 self.cycle()
         else:
             for row in self._stopping_path(moving, previous_rad):
-                if self._stop.level >= QUICK_STOP:
+                if self.stop.level >= QUICK_STOP:
                     break
                 for (_, _, set_point), position_rad in zip(moving, row, strict=True):
                     set_point.velocity_rad_s = (position_rad - set_point.position_rad) / self.period_s
@@ -302,6 +285,6 @@ class CyclicLoop:
                 if source.update(self.feedback[joint], scratch):
                     row[k] = scratch.position_rad
             path.append(row)
-        most = [self._most_rad_s2.get(joint, math.inf) for joint, _, _ in moving]
+        most = [self.most_rad_s2.get(joint, math.inf) for joint, _, _ in moving]
         stop = stopping_path(np.array(path), self.period_s, most)
         return [] if stop is None else stop.tolist()

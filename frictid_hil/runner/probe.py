@@ -8,6 +8,7 @@ a changed load or a cold gear show here, where the joint is still held by its po
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,22 +21,22 @@ from frictid_hil.units import format_torque
 _MOVING_RAD_S = math.radians(4.0)
 
 
+@dataclass
 class ProbeWatch:
     """Passes a stream on and keeps what the joint reports while it moves."""
 
-    def __init__(self, source: SetPointSource, probe: Probe, joint: str) -> None:
-        self._source = source
-        self._probe = probe
-        self._where = f"joint {joint}"
-        self._rows: list[tuple[float, float, float]] = []
-        self._temperature_c = math.nan
+    source: SetPointSource
+    probe: Probe
+    joint: str
+    _rows: list[tuple[float, float, float]] = field(default_factory=list)
+    _temperature_c: float = math.nan
 
     def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
         """Keep the report, then pass the next set-point on."""
         if feedback.age_cycles == 0 and abs(feedback.velocity_rad_s) > _MOVING_RAD_S:
             self._rows.append((feedback.position_rad, feedback.velocity_rad_s, feedback.torque_nm))
         self._temperature_c = feedback.temperature_c
-        return self._source.update(feedback, set_point)
+        return self.source.update(feedback, set_point)
 
     def judge(self) -> None:
         """Compare what was measured with the profile.
@@ -49,8 +50,8 @@ class ProbeWatch:
         )
         forward, backward = velocity > 0, velocity < 0
         if not (forward.any() and backward.any()):
-            raise SafetyAbort("did not move both ways during the probe", where=self._where)
-        probe = self._probe
+            raise SafetyAbort("did not move both ways during the probe", where=f"joint {self.joint}")
+        probe = self.probe
         gravity = np.array([probe.gravity.torque_nm(q) for q in position.tolist()])
         friction = probe.curve.torque(velocity)
         measured = torque - gravity
@@ -69,15 +70,15 @@ class ProbeWatch:
             raise ProfileMismatch(
                 f"stands at {self._temperature_c:.1f} degC, its profile is of {probe.temperature_c:.1f} degC"
                 f" (policy.max_temperature_difference_c = {probe.temperature_tolerance_c:g})",
-                where=self._where,
+                where=f"joint {self.joint}",
                 next_step="warm the joint up, or calibrate it at this temperature; --force uses it all the same",
             )
 
     def _mismatch(self, quantity: str, found_nm: float, said_nm: float, cause: str) -> ProfileMismatch:
         return ProfileMismatch(
             f"{quantity} is {format_torque(found_nm)}, its profile says {format_torque(said_nm)} "
-            f"(tolerance {100 * self._probe.tolerance:.0f} % of friction)",
-            where=self._where,
+            f"(tolerance {100 * self.probe.tolerance:.0f} % of friction)",
+            where=f"joint {self.joint}",
             cause=f"{cause}, or an edited profile",
             next_step="calibrate the joint again; --force compensates all the same, under the supervisor's bounds",
         )

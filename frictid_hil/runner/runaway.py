@@ -8,6 +8,7 @@ push does counts; the speed bound ends whatever is faster.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 _ALONE_RAD_S = math.radians(5.0)
 """Speed gained with nobody pushing."""
@@ -19,24 +20,21 @@ _SMOOTHED_S = 0.01
 """Speed and push alike, so that neither is late against the other."""
 
 
+@dataclass
 class RunawayWatch:
-    """Judges one joint, report by report.
+    """Judges one joint, report by report."""
 
-    Args:
-        period_s: of the cycle.
-        growth_s: longest growth of speed that a person's push explains.
-    """
+    period_s: float  # of the cycle
+    growth_s: float  # longest growth of speed that a person's push explains
+    _velocity: float = 0.0
+    _push_nm: float = 0.0
+    _alone_from: float = 0.0
+    _grown_from: float = 0.0
+    _highest: float = 0.0
+    _growing_s: float = 0.0
 
-    def __init__(self, period_s: float, growth_s: float) -> None:
-        self._period_s = period_s
-        self._growth_s = growth_s
-        self._blend = period_s / (period_s + _SMOOTHED_S)
-        self._velocity = 0.0
-        self._push_nm = 0.0
-        self._alone_from = 0.0
-        self._grown_from = 0.0
-        self._highest = 0.0
-        self._growing_s = 0.0
+    def __post_init__(self) -> None:
+        self._blend = self.period_s / (self.period_s + _SMOOTHED_S)
 
     def verdict(self, velocity_rad_s: float, external_torque_nm: float) -> str:
         """Say in a sentence what is wrong; an empty string while all is well."""
@@ -54,7 +52,7 @@ class RunawayWatch:
             self._growing_s = 0.0
         self._highest = max(self._highest, speed)
         gained = speed - self._grown_from
-        self._growing_s = self._growing_s + self._period_s if gained > _FELL_RAD_S else 0.0
-        if gained > _GROWN_RAD_S and self._growing_s > self._growth_s:
+        self._growing_s = self._growing_s + self.period_s if gained > _FELL_RAD_S else 0.0
+        if gained > _GROWN_RAD_S and self._growing_s > self.growth_s:
             return f"speed has grown for {self._growing_s:.2f} s, by {math.degrees(gained):.1f} deg/s"
         return ""

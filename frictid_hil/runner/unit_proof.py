@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,20 +38,17 @@ _COARSE = 0.25
 """Share of the mean speed. A velocity that is reported in coarser steps tells nothing."""
 
 
+@dataclass
 class Travelled:
-    """Adds up the way of a joint, there and back, by its position and by its velocity.
+    """Adds up the way of a joint, there and back, by its position and by its velocity."""
 
-    Args:
-        period_s: of the set-points.
-    """
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self.by_position_rad = 0.0
-        self._least_rad = self._most_rad = 0.0
-        self._time_s = 0.0
-        self._step_rad_s = math.inf
-        self._last: tuple[int, float, float] | None = None
+    period_s: float  # of the set-points
+    by_position_rad: float = 0.0
+    _least_rad: float = 0.0
+    _most_rad: float = 0.0
+    _time_s: float = 0.0
+    _step_rad_s: float = math.inf
+    _last: tuple[int, float, float] | None = None
 
     def add(self, report: Feedback, direction: float) -> None:
         """Add one report. The joint was commanded to move forward (+1), backward (-1), or to stand (0)."""
@@ -68,7 +66,7 @@ class Travelled:
         self._time_s += elapsed_s
         self.by_position_rad += direction * (now[1] - last[1])
         least_rad, most_rad = sorted(
-            direction * way_rad for way_rad in velocity_says(last[2], velocity, elapsed_s, self._period_s)
+            direction * way_rad for way_rad in velocity_says(last[2], velocity, elapsed_s, self.period_s)
         )
         self._least_rad += least_rad
         self._most_rad += most_rad
@@ -115,9 +113,7 @@ class UnitProof:
     def __init__(
         self, joint: JointSetup, here_rad: float, resolution_rad: float, droop_rad: float, period_s: float
     ) -> None:
-        self._joint = joint
-        self._here_rad = here_rad
-        self._droop_rad = droop_rad
+        self._joint, self._here_rad, self._droop_rad = joint, here_rad, droop_rad
         self._step_rad = resolution_rad if math.isfinite(resolution_rad) else 0.0
         inward = math.copysign(1.0, (joint.position_min_rad + joint.position_max_rad) / 2 - here_rad)
         few_rad = min(max(_STEPS * self._step_rad, _STEPS_LEAST_RAD), _STEPS_MOST_RAD)
