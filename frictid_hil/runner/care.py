@@ -60,10 +60,7 @@ class Care:
     def limits(self, joint: JointSetup, plan: JointPlan, command_delay_s: float) -> JointLimits:
         """What the supervisor holds a joint to while this plan runs, whether it is the one that moves or not.
 
-        Args:
-            joint: of the robot.
-            plan: that runs.
-            command_delay_s: from set-point to motion, normal for this driver.
+        From set-point to motion ``command_delay_s`` is normal for this driver.
         """
         low, high = joint.position_min_rad, joint.position_max_rad
         velocity = joint.max_velocity_rad_s

@@ -29,13 +29,7 @@ Reference = tuple[float, float]
 
 
 class LawInForce:
-    """One law of one joint.
-
-    Args:
-        law: what to give.
-        period_s: of the cycle.
-        torque_nm: what the joint is being given now; the law takes over from there without a jump.
-    """
+    """One law of one joint; it takes over from the torque that the joint is being given, without a jump."""
 
     def __init__(self, law: ControlLaw, period_s: float, torque_nm: float) -> None:
         self.law = law

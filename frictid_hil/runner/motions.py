@@ -126,12 +126,7 @@ class Motions:
         return SignWatch(points, joint.name, self.loop.period_s)
 
     def _judged(self, index: int, motion: Motion, source: SetPointSource) -> dict[str, Any]:
-        """Judge a watched motion; returns what its mark tells besides.
-
-        Raises:
-            SafetyAbort: friction helps motion, or the joint did not move.
-            ProfileMismatch: the profile is not this joint's.
-        """
+        """Judge a watched motion; returns what its mark tells besides."""
         if isinstance(source, SignWatch):
             self.loop.supervisor.set_limits(index, self.limits[index])
             source.judge()

@@ -108,26 +108,15 @@ def run_in_own_process(
     driver: str,
     setup: RobotSetup,
     plan: Plan,
-    recorder: Recorder,
+    recorder: Recorder,  # made of shared rings
     *,
-    notify: Callable[[Event], None],
-    proceed: Callable[[Preflight], bool],
-    stop: StopSignals,
-    drain: Callable[[], None],
+    notify: Callable[[Event], None],  # called in this process for each event
+    proceed: Callable[[Preflight], bool],  # asked in this process
+    stop: StopSignals,  # passed on to the child
+    drain: Callable[[], None],  # called every 50 ms to empty the rings
     care: Care,
 ) -> None:
     """Run the scheduler in a child process; returns when it has ended.
-
-    Args:
-        driver: entry-point name.
-        setup: the robot.
-        plan: what to do.
-        recorder: made of shared rings.
-        notify: called in this process for each event.
-        proceed: asked in this process.
-        stop: passed on to the child.
-        drain: called every 50 ms to empty the rings.
-        care: bounds.
 
     Raises:
         FrictidError: whatever ended the run in the child.

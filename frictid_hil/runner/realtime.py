@@ -63,10 +63,8 @@ def make_punctual() -> list[str]:
 def _keep_processors_awake() -> bool:
     """Allow no idle processor a sleep that takes time to wake from, for as long as this process lives.
 
-    The kernel's rule: the bound holds while the file is open. Source: Documentation/power/pm_qos_interface.rst.
-
-    Returns:
-        False where it was not permitted; True also on a computer that has no such bound.
+    The kernel's rule: the bound holds while the file is open. Source: Documentation/power/pm_qos_interface.rst. False
+    where it was not permitted; True also on a computer that has no such bound.
     """
     try:
         kept_open = os.open(WAKE_TIME, os.O_WRONLY)
@@ -137,11 +135,7 @@ def judged(late_s: Array, duration_s: float, told: list[str], isolated_cpu: int 
 
 
 def measure_latency(duration_s: float) -> Latency:
-    """Wait for a deadline every millisecond, as the loop does, and see how late each wait returns.
-
-    Args:
-        duration_s: at least 0.1.
-    """
+    """Wait for a deadline every millisecond, as the loop does, for 0.1 s or longer, and see how late it returns."""
     told, cpu = make_punctual(), move_to_isolated_cpu()
     period_ns = round(1e9 / _MEASURED_HZ)
     late_ns = np.zeros(max(100, round(duration_s * _MEASURED_HZ)), np.int64)

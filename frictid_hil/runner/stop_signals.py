@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from types import FrameType
 from typing import TypeVar
 
@@ -91,34 +92,27 @@ class StopSignals:
             raise Interrupted("stopped by a signal; nothing has moved")
 
 
+@dataclass
 class HeardStop:
-    """The other end of that pipe, in the process of the loop; the level also rises when the parent is gone or stands.
+    """The other end of that pipe, in the loop's process; the level also rises when the parent is gone or stands."""
 
-    Args:
-        pipe: to read signal numbers from.
-        parent_pid: who writes them.
-        behind: whether the parent has taken no rows for so long that they would soon be lost.
+    pipe: int  # to read signal numbers from
+    parent_pid: int  # who writes them
+    behind: Callable[[], bool] = lambda: False  # the parent has taken no rows for so long that they would soon be lost
+    terminated: bool = False  # this process itself was asked to end
+    left_alone: bool = False  # the parent was behind
+    _level: int = NOTHING_ASKED
 
-    Attributes:
-        terminated: this process itself was asked to end.
-        left_alone: the parent was behind.
-    """
-
-    def __init__(self, pipe: int, parent_pid: int, behind: Callable[[], bool] = lambda: False) -> None:
-        os.set_blocking(pipe, False)
-        self._pipe = pipe
-        self._parent_pid = parent_pid
-        self._level = NOTHING_ASKED
-        self._behind = behind
-        self.terminated = self.left_alone = False
+    def __post_init__(self) -> None:
+        os.set_blocking(self.pipe, False)
 
     @property
     def level(self) -> int:
         """The highest level asked for so far."""
         with contextlib.suppress(BlockingIOError):
-            asked = sum(number in STOP_SIGNALS for number in os.read(self._pipe, 64))
+            asked = sum(number in STOP_SIGNALS for number in os.read(self.pipe, 64))
             self._level = min(QUICK_STOP, self._level + asked)
-        self.left_alone = self.left_alone or self._behind()
-        if self.terminated or self.left_alone or os.getppid() != self._parent_pid:
+        self.left_alone = self.left_alone or self.behind()
+        if self.terminated or self.left_alone or os.getppid() != self.parent_pid:
             return max(DECELERATE, self._level)
         return self._level

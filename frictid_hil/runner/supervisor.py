@@ -47,23 +47,15 @@ class JointLimits:
 
 
 class Supervisor:
-    """Watches all joints; knows which one may move.
-
-    Args:
-        names: joint names, order of the feedback.
-        limits: one per joint, same order.
-        cycle_hz: rate of reports.
-        interlock: must be closed from ``arm_interlock`` on.
-        workspace: the box that the arm may not leave while a joint moves.
-    """
+    """Watches all joints; knows which one may move."""
 
     def __init__(
         self,
-        names: Sequence[str],
-        limits: Sequence[JointLimits],
-        cycle_hz: float,
-        interlock: Interlock | None = None,
-        workspace: WorkspaceWatch | None = None,
+        names: Sequence[str],  # in the order of the feedback
+        limits: Sequence[JointLimits],  # in the same order
+        cycle_hz: float,  # rate of reports
+        interlock: Interlock | None = None,  # must be closed from ``arm_interlock`` on
+        workspace: WorkspaceWatch | None = None,  # the box that the arm may not leave while a joint moves
     ) -> None:
         self.names = tuple(names)
         self._limits = list(limits)

@@ -47,11 +47,6 @@ class Port(Protocol):
 class SerialAdapter(can.BusABC):
     """What both have in common.
 
-    Args:
-        channel: path of the serial port.
-        tty_baudrate: of its line.
-        port: opened already, for tests.
-
     Raises:
         CanInitializationError: no such port, or somebody else has it.
     """

@@ -24,12 +24,7 @@ _FAULT = 0xA
 
 
 class FaultyMotors(DeviceFaults):
-    """As ``frictid_hil.testing.wire.Devices``.
-
-    Args:
-        rack: the motors.
-        faults: what goes wrong.
-    """
+    """As ``frictid_hil.testing.wire.Devices``."""
 
     def __init__(self, rack: Rack, faults: Sequence[Fault]) -> None:
         super().__init__(faults, rack.actuators, rack.advance)

@@ -34,12 +34,7 @@ _ERRORS: Mapping[str, Callable[[], Exception]] = {
 
 
 class FaultyChain(DeviceFaults):
-    """As ``frictid_drivers.servos.line.BytePort``.
-
-    Args:
-        chain: the servos.
-        faults: what goes wrong.
-    """
+    """As ``frictid_drivers.servos.line.BytePort``."""
 
     def __init__(self, chain: Chain, faults: Sequence[Fault]) -> None:
         super().__init__(faults, chain.servos, chain.advance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import serial
@@ -74,28 +75,18 @@ class SerialPort:
         self._serial.close()
 
 
+@dataclass
 class Line:
-    """Packets of one maker on one port.
+    """Packets of one maker on one port."""
 
-    Args:
-        port: opened.
-        wire: of the maker.
-        sink: told of every packet.
-        clock: run time.
-        answer_s: how long an answer may take.
-
-    Attributes:
-        heard: told of every packet, with its run time and identifier in the log.
-    """
-
-    def __init__(self, port: BytePort, wire: Wire, sink: FrameSink | None, clock: Clock, answer_s: float) -> None:
-        self._answer_ns = round(answer_s * 1e9)
-        self._port = port
-        self._wire = wire
-        self._sink = sink
-        self._clock = clock
-        self._buffer = bytearray()
-        self.heard: Callable[[int, int, bytes], None] | None = None
+    port: BytePort
+    wire: Wire
+    sink: FrameSink | None  # told of every packet
+    clock: Clock
+    answer_s: float  # how long an answer may take
+    # Told of every packet, with its run time and identifier in the log.
+    heard: Callable[[int, int, bytes], None] | None = None
+    _buffer: bytearray = field(default_factory=bytearray)
 
     def send(self, packet: bytes) -> None:
         """One packet.
@@ -104,7 +95,7 @@ class Line:
             HardwareError: the port is gone.
         """
         try:
-            self._port.write(packet)
+            self.port.write(packet)
         except PORT_ERRORS as error:
             raise _gone(error) from error
         self._tell(SENT_ID, packet, True)
@@ -112,23 +103,23 @@ class Line:
     def received(self, until_ns: int) -> Iterator[Packet]:
         """Packets as they come until then; at once those that are here."""
         while True:
-            left_s = (until_ns - self._clock.now_ns()) * 1e-9
+            left_s = (until_ns - self.clock.now_ns()) * 1e-9
             try:
-                data = self._port.read(0.0 if self._clock.lock_step else max(0.0, left_s))
+                data = self.port.read(0.0 if self.clock.lock_step else max(0.0, left_s))
             except PORT_ERRORS as error:
                 raise _gone(error) from error
             self._buffer += data
-            for packet in self._wire.parse(self._buffer, answers=True):
+            for packet in self.wire.parse(self._buffer, answers=True):
                 self._tell(RECEIVED_ID, packet.raw, False)
                 yield packet
-            if not data and (self._clock.lock_step or left_s <= 0):
+            if not data and (self.clock.lock_step or left_s <= 0):
                 return
 
     def _awaited(self, until_ns: int) -> Iterator[Packet]:
         """As ``received``; in lock-step, too, time passes until the answer comes."""
         yield from self.received(until_ns)
-        if self._clock.lock_step:
-            self._clock.wait_until(until_ns)
+        if self.clock.lock_step:
+            self.clock.wait_until(until_ns)
             yield from self.received(until_ns)
 
     def tell(self, address: int, data: Mapping[int, bytes]) -> None:
@@ -137,7 +128,7 @@ class Line:
         Raises:
             HardwareError: the port is gone.
         """
-        self.send(self._wire.sync_write(address, data))
+        self.send(self.wire.sync_write(address, data))
 
     def ask(self, servo: int, address: int, count: int) -> bytes:
         """Read so many bytes.
@@ -146,8 +137,8 @@ class Line:
             HardwareError: it does not answer.
         """
         for _ in range(_TRIES):
-            self.send(self._wire.read(servo, address, count))
-            for packet in self._awaited(self._clock.now_ns() + self._answer_ns):
+            self.send(self.wire.read(servo, address, count))
+            for packet in self._awaited(self.clock.now_ns() + round(self.answer_s * 1e9)):
                 if packet.id == servo and len(packet.data) == count:
                     return packet.data
         raise HardwareError(
@@ -172,13 +163,13 @@ class Line:
     def close(self) -> None:
         """Release the port."""
         with contextlib.suppress(*PORT_ERRORS):
-            self._port.close()
+            self.port.close()
 
     def _tell(self, can_id: int, packet: bytes, sent: bool) -> None:
-        t_ns = self._clock.now_ns()
+        t_ns = self.clock.now_ns()
         size = next((size for size in LOGGED_LENGTHS if size >= len(packet)), len(packet))
-        if self._sink is not None:
-            self._sink(t_ns, can_id, packet.ljust(size, b"\0"), sent)
+        if self.sink is not None:
+            self.sink(t_ns, can_id, packet.ljust(size, b"\0"), sent)
         if self.heard is not None:
             self.heard(t_ns, can_id, packet)
 

@@ -27,21 +27,14 @@ _WAY_MS = 300
 
 
 class OperatingMode:
-    """The mode of one servo, which is in position mode now.
-
-    Args:
-        line: open.
-        mine: the servo.
-        most_rad_s: how fast it may go to where it shall hold.
+    """The mode of one servo, in position mode now; to where it shall hold it goes no faster than ``most_rad_s``.
 
     Raises:
         HardwareError: it does not answer.
     """
 
     def __init__(self, line: Line, mine: JointSettings, most_rad_s: float) -> None:
-        self._line = line
-        self._mine = mine
-        self._registers = mine.model.registers
+        self._line, self._mine, self._registers = line, mine, mine.model.registers
         self._kept = {address: line.ask(mine.id, address, count) for address, count in _RESET}
         by_time = line.ask(mine.id, _DRIVE_MODE, 1)[0] & _BY_TIME
         self._slow = _WAY_MS if by_time else max(1, math.floor(most_rad_s / _PROFILE_RAD_S))

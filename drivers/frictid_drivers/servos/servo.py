@@ -24,24 +24,13 @@ _HOLD_SHARE = 0.5
 
 
 class Servo:
-    """One joint's.
-
-    Args:
-        joint: of the robot.
-        figures: that packets tell of it.
-        current_limit: largest goal current, in its steps.
-
-    Attributes:
-        operating: of one that takes currents.
-        energised: it was given power.
-        ends_rad: goals stay between them.
-    """
+    """One joint's; packets tell its figures, and no goal current is beyond the limit, which is in the servo's steps."""
 
     def __init__(self, joint: JointSetup, figures: Figures, current_limit: int) -> None:
         self.joint, self.mine, self.figures = joint, figures.settings, figures
         self.wish = Wish(joint, figures.feedback)
-        self.operating: OperatingMode | None = None
-        self.ends_rad = (joint.position_min_rad, joint.position_max_rad)
+        self.operating: OperatingMode | None = None  # of one that takes currents
+        self.ends_rad = (joint.position_min_rad, joint.position_max_rad)  # goals stay between them
         self.energised = self._powered = False
         self._current_limit = current_limit
         self._most_counts_s = joint.max_velocity_rad_s / self.mine.model.count_rad

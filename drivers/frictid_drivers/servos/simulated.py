@@ -61,16 +61,7 @@ class VirtualServoDriver(ServoDriver):
 
 
 class Servo(Device):
-    """One servo: memory, loop and plant.
-
-    Args:
-        joint: of the robot file.
-        setup: the robot.
-        mine: its options.
-
-    Attributes:
-        error: bits that it shows.
-    """
+    """One servo: memory, loop and plant; ``error`` has the bits that it shows."""
 
     def __init__(self, joint: JointSetup, setup: RobotSetup, mine: JointSettings) -> None:
         super().__init__(joint, setup)
@@ -224,11 +215,7 @@ class Servo(Device):
 class Chain:
     """All servos of a robot on one line, as a port of the host.
 
-    Args:
-        setup: with ``simulated`` of every joint.
-
     Attributes:
-        wire: of the maker.
         fault: passed bytes and whether they go to the host; returns what becomes of them.
     """
 
