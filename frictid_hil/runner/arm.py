@@ -15,8 +15,8 @@ from frictid_hil.protocol.error_words import told_error
 from frictid_hil.runner.care import Care
 from frictid_hil.runner.cycle import CyclicLoop
 from frictid_hil.runner.motions import AT_RAD, stream
-from frictid_hil.runner.reference import verify_reference
 from frictid_hil.runner.unit_proof import UnitProof
+from frictid_hil.units import degrees, format_angle
 
 _POWER_TIMEOUT_S = 15.0
 _STANDSTILL_S = 0.2
@@ -26,18 +26,14 @@ _DISABLING_S = 0.1
 
 @dataclass(frozen=True)
 class Arm:
-    """All joints of one stretch of cyclic traffic."""
+    """All joints of one stretch of cyclic traffic; ``SafetyAbort`` names the joint that is not as it must be."""
 
     joints: Sequence[JointSetup]  # in the order of set-points and reports
     loop: CyclicLoop
     care: Care
 
     def verify(self, planned_rad: Mapping[str, float]) -> None:
-        """Check, before anything gets power, that every joint stands where it should and that the interlock is closed.
-
-        Raises:
-            SafetyAbort: naming the joint.
-        """
+        """Check, before anything gets power, that every joint is where it should be and the interlock is closed."""
         loop = self.loop
         loop.wait_for(lambda feedback: all(report.valid for report in feedback), 1.0, "a first report of every joint")
         verify_reference(self.joints, loop.feedback, planned_rad, self.care.reference_tolerance_rad)
@@ -45,11 +41,7 @@ class Arm:
         self._verify_interlock()
 
     def enable(self) -> None:
-        """Give power to every joint; each one is held where it stands.
-
-        Raises:
-            SafetyAbort: a joint does not take it.
-        """
+        """Give power to every joint; each one is held where it stands."""
         self._settling()
         for joint in self.joints:
             self.loop.driver.enable(joint.name, Mode.POSITION)
@@ -72,11 +64,7 @@ class Arm:
     def prove_units(
         self, moving: Collection[int], planned_rad: Mapping[str, float], resolution_rad: Mapping[str, float]
     ) -> None:
-        """Move each joint of the plan by a few encoder steps and by 0.5 deg while all others are locked.
-
-        Raises:
-            SafetyAbort: command, position and velocity of a joint tell of different motions.
-        """
+        """Move each joint of the plan by a few encoder steps and by 0.5 deg while all others are locked."""
         loop = self.loop
         for index, joint in enumerate(self.joints):
             here_rad = loop.set_points[index].position_rad
@@ -87,11 +75,7 @@ class Arm:
             loop.run({index: UnitProof(joint, here_rad, resolution, droop, loop.period_s)})
 
     def lock_all_but(self, moving: Collection[int], planned_rad: Mapping[str, float]) -> None:
-        """Bring every other joint to its planned place, lock it there, and wait until all of them stand.
-
-        Raises:
-            SafetyAbort: one does not come to rest.
-        """
+        """Bring every other joint to its planned place, lock it there, and wait until all of them stand."""
         # Joints that are near, but not at, their planned locked position are brought there one by one.
         for index, joint in enumerate(self.joints):
             target_rad = planned_rad.get(joint.name)
@@ -180,3 +164,33 @@ class Arm:
             return still >= need
 
         loop.wait_for(standing, 2.0 + _STANDSTILL_S, "standstill of every locked joint")
+
+
+def verify_reference(
+    joints: Sequence[JointSetup], reports: Sequence[Feedback], planned_rad: Mapping[str, float], tolerance_rad: float
+) -> None:
+    """Compare every joint's position with the plan and with its limits.
+
+    Args:
+        joints: in the order of the reports.
+        reports: valid.
+        planned_rad: where joints are to be locked, by name; others are expected at their own locked position.
+        tolerance_rad: a joint further off has lost its reference, or was moved.
+
+    Raises:
+        SafetyAbort: naming the joint.
+    """
+    for joint, report in zip(joints, reports, strict=True):
+        expected_rad = planned_rad.get(joint.name, joint.locked_position_rad)
+        if not abs(report.position_rad - expected_rad) <= tolerance_rad:
+            raise SafetyAbort(
+                f"stands at {degrees(report.position_rad):.2f} deg, expected {degrees(expected_rad):.2f} deg "
+                f"(within {format_angle(tolerance_rad)})",
+                where=f"joint {joint.name}",
+                cause="the position reference is lost, or the arm was moved",
+                next_step="home the robot or bring the joint to its locked_position_rad, then start again",
+            )
+        if not joint.position_min_rad <= report.position_rad <= joint.position_max_rad:
+            raise SafetyAbort(
+                f"stands at {degrees(report.position_rad):.2f} deg, outside its limits", where=f"joint {joint.name}"
+            )

@@ -26,11 +26,11 @@ from frictid_hil.plan.plan import REHEARSAL, JointPlan, Motion, Move
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import Batched, Driver, Feedback, JointState, SetPoint
 from frictid_hil.recording.samples import Mark
+from frictid_hil.runner.arm import verify_reference
 from frictid_hil.runner.care import Care
-from frictid_hil.runner.cycle import StopRequest
+from frictid_hil.runner.cycle import StopRequest, Stream
 from frictid_hil.runner.events import Event, JobProgress, JointRun, Marked, PhaseStarted, Warned
 from frictid_hil.runner.motions import AT_RAD, REHEARSAL_TORQUE, from_here
-from frictid_hil.runner.reference import verify_reference
 from frictid_hil.runner.ring import Ring
 from frictid_hil.runner.sign_watch import SignWatch
 from frictid_hil.runner.supervisor import JointLimits, Supervisor
@@ -192,7 +192,7 @@ class BatchRunner:
         """Judge by the rehearsal whether friction opposes motion."""
         times_ns = columns["time_ns"] + self.offset_ns
         inside = (times_ns >= rehearsal.start_ns) & (times_ns < rehearsal.end_ns)
-        watch, set_point = SignWatch(_Endless(), name, math.inf), SetPoint()
+        watch, set_point = SignWatch(Stream([0.0], 1.0), name, math.inf), SetPoint()
         moved = (columns[column][inside].tolist() for column in ("velocity_rad_s", "torque_nm"))
         for velocity, torque in zip(*moved, strict=True):
             watch.update(Feedback(velocity_rad_s=velocity, torque_nm=torque), set_point)
@@ -225,13 +225,6 @@ class BatchRunner:
                 return [report.position_rad for report in here]
             before = here
         raise SafetyAbort(f"standstill of every joint not seen in {_LOOKS_AT_STANDSTILL} looks")
-
-
-class _Endless:
-    """A source that never ends."""
-
-    def update(self, feedback: Feedback, set_point: SetPoint) -> bool:
-        return True
 
 
 class _EverySecond:

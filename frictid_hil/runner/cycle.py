@@ -98,7 +98,11 @@ class CycleCount:
 
 @dataclass(eq=False)
 class CyclicLoop:
-    """Exchanges, supervises, records; owns the set-points of all joints."""
+    """Exchanges, supervises, records; owns the set-points of all joints.
+
+    What cycles raises ``SafetyAbort`` by the supervisor, and ``Interrupted`` where a stop is asked for: ``run`` brings
+    all joints to rest before that, unless a quick stop is asked for.
+    """
 
     driver: Driver  # cycling (``start_cycling`` was called)
     supervisor: Supervisor  # passes every cycle
@@ -132,11 +136,7 @@ class CyclicLoop:
         return self._deadline_ns + self.offset_ns
 
     def cycle(self, *, supervised: bool = True) -> Sequence[Feedback]:
-        """One exchange at the next deadline.
-
-        Raises:
-            SafetyAbort: by the supervisor.
-        """
+        """One exchange at the next deadline."""
         clock, count, deadline_ns = self.driver.clock, self.count, self._deadline_ns
         clock.wait_until(deadline_ns)
         late_ns = clock.now_ns() - deadline_ns
@@ -184,10 +184,6 @@ class CyclicLoop:
         Args:
             sources: of the set-points, by index of the joint.
             ending: brings the only joint to rest when asked to; without one all decelerate along their paths.
-
-        Raises:
-            SafetyAbort: by the supervisor.
-            Interrupted: asked to stop; all joints have been decelerated to rest first unless a quick stop was asked.
         """
         moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
         previous_rad = [set_point.position_rad for _, _, set_point in moving]
@@ -203,32 +199,18 @@ class CyclicLoop:
             self.count.limited += any(feedback[joint].limited for joint in sources)
 
     def hold(self, cycles: int) -> None:
-        """Cycle with unchanged set-points.
-
-        Raises:
-            SafetyAbort: by the supervisor.
-            Interrupted: asked to stop.
-        """
+        """Cycle with unchanged set-points."""
         for _ in range(cycles):
             self.go_on()
             self.cycle()
 
     def go_on(self) -> None:
-        """Return, unless a stop was asked for.
-
-        Raises:
-            Interrupted: a stop was asked for.
-        """
+        """Return, unless a stop was asked for."""
         if self.stop.level:
             raise Interrupted("stopped on request", next_step=GO_ON)
 
     def wait_for(self, done: Callable[[Sequence[Feedback]], bool], timeout_s: float, what: str) -> None:
-        """Keep cycling with unchanged set-points until ``done(feedback)``.
-
-        Raises:
-            SafetyAbort: not done in time; ``what`` says what was awaited.
-            Interrupted: asked to stop.
-        """
+        """Keep cycling with unchanged set-points until ``done(feedback)``; ``SafetyAbort`` where it takes too long."""
         for _ in range(max(1, round(timeout_s / self.period_s))):
             self.go_on()
             if done(self.cycle()):

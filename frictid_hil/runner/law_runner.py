@@ -44,12 +44,7 @@ class LawRunner:
     _source: LawSource | None = None
 
     def source(self, motion: Compensated) -> LawSource:
-        """The set-points of one stretch. A joint that is not under this law yet is taken into it first.
-
-        Raises:
-            SafetyAbort: by the supervisor, or the drive did not take the mode.
-            Interrupted: asked to stop.
-        """
+        """The set-points of one stretch. A joint that is not under this law yet is taken into it first."""
         loop = self.loop
         source = self._source
         if source is None or source.in_force.law != motion.law or self._drive_mode is not motion.drive_mode:

@@ -47,7 +47,7 @@ class JointLimits:
 
 
 class Supervisor:
-    """Watches all joints; knows which one may move."""
+    """Watches all joints; knows which one may move. ``SafetyAbort`` names joint, quantity, value and bound."""
 
     def __init__(
         self,
@@ -103,20 +103,12 @@ class Supervisor:
         self._runaway = watch
 
     def arm_interlock(self, feedback: Sequence[Feedback]) -> None:
-        """The interlock must be closed now and in every cycle from now on.
-
-        Raises:
-            SafetyAbort: it is open, or its input is not reported.
-        """
+        """The interlock must be closed now and in every cycle from now on."""
         self._interlock_armed = True
         self.check_interlock(feedback)
 
     def check_interlock(self, feedback: Sequence[Feedback]) -> None:
-        """Pass one cycle's inputs.
-
-        Raises:
-            SafetyAbort: the interlock is open, or its input was not reported for too long.
-        """
+        """Pass one cycle's inputs."""
         if self._interlock is not None and self._interlock_armed:
             self._interlock.check(feedback[self.names.index(self._interlock.joint)], self._cycle_hz)
 
@@ -130,11 +122,7 @@ class Supervisor:
         self._max_age[joint] = max(self._max_age[joint], 3 * cycles)
 
     def check(self, set_points: Sequence[SetPoint], feedback: Sequence[Feedback]) -> None:
-        """Pass one cycle's feedback.
-
-        Raises:
-            SafetyAbort: naming joint, quantity, value and bound.
-        """
+        """Pass one cycle's feedback."""
         self.check_interlock(feedback)
         for moving in self._moving:
             self._check_moving(moving, set_points[moving], feedback[moving])

@@ -314,11 +314,7 @@ class MitDriver:
         return self._answer(joint, asked, match, f"parameter {parameter.index:#x}")
 
     def _set(self, joint: JointSetup, parameter: Parameter, value: float, what: str) -> None:
-        """Write where it differs, read back, and remember what to restore.
-
-        Raises:
-            HardwareError: not taken.
-        """
+        """Write where it differs, read back, and remember what to restore."""
         settings = self._settings[joint.name]
         before = self._ask(joint, parameter)
         if before == value:

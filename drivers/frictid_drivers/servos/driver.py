@@ -113,6 +113,8 @@ class ServoDriver:
     def identify(self) -> dict[str, JointIdentity]:
         """What every servo told when it was reached, and what its numbers are worth."""
         self._open_line()
+        period_s = 1.0 / (self._cycle_hz or self.setup.cycle_hz)
+        timing = Timing(uncertainty_s=0.002, velocity_delay_s=speed_cycles(period_s) * period_s / 2.0)
         return {
             joint.name: JointIdentity(
                 joint=joint.name,
@@ -122,7 +124,7 @@ class ServoDriver:
                 position_resolution_rad=mine.model.count_rad,
                 torque_resolution_nm=mine.torque_nm_per_unit,
                 torque_source=torque_source(mine),
-                timing=Timing(uncertainty_s=0.002, velocity_delay_s=self._velocity_delay_s()),
+                timing=timing,
                 settings={
                     "torque_uncertainty_percent": mine.model.uncertainty_percent,
                     **({} if self._told[joint.name].i_gain else {POSITION_GAIN: self._told[joint.name].p_gain}),
@@ -362,10 +364,6 @@ class ServoDriver:
         answered = count * (wire.answer_overhead + registers.block_bytes)
         delays_s = sum(told.delay_s for told in self._told.values())
         return float(int(_BUSIEST / ((asked + answered) * 10.0 / self._line_settings.baud + delays_s)))
-
-    def _velocity_delay_s(self) -> float:
-        period_s = 1.0 / (self._cycle_hz or self.setup.cycle_hz)
-        return speed_cycles(period_s) * period_s / 2.0
 
     def _watchdog(self, seconds: float) -> bytes:
         return bytes([min(127, round(seconds / _WATCHDOG_STEP_S))])

@@ -77,7 +77,7 @@ class SerialPort:
 
 @dataclass
 class Line:
-    """Packets of one maker on one port."""
+    """Packets of one maker on one port; ``HardwareError`` where the port is gone or a servo that is asked is silent."""
 
     port: BytePort
     wire: Wire
@@ -89,11 +89,7 @@ class Line:
     _buffer: bytearray = field(default_factory=bytearray)
 
     def send(self, packet: bytes) -> None:
-        """One packet.
-
-        Raises:
-            HardwareError: the port is gone.
-        """
+        """One packet."""
         try:
             self.port.write(packet)
         except PORT_ERRORS as error:
@@ -123,19 +119,11 @@ class Line:
             yield from self.received(until_ns)
 
     def tell(self, address: int, data: Mapping[int, bytes]) -> None:
-        """Write the same number of bytes to each of these servos; nobody answers.
-
-        Raises:
-            HardwareError: the port is gone.
-        """
+        """Write the same number of bytes to each of these servos; nobody answers."""
         self.send(self.wire.sync_write(address, data))
 
     def ask(self, servo: int, address: int, count: int) -> bytes:
-        """Read so many bytes.
-
-        Raises:
-            HardwareError: it does not answer.
-        """
+        """Read so many bytes."""
         for _ in range(_TRIES):
             self.send(self.wire.read(servo, address, count))
             for packet in self._awaited(self.clock.now_ns() + round(self.answer_s * 1e9)):
@@ -149,11 +137,7 @@ class Line:
         )
 
     def put(self, servo: int, address: int, data: bytes) -> bool:
-        """Write and read back; False where the servo does not take it.
-
-        Raises:
-            HardwareError: it does not answer.
-        """
+        """Write and read back; False where the servo does not take it."""
         for _ in range(_TRIES):
             self.tell(address, {servo: data})
             if self.ask(servo, address, len(data)) == data:

@@ -30,7 +30,7 @@ class OperatingMode:
     """The mode of one servo, in position mode now; to where it shall hold it goes no faster than ``most_rad_s``.
 
     Raises:
-        HardwareError: it does not answer.
+        HardwareError: it does not answer, or did not take another mode and has no power now.
     """
 
     def __init__(self, line: Line, mine: JointSettings, most_rad_s: float) -> None:
@@ -41,22 +41,14 @@ class OperatingMode:
         self._slowed = False
 
     def take_currents(self, goal: int, *, powered: bool) -> None:
-        """Current mode, beginning with this goal; under power if it was.
-
-        Raises:
-            HardwareError: it did not take the mode, and has no power now.
-        """
+        """Current mode, beginning with this goal; under power if it was."""
         self._change(self._registers.current_mode, powered)
         self.follow_current(goal)
         if powered:
             self._tell(self._registers.torque, _ON)
 
     def take_positions(self, goal: int | None, *, powered: bool) -> None:
-        """Position mode, beginning with this goal; under power if it was and the goal is known.
-
-        Raises:
-            HardwareError: it did not take the mode, and has no power now.
-        """
+        """Position mode, beginning with this goal; under power if it was and the goal is known."""
         self._change(self._registers.position_mode, powered)
         self._restore()
         if powered and goal is not None:
