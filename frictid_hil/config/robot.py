@@ -171,7 +171,7 @@ class GatesFile(Strict):
     saturation: Share | None = None  # share of the samples with torque at its limit; usually 0.005
     drift: Share | None = None  # change of the friction over the run; usually 0.05
     link_resonance: Share | None = None  # frequency of the fastest cycle over the link's resonance; usually 0.2
-    # change of the friction in other stretches of the run, against the curve; usually 0.15
+    # change of the friction in other stretches of the run, or of the repeated cycle; usually 0.15
     other_stretches: Share | None = None
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from frictid_hil.friction.estimate import Estimate
 from frictid_hil.friction.gate import Gate
 from frictid_hil.friction.recording import CycleRecording, Motion
+from frictid_hil.friction.repetition import changed_between, friction_at
 from frictid_hil.friction.trajectory import Array
 
 MOST_SEEN_S = 0.0015
@@ -53,7 +54,7 @@ FLAT_SPIKE = 6.0
 
 CONTINUED = 2.0
 """The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair, where the
-curve is only continued ..."""
+curve is only continued, and no cycle tells its friction at that speed ..."""
 SLOWEST_SHARE = 0.5
 """... down to this share of that pair's speed."""
 _BESIDE = 1.0 / 12.0
@@ -61,14 +62,14 @@ _BESIDE = 1.0 / 12.0
 _AROUND = 0.2
 """Share of a cycle to either side of its middle in which the joint turns."""
 _STEPS = 1000.0
-_LEAST_SAMPLES = 50
+_LEAST_SAMPLES, _LEAST_AT_SPEED = 50, 12
 
 
 def consistency(recording: CycleRecording, motion: Motion, result: Estimate, most_changed: float) -> list[Gate]:
     """All questions that a recording allows to ask; the last argument is ``GateLimits.other_stretches``."""
     asked = [_delay(recording, result), _turnover(recording, motion, result), _velocity(recording, motion)]
-    asked += [_inertia(recording, result), _flat(recording)]
-    return [gate for gate in (*asked, _elsewhere(recording, result, most_changed)) if gate is not None]
+    asked += [_inertia(recording, result), _flat(recording), _repetition(recording, motion, result, most_changed)]
+    return [gate for gate in (*asked, _elsewhere(recording, motion, result, most_changed)) if gate is not None]
 
 
 def _delay(recording: CycleRecording, result: Estimate) -> Gate | None:
@@ -198,15 +199,35 @@ def _flat(recording: CycleRecording) -> Gate:
     return Gate.about("flat_tops", share <= FLAT_SHARE, share, FLAT_SHARE, said, cause)
 
 
-def _elsewhere(recording: CycleRecording, result: Estimate, most: float) -> Gate | None:
+def _repetition(recording: CycleRecording, motion: Motion, result: Estimate, most: float) -> Gate | None:
+    """The torque of the repeated cycle against that of its first run, at the same places."""
+    changed = changed_between(recording, motion)
+    if changed is None or recording.repeat is None:
+        return None
+    peak_rad_s = recording.procedure.peak_velocities_rad_s[[recording.repeat.cycle - 1]]
+    level_nm = float(result.curve.magnitude(peak_rad_s)[0])
+    shares, allowed = np.abs(changed[0]) / level_nm, most + SURE * changed[1] / level_nm
+    worst = int(np.argmax(shares))
+    share = float(shares[worst])
+    return Gate.about(
+        "repetition",
+        share <= allowed,
+        share,
+        allowed,
+        f"cycle {recording.repeat.cycle} again: in part {worst + 2} of {shares.size + 1} its torque differs by "
+        f"{100 * share:.1f} % of the friction (allowed {100 * allowed:.3g} %)",
+        "the torque's scale or offset changed during the run, something touched the joint, or wrong reports",
+    )
+
+
+def _elsewhere(recording: CycleRecording, motion: Motion, result: Estimate, most: float) -> Gate | None:
     """Half of forward minus backward torque in other stretches of the run, against the curve at the same speeds."""
-    slowest = float(result.curve.velocity_rad_s[0])
     judged = []
     for name, velocity, torque in recording.elsewhere:
-        continued = float(np.abs(velocity).max(initial=0.0)) < slowest
-        ratio = _friction_against(result, velocity, torque, SLOWEST_SHARE * slowest if continued else slowest)
-        if ratio is not None:
-            judged.append((abs(ratio - 1.0), most * (CONTINUED if continued else 1.0), ratio, name))
+        judged += [
+            (abs(ratio - 1.0), bound, ratio, name)
+            for ratio, bound in _ratios(recording, motion, result, velocity, torque, most)
+        ]
     if not judged:
         return None
     worst, allowed, ratio, name = max(judged, key=lambda one: one[0] / one[1])
@@ -221,18 +242,27 @@ def _elsewhere(recording: CycleRecording, result: Estimate, most: float) -> Gate
     )
 
 
-def _friction_against(result: Estimate, velocity: Array, torque: Array, slowest: float) -> float | None:
-    """Measured over identified friction; None where the stretch does not go both ways from this speed on."""
-    fastest = result.curve.velocity_rad_s[-1]
-    steady = (np.abs(velocity) >= max(slowest, 0.9 * float(np.abs(velocity).max(initial=0.0)))) & (
-        np.abs(velocity) <= fastest
-    )
+def _ratios(
+    recording: CycleRecording, motion: Motion, result: Estimate, velocity: Array, torque: Array, most: float
+) -> list[tuple[float, float]]:
+    """Friction of a stretch over that of the curve, or, where the curve does not reach, of each cycle; their bounds."""
+    slowest, fastest = float(result.curve.velocity_rad_s[0]), float(result.curve.velocity_rad_s[-1])
+    top = float(np.abs(velocity).max(initial=0.0))
+    continued = top < slowest
+    steady = (np.abs(velocity) >= max(0.0 if continued else slowest, 0.9 * top)) & (np.abs(velocity) <= fastest)
     ways = [steady & (velocity > 0.0), steady & (velocity < 0.0)]
     if min(int(way.sum()) for way in ways) < _LEAST_SAMPLES:
-        return None
+        return []
     there, back = (float(np.mean(torque[way])) for way in ways)
-    expected = np.mean([float(np.mean(result.curve.magnitude(np.abs(velocity[way])))) for way in ways])
-    return (there - back) / 2 / float(expected)
+    measured_nm, speed = (there - back) / 2, np.abs(velocity)
+    if continued:
+        cycles_nm = friction_at(recording, motion, float(np.mean(speed[steady])), _LEAST_AT_SPEED)
+        if cycles_nm.size:
+            return [(measured_nm / float(cycle_nm), most) for cycle_nm in cycles_nm]
+        if 0.9 * top < SLOWEST_SHARE * slowest:
+            return []
+    expected_nm = np.mean([float(np.mean(result.curve.magnitude(speed[way]))) for way in ways])
+    return [(measured_nm / float(expected_nm), most * (CONTINUED if continued else 1.0))]
 
 
 def turnover_lateness(recording: CycleRecording, motion: Motion) -> Array:

@@ -8,6 +8,8 @@ import pytest
 from frictid_hil.friction.consistency import MOST_SEEN_S
 from frictid_hil.friction.estimate import estimate
 from frictid_hil.friction.quality import gates
+from frictid_hil.friction.recording import synchronised
+from frictid_hil.friction.repetition import friction_at
 from frictid_hil.friction.rigid_body import Measured
 
 
@@ -139,8 +141,9 @@ def test_a_late_turnover_and_a_delay_that_is_not_quite_sure_are_two_witnesses(so
 
 
 @pytest.mark.parametrize(("share", "told"), [(0.7, None), (0.7, 0.67), (0.7, 1.4), (0.3, 0.67)])
-def test_a_stretch_slower_than_the_slowest_pair_is_judged_too(sound, share, told):
+def test_a_stretch_slower_than_the_slowest_pair_is_judged_too(sound, monkeypatch, share, told):
     """A rehearsal that was slower than every cycle was not compared: a torque times 1.5 from then on was called ok."""
+    monkeypatch.setattr("frictid_hil.friction.consistency.friction_at", lambda *_: np.zeros(0))
     found = estimate(sound)
     speed = share * found.curve.velocity_rad_s[0]
     velocity = np.repeat([speed, -speed], 100)
@@ -148,3 +151,29 @@ def test_a_stretch_slower_than_the_slowest_pair_is_judged_too(sound, share, told
     judged = {gate.name: gate for gate in gates(replace(sound, elsewhere=(("rehearsal", velocity, torque),)), found)}
     # Below half of that speed the curve says nothing.
     assert judged["other_stretches"].passed is (told is None) if share > 0.5 else "other_stretches" not in judged
+
+
+@pytest.mark.parametrize("share", [0.85, 0.4])
+@pytest.mark.parametrize(("told", "passed"), [(1.0, True), (0.9, True), (0.72, False), (1.25, False)])
+def test_a_slow_stretch_is_held_against_the_cycles_as_they_pass_through_its_speed(plants, sound, share, told, passed):
+    """The curve is only continued there, so 30 % were allowed, and a torque times 1.5 from the cycles on passed."""
+    found = estimate(sound)
+    speed = share * found.curve.velocity_rad_s[0]
+    velocity = np.repeat([speed, -speed], 100)
+    friction_nm = float(np.mean(friction_at(sound, synchronised(sound), speed, 12)))
+    torque = told * friction_nm * np.sign(velocity)
+    judged = {gate.name: gate for gate in gates(replace(sound, elsewhere=(("rehearsal", velocity, torque),)), found)}
+    assert judged["other_stretches"].passed is passed, judged["other_stretches"].reason
+
+
+@pytest.mark.parametrize("factor", [1.5, 0.7])
+@pytest.mark.parametrize("place", [0.2, 0.45, 0.7, 0.85])
+def test_a_torque_that_changes_its_scale_within_the_cycle_that_is_repeated(plants, place, factor):
+    """The windows' own scatter grew with it and excused the drift: 5.3 % where 5 and what chance feigns are allowed."""
+    few = plants.record(plants.arm[2], replace(plants.procedure(20), cycles=2))
+    assert "repetition" not in failed(few)
+    repeated = few.repeat.cycle - 1
+    begin_s, end_s = few.procedure.cycle_starts_s[repeated : repeated + 2]
+    since_s = begin_s + place * (end_s - begin_s)
+    torque = np.where(few.time_s >= since_s, factor, 1.0) * few.torque_nm
+    assert "repetition" in failed(replace(few, torque_nm=torque))

@@ -25,6 +25,7 @@ def test_a_sound_recording_passes_every_gate_and_says_why(sound):
     assert set(found) == {
         "tracking", "high_frequency_torque", "samples_per_window", "late_cycles", "saturation", "drift",
         "direction_asymmetry", "straightness", "seen_delay", "turnover", "velocity", "inertia", "flat_tops",
+        "repetition",
     }  # fmt: skip
     assert all(gate.passed for gate in found.values())
     assert all(len(gate.reason) > 20 for gate in found.values())
