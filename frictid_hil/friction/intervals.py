@@ -12,7 +12,8 @@
   only so well.
 
 For least squares, scatter comes from the misfit of every quarter cycle as a whole (``clustered``: misfit that lasts a
-pass is counted once, not per sample), and the model term from the bend that a line cannot follow.
+pass is counted once, not per sample), and the model term from the bend that a line cannot follow and, where the torque
+swings between set-points, from what every pass has alike at one speed (``Fit.beats_nm``).
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def least_squares_terms(
     return Terms(
         scatter=(np.sqrt(np.diag(solved.covariance)) * stdtrit(solved.freedom, 0.975))[odd_block][kept] / COVERAGE,
         skew=np.abs(solved.per_second_of_skew[odd_block])[kept] * recording.skew.uncertainty_s,
-        model=bend[kept],
+        model=np.hypot(bend, solved.beats_nm if recording.skew.torque_beats else 0.0)[kept],
         drift=(np.abs(odd) * _drift_shares(recording, seen_s, drift))[kept],
         beside=np.zeros_like(odd[kept]) if others is None else others.deviation(others.on_knots)[kept],
         link=np.zeros_like(odd[kept]) if link is None else _spread(solved.per_doubt[odd_block], link.covariance)[kept],

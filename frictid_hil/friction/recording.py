@@ -27,6 +27,8 @@ class Skew:
     torque_delay_s: float = 0.0  # of the torque, filters and half a step of zero-order hold included
     torque_lag_s: float = 0.0  # the part of it that is a first-order low-pass
     uncertainty_s: float = 0.0002  # one standard deviation of torque delay minus position delay
+    # The torque swings between set-points and is read once between two: at some speeds its readings are not its mean.
+    torque_beats: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,9 @@ FINE = 0.1
 """Width of the kernel in radians of the fastest cycle. Three widths after each reversal are lost with what is guarded:
 at 0.2 a programme of two speeds saw nothing between the first and three quarters of the second, 0.3 % became 1.2 %."""
 
+FAST_SHARE = 0.09
+"""Knots from this share of the highest speed on are fast ones."""
+_SPEED_BINS, _LEAST_IN_BIN = 20, 20
 _REACH = 4.5
 """Half length of the kernel in widths."""
 
@@ -66,6 +69,7 @@ class Fit:
     per_doubt: Array  # change of the coefficients for one of each doubtful column less in the torque, shape (size, m)
     unobserved: Array  # speeds of the hats that too few samples saw; they were left out
     residual_rms_nm: float  # of the filtered torque
+    beats_nm: float  # standard deviation of what comes again at each speed and is no line between two knots
 
     @property
     def odd_nm(self) -> Array:
@@ -125,7 +129,26 @@ def fit(
         per_doubt=-solved.others[:, 1:],
         unobserved=knots[~observed],
         residual_rms_nm=solved.residual_rms,
+        beats_nm=_beats_nm(
+            motion.velocity_rad_s[chosen.rows],
+            both[:, blocks.size] - both[:, : blocks.size] @ solved.values,
+            knots[observed],
+        ),
     )
+
+
+def _beats_nm(velocity: Array, rest: Array, knots: Array) -> float:
+    """What is left at each speed, both ways: quarters that err alike there do not tell by their scatter.
+
+    Speeds below the fast knots are left out: there knots are as dense as these bins.
+    """
+    speed = np.abs(velocity)
+    number = np.floor(speed / knots[-1] * _SPEED_BINS).astype(np.int64)
+    inside = (speed >= FAST_SHARE * knots[-1]) & (number < _SPEED_BINS)
+    count = np.bincount(number[inside], minlength=_SPEED_BINS)
+    sums = np.bincount(number[inside], (np.sign(velocity) * rest)[inside], _SPEED_BINS)
+    seen = count >= _LEAST_IN_BIN
+    return float(np.sqrt(np.mean((sums[seen] / count[seen]) ** 2))) if seen.any() else 0.0
 
 
 class Unexplained:

@@ -55,6 +55,9 @@ class Timing:
     # The part of it that is a first-order low-pass, which can be undone and not only shifted back.
     torque_lag_s: float = 0.0
     uncertainty_s: float = 0.0002  # one standard deviation of the torque-to-velocity skew that remains
+    # The torque swings from set-point to set-point and is read once between two: at some speeds its readings are not
+    # its mean.
+    torque_beats: bool = False
     source: str = "assumed"  # where these figures come from (``drive``, ``robot file``, ``assumed``)
 
 

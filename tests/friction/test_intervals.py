@@ -137,6 +137,25 @@ def test_a_repeated_cycle_that_runs_slower_feigns_no_drift(plants, index):
     assert estimate(plants.record(falling, plants.procedure(5))).drift.change == pytest.approx(-0.015, abs=0.0035)
 
 
+def test_a_torque_that_beats_with_the_speed_is_in_the_interval_where_it_is_declared(plants):
+    """A servo's current, read once per goal, was off by the same at the same speed in every pass: no scatter tells."""
+    joint = plants.arm[1]
+    recording = plants.record(joint, replace(plants.procedure(20), cycles=2))
+    speed = np.abs(recording.velocity_rad_s)
+    beat = 0.08 * joint.steady(speed) * np.sin(2 * np.pi * speed / (0.15 * recording.procedure.velocity_rad_s))
+    recording = replace(recording, torque_nm=recording.torque_nm + np.sign(recording.velocity_rad_s) * beat)
+    halves, errors = [], []
+    for beats in (False, True):
+        found = estimate(replace(recording, skew=replace(recording.skew, torque_beats=beats)), "least-squares")
+        knots = np.array(found.curve.velocity_rad_s)
+        errors.append(np.abs(np.array(found.curve.torque_nm) - joint.steady(knots)))
+        halves.append(found.half_width_nm)
+    (missed, covered), (error, same) = halves, errors
+    assert np.array_equal(error, same)
+    assert not np.all(error <= missed)
+    assert np.all(error <= covered)
+
+
 def test_coulomb_interval_is_that_of_a_line_through_two_uncertain_pairs():
     curve = FrictionCurve.through(np.array([0.2, 0.4, 0.6]), np.array([5.0, 5.2, 5.4]))
     draws = np.random.default_rng(0).normal(size=(100_000, 2)) * [0.1, 0.05]

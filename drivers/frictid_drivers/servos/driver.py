@@ -114,7 +114,8 @@ class ServoDriver:
         """What every servo told when it was reached, and what its numbers are worth."""
         self._open_line()
         period_s = 1.0 / (self._cycle_hz or self.setup.cycle_hz)
-        timing = Timing(uncertainty_s=0.002, velocity_delay_s=speed_cycles(period_s) * period_s / 2.0)
+        delay_s = speed_cycles(period_s) * period_s / 2.0
+        timing = Timing(uncertainty_s=0.002, velocity_delay_s=delay_s, torque_beats=True)
         return {
             joint.name: JointIdentity(
                 joint=joint.name,

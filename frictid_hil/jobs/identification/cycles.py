@@ -27,7 +27,8 @@ def declared_skew(samples: Samples) -> Skew:
     timing = samples.meta.get("timing")
     if not isinstance(timing, Mapping):
         return Skew()
-    return Skew(**{key: float(timing[key]) for key in _TIMING if timing.get(key) is not None})
+    delays = {key: float(timing[key]) for key in _TIMING if timing.get(key) is not None}
+    return Skew(**delays, torque_beats=timing.get("torque_beats") is True)
 
 
 def told_of(samples: Samples) -> list[str]:
