@@ -107,12 +107,18 @@ def _turnover(recording: CycleRecording, motion: Motion, result: Estimate) -> Ga
     late_s = turnover_lateness(recording, motion)
     if late_s.size == 0:
         return None
-    worst_s = float(late_s[np.argmax(np.abs(late_s))] if fine else max(0.0, late_s[-1]))
+    worst_s = float(late_s[np.argmax(np.abs(late_s))] if fine else late_s[-1])
     # Two witnesses need to say less: inertia alone makes some milliseconds of one of them.
     seen_s, deviation_s = (result.figures.get(f"seen_delay{part}_s", 0.0) for part in ("", "_deviation"))
     least_s = MOST_SEEN_S if result.link_resonance_hz is None else max(MOST_SEEN_DRAGGED_S, SURE_BESIDE * deviation_s)
     both = seen_s * np.sign(worst_s) > least_s
     allowed_s = (MOST_TURNOVER_SEEN_S if both else MOST_TURNOVER_S) if fine else MOST_COARSE_TURNOVER_S
+    if not fine and worst_s < 0.0:
+        # Sooner is what the coarse steps of slow cycles feign, unless there is one and the data ask for it as well.
+        if both and recording.procedure.cycles < FEW_CYCLES:
+            allowed_s = MOST_TURNOVER_S
+        else:
+            worst_s = 0.0
     return Gate.about(
         "turnover",
         abs(worst_s) <= allowed_s,

@@ -54,6 +54,14 @@ def test_a_torque_that_is_late_in_the_fast_ones_of_few_cycles(plants, step_s, by
     assert "turnover" in failed(spoilt)
 
 
+def test_a_position_that_is_late_in_few_cycles_of_coarse_samples(plants):
+    """Friction turned over before the joint did: 2 % outside, and only what came too late was asked."""
+    few = thinned(plants.record(plants.arm[2], replace(plants.procedure(50), cycles=2)), 0.005)
+    assert "turnover" not in failed(few)
+    spoilt = late(replace(few, velocity_rad_s=None), "position_rad", 0.02)
+    assert "turnover" in failed(spoilt)
+
+
 @pytest.mark.slow
 def test_a_torque_that_is_late_in_the_fastest_cycle_is_told_although_it_looks_like_a_soft_link(plants):
     """The link that is found takes most of the delay away that the data would ask for."""
