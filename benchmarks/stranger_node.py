@@ -146,9 +146,9 @@ def main() -> None:
     robot, family = sys.argv[1:]
     file = load_robot(robot).file
     interface, _, channel = file.bus.partition(":")
-    port = file.options["port"]
+    group = {name: file.options[name] for name in ("port",) if name in file.options}
     gateway = interface == "socketcand"
-    line = Line(Gateway(port) if gateway else can.Bus(interface=interface, channel=channel, port=port))
+    line = Line(Gateway(group["port"]) if gateway else can.Bus(interface=interface, channel=channel, **group))
     stranger = build(robot, family, line)
     print("ready", flush=True)
     assert stranger

@@ -56,17 +56,21 @@ class Stack:
         arguments: of the script, after robot file and family.
         usual_hz: cycle rate, where a family has no own.
         gateway: the bus is behind a gateway on TCP, as `socketcand` serves it.
+        link: name of a SocketCAN link; "" elsewhere.
     """
 
     script: str
     arguments: tuple[str, ...] = ()
     usual_hz: int = 500
     gateway: bool = False
+    link: str = ""
 
     def wire(self, folder: Path, family: str) -> tuple[str, dict[str, Any]]:
         """Bus and options of a robot file, of this process's own."""
         if self.arguments:
             return f"slcan:{folder / family}.tty", {"sleep_after_open": 0}
+        if self.link:
+            return f"socketcan:{self.link}", {}
         port = 20_000 + os.getpid() % 20_000
         if self.gateway:
             return f"socketcand:{CHANNEL}", {"host": "127.0.0.1", "port": port, "tcp_tune": True}
@@ -76,6 +80,7 @@ class Stack:
 
 DURAND = Stack("stranger_node.py")
 GATEWAY = Stack("stranger_node.py", gateway=True)
+SOCKETCAN = Stack("stranger_node.py", usual_hz=250, link="vcan0")
 PACKAGE = Path(__file__).with_name("npm_canopen")
 
 

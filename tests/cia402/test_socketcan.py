@@ -70,6 +70,13 @@ def test_a_classical_link_is_refused_for_can_fd_and_the_command_told(found):
     assert refused["exit_code"] == 3 and "ip link set vcan0 up type can" in refused["next"]
 
 
+def test_behind_another_authors_canopen_on_that_link(tmp_path):
+    pytest.importorskip("durand", reason="durand (of the extra dev) is not installed")
+    kernel_with_can.run(FOLDER / "socketcan_strangers.py", tmp_path, timeout_s=570.0)
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert all(one["good"] for one in found.values()), found
+
+
 def test_a_script_that_fails_there_fails_here(tmp_path):
     script = tmp_path / "fails.py"
     script.write_text("import sys\nsys.exit('as it should')\n")
