@@ -18,7 +18,7 @@ from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.friction.curve import FrictionCurve
 from frictid_hil.plan.linear_axis import linear_names
 from frictid_hil.profiles.drift import differences, drift
-from frictid_hil.profiles.promotions import Promotion
+from frictid_hil.profiles.records import Promotion
 from frictid_hil.profiles.store import ProfileStore
 
 

@@ -214,7 +214,7 @@ class _Options:
         values = {key: inner.number(key, 0.0, -1.0, 1.0) for key in _DELAYS if key in given}
         if not 0.0 <= values.get("torque_lag_s", 0.0) <= max(values.get("torque_delay_s", 0.0), 0.0):
             inner.problem("torque_lag_s", "is the part of torque_delay_s that is a low-pass, 0 or more")
-        return Timing(**values, source="robot file")
+        return Timing(**values, torque_beats=False, source="robot file")
 
     def fd(self, bitrate: int) -> tuple[int | None, int]:
         """Data bit rate and length of PDOs: None and 8 on a classical bus."""
