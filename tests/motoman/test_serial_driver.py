@@ -350,6 +350,16 @@ def test_a_controller_whose_host_died_comes_back_to_host_control() -> None:
     driver.close()
 
 
+@pytest.mark.parametrize("wish", ["lock", "unlock", "disable"])
+def test_a_joint_that_there_is_not_is_refused(wish: str) -> None:
+    driver, _ = cycling(make_bench())
+    with pytest.raises(InvalidFields, match="no such joint"):
+        getattr(driver, wish)("elbow")
+    with pytest.raises(InvalidFields, match="no such joint"):
+        driver.enable("elbow", Mode.POSITION)
+    driver.close()
+
+
 def test_a_locked_joint_ignores_its_set_point() -> None:
     bench = make_bench(axes=2)
     driver, set_points = cycling(bench)

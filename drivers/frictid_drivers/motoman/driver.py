@@ -184,19 +184,19 @@ class MotomanDriver:
         """Let the joint follow its set-points from here on; ``HardwareError`` for a mode other than position."""
         if mode is not Mode.POSITION:
             raise HardwareError(f"a serial controller cannot do mode {mode.name}", where=f"joint {joint}")
-        self._cycling().wanted.add(joint)
+        self._cycling().wanted.add(self._setup.joint(joint).name)
 
     def disable(self, joint: str) -> None:
         """Hold the joint and no longer follow its set-points; servo power goes off with ``stop_cycling``."""
-        self._cycling().wanted.discard(joint)
+        self._cycling().wanted.discard(self._setup.joint(joint).name)
 
     def lock(self, joint: str) -> None:
         """Hold the joint where it stands, whatever its set-point."""
-        self._cycling().locked.add(joint)
+        self._cycling().locked.add(self._setup.joint(joint).name)
 
     def unlock(self, joint: str) -> None:
         """Follow the set-point again."""
-        self._cycling().locked.discard(joint)
+        self._cycling().locked.discard(self._setup.joint(joint).name)
 
     def exchange(self, set_points: Sequence[SetPoint]) -> Sequence[Feedback]:
         """Targets out, newest report in; ``SafetyAbort`` where the controller stopped, or a target is out of bounds."""
