@@ -8,6 +8,7 @@ else: no seed, no truth, no path to any. Truth is written out after the last ans
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import queue
 import subprocess
@@ -146,32 +147,23 @@ class _Kept:
 def draw_sealed(world: str, cases: int, seed: int, folder: Path, processes: int, progress: Progress) -> Sealed:
     """Draw all cases and write their sets below ``folder``; truth comes back to the caller's memory alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    tasks: list[_Task] = [
-        (world, index, seed, card, folder) for index, card in enumerate(WORLDS[world].cards(cases, seed))
-    ]
+    cards = WORLDS[world].cards(cases, seed)
+    arguments = range(len(cards)), itertools.repeat(seed), cards, itertools.repeat(folder)
     truths: dict[str, dict[str, Any]] = {}
-    for done, truth in enumerate(_mapped(tasks, processes), start=1):
+    for done, truth in enumerate(_mapped(WORLDS[world].draw, arguments, processes), start=1):
         truths[truth["case"]] = truth
-        progress("draw", done, len(tasks))
+        progress("draw", done, len(cards))
     texts = {name: truth_text(truth) for name, truth in truths.items()}
     digest = hashlib.sha256("".join(texts[name] for name in sorted(texts)).encode()).hexdigest()
     return Sealed(folder, truths, texts, digest)
 
 
-_Task = tuple[str, int, int, Any, Path]
-
-
-def _mapped(tasks: Sequence[_Task], processes: int) -> Iterator[dict[str, Any]]:
+def _mapped(draw: Callable[..., dict[str, Any]], arguments: tuple[Any, ...], processes: int) -> Iterator[Any]:
     if processes <= 1:
-        yield from map(_draw_and_write, tasks)
+        yield from map(draw, *arguments)
         return
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_draw_and_write, tasks, chunksize=4)
-
-
-def _draw_and_write(task: _Task) -> dict[str, Any]:
-    world, index, seed, card, folder = task
-    return WORLDS[world].draw(index, seed, card, folder)
+        yield from pool.map(draw, *arguments, chunksize=4)
 
 
 def _diagnosed(

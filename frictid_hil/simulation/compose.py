@@ -100,7 +100,8 @@ def kernel_source() -> str:
             lines.append(line)
             continue
         stage = marker["stage"]
-        for effect, hook in _hooks_at(effects, stage):
+        hooks = [(effect, hook) for effect in effects.values() for hook in effect.hooks if hook.stage == stage]
+        for effect, hook in sorted(hooks, key=lambda pair: pair[1].order):
             name = f"{effect.name}_{hook.function.__name__}"
             used[name] = hook.function
             call = f"{name}({_arguments(effect, hook.function, where, known[stage])})"
@@ -112,11 +113,6 @@ def kernel_source() -> str:
         imports.append(f"{name} = njit(error_model='numpy')(_{name})  # {_digest(inspect.getsource(function))}")
     text = "\n".join(["# Composed from plant.py and the effects; do not edit.", *lines, ""])
     return text.replace("import math\n", "\n".join(["import math", *imports, ""]), 1)
-
-
-def _hooks_at(effects: Mapping[str, Effect], stage: str) -> list[tuple[Effect, Any]]:
-    found = [(effect, hook) for effect in effects.values() for hook in effect.hooks if hook.stage == stage]
-    return sorted(found, key=lambda pair: pair[1].order)
 
 
 def _arguments(effect: Effect, function: Callable[..., Any], where: Layout, known: frozenset[str]) -> str:

@@ -51,7 +51,7 @@ class Fields:
             if default is None:
                 self.problem(key, "is required")
             return low if default is None and math.isfinite(low) else (default or 0.0)
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not _is_number(value):
             self.problem(key, f"expected a number, found {value!r}")
         elif not math.isfinite(value) or not low <= value <= high:
             self.problem(key, f"expected a number {_range(low, high)}, found {value!r}")
@@ -63,16 +63,11 @@ class Fields:
         """A list of finite numbers, not empty."""
         self._read.append(key)
         value = self._mapping.get(key)
-        if (
-            not isinstance(value, list | tuple)
-            or not value
-            or not all(
-                isinstance(item, int | float) and not isinstance(item, bool) and math.isfinite(item) for item in value
-            )
-        ):
-            self.problem(key, f"expected a list of numbers, found {value!r}")
-            return []
-        return [float(item) for item in value]
+        items = list(value) if isinstance(value, list | tuple) else []
+        if items and all(_is_number(item) and math.isfinite(item) for item in items):
+            return [float(item) for item in items]
+        self.problem(key, f"expected a list of numbers, found {value!r}")
+        return []
 
     def choice(self, key: str, default: str, allowed: tuple[str, ...]) -> str:
         """One of a few words."""
@@ -98,6 +93,10 @@ class Fields:
         """
         if self.problems:
             raise InvalidFields(self.problems)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _range(low: float, high: float) -> str:

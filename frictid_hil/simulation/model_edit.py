@@ -17,7 +17,7 @@ import numpy as np
 
 from frictid_hil.errors import FrictidError
 from frictid_hil.simulation.model_text import Element, ModelText
-from frictid_hil.simulation.native import Native
+from frictid_hil.simulation.native import Native, words
 from frictid_hil.simulation.robot_model import RobotModel
 
 if TYPE_CHECKING:
@@ -154,18 +154,14 @@ def _edit_inertial(text: ModelText, robot: RobotModel, name: str, joint: Element
     lever = m.body_ipos[body] - anchor
     along = axis * float(axis @ lever)
     centre = anchor + along + (lever - along) / factor
-    told = {"pos": _numbers(centre), "mass": f"{m.body_mass[body] * factor**2:.9g}"}
+    told = {"pos": words(centre), "mass": f"{m.body_mass[body] * factor**2:.9g}"}
     assert joint.parent is not None  # a joint stands in a body
     found = text.children(joint.parent, "inertial")
     if found:
         text.set(found[0], dict(told))
         return
-    told |= {"quat": _numbers(m.body_iquat[body]), "diaginertia": _numbers(m.body_inertia[body])}
+    told |= {"quat": words(m.body_iquat[body]), "diaginertia": words(m.body_inertia[body])}
     text.add_inside(joint.parent, "<inertial" + "".join(f' {key}="{value}"' for key, value in told.items()) + "/>")
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(f"{float(value):.9g}" for value in values)
 
 
 def _turned(key: str, value: str, degrees: bool) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -144,12 +144,12 @@ def _write_friction(native: Native, believed: ModelJoint, model: JointModel, use
     inertia, step = model.inertia_kg_m2, use.timestep_s
     stiffness = min(stiffness * dry / (dry + soft_nm), _STIFFEST * inertia / step**2)
     name = believed.name
-    native.joint |= {"damping": _words(poly), "frictionloss": "0"}
+    native.joint |= {"damping": words(poly), "frictionloss": "0"}
     if rise > 0.0:
         base = _RISE_BASE * rise
         sigma = min(stiffness * rise / dry, inertia / (_STEP_RULE * step**2))
         lugre = (sigma, _STEP_RULE * step * sigma, base, base + rise, at)
-        native.more_actuators.append(_passive(name, "stribeck", f'lugre="{_words(lugre)}"'))
+        native.more_actuators.append(_passive(name, "stribeck", f'lugre="{words(lugre)}"'))
         dry -= base
     if ramps:
         _write_ramps(native, name, ramps, dry, dry / stiffness)
@@ -298,11 +298,11 @@ def _write_ramps(
         native.more_actuators.append(
             f'<general name="{joint}_fall_{number}" joint="{joint}" dyntype="dcmotor" dynprm="0" actearly="true" '
             f'gaintype="dcmotor" gainprm="1 0" input="none" biastype="affine" biasprm="0 0 {_word(fall / knee)}" '
-            f'forcelimited="true" forcerange="{_words((-fall, fall))}"/>  <!-- passive: no control -->'
+            f'forcelimited="true" forcerange="{words((-fall, fall))}"/>  <!-- passive: no control -->'
         )
     level, held = _HOLDS_NM * dry, _HOLDS * sum(fall / knee for knee, fall in ramps)
     lugre = (level / yields_rad, held, level, level, 1.0)
-    native.more_actuators.append(_passive(joint, "rest", f'lugre="{_words(lugre)}"'))
+    native.more_actuators.append(_passive(joint, "rest", f'lugre="{words(lugre)}"'))
 
 
 # -- inertia, gravity, constant and periodic torques ----------------------------------------------------------------
@@ -335,7 +335,7 @@ def _write_plant(native: Native, believed: ModelJoint, model: JointModel, use: U
                 poles = values[f"{prefix}cycles_per_motor_revolution"] * model.gear_ratio
                 phase = values[f"{prefix}phase_rad"] - 0.5 * math.pi
                 native.more_actuators.append(
-                    _passive(name, f"{prefix}ripple", f'cogging="{_words((amplitude, poles, phase))}"')
+                    _passive(name, f"{prefix}ripple", f'cogging="{words((amplitude, poles, phase))}"')
                 )
         native.placed["torque_ripple"] = "passive dcmotor: cogging, one for each line"
     if "encoder_offset" in effects:
@@ -374,7 +374,7 @@ def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: U
             native.lost["torque_constant_error"] = "the drive's report: MuJoCo tells the true torque"
     if math.isfinite(limit) and ("torque_saturation" in effects or (gain != 1.0 and motor.law == "position")):
         force = limit * gain / abs(motor.gear)
-        native.actuators["forcerange"] = _words((-force, force))
+        native.actuators["forcerange"] = words((-force, force))
         if "torque_saturation" in effects:
             native.placed["torque_saturation"] = "actuator: forcerange"
     if "torque_delay" in effects:
@@ -451,8 +451,8 @@ def limits_of_gap(
     stiff, damped = stiffness / reduced, max(damping, 1e-9) / reduced
     stiff = stiff if step_s is None else _at_step(stiff, damped, step_s)
     return (
-        f'limited="true" range="{_words((-0.5 * gap_rad, 0.5 * gap_rad))}" solimplimit="0.001 0.001 0.001" '
-        f'solreflimit="{_words((-stiff, -damped))}"'
+        f'limited="true" range="{words((-0.5 * gap_rad, 0.5 * gap_rad))}" solimplimit="0.001 0.001 0.001" '
+        f'solreflimit="{words((-stiff, -damped))}"'
     )
 
 
@@ -497,5 +497,6 @@ def _word(value: float) -> str:
     return f"{value:.9g}"
 
 
-def _words(values: tuple[float, ...]) -> str:
+def words(values: Iterable[float]) -> str:
+    """Numbers as MuJoCo reads them."""
     return " ".join(_word(value) for value in values)

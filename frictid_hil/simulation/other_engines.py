@@ -55,12 +55,8 @@ class _InMjx:
 
 def installed() -> dict[str, Callable[[Any, Any], Stepper]]:
     """Engines that can step a compiled model here, by name and version."""
-    found: dict[str, Callable[[Any, Any], Stepper]] = {}
-    if _there("mujoco_warp"):
-        found[_named("mujoco-warp")] = _InWarp
-    if _there("mujoco.mjx"):
-        found[_named("mujoco-mjx")] = _InMjx
-    return found
+    known = (("mujoco_warp", "mujoco-warp", _InWarp), ("mujoco.mjx", "mujoco-mjx", _InMjx))
+    return {_named(package): engine for module, package, engine in known if _there(module)}
 
 
 def newton() -> str | None:

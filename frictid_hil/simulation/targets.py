@@ -106,17 +106,12 @@ def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numb
         ]
         for name, drawn in samples.items():
             ranges = {
-                key: _range([getattr(n, key) for n in drawn])
+                key: tuple(float(f"{v:.6g}") for v in np.quantile([getattr(n, key) for n in drawn], (0.025, 0.975)))
                 for key in ("dry_nm", "viscous_nm_s_per_rad", "armature_kg_m2", "delay_s")
             }
             lines.append(f"    {json.dumps(name)}: {ranges!r},")
         lines += ["}", ""]
     return "\n".join(lines)
-
-
-def _range(values: Sequence[float]) -> tuple[float, float]:
-    low, high = np.quantile(values, (0.025, 0.975))
-    return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
 def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:

@@ -84,8 +84,7 @@ def behind_play(position_rad: Array, gap_rad: float, step_s: float) -> Array:
     return played(position_rad, gap_rad)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Transmitted torque over the angle between motor and link."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     half = p["gap_rad"] / 2
     twist = np.linspace(-4.0 * half, 4.0 * half, 201)
     torque = p["contact_stiffness_nm_per_rad"] * (twist - np.clip(twist, -half, half))
@@ -115,7 +114,7 @@ EFFECT = Effect(
         Hook("coupling", coupling, order=60),
         Hook("coupling_damping", coupling_damping, order=60),
     ),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     parted=(
         Parting(
             "joint_elasticity",

@@ -31,8 +31,7 @@ def regressors(views: Sequence[DriveView]) -> list[Array]:
     return [v.parts_nm for v in views]
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Demand over tracking error of the proportional part."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     error = np.linspace(-1.0, 1.0, 3)
     curves = {"believed": error, "true": (1.0 + p["kp_error_share"]) * error}
     return Illustration.over("tracking error / its largest", error, "demand / its largest", curves)
@@ -58,7 +57,7 @@ EFFECT = Effect(
         Hook("integral_gain", integral),
         Hook("derivative_gain", derivative),
     ),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="controller_gains",
     demand=DemandForm(("kp_error_share", "ki_error_share", "kd_error_share"), regressors),
 )

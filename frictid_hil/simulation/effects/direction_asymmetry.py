@@ -17,8 +17,7 @@ def friction(
     return other_nm + coulomb_share * level_nm * abs(slip) + viscous_share * abs(rate_nm)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     velocity = np.linspace(-1.0, 1.0, 201)
     symmetric = np.sign(velocity) + velocity
     even = p["coulomb_share"] * np.sign(np.abs(velocity)) + p["viscous_share"] * np.abs(velocity)
@@ -43,7 +42,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("friction", friction),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=linear(
         {
             "coulomb_share": lambda v: v.coulomb_nm * np.abs(v.slip),

@@ -20,8 +20,7 @@ def level(level_nm: float, load_nm: float, slip: float, driving_share: float, ba
     return level_nm + (driving_share if driving else backdriving_share) * abs(load_nm)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Added friction over the load along the motion."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     load = np.linspace(-50.0, 50.0, 201)
     added = np.where(load >= 0.0, p["driving_share"] * load, -p["backdriving_share"] * load)
     curves = {"without": np.zeros_like(load), "with": added}
@@ -46,7 +45,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.VELOCITY_BAND)),
     hooks=(Hook("level", level, order=61),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     parted=(Parting("load_dependent_friction", "moves_payload", "lifting and lowering one load at equal speed", 15.0),),
     inverse=linear(
         {

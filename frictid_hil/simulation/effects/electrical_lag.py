@@ -39,8 +39,7 @@ def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: 
     return mean
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """A step of demand and the current that follows."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     return Illustration.lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current")
 
 
@@ -56,7 +55,7 @@ EFFECT = Effect(
     parameters=(Parameter("time_constant_s", 0.0, LATEST_S, 0.002, "of the closed current loop", off=0.0),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(Hook("current", current, order=40), Hook("settle", settle)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="current_lag_s",
     actuation=ActuationForm(
         "time_constant_s", guesses_by_sample, reported, order=40, late=True, believed_as="current_lag_s"

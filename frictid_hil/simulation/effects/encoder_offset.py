@@ -19,8 +19,7 @@ LARGEST_RAD = 0.2
 """Offset up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than the model has it."""
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Gravity over reported position, in units of its amplitude."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     position = np.linspace(-np.pi, np.pi, 301)
     curves = {"believed": np.cos(position), "true": np.cos(position - p["offset_rad"])}
     return Illustration.over("reported position (rad)", position, "gravity / amplitude", curves)
@@ -38,7 +37,7 @@ EFFECT = Effect(
     parameters=(Parameter("offset_rad", -0.5, 0.5, 0.03, "reported minus true position", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.POSITION,)),
     hooks=(Hook("encoder", encoder),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="zero_offset_rad",
     parted=(
         Parting(

@@ -49,8 +49,7 @@ def position_step(positions: Sequence[Array], resolution_rad: float) -> tuple[fl
     return (slope, factor) if factor > COARSER else (nominal, 1.0)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Reported over true position."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     step = max(p["step_rad"], 1e-9)
     true = np.linspace(0.0, 6.0 * step, 601)
     return Illustration("position (rad)", "reported (rad)", (("reported", true, np.round(true / step) * step),))
@@ -71,6 +70,6 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.KINEMATIC, Channel.PLANT), (Region.KINEMATICS, Region.STANDSTILL, Region.FREQUENCY)),
     hooks=(Hook("resolution", resolution),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     kinematic=KinematicForm("step_rad", read, position_step=True),
 )

@@ -21,8 +21,7 @@ def rate(rate_nm: float, error_share: float) -> float:
     return rate_nm * (1.0 + error_share)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     velocity = np.linspace(0.01, 1.0, 100)
     curves = {"believed": 1.0 + velocity, "true": (1.0 + p["error_share"]) * (1.0 + velocity)}
     return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
@@ -41,7 +40,7 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.9, 4.0, 0.1, "true over believed friction, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level, order=5), Hook("rate", rate, order=5)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="friction_torque",
     parted=(
         Parting(

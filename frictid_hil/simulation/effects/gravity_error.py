@@ -16,8 +16,7 @@ def gravity(gravity_nm: float, error_share: float) -> float:
     return gravity_nm * (1.0 + error_share)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Gravity over position, in units of the stated amplitude."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     position = np.linspace(-np.pi, np.pi, 301)
     curves = {"stated": np.cos(position), "true": (1.0 + p["error_share"]) * np.cos(position)}
     return Illustration.over("position (rad)", position, "gravity / stated", curves)
@@ -35,7 +34,7 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.9, 2.0, 0.05, "true over stated gravity of the link, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="gravity_torque_nm",
     parted=(
         Parting(

@@ -16,8 +16,7 @@ def inertia(link_kg_m2: float, error_share: float) -> float:
     return link_kg_m2 * (1.0 + error_share)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Torque over acceleration, per stated inertia."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     acceleration = np.linspace(-10.0, 10.0, 3)
     curves = {"stated": acceleration, "true": (1.0 + p["error_share"]) * acceleration}
     return Illustration.over("acceleration (rad/s2)", acceleration, "torque / stated inertia (rad/s2)", curves)
@@ -34,7 +33,7 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.8, 3.0, 0.1, "true over stated link inertia, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.ACCELERATION, Region.FREQUENCY)),
     hooks=(Hook("inertia", inertia),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="inertia_kg_m2",
     inverse=linear({"error_share": lambda v: v.link_inertia_kg_m2 * v.acceleration_rad_s2}, (-1.0, math.inf)),
 )

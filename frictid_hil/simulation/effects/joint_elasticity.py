@@ -58,8 +58,7 @@ RATIOS = (0.03, 0.12)  # damping of the resonance over the critical one
 CLOSER = (0.9, 0.95, 1.05, 1.1)  # resonances that are tried beside the one that describes most
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Link motion over motor motion, against frequency, for a link of 1 kg m2."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     stiffness = 1.0 / max(p["compliance_rad_per_nm"], 1e-9)
     resonance_hz = np.sqrt(stiffness) / (2.0 * np.pi)
     frequency = np.linspace(0.05, 2.0, 300) * resonance_hz
@@ -85,7 +84,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.FREQUENCY, Region.ACCELERATION)),
     hooks=(Hook("coupling", coupling), Hook("coupling_damping", coupling_damping)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=SHAPES,
         shapes_for=shapes_for,

@@ -28,8 +28,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Added friction over transmitted torque."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     load = np.linspace(-50.0, 50.0, 201)
     added = p["linear_share"] * np.abs(load) + p["quadratic_per_nm"] * load**2
     curves = {"without": np.zeros_like(load), "with": added}
@@ -60,7 +59,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.ACCELERATION)),
     hooks=(Hook("level", level, order=60),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=({"quadratic": 0.0}, {"quadratic": 1.0}),
         regressors=regressors,

@@ -56,8 +56,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return [(v.coulomb_nm * (soft_spring(v.position_rad, *numbers) - v.slip))[:, None] for v in views]
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Loop of the soft element over a small sinusoidal motion."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     position = 2.0 * p["distance_rad"] * np.sin(np.linspace(0.0, 4.0 * np.pi, 2000))
     state, loop = np.zeros(1), np.empty(2000)
     shape = p["distance_rad"], p["loop_exponent"], p["loop_beta"]
@@ -94,7 +93,7 @@ EFFECT = Effect(
         Hook("remember", remember),
         Hook("settle", settle),
     ),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=tuple(
             {"distance_rad": d, "loop_exponent": n, "loop_beta": b}

@@ -42,8 +42,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return [(v.coulomb_nm * v.slip * rest_memory(v.velocity_rad_s, v.step_s, *numbers))[:, None] for v in views]
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Rise of the break-away level with the dwell."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     dwell = np.linspace(0.0, 5.0 * p["dwell_time_s"], 200)
     rise = p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))
     return Illustration("dwell (s)", "rise of break-away / Coulomb level", (("break-away", dwell, rise),))
@@ -68,7 +67,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.REVERSAL)),
     hooks=(Hook("level", level), Hook("remember", remember), Hook("settle", settle)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),
         regressors=regressors,

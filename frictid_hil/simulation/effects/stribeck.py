@@ -38,8 +38,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Friction over speed, in units of the Coulomb level."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     speed = np.linspace(0.0, 6.0 * p["stribeck_velocity_rad_s"], 200)
     raised = 1.0 + p["share"] * np.exp(-((speed / p["stribeck_velocity_rad_s"]) ** p["exponent"]))
     curves = {"without": np.ones_like(speed), "with": raised}
@@ -63,7 +62,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     parted=(
         Parting(
             "stiction_breakaway",

@@ -70,8 +70,7 @@ def fall(shape: Shape, coefficients: Array) -> dict[str, float]:
     }
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Both parts of friction over a long run at the reference power."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     time = np.linspace(0.0, 5.0 * p["time_constant_s"], 200)
     warm = 1.0 - np.exp(-time / p["time_constant_s"])
     curves = {"sliding level": 1.0 - p["coulomb_share"] * warm, "rate part": 1.0 - p["viscous_share"] * warm}
@@ -103,7 +102,7 @@ EFFECT = Effect(
         Hook("remember", remember),
         Hook("temperature", temperature),
     ),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=grid(time_constant_s=(15.0, 40.0, 100.0, 300.0)),
         regressors=regressors,

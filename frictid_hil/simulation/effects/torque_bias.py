@@ -15,8 +15,7 @@ def shaft(torque_nm: float, bias_nm: float) -> float:
     return torque_nm - bias_nm
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Measured torque of slow motion both ways, around a Coulomb level of 1 N m."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     velocity = np.linspace(-1.0, 1.0, 201)
     curves = {"without": np.sign(velocity), "with": np.sign(velocity) + p["bias_nm"]}
     return Illustration.over("velocity (rad/s)", velocity, "torque (N m)", curves)
@@ -34,7 +33,7 @@ EFFECT = Effect(
     parameters=(Parameter("bias_nm", -50.0, 50.0, 0.3, "measured minus modelled torque", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     parted=(
         Parting(
             "direction_asymmetry",

@@ -23,8 +23,7 @@ def scaled(position_rad: Array, gain: float, step_s: float) -> Array:
     return gain * position_rad
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """True over reported torque."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     reported = np.linspace(-1.0, 1.0, 3)
     curves = {"stated": reported, "with": (1.0 + p["error_share"]) * reported}
     return Illustration.over("reported torque (N m)", reported, "true torque (N m)", curves)
@@ -43,7 +42,7 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.4, 0.4, 0.03, "true over stated torque constant, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.ACCELERATION, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft, order=10),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="torque_constant",
     tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
     inverse=linear({"error_share": lambda v: -v.torque_nm}, (-1.0, math.inf)),

@@ -74,8 +74,7 @@ def followed(position_rad: Array, lag_s: float, step_s: float) -> Array:
     return lagged(position_rad, step_s, lag_s)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """A step and its delayed copy."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     time = np.linspace(-1.0, 4.0, 501) * max(p["delay_s"], 1e-4)
     demand = np.where(time >= 0.0, 1.0, 0.0)
     late = np.where(time >= p["delay_s"], 1.0, 0.0)
@@ -95,7 +94,7 @@ EFFECT = Effect(
     parameters=(Parameter("delay_s", 0.0, LATEST_S, 0.002, "from demand to current", off=0.0, replayed=False),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(Hook("current", current, order=20), Hook("settle", settle)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="torque_delay_s",
     actuation=ActuationForm("delay_s", guesses_by_sample, reported, order=20, late=True, believed_as="torque_delay_s"),
     inverse=InverseForm(

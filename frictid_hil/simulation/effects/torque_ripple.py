@@ -116,8 +116,7 @@ def _step_rad(v: View) -> Array:
     return travel
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Ripple over two motor revolutions."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     turns = np.linspace(0.0, 2.0, 400)
     torque = np.zeros_like(turns)
     for prefix in PREFIXES:
@@ -164,7 +163,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.FREQUENCY)),
     hooks=(Hook("shaft", shaft),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=USUAL,
         regressors=regressors,

@@ -51,8 +51,7 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.linspace(0.7, 1.05, 15) * given / limit
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Torque over demand, in units of the stated limit."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     demand = np.linspace(-1.0, 1.0, 201)
     clipped = reported(demand, p["limit_share"], 0.0, 1.0, p["exponent"])
     return Illustration("demand / limit", "torque / limit", (("stated", demand, demand), ("with", demand, clipped)))
@@ -75,7 +74,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.ACCELERATION)),
     hooks=(Hook("current", current, order=30),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     actuation=ActuationForm(
         "limit_share", guesses, reported, order=50, detail="exponent", details=(HARD, 30.0, 20.0, 14.0, 10.0)
     ),

@@ -58,8 +58,7 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """The error over two motor revolutions."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     turns = np.linspace(0.0, 2.0, 400)
     motor_rad = 2.0 * np.pi * turns
     error = p["amplitude_rad"] * np.cos(motor_rad * p["cycles_per_motor_revolution"] + p["phase_rad"])
@@ -89,7 +88,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.FREQUENCY, Region.ACCELERATION)),
     hooks=(Hook("friction", friction),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     parted=(Parting("torque_ripple", "sines_large", "an error of the gear grows with speed squared", 15.0),),
     inverse=InverseForm(
         shapes=(

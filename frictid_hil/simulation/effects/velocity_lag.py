@@ -69,8 +69,7 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.array([seen]) if seen is not None else np.empty(0)
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """A step of velocity and its report."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     return Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported")
 
 
@@ -87,7 +86,7 @@ EFFECT = Effect(
     parameters=(Parameter("time_constant_s", 0.0, 0.1, 0.004, "of the first-order lag", off=0.0),),
     signature=Signature((Channel.KINEMATIC,), (Region.KINEMATICS,)),
     hooks=(Hook("report_velocity", report_velocity), Hook("settle", settle)),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="velocity_filter_s",
     actuation=ActuationForm("time_constant_s", guesses, None),
     kinematic=KinematicForm("time_constant_s", read),

@@ -16,8 +16,7 @@ def rate(rate_nm: float, curve_nm: float, error_share: float) -> float:
     return rate_nm + error_share * curve_nm
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Friction over velocity of a joint with one unit of Coulomb and one of viscous friction."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     velocity = np.linspace(0.01, 1.0, 100)
     curves = {"believed": 1.0 + velocity, "true": 1.0 + (1.0 + p["error_share"]) * velocity}
     return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
@@ -36,7 +35,7 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -1.0, 4.0, 0.2, "true over believed rate-dependent part, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
     hooks=(Hook("rate", rate, order=6),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     belief="viscous",
     parted=(Parting("viscous_nonlinearity", "sines_large", "high speeds tell a slope from a bend", 15.0),),
     inverse=linear({"error_share": lambda v: v.rate_nm}, (-1.0, math.inf)),

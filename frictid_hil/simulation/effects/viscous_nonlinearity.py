@@ -46,8 +46,7 @@ BENDS = grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 2.0, 3.0)) 
 )
 
 
-def illustrate(p: Mapping[str, float]) -> Illustration:
-    """Added friction over speed, in units of the Coulomb level."""
+def _illustrate(p: Mapping[str, float]) -> Illustration:
     speed = np.linspace(0.0, 8.0 * p["knee_rad_s"], 200)
     added = np.array([rate(0.0, 1.0, v, p["share"], p["knee_rad_s"], p["bend"]) for v in speed])
     curves = {"line": added[-1] * speed / speed[-1], "bent": added}
@@ -73,7 +72,7 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
     hooks=(Hook("rate", rate),),
-    illustrate=illustrate,
+    illustrate=_illustrate,
     inverse=InverseForm(
         shapes=BENDS,
         shapes_for=shapes,
