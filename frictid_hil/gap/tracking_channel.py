@@ -11,8 +11,8 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import Builder, Channel, Rows, Term
 from frictid_hil.gap.plant_channel import SIZES, family
 from frictid_hil.gap.residuals import LowPass, Recording, rms
+from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effects import all_effects
-from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 STEPS = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4, 2.0, 3.0)
 """Values of a link that are tried, over its usual size."""

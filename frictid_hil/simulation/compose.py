@@ -18,6 +18,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -66,15 +67,11 @@ class Kernel:
 @functools.cache
 def layout() -> Layout:
     """The layout of all effects there are."""
-    parameters: dict[str, int] = {}
-    states: dict[str, int] = {}
-    next_parameter, next_state = plant.CORE_PARAMETERS, plant.CORE_STATES
-    for effect in all_effects().values():
-        parameters[effect.name] = next_parameter
-        states[effect.name] = next_state
-        next_parameter += len(effect.parameters)
-        next_state += effect.state_size
-    return Layout(parameters, states, next_parameter, next_state)
+    effects = all_effects()
+    *parameters, curve_at = accumulate((len(e.parameters) for e in effects.values()), initial=plant.CORE_PARAMETERS)
+    *states, state_size = accumulate((e.state_size for e in effects.values()), initial=plant.CORE_STATES)
+    first = dict(zip(effects, parameters, strict=True)), dict(zip(effects, states, strict=True))
+    return Layout(*first, curve_at, state_size)
 
 
 @functools.cache

@@ -1,8 +1,9 @@
 """What the inverse form of an effect of drive or encoder is: how it shows between demand, motion and their reports.
 
 Such an effect is no torque of the joint's balance. It stands between the controller's demand and the reported torque
-(``ActuationForm``), or in the reported position and velocity themselves (``KinematicForm``), or both. The diagnosis
-composes whatever forms there are and knows none of them by name.
+(``ActuationForm``), or in the reported position and velocity themselves (``KinematicForm``), or both; where nothing but
+command and position is recorded, effects form a chain from one to the other (``TrackingForm``). The diagnosis composes
+whatever forms there are and knows none of them by name.
 """
 
 from __future__ import annotations
@@ -93,6 +94,32 @@ class KinematicForm:
     # Its value is the step of the reported position, which makes noise wherever position is differentiated or a stiff
     # spring is driven by it.
     position_step: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """One number of the chain."""
+
+    name: str  # with its unit, as reported
+    position: Callable[[Array, float, float], Array]  # (what comes in (n,), value, step_s) -> what goes on (n,)
+    start: float  # size from which it is sought
+    upper: float  # largest value
+    lower: float = 0.0  # smallest value
+    neutral: float = 0.0  # value that changes nothing
+    of_travel: bool = False  # start and upper are shares of the longest travel
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingForm:
+    """An effect in the chain."""
+
+    links: tuple[Link, ...]  # its numbers, fitted together
+    order: int  # effects act, and are sought, by rising order; the links of those before are fitted again beside it
+    # Confidence in it where it pays on logs not fitted; position alone tells some effects better.
+    certainty: float = 0.6
+    looks_like: tuple[str, ...] = ()  # effects that position alone cannot tell from it
+    # Effects that it may imitate on few motions; it is then named beside them, never by itself.
+    mimics: tuple[str, ...] = ()
 
 
 LATEST_S = 0.05  # longest time by which a torque comes late

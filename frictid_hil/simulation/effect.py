@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, DemandForm, KinematicForm
+from frictid_hil.simulation.drive_form import ActuationForm, DemandForm, KinematicForm, TrackingForm
 from frictid_hil.simulation.inverse import InverseForm
-from frictid_hil.simulation.tracking_form import TrackingForm
 
 
 class Channel(Enum):

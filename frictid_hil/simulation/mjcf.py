@@ -9,7 +9,7 @@ joint's own friction, drive and sensors in their place, by the very formulas of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -60,6 +60,7 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
     limits = f'ctrllimited="true" ctrlrange="{-limit:.9g} {limit:.9g}"' if math.isfinite(limit) else ""
     soft = stiffness > 0.0
     own = _own_friction(model)
+    actuators, tendons = "\n    ".join(own.more_actuators), "\n    ".join(own.more_tendons)
     on_joint = f'armature="{motor:.9g}" ' + " ".join(f'{key}="{value}"' for key, value in own.joint.items())
     body = _body(link, cos_nm, sin_nm)
     play = float(state[plant.PLAY])
@@ -84,10 +85,10 @@ def described(model: JointModel, name: str, *, payload: bool = False) -> Exporte
   <actuator>
     <general name="motor" joint="joint" gaintype="fixed" gainprm="{gain:.9g}" biastype="affine"
              biasprm="{nothing:.9g} 0 0" {limits}/>
-    {_lines(own.more_actuators)}
+    {actuators}
   </actuator>
   <tendon>
-    {_lines(own.more_tendons)}
+    {tendons}
   </tendon>
   <sensor>
     <jointpos name="position" joint="joint"/>
@@ -121,10 +122,6 @@ def _own_friction(model: JointModel) -> Native:
     kept = {name: values for name, values in model.effects.items() if name in FRICTION or name == "torque_ripple"}
     form = "lugre" if "stribeck" in kept else "spring"
     return native_elements(bare, replace(model, effects=kept), use, form, friction=True)
-
-
-def _lines(elements: Sequence[str]) -> str:
-    return "\n    ".join(elements)
 
 
 def _accounts(model: JointModel, soft: bool, own: Native) -> tuple[dict[str, str], dict[str, str], tuple[str, ...]]:

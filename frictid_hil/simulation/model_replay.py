@@ -47,17 +47,11 @@ def replayed(
     engine: Callable[[Any, Any], Stepper] | None = None,
     begin: int = 0,
 ) -> Replayed:
-    """Run a model along the commands of a recording, from where the recording begins.
+    """Run a model, as it was or edited, along the commands of a recording, from where the recording begins.
 
-    Args:
-        model: the one to run, as it was or edited.
-        joints: of the recording, k of them, all driven by position.
-        held: where the others stand; they are not moved.
-        time_s: shape (n,).
-        position_rad: measured, shape (n, k); only the first row is used.
-        command_rad: shape (n, k).
-        engine: takes over from MuJoCo at the row ``begin``, see ``other_engines``.
-        begin: see there.
+    The joints are k of the recording, all driven by position; those ``held`` are not moved. Time has the shape (n,),
+    positions (only the first row is used) and commands (n, k). An engine of ``other_engines`` takes over from MuJoCo
+    at the row ``begin``.
     """
     library, m = mujoco_library(), model
     data = library.MjData(m)

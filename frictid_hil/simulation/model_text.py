@@ -149,10 +149,8 @@ class ModelText:
 
     def section(self, tag: str) -> Element | None:
         """The last section of a name below a root: what is added there moves no index of what stands before."""
-        for e in reversed(self._elements):
-            if e.tag == tag and e.parent is not None and e.parent.tag in ("mujoco", "mujocoinclude"):
-                return e
-        return None
+        below = (e for e in reversed(self._elements) if e.tag == tag and e.parent is not None)
+        return next((e for e in below if e.parent and e.parent.tag in ("mujoco", "mujocoinclude")), None)
 
     def children(self, element: Element, tag: str) -> list[Element]:
         """The direct children of a name."""

@@ -151,6 +151,12 @@ def transmission(parameters: Vector) -> tuple[float, float, float]:
     return coupling_nm_per_rad, coupling_nm_s_per_rad, play_rad
 
 
+def still(state: Vector) -> None:
+    """Neither motor nor link moves."""
+    for slot in (MOTOR_VELOCITY, MOTOR_ACCELERATION, LINK_VELOCITY, LINK_ACCELERATION):
+        state[slot] = 0.0
+
+
 def place(parameters: Vector, state: Vector, position_rad: float) -> float:
     """Put the joint at rest where its encoder reads ``position_rad``, friction relaxed; returns the holding torque."""
     true_rad = 2.0 * position_rad - encoder_angle(parameters, position_rad)
@@ -169,10 +175,7 @@ def place(parameters: Vector, state: Vector, position_rad: float) -> float:
             true_rad += stretch_rad
     state[MOTOR_POSITION] = true_rad
     state[LINK_POSITION] = true_rad - stretch_rad
-    state[MOTOR_VELOCITY] = 0.0
-    state[LINK_VELOCITY] = 0.0
-    state[MOTOR_ACCELERATION] = 0.0
-    state[LINK_ACCELERATION] = 0.0
+    still(state)
     state[SLIP] = 0.0
     torque_nm = holding_torque(parameters, state)
     state[INTEGRAL] = torque_nm
@@ -371,10 +374,7 @@ def stand(parameters: Vector, state: Vector, step_s: float) -> None:
     """One sub-step under the brake."""
     motor_torque(parameters, state, step_s)
     remember(parameters, state, 0.0, 0.0, step_s)
-    state[MOTOR_VELOCITY] = 0.0
-    state[MOTOR_ACCELERATION] = 0.0
-    state[LINK_VELOCITY] = 0.0
-    state[LINK_ACCELERATION] = 0.0
+    still(state)
 
 
 def report(parameters: Vector, state: Vector, readings: Vector, tick: int, substeps: int, period_s: float) -> None:

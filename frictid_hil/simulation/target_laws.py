@@ -92,9 +92,8 @@ def _isaac_lab(text: str) -> dict[str, Law]:
 
 
 def _mjlab(text: str) -> dict[str, Law]:
-    tables = [n for n in ast.parse(text).body if isinstance(n, ast.Assign) and isinstance(n.targets[0], ast.Name)]
-    values = {node.targets[0].id: node.value for node in tables if isinstance(node.targets[0], ast.Name)}
-    damping = ast.literal_eval(values["JOINT_DAMPING"])
+    tables = {ast.unparse(n.targets[0]): n.value for n in ast.parse(text).body if isinstance(n, ast.Assign)}
+    damping = ast.literal_eval(tables["JOINT_DAMPING"])
     laws = {}
     for told in _calls(text):
         (name,) = told["target_names_expr"]

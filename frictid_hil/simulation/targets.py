@@ -91,10 +91,9 @@ def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numb
             "friction": max(n.dry_nm + n.rise_nm, n.straight[0]),
             "dynamic_friction": n.straight[0],
             "viscous_friction": n.straight[1],
+            "actuator_effort_limit": n.torque_limit_nm,
         }
-        if math.isfinite(n.torque_limit_nm):
-            values["actuator_effort_limit"] = n.torque_limit_nm
-        told = [f"joint_names_expr=[{json.dumps(name)}]", *(f"{key}={value:.6g}" for key, value in values.items())]
+        told = [f"joint_names_expr=[{json.dumps(name)}]", *_keywords(values)]
         if steps:
             told += [f"min_delay={steps}", f"max_delay={steps}"]
         lines.append(f"    {json.dumps(name)}: {kind}({', '.join(told)}),")
@@ -112,6 +111,11 @@ def isaac_lab(joints: Mapping[str, Numbers], samples: Mapping[str, Sequence[Numb
             lines.append(f"    {json.dumps(name)}: {ranges!r},")
         lines += ["}", ""]
     return "\n".join(lines)
+
+
+def _keywords(values: Mapping[str, float]) -> list[str]:
+    """Arguments of a configuration; none for a limit that is infinite."""
+    return [f"{key}={value:.6g}" for key, value in values.items() if value < math.inf]
 
 
 def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:
@@ -133,10 +137,9 @@ def mjlab(joints: Mapping[str, Numbers], step_s: float) -> str:
             "damping": n.kv_nm_s_per_rad,
             "armature": n.armature_kg_m2,
             "frictionloss": n.straight[0],
+            "effort_limit": n.torque_limit_nm,
         }
-        if math.isfinite(n.torque_limit_nm):
-            values["effort_limit"] = n.torque_limit_nm
-        told = ", ".join(f"{key}={value:.6g}" for key, value in values.items())
+        told = ", ".join(_keywords(values))
         lines.append(f"    BuiltinPositionActuatorCfg(target_names_expr=({json.dumps(name)},), {told}),")
     damping = {name: float(f"{n.straight[1]:.6g}") for name, n in joints.items()}
     steps = {name: round(n.delay_s / step_s) for name, n in joints.items()}

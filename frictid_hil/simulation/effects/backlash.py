@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View, behind_transmission, grid, most_telling
-from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 
 def play(play_rad: float, gap_rad: float) -> float:

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
+from frictid_hil.simulation.drive_form import Link, TrackingForm
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 from frictid_hil.simulation.inverse import linear
-from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 
 def shaft(torque_nm: float, error_share: float) -> float:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import LATEST_S, ActuationForm, guesses_by_sample
+from frictid_hil.simulation.drive_form import LATEST_S, ActuationForm, Link, TrackingForm, guesses_by_sample
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
 from frictid_hil.simulation.inverse import InverseForm, Shape, View
-from frictid_hil.simulation.tracking_form import Link, TrackingForm
 
 
 def current(current_nm: float, state: Any, at: int, step_s: float, delay_s: float) -> float:
