@@ -186,7 +186,7 @@ class JointModel:
             "motor_inertia_share": self.motor_inertia_share,
             "gravity_cos_nm": self.gravity_cos_nm,
             "gravity_sin_nm": self.gravity_sin_nm,
-            "friction": _friction_mapping(self.friction),
+            "friction": {n: list(v) if isinstance(v, tuple) else v for n, v in asdict(self.friction).items()},
             "presliding_stiffness_nm_per_rad": self.presliding_stiffness_nm_per_rad,
         }
         if self.payload is not None:
@@ -266,9 +266,3 @@ def _read_effects(fields: Fields) -> dict[str, dict[str, float]]:
         effects[name] = {p.name: part.number(p.name, off[p.name], low=p.lower, high=p.upper) for p in effect.parameters}
         part.no_others()
     return effects
-
-
-def _friction_mapping(friction: FrictionCurve | CoulombViscous) -> dict[str, Any]:
-    if isinstance(friction, CoulombViscous):
-        return asdict(friction)
-    return {"velocity_rad_s": list(friction.velocity_rad_s), "torque_nm": list(friction.torque_nm)}

@@ -103,9 +103,6 @@ _NOWHERE = {
 }
 
 
-# -- friction -----------------------------------------------------------------------------------------------------
-
-
 def curve_numbers(model: JointModel, use: Use) -> tuple[float, float, float, _Damping]:
     """(level, rise at standstill, Stribeck speed, damping polynomial) that stand nearest to the joint's sliding."""
     fastest = float(np.max(use.speed_rad_s))
@@ -243,7 +240,7 @@ def _level_and_damping(speed: Array, torque: Array, fastest: float) -> tuple[flo
 
 def _with_stribeck(speed: Array, torque: Array, fastest: float) -> tuple[float, float, float, _Damping]:
     """(Coulomb, rise, Stribeck speed, damping) of the nearest curve of LuGre's form."""
-    best: tuple[float, float, float, float, _Damping] | None = None
+    found: list[tuple[float, float, float, float, _Damping]] = []
     for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.6 * fastest, 60):
         bump = np.exp(-((speed / at) ** 2))
         for powers in _POWERS:
@@ -253,36 +250,33 @@ def _with_stribeck(speed: Array, torque: Array, fastest: float) -> tuple[float, 
             if weights[0] < 0.0 or weights[1] < 0.0 or poly is None:
                 continue
             rest = float(np.mean((torque - table @ weights) ** 2))
-            if best is None or rest < best[0]:
-                best = (rest, float(weights[0]), float(weights[1]), float(at), poly)
+            found.append((rest, float(weights[0]), float(weights[1]), float(at), poly))
             break
-    if best is None:
+    if not found:
         level, poly = _level_and_damping(speed, torque, fastest)
         return level, 0.0, 0.1, poly
-    return best[1:]
+    return min(found, key=lambda one: one[0])[1:]
 
 
 def _with_ramps(speed: Array, torque: Array, fastest: float) -> tuple[float, list[tuple[float, float]], _Damping]:
     """(level at standstill, (knee in rad/s, fall in N m) of each ramp, damping) of the nearest falling curve."""
-    best: tuple[float, float, list[tuple[float, float]], _Damping] | None = None
+    found: list[tuple[float, float, list[tuple[float, float]], _Damping]] = []
     for at in np.geomspace(max(5e-3, 0.01 * fastest), 0.3 * fastest, 40):
         knees = at * np.array(_KNEES)
         ramps = -np.minimum(speed[:, None] / knees, 1.0)
         for powers in _POWERS:
             table = np.column_stack([np.ones_like(speed), ramps, *(speed**p for p in powers)])
             bounds = ([0.0] * (1 + knees.size) + [-np.inf] * len(powers), np.inf)
-            found = lsq_linear(table, torque, bounds, method="bvls")
-            poly = _polynomial(found.x[1 + knees.size :], fastest)
-            if poly is None:
-                continue
-            falls = [(float(v), float(f)) for v, f in zip(knees, found.x[1 : 1 + knees.size], strict=True)]
-            if best is None or found.cost < best[0]:
-                best = (found.cost, float(found.x[0]), falls, poly)
-            break
-    if best is None:
+            fit = lsq_linear(table, torque, bounds, method="bvls")
+            poly = _polynomial(fit.x[1 + knees.size :], fastest)
+            if poly is not None:
+                falls = [(float(v), float(f)) for v, f in zip(knees, fit.x[1 : 1 + knees.size], strict=True)]
+                found.append((fit.cost, float(fit.x[0]), falls, poly))
+                break
+    if not found:
         level, poly = _level_and_damping(speed, torque, fastest)
         return level, [], poly
-    _, level, falls, poly = best
+    _, level, falls, poly = min(found, key=lambda one: one[0])
     return level, [(v, f) for v, f in falls if f > _SMALLEST_RISE * level], poly
 
 
@@ -303,9 +297,6 @@ def _write_ramps(
     level, held = _HOLDS_NM * dry, _HOLDS * sum(fall / knee for knee, fall in ramps)
     lugre = (level / yields_rad, held, level, level, 1.0)
     native.more_actuators.append(_passive(joint, "rest", f'lugre="{words(lugre)}"'))
-
-
-# -- inertia, gravity, constant and periodic torques ----------------------------------------------------------------
 
 
 def _write_plant(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
@@ -345,8 +336,6 @@ def _write_plant(native: Native, believed: ModelJoint, model: JointModel, use: U
 
 
 _FRESH = "only the command is late: MuJoCo's own loop sees position and velocity at once"
-
-# -- motor ----------------------------------------------------------------------------------------------------------
 
 
 def _write_drive(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
@@ -410,9 +399,6 @@ def largest_torque(model: JointModel) -> float:
     return float(current[-1])
 
 
-# -- transmission ---------------------------------------------------------------------------------------------------
-
-
 def _write_transmission(native: Native, believed: ModelJoint, model: JointModel, use: Use) -> None:
     effects, name = model.effects, believed.name
     motor = model.motor_inertia_share * model.inertia_kg_m2
@@ -465,9 +451,6 @@ def _at_step(stiffness: float, damping: float, step_s: float) -> float:
     decay = math.exp(-damping * step_s)
     turn = cmath.cos(cmath.sqrt(stiffness - 0.25 * damping**2) * step_s).real
     return (1.0 + decay - 2.0 * math.sqrt(decay) * turn) / step_s**2
-
-
-# -- words ------------------------------------------------------------------------------------------------------------
 
 
 def _passive(joint: str, what: str, law: str) -> str:
