@@ -38,8 +38,6 @@ class _InWarp:
 
 
 class _InMjx:
-    """MJX, its JAX path."""
-
     def __init__(self, model: Any, data: Any) -> None:
         mjx = importlib.import_module("mujoco.mjx")
         self._model = mjx.put_model(model)
@@ -80,13 +78,8 @@ def in_newton(
 ) -> Array:
     """Torque of the drives of a stage's joints along commands, in Newton's MuJoCo solver, (n, k).
 
-    Args:
-        stage: USD, with a position drive on every joint.
-        joints: names of its prims, k of them.
-        step_s: of the solver, at most.
-        time_s: shape (n,).
-        start_rad: where the joints begin, (k,).
-        command_rad: shape (n, k).
+    Every joint of the stage has a position drive; ``joints`` are names of k prims. The solver's step is ``step_s`` at
+    most; time has the shape (n,), the start (k,), commands (n, k).
 
     Raises:
         Exception: whatever Newton raises of a stage that it cannot read.
