@@ -37,26 +37,23 @@ DISABLE_VOLTAGE = 0x00
 FAULT_RESET = 0x80
 
 _RELEVANT = 0x6F
-
-
-def _said_by(bits: int) -> DriveState:
-    for state in DriveState:
-        mask, value = state.value
-        if bits & mask == value:
-            return state
-    return DriveState.UNKNOWN
-
-
-_STATES = tuple(_said_by(bits) for bits in range(_RELEVANT + 1))
+_STATES = tuple(
+    next((state for state in DriveState if bits & state.value[0] == state.value[1]), DriveState.UNKNOWN)
+    for bits in range(_RELEVANT + 1)
+)
 
 _JOINT_STATES = {
+    DriveState.NOT_READY: JointState.DISABLED,
+    DriveState.SWITCH_ON_DISABLED: JointState.DISABLED,
+    DriveState.READY: JointState.DISABLED,
+    DriveState.SWITCHED_ON: JointState.DISABLED,
     DriveState.ENABLED: JointState.ENABLED,
     DriveState.QUICK_STOP_ACTIVE: JointState.STOPPING,
     DriveState.FAULT_REACTION: JointState.FAULT,
     DriveState.FAULT: JointState.FAULT,
     DriveState.UNKNOWN: JointState.UNKNOWN,
 }
-JOINT_STATES = tuple(_JOINT_STATES.get(state, JointState.DISABLED) for state in _STATES)
+JOINT_STATES = tuple(_JOINT_STATES[state] for state in _STATES)
 """What the runner calls the state, by ``statusword & 0x6F``."""
 
 
