@@ -299,11 +299,10 @@ class ProcessData:
 
         def count(value: int) -> None:
             while_invalid(value)
-            bits = 0
-            for sub in range(1, value + 1):
-                mapped(number(key(mapping, sub)))
-                bits += number(key(mapping, sub)) & 0xFF
-            if bits > 8 * self._longest:
+            words = [number(key(mapping, sub)) for sub in range(1, value + 1)]
+            for word in words:
+                mapped(word)
+            if sum(word & 0xFF for word in words) > 8 * self._longest:
                 raise SdoAbort(Abort.MAPPING_TOO_LONG)
 
         def entry(value: int) -> None:
