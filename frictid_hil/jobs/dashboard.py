@@ -69,11 +69,11 @@ def application(runs: Path, store: ProfileStore) -> Starlette:
     from starlette.responses import Response as Plain
     from starlette.routing import Route
 
-    def shown(page: Page) -> Response:
-        return HTMLResponse(html_of(page))
+    def shown(page: Page, status: int = 200) -> Response:
+        return HTMLResponse(html_of(page), status_code=status)
 
     def not_found(words: str) -> Response:
-        return HTMLResponse(html_of(Page("Not found", words, [])), status_code=404)
+        return shown(Page("Not found", words, []), 404)
 
     def home(_: Request) -> Response:
         newest = {name: store.history(name, 1) for name in store.robots()}
@@ -84,15 +84,14 @@ def application(runs: Path, store: ProfileStore) -> Starlette:
 
     def robot(request: Request) -> Response:
         addresses = {path.resolve(): address for address, path in runs_in(runs).items()}
+
+        def night(run: Path) -> str:
+            return f"/runs/{addresses[run]}/{NIGHT_PAGE}" if run in addresses else ""
+
         try:
-            page = page_of(
-                store,
-                request.path_params["name"],
-                lambda run: f"/runs/{addresses[run]}/{NIGHT_PAGE}" if run in addresses else "",
-            )
+            return shown(page_of(store, request.path_params["name"], night))
         except FrictidError as error:
             return not_found(str(error))
-        return shown(page)
 
     def run(request: Request) -> Response:
         address = request.path_params["address"]
