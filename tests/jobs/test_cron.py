@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.errors import UsageError
-from frictid_hil.jobs.cron import cron_fields
+from frictid_hil.jobs.schedule import cron_fields
 
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 BASE = datetime(2027, 12, 27, 0, 0)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Procedure
+from frictid_hil.jobs.identification.cycles import PathTime, path_time
 from frictid_hil.jobs.identification.joint_profile import identify_joint
-from frictid_hil.jobs.identification.path_time import PathTime, path_time
 from frictid_hil.recording.samples import Mark, Samples
 
 P = Procedure(math.radians(20.0), math.radians(115.0), 10)
