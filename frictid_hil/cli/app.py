@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from frictid_hil.cli import calibrate, columns, compensate, emulate, gap, jobs, new, profiles, reports
+from frictid_hil.cli import calibrate, columns, emulate, gap, jobs, new, profiles, reports
 from frictid_hil.cli.output import Output
 from frictid_hil.cli.terminal import outlive_the_terminal
 from frictid_hil.errors import UsageError
@@ -21,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (calibrate, compensate, reports, jobs, columns):
+for group in (calibrate, reports, jobs, columns):
     app.add_typer(group.app)
 app.add_typer(profiles.app, name="profile")
 app.add_typer(gap.app, name="gap")
