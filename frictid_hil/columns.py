@@ -22,8 +22,7 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 }
 """Dimension of each column of ``Samples``, on a rotary joint and on a linear axis."""
 
-JOINT = "{joint}"
-"""Stands in a column map for the name of any joint."""
+JOINT = "{joint}"  # stands in a column map for the name of any joint
 
 TIME_UNITS_NS: dict[str, float] = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 

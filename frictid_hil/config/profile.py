@@ -34,11 +34,9 @@ KIND = "frictid.profile"
 NEWEST = 1
 
 _DIGITS = 6
-_SECONDARY = 4
-"""Digits of what is not the curve itself: half widths, both directions, figures of quality."""
+_SECONDARY = 4  # digits of what is not the curve itself: half widths, both directions, figures of quality
 _SAME_SPEED = 1e-3
-_DERIVED = 1e-3
-"""How well the slopes in a file must follow from its pairs, as a share of the torque."""
+_DERIVED = 1e-3  # how well the slopes in a file must follow from its pairs, as a share of the torque
 
 
 def rounded(value: Any, digits: int = _DIGITS) -> Any:
@@ -445,11 +443,7 @@ class FrictionProfile(Strict):
         return dump(self.values())
 
     def save(self, path: Path) -> None:
-        """Write the file, whole or not at all.
-
-        Raises:
-            FrictidError: disk full, or no permission.
-        """
+        """Write the file, whole or not at all; ``FrictidError`` where the disk is full or refuses."""
         write_whole(path, self.to_yaml())
 
 

@@ -43,8 +43,7 @@ NEWEST = 1
 MOST_TRAVEL_RAD = 4.001 * math.pi
 """Two turns. A longer travel, or a higher speed than the next, is taken for degrees unless the axis is continuous."""
 
-FASTEST_RAD_S = 50.0
-"""2865 deg/s: the last axes of fast SCARA arms turn at 2500 deg/s."""
+FASTEST_RAD_S = 50.0  # 2865 deg/s: the last axes of fast SCARA arms turn at 2500 deg/s
 
 Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, le=1)]

@@ -127,11 +127,7 @@ def read(path: Path) -> Document:
 
 
 def parse(text: str, path: Path) -> Document:
-    """Read YAML from text; ``path`` names it in errors.
-
-    Raises:
-        ConfigError: as ``read``.
-    """
+    """Read YAML from text; ``path`` names it in errors, which are those of ``read``."""
     if len(text) > MAX_BYTES:
         raise _too_large(path)
     try:

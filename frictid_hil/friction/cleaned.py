@@ -25,14 +25,10 @@ from frictid_hil.friction.recording import CycleRecording, Motion, synchronised
 from frictid_hil.friction.skew import Delay, TimeSkew, measured_skew, seen_delay
 from frictid_hil.friction.trajectory import Array
 
-_GAP_STEPS = 3.0
-"""Between two samples, in sample periods: a longer one has jerked the joint."""
-SHAKES_S = 0.02
-"""How long a position loop may take to catch up with its path: that of one with a bandwidth of 20 Hz."""
-SPIKE = 6.0
-"""Standard deviations of the torque's own noise that a sample must lie beside its neighbours to be no noise."""
-_BESIDE = 3
-"""Samples on either side whose median is taken."""
+_GAP_STEPS = 3.0  # between two samples, in sample periods: a longer one has jerked the joint
+SHAKES_S = 0.02  # how long a position loop may take to catch up with its path: that of one with a bandwidth of 20 Hz
+SPIKE = 6.0  # standard deviations of the torque's own noise that a sample must lie beside its neighbours to be no noise
+_BESIDE = 3  # samples on either side whose median is taken
 
 Found = TypeVar("Found")
 

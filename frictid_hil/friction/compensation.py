@@ -43,8 +43,7 @@ the compensation of the old direction until then, that of the new one from then 
 grows with R. At 0.95 the jump is as large as the speed of the tracking test."""
 
 RATIO_MARGIN = 0.02
-STIFFNESS_MARGIN = 0.1
-"""The setting ``ours`` is to stand with R larger by the one and K larger by this share."""
+STIFFNESS_MARGIN = 0.1  # the setting ``ours`` is to stand with R larger by the one and K larger by this share
 
 
 def stiffness_with_margin(

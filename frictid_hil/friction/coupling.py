@@ -30,11 +30,9 @@ from frictid_hil.friction.recording import Companion, CycleRecording, Motion, pa
 from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.trajectory import Array
 
-_WIDTH_S = 0.008
-"""Of the kernel that both sides go through: half power at 17 Hz, above every joint's own frequency."""
+_WIDTH_S = 0.008  # of the kernel that both sides go through: half power at 17 Hz, above every joint's own frequency
 _GUARD_RAD = 0.005
-_SLOWEST = 0.1
-"""Samples below this share of the highest speed are left out: friction is still a spring there."""
+_SLOWEST = 0.1  # samples below this share of the highest speed are left out: friction is still a spring there
 _KNOTS = np.array([0.0, 0.15, 0.35, 0.6, 1.0])
 _POSTURE = 0.05
 """Share of M_ij by which it may differ along the travel from what the stretch shows, one standard deviation."""

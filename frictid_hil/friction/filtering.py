@@ -16,8 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from frictid_hil.friction.trajectory import Array
 
-_REACH = 6.0
-"""Half length of a kernel in widths; what is cut off is 2e-9 of the whole."""
+_REACH = 6.0  # half length of a kernel in widths; what is cut off is 2e-9 of the whole
 
 
 @dataclass(frozen=True, slots=True)

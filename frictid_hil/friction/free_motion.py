@@ -25,19 +25,15 @@ from frictid_hil.friction.regression import hat_functions
 from frictid_hil.friction.rigid_body import COVERAGE, Measured
 from frictid_hil.friction.trajectory import Array
 
-_SHARES = np.array([0.02, 0.05, 0.1, 0.18, 0.3, 0.45, 0.65, 0.85, 1.0])
-"""Knots as shares of the highest speed."""
+_SHARES = np.array([0.02, 0.05, 0.1, 0.18, 0.3, 0.45, 0.65, 0.85, 1.0])  # knots as shares of the highest speed
 _BODY = ("inertia_kg_m2", "bias_nm", "gravity_cos_nm", "gravity_sin_nm")
-_LEAST_S = 0.2
-"""Time that must be spent around a knot in each direction."""
+_LEAST_S = 0.2  # time that must be spent around a knot in each direction
 _LEAST_SAMPLES = 5
 _BUNCH_S = 1.0
 _GAP_STEPS = 5.0
 _LEAST_GRAVITY_TRAVEL_RAD = 0.5
-_LEAST_REAL = 0.4
-"""Share of the acceleration that a wider kernel leaves; noise keeps next to nothing of it."""
-MOST_INTERVAL = 0.2
-"""Of the friction: half a 95 % interval that a curve may have."""
+_LEAST_REAL = 0.4  # share of the acceleration that a wider kernel leaves; noise keeps next to nothing of it
+MOST_INTERVAL = 0.2  # of the friction: half a 95 % interval that a curve may have
 MOST_APART = 0.15
 """Of the friction: how far the curves of both halves of the recording may lie apart, beyond their intervals."""
 

@@ -35,12 +35,10 @@ from frictid_hil.friction.regression import Fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
-FINER = 8
-"""Points per sample at which windows begin and end: one sample too many on one side is an error of its own."""
+FINER = 8  # points per sample at which windows begin and end: one sample too many on one side is an error of its own
 STEADY = 0.28
 """Width of the windows' kernel in radians of the fastest cycle: it keeps a ringing link from moving their ends."""
-_ENOUGH = 6
-"""Cycles from which on two parameters can be told from the scatter of so many differences."""
+_ENOUGH = 6  # cycles from which on two parameters can be told from the scatter of so many differences
 
 
 @dataclass(frozen=True, slots=True, eq=False)

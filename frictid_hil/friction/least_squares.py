@@ -18,8 +18,7 @@ from frictid_hil.friction.trajectory import Array
 _SLOW = np.array([0.0, 0.006, 0.0125, 0.019, 0.027, 0.037, 0.055])
 _FAST = np.append(0.0932 * np.arange(1, 10), 1.0)
 """Knots as shares of V: dense where the Stribeck dip may be, then about the V_n of the standard procedure."""
-_TRUSTED = 0.015
-"""A knot below the standard V_1 is kept while its interval stays below this share of the friction."""
+_TRUSTED = 0.015  # A knot below the standard V_1 is kept while its interval stays below this share of the friction
 
 
 @dataclass(frozen=True, slots=True, eq=False)

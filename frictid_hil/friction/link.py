@@ -26,13 +26,11 @@ from frictid_hil.friction.regression import Unexplained, fit
 from frictid_hil.friction.rigid_body import COVERAGE, Measured
 from frictid_hil.friction.trajectory import Array
 
-_LOWEST = 1.2
-"""Times the fastest cycle: a link softer than that is another machine."""
+_LOWEST = 1.2  # times the fastest cycle: a link softer than that is another machine
 _HIGHEST_HZ = 90.0
 _LOG_DAMPING = (-5.8, -0.7)
 _GUESS = -3.2
-_STEP = 0.12
-"""Of the search over the logarithm of the frequency."""
+_STEP = 0.12  # of the search over the logarithm of the frequency
 _CHANCE = 20.0
 """What the link takes of the residual's power, in shares of what one independent sample leaves. The best of some twenty
 frequencies takes x by chance with a probability of 20 exp(-x / 2), 0.1 % here: short programmes at a low rate leave few

@@ -11,10 +11,8 @@ from frictid_hil.errors import IdentificationError
 from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 
-_ONSET = 0.01
-"""Share of the travel at which the first cycle is seen to have begun."""
-_WORST_MISFIT = 0.1
-"""Share of the travel; a path further than this from the trajectory is another motion."""
+_ONSET = 0.01  # share of the travel at which the first cycle is seen to have begun
+_WORST_MISFIT = 0.1  # share of the travel; a path further than this from the trajectory is another motion
 
 
 def cycles_start_s(time_s: Array, position_rad: Array, procedure: Procedure, *, where: str = "") -> float:

@@ -25,14 +25,10 @@ from frictid_hil.friction.intervals import coulomb_half_width_nm
 from frictid_hil.friction.rigid_body import Measured
 from frictid_hil.friction.trajectory import Array
 
-_CONSTANT_PER_S = 0.4
-"""A speed counts as constant while it changes by less than this share of itself per second."""
-_SLOWEST = 0.02
-"""Speeds below this share of the highest plateau are holds, not plateaus."""
-_SAME_SPEED = 0.05
-"""Plateaus whose speeds differ by less than this share are one speed."""
-_SETTLE_S = 0.1
-"""Dropped at both ends of a plateau: the axis is still settling, or the next corner is smoothed in."""
+_CONSTANT_PER_S = 0.4  # A speed counts as constant while it changes by less than this share of itself per second
+_SLOWEST = 0.02  # speeds below this share of the highest plateau are holds, not plateaus
+_SAME_SPEED = 0.05  # plateaus whose speeds differ by less than this share are one speed
+_SETTLE_S = 0.1  # dropped at both ends of a plateau: the axis is still settling, or the next corner is smoothed in
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,11 +33,9 @@ from frictid_hil.friction.recording import CycleRecording, synchronised
 from frictid_hil.friction.rigid_body import Measured, RigidBody
 from frictid_hil.friction.trajectory import Array
 
-_SLID = 0.7
-"""Share of F_0: friction between this in the one and in the other direction is counted as presliding."""
+_SLID = 0.7  # share of F_0: friction between this in the one and in the other direction is counted as presliding
 _SMOOTHING_S = 0.02
-_TURN_SHARE = 0.3
-"""A turning point is followed by at least this share of the whole travel in the other direction."""
+_TURN_SHARE = 0.3  # A turning point is followed by at least this share of the whole travel in the other direction
 _LEAST_ROWS = 20
 _PLAINLY = 0.015
 """A joint is called gradual where that shape leaves nowhere more than this share of D.
@@ -45,16 +43,12 @@ _PLAINLY = 0.015
 Averaged over a tenth of D / sigma. A joint whose friction is partly of the other kind leaves 2 % and more, and would
 hunt with a spring that is twice as stiff after the turning point as at rest (docs/reference/compensation-law.md).
 """
-_LOOKED_AT = 20
-"""Tenths of D / sigma from the turning point on; friction has turned over long before."""
+_LOOKED_AT = 20  # tenths of D / sigma from the turning point on; friction has turned over long before
 _LEAST_IN_TENTH = 10
-_LEAST_CLARITY = 4.0
-"""The passage is larger than what the fitted shape leaves by at least this factor."""
-_BESIDE = 4
-"""Samples to either side over which position is differenced, for the stiffness of a loop."""
+_LEAST_CLARITY = 4.0  # the passage is larger than what the fitted shape leaves by at least this factor
+_BESIDE = 4  # samples to either side over which position is differenced, for the stiffness of a loop
 _LEAST_LOOP_ROWS = 400
-_EXPLAINED = 0.9
-"""Share of the torque's variance below which it is no such loop."""
+_EXPLAINED = 0.9  # share of the torque's variance below which it is no such loop
 
 
 @dataclass(frozen=True, slots=True)

@@ -167,8 +167,7 @@ def _check(recording: CycleRecording) -> None:
         raise IdentificationError("time must increase strictly over at least 100 samples", where=recording.where)
 
 
-_VELOCITY_NOISE = 0.002
-"""Tolerated noise of the velocity from encoder counts, as a share of the first cycle's peak."""
+_VELOCITY_NOISE = 0.002  # tolerated noise of the velocity from encoder counts, as a share of the first cycle's peak
 
 
 def _width_s(recording: CycleRecording, position: Array) -> float:

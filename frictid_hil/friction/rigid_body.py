@@ -15,8 +15,7 @@ from frictid_hil.friction.recording import CycleRecording
 from frictid_hil.friction.regression import Fit
 from frictid_hil.friction.trajectory import Array
 
-COVERAGE = 1.96
-"""Standard deviations in half a 95 % interval."""
+COVERAGE = 1.96  # standard deviations in half a 95 % interval
 
 
 @dataclass(frozen=True, slots=True)

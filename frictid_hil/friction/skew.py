@@ -40,8 +40,7 @@ from frictid_hil.friction.regression import fit, hat_functions, ripple_waves
 from frictid_hil.friction.rigid_body import COVERAGE
 from frictid_hil.friction.trajectory import Array
 
-_WIDTH_S = 0.006
-"""Of the kernel that both sides go through: half power at 22 Hz."""
+_WIDTH_S = 0.006  # of the kernel that both sides go through: half power at 22 Hz
 _GUARD_RAD = 0.005
 _SLOWEST = 0.25
 """Samples below this share of the highest speed are left out: friction may rise towards standstill there, and ripple of
@@ -141,11 +140,7 @@ def measured_skew(shaken: CycleRecording, link: Link | None = None) -> Delay:
 
 
 def seen_delay(recording: CycleRecording, motion: Motion, level_nm: float) -> Delay:
-    """The delay that would explain most of the cycles.
-
-    Raises:
-        IdentificationError: as ``regression.fit``.
-    """
+    """The delay that would explain most of the cycles; raises as ``regression.fit``."""
     rate = np.gradient(motion.torque_nm, motion.smoother.step_s)[:, None]
     solved = fit(recording, motion, few_knots(recording), level_nm, width_rad=0.0, extra=rate)
     index = solved.blocks.extra.start

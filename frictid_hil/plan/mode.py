@@ -9,9 +9,6 @@ class Mode(IntEnum):
     """How a joint is commanded; values are those of CiA-402 object 6060."""
 
     NONE = 0
-    POSITION = 8
-    """Cyclic synchronous position (CSP)."""
-    VELOCITY = 9
-    """Cyclic synchronous velocity (CSV)."""
-    TORQUE = 10
-    """Cyclic synchronous torque (CST)."""
+    POSITION = 8  # cyclic synchronous position (CSP)
+    VELOCITY = 9  # cyclic synchronous velocity (CSV)
+    TORQUE = 10  # cyclic synchronous torque (CST)

@@ -18,12 +18,9 @@ from frictid_hil.friction import trajectory
 from frictid_hil.friction.trajectory import Array, Procedure
 from frictid_hil.plan.setup import JointSetup
 
-COUPLING = "coupling"
-"""Name of the motion that shows how strongly joints that move together act on each other."""
-SKEW = "skew"
-"""Name of the motions that show by how much the torque is late."""
-REHEARSAL = "rehearsal"
-"""Name of the motion that shows a joint's whole travel slowly, with the torque watched."""
+COUPLING = "coupling"  # name of the motion that shows how strongly joints that move together act on each other
+SKEW = "skew"  # name of the motions that show by how much the torque is late
+REHEARSAL = "rehearsal"  # name of the motion that shows a joint's whole travel slowly, with the torque watched
 
 
 class Motion(Protocol):
@@ -328,12 +325,9 @@ class Expected:
         return self.inertia_kg_m2 if self.link_inertia_kg_m2 is None else self.link_inertia_kg_m2
 
 
-_ENDLESS_S = 10.0
-"""How much of an endless motion is checked."""
-_CORNER_S = 0.1
-"""Time in which a motion of straight lines is stopped, where the inertia of the joint is not known."""
-_STOPPING_TORQUE = 0.8
-"""Share of a joint's maximum torque that a stop may ask for."""
+_ENDLESS_S = 10.0  # how much of an endless motion is checked
+_CORNER_S = 0.1  # time in which a motion of straight lines is stopped, where the inertia of the joint is not known
+_STOPPING_TORQUE = 0.8  # share of a joint's maximum torque that a stop may ask for
 
 
 def joint_plan(

@@ -67,11 +67,7 @@ class RobotSetup:
         return self.simulated and not self.realtime
 
     def joint(self, name: str) -> JointSetup:
-        """The joint of that name.
-
-        Raises:
-            InvalidFields: no such joint; the message lists the joints there are.
-        """
+        """The joint of that name; ``InvalidFields`` with the joints there are where there is none."""
         for joint in self.joints:
             if joint.name == name:
                 return joint

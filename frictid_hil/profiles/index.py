@@ -20,8 +20,7 @@ from typing import Any
 _VERSION = 1
 _BUSY_S = 30.0
 
-_AT_ONCE = 200
-"""Files read between two commits: an interrupted reading of thousands goes on where it was."""
+_AT_ONCE = 200  # files read between two commits: an interrupted reading of thousands goes on where it was
 
 
 class Index:

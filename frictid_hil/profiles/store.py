@@ -60,6 +60,11 @@ class ProfileStore:
     """All robots' profiles below one folder, the user's data folder unless told. It is made when something is added.
 
     ``told`` is given how many of how many profiles were read so far, where all of them have to be.
+
+    Raises:
+        FrictidError: by all that writes: disk full, no permission, or another process holds the store for too long.
+        UsageError: by all that takes an id: there is no profile of it, or more than one.
+        ConfigError: by all that reads a profile: its file is not what was added.
     """
 
     def __init__(self, root: Path | None = None, told: Callable[[int, int], None] | None = None) -> None:
@@ -71,23 +76,12 @@ class ProfileStore:
         return sorted(path.name for path in self.root.glob("*") if (path / "profiles").is_dir())
 
     def add(self, profile: FrictionProfile) -> str:
-        """Keep a profile; adding the same bytes again changes nothing.
-
-        Returns:
-            Its id.
-
-        Raises:
-            FrictidError: disk full, no permission, or another process holds the store for too long.
-        """
+        """Keep a profile, and give its id; adding the same bytes again changes nothing."""
         with self._locked(profile.robot) as folder:
             return _written(folder / "profiles", profile.provenance.created_utc, profile.to_yaml())
 
     def path(self, robot: str, identity: str) -> Path:
-        """The file of a profile, by its id, or a beginning of one that fits no other.
-
-        Raises:
-            UsageError: there is none, or more than one.
-        """
+        """The file of a profile, by its id, or a beginning of one that fits no other."""
         folder = self._folder(robot)
         if _NAMES["profiles"].fullmatch(identity) and (whole := folder / "profiles" / f"{identity}.yaml").exists():
             return whole  # a store may hold ten thousand: look at the folder only for a beginning of an id
@@ -102,12 +96,7 @@ class ProfileStore:
         return folder / "profiles" / f"{found[0]}.yaml"
 
     def load(self, robot: str, identity: str) -> FrictionProfile:
-        """A profile by its id (or the beginning of it).
-
-        Raises:
-            UsageError: there is none.
-            ConfigError: its file is not what was added.
-        """
+        """A profile by its id (or the beginning of it)."""
         path = self.path(robot, identity)
         if not path.stem.endswith(hashlib.sha256(path.read_bytes()).hexdigest()[:12]):
             raise ConfigError(
@@ -132,12 +121,7 @@ class ProfileStore:
         return baseline_of(self.promotions(robot))
 
     def promote(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
-        """Make a stored profile the active one; promoting the active one again changes nothing.
-
-        Raises:
-            UsageError: there is none of that id.
-            FrictidError: as ``add``.
-        """
+        """Make a stored profile the active one; promoting the active one again changes nothing."""
         with self._locked(robot) as folder:
             path = self.path(robot, identity)
             active = self.active(robot)
@@ -149,7 +133,7 @@ class ProfileStore:
         """Measure drift from this profile from now on; what is active stays.
 
         Raises:
-            UsageError: there is none of that id, or nothing was promoted yet.
+            UsageError: nothing was promoted yet.
         """
         with self._locked(robot) as folder:
             if self.active(robot) is None:
@@ -177,11 +161,7 @@ class ProfileStore:
         return self._notes(Promotion, robot, "promotions", last)
 
     def note_attempt(self, robot: str, attempt: Attempt) -> None:
-        """Keep how a recalibration ended.
-
-        Raises:
-            FrictidError: as ``add``.
-        """
+        """Keep how a recalibration ended."""
         with self._locked(robot) as folder:
             _written(folder / "recalibrations", attempt.utc, _note_text(attempt))
 
@@ -194,11 +174,7 @@ class ProfileStore:
         return len(_names(self._folder(robot), "profiles"))
 
     def history(self, robot: str, last: int | None = None) -> list[Stored]:
-        """Profiles of a robot, all or the last few, oldest first; distances are from the baseline of today.
-
-        Raises:
-            ConfigError: a file that the index does not know yet was changed.
-        """
+        """Profiles of a robot, all or the last few, oldest first; distances are from the baseline of today."""
         folder = self._folder(robot)
         names = _names(folder, "profiles")[-last if last else None :]
         baseline = self.baseline(robot)

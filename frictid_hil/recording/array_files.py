@@ -25,8 +25,7 @@ from frictid_hil.errors import InputFileError
 from frictid_hil.recording.arrays import ArrayTable, is_usable, refusing
 from frictid_hil.recording.bounds import MAX_BYTES, check_expansion, check_rows
 
-_PAUSE_S = 1.0
-"""Between episodes, whose times all begin at zero."""
+_PAUSE_S = 1.0  # between episodes, whose times all begin at zero
 _DTYPES = {
     "FloatStorage": "<f4",
     "DoubleStorage": "<f8",

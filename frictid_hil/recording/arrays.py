@@ -21,8 +21,7 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.recording.bounds import check_rows
 
 Shape = tuple[int, ...]
-MAX_COLUMNS = 128
-"""Matrices that are wider are images and the like."""
+MAX_COLUMNS = 128  # matrices that are wider are images and the like
 
 
 @dataclass(frozen=True, slots=True)

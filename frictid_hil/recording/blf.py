@@ -44,8 +44,7 @@ _HEAD: list[tuple[str, str]] = [
     ("dlc", "u1"),
     ("can_id", "<u4"),
 ]
-FRAME = np.dtype([*_HEAD, ("data", "u1", 8)])
-"""A classic CAN frame, 48 bytes; bit 31 of the id says extended."""
+FRAME = np.dtype([*_HEAD, ("data", "u1", 8)])  # A classic CAN frame, 48 bytes; bit 31 of the id says extended
 
 FD_FRAME_OBJECT = np.dtype(
     [
@@ -60,8 +59,7 @@ FD_FRAME_OBJECT = np.dtype(
 )
 """A CAN FD frame, 120 bytes."""
 
-_FD_LENGTHS = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64], np.uint8)
-"""By dlc."""
+_FD_LENGTHS = np.array([*range(9), 12, 16, 20, 24, 32, 48, 64], np.uint8)  # by dlc
 
 
 def file_header(file_size: int, content_size: int, frames: int) -> bytes:

@@ -19,11 +19,7 @@ def allowed_bytes(packed: int) -> int:
 
 
 def check_expansion(packed: int, unpacked: int, where: str) -> None:
-    """Refuse a file that says it holds, or of which there came out so far, more than is allowed.
-
-    Raises:
-        InputFileError: too much.
-    """
+    """Refuse, by an ``InputFileError``, a file of which more came out, or is said to, than is allowed."""
     if unpacked > allowed_bytes(packed):
         raise InputFileError(
             f"{packed:,} bytes that unpack to {unpacked:,} or more; at most {allowed_bytes(packed):,} are read",
@@ -34,10 +30,6 @@ def check_expansion(packed: int, unpacked: int, where: str) -> None:
 
 
 def check_rows(rows: int, where: str) -> None:
-    """Refuse a table of too many rows.
-
-    Raises:
-        InputFileError: more than ``MAX_ROWS``.
-    """
+    """Refuse a table of more than ``MAX_ROWS`` rows by an ``InputFileError``."""
     if rows > MAX_ROWS:
         raise InputFileError(f"more than {MAX_ROWS:,} rows", where=where, next_step="split the recording")

@@ -25,22 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from frictid_hil.errors import InputFileError
-from frictid_hil.protocol.driver import FD_FRAME
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME
 from frictid_hil.recording import blf
 from frictid_hil.recording.bounds import allowed_bytes, check_expansion
 from frictid_hil.recording.growing_file import GrowingLog
 
-EXTENDED = 0x8000_0000
-"""Bit of ``can_id`` that says the frame has a 29-bit id."""
-
 LOG_SUFFIXES = (".blf", ".asc", ".log", ".trc", ".db", ".mf4")
-LONGEST = 64
-"""Bytes of a CAN FD frame at most; what a damaged log holds beyond is no frame."""
+LONGEST = 64  # bytes of a CAN FD frame at most; what a damaged log holds beyond is no frame
 MOST_TEXT_RATIO = 40
 _LEAST_TEXT_BYTES = 1_000_000
 _FRAMES_PER_CONTAINER = 2048
-_EPOCH_S = 1e8
-"""Times beyond this (three years) are of a wall clock, not run time."""
+_EPOCH_S = 1e8  # times beyond this (three years) are of a wall clock, not run time
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,10 +36,8 @@ from frictid_hil.recording.samples import Samples
 from frictid_hil.recording.table import mapped, samples_of
 
 _MAX_HEADER = 65_536
-_MOST_REMARKS = 10_000
-"""Blank lines and remarks before the header, and between it and the first row."""
-_MOST_TITLES = 50
-"""Lines before the header that are neither: who measured, when, with what."""
+_MOST_REMARKS = 10_000  # blank lines and remarks before the header, and between it and the first row
+_MOST_TITLES = 50  # lines before the header that are neither: who measured, when, with what
 
 _ORDER = (
     "position_rad",

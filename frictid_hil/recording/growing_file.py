@@ -15,7 +15,7 @@ class GrowingFile:
     An existing file is replaced, a link is not followed.
 
     Raises:
-        FrictidError: the file cannot be created (no permission, disk full).
+        FrictidError: by every method, too: the disk refuses (no permission, disk full); what was written is kept.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,11 +33,7 @@ class GrowingFile:
         return self._file.closed
 
     def write(self, piece: bytes) -> None:
-        """Append a piece.
-
-        Raises:
-            FrictidError: disk full; the file ends where it did before.
-        """
+        """Append a piece; where that fails the file ends where it did before."""
         view = memoryview(piece)
         try:
             while view:
@@ -49,11 +45,7 @@ class GrowingFile:
         self.end += len(piece)
 
     def rewrite_head(self, head: bytes) -> None:
-        """Replace the first bytes, for formats that tell there what only the end knows; nothing follows it.
-
-        Raises:
-            FrictidError: it cannot be written.
-        """
+        """Replace the first bytes, for formats that tell there what only the end knows; nothing follows it."""
         try:
             self._file.seek(0)
             self._file.write(head)
@@ -61,11 +53,7 @@ class GrowingFile:
             raise could_not_write(self._path, error) from error
 
     def sync(self) -> None:
-        """Have everything on the disk before returning.
-
-        Raises:
-            FrictidError: the disk refuses; what was synced before is kept.
-        """
+        """Have everything on the disk before returning."""
         try:
             os.fsync(self._file.fileno())
         except OSError as error:

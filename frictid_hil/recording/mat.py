@@ -32,11 +32,7 @@ _COMPLEX = 0x0800
 
 
 def open_mat(path: Path) -> ArrayTable:
-    """The numeric variables of a ``.mat`` file.
-
-    Raises:
-        InputFileError: unreadable, or larger than it may be.
-    """
+    """The numeric variables of a ``.mat`` file; ``InputFileError`` where unreadable, or larger than it may be."""
     try:
         data = path.read_bytes()
     except (OSError, MemoryError) as error:

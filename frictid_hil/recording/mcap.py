@@ -38,8 +38,7 @@ from frictid_hil.recording.samples import Mark, Samples
 from frictid_hil.version import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
-_CHUNK_ROWS = 32_768
-"""Rows that are written without being asked to, so that memory stays bounded."""
+_CHUNK_ROWS = 32_768  # rows that are written without being asked to, so that memory stays bounded
 
 _MARKS_CHANNEL = 1
 _ROTARY_SCHEMA, _LINEAR_SCHEMA, _MARK_SCHEMA = 1, 2, 3
@@ -221,11 +220,7 @@ class SampleWriter(GrowingLog):
 
 
 def write_samples(path: Path, recordings: Sequence[Samples]) -> None:
-    """Write whole recordings, one per joint.
-
-    Raises:
-        FrictidError: disk full, or no permission.
-    """
+    """Write whole recordings, one per joint."""
     linear = [samples.joint for samples in recordings if samples.prismatic]
     with SampleWriter(path, [samples.joint for samples in recordings], prismatic=linear) as writer:
         for samples in recordings:

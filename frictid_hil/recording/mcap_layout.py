@@ -29,12 +29,10 @@ VALUES = (
 )
 """Columns of float64, in order."""
 
-COUNTS = ("status", "error_code")
-"""Columns of uint32, in order."""
+COUNTS = ("status", "error_code")  # columns of uint32, in order
 
 MESSAGE_OPCODE = 0x05
-CDR_LITTLE_ENDIAN = 0x0100
-"""The four bytes 00 01 00 00."""
+CDR_LITTLE_ENDIAN = 0x0100  # the four bytes 00 01 00 00
 
 RECORD = np.dtype(
     [
@@ -51,8 +49,7 @@ RECORD = np.dtype(
         *((name, "<u4") for name in COUNTS),
     ]
 )
-RECORD_LENGTH = RECORD.itemsize - 9
-"""What the ``length`` field of every sample's record says."""
+RECORD_LENGTH = RECORD.itemsize - 9  # what the ``length`` field of every sample's record says
 
 MARKS_TOPIC = "/marks"
 ROTARY, LINEAR = "frictid_msgs/msg/JointSample", "frictid_msgs/msg/LinearSample"

@@ -71,11 +71,7 @@ def is_ours(path: Path) -> bool | None:
 
 
 def read_rows(path: Path) -> dict[str, Rows]:
-    """Every field of every sample, by joint: arrays of ``mcap_layout.RECORD`` (``log_time`` is the run time in ns).
-
-    Raises:
-        InputFileError: as ``read_mcap``.
-    """
+    """Every field of every sample, by joint: arrays of ``mcap_layout.RECORD``; raises as ``read_mcap``."""
     return _Contents.of(path).rows_by_joint(path)
 
 

@@ -26,8 +26,7 @@ _TABLES: dict[tuple[str, ...], Callable[[Path], Table]] = {
     (".pt",): array_files.open_pace,
     (".mcap", ".bag", ".db3"): open_bag,
 }
-READABLE = tuple(suffix for suffixes in _TABLES for suffix in suffixes)
-"""How the names of recordings end."""
+READABLE = tuple(suffix for suffixes in _TABLES for suffix in suffixes)  # how the names of recordings end
 
 
 def read(path: str | Path, columns: ColumnMap | None = None, joint: str | None = None) -> list[Samples]:

@@ -23,8 +23,7 @@ from frictid_hil.recording.arrays import ArrayTable, refusing
 from frictid_hil.recording.bounds import check_expansion, check_rows
 
 _NAMES = ("name", "joint_names")
-_MAX_FORMS = 200
-"""Messages of one topic may differ in this many ways (order of names, lengths of lists)."""
+_MAX_FORMS = 200  # messages of one topic may differ in this many ways (order of names, lengths of lists)
 _MEANING = {
     "position_rad": ("position", "feedback.positions", "actual.positions"),
     "velocity_rad_s": ("velocity", "feedback.velocities", "actual.velocities"),

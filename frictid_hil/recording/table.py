@@ -20,8 +20,7 @@ from frictid_hil.plan.linear_axis import linear_name
 from frictid_hil.recording.proofs import doubts_of
 from frictid_hil.recording.samples import Nanoseconds, Samples, checked
 
-_EPOCH_NS = 1e17
-"""Times beyond this (three years) are of a wall clock; run time is what has passed since the first row."""
+_EPOCH_NS = 1e17  # times beyond this (three years) are of a wall clock; run time is what has passed since the first row
 
 _MAY_BE_MISSING = ("external_torque_nm", "temperature_c")
 

@@ -15,10 +15,8 @@ from frictid_hil.report.figures import IDENTIFIED, MEASURED, PUBLISHED, Figure, 
 from frictid_hil.report.pages import Link, Page, Section, Table
 from frictid_hil.simulation.effect import Region
 
-PART_S = 2.0
-"""Parts of a motion whose differences count as independent of one another."""
-_SHOWN = 0.03
-"""Share of an arm's largest gap below which a region has no colour of its own."""
+PART_S = 2.0  # parts of a motion whose differences count as independent of one another
+_SHOWN = 0.03  # share of an arm's largest gap below which a region has no colour of its own
 
 
 @dataclass(frozen=True, slots=True)

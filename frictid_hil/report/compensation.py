@@ -190,8 +190,7 @@ def _percent(value: float | None) -> str:
     return "" if value is None else f"{value:.1f} %"
 
 
-_Column = tuple[str, Callable[[Mapping[str, Any]], str]]
-"""A heading, and what stands below it of a mode's figures."""
+_Column = tuple[str, Callable[[Mapping[str, Any]], str]]  # A heading, and what stands below it of a mode's figures
 _SPEED: _Column = ("speed V_s [deg/s]", lambda mode: _number(mode["velocity_rms_rad_s"], degrees(1.0)))
 _REDUCED: _Column = (
     "reduced by",

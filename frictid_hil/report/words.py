@@ -6,8 +6,7 @@ import math
 
 from frictid_hil.config.profile import Estimate
 
-_SYMMETRIC = 0.05
-"""Ends of an interval that are this much alike are written as +-."""
+_SYMMETRIC = 0.05  # ends of an interval that are this much alike are written as +-
 
 
 def when(utc: str) -> str:

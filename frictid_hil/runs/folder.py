@@ -132,11 +132,7 @@ class RunFolder:
         return self._keeper
 
     def claim_output(self, path: Path) -> None:
-        """Make a folder that a result will be written to, or see that one can be written to.
-
-        Raises:
-            FrictidError: it cannot.
-        """
+        """Make a folder for a result, or see that it takes files; ``FrictidError`` where it does not."""
         self._made += made_folders(path)
 
     def begin(self) -> None:
@@ -249,11 +245,7 @@ class RunFolder:
 
 
 def load_manifest(path: Path) -> dict[str, Any]:
-    """The manifest of a run folder.
-
-    Raises:
-        UsageError: not a run folder.
-    """
+    """The manifest of a run folder; ``UsageError`` where it is none."""
     try:
         manifest = json.loads((path / "manifest.json").read_text())
     except OSError as error:
@@ -283,11 +275,7 @@ def manifest_of(path: Path, robot: Robot) -> dict[str, Any]:
 
 
 def kept_joints(run: Path) -> dict[str, tuple[JointProfile, dict[str, Any]]]:
-    """Finished joints of a run, each with its result.
-
-    Raises:
-        ConfigError: a file among them is something else.
-    """
+    """Finished joints of a run, each with its result; ``ConfigError`` where a file among them is something else."""
     kept = {}
     for path in sorted((run / "joints").glob("*.json")):
         try:

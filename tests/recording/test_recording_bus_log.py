@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from frictid_hil.errors import FrictidError, InputFileError
-from frictid_hil.protocol.driver import FD_FRAME
-from frictid_hil.recording.bus_log import EXTENDED, BusLogWriter, Frames, LogBus, logged, read_frames
+from frictid_hil.protocol.driver import EXTENDED, FD_FRAME
+from frictid_hil.recording.bus_log import BusLogWriter, Frames, LogBus, logged, read_frames
 
 ROW = np.dtype([("t_ns", "<i8"), ("can_id", "<u4"), ("length", "u1"), ("sent", "u1"), ("pad", "<u2"), ("data", "V64")])
 
