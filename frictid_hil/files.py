@@ -17,22 +17,14 @@ PLAIN_NAME = r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,63}"
 
 
 def part_of_path(name: str) -> str:
-    """The name itself, where it may be part of a path.
-
-    Raises:
-        UsageError: it leads elsewhere (``../x``, ``left/elbow``), or is no plain name.
-    """
+    """The name itself, where it may be part of a path; else (``../x``, ``left/elbow``) a ``UsageError``."""
     if re.fullmatch(PLAIN_NAME, name) is None:
         raise UsageError(f"{name!r} cannot name a file; letters, digits, '_', '-', '.' and spaces can")
     return name
 
 
 def refuse_overwriting(paths: Iterable[Path | None], *, force: bool = False) -> None:
-    """Refuse to write over what is there, before any work is done for it.
-
-    Raises:
-        UsageError: naming every file that exists, unless ``force``.
-    """
+    """Refuse to write over what is there, naming all of it in a ``UsageError``, unless ``force``."""
     there = [str(path) for path in paths if path is not None and path.exists()]
     if there and not force:
         raise UsageError(

@@ -387,11 +387,7 @@ class FrictionProfile(Strict):
     provenance: Provenance  # where it comes from
 
     def joint(self, name: str) -> JointProfile:
-        """The joint of that name.
-
-        Raises:
-            ProfileMismatch: the profile has none.
-        """
+        """The joint of that name; ``ProfileMismatch`` where the profile has none."""
         if name not in self.joints:
             raise ProfileMismatch(
                 f"the profile of {self.robot} has no joint {name!r}; it has {', '.join(self.joints)}",

@@ -52,11 +52,7 @@ def dump(values: Mapping[str, Any]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Mappings, sequences and numbers of any library as the plain kinds that YAML and JSON know.
-
-    Raises:
-        ValueError: as ``dump``.
-    """
+    """Mappings, sequences and numbers of any library as the plain kinds of YAML and JSON; raises as ``dump``."""
     if value is None or isinstance(value, str | bool):
         return value
     if isinstance(value, Mapping):

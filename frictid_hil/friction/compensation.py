@@ -90,11 +90,7 @@ class CompensationSettings:
         viscous_nm_s_per_rad: float | None = None,  # B_c for ``mol``; least squares on phi - F_0 unless given
         gradual: bool = False,  # see ``CompensationSettings``
     ) -> CompensationSettings:
-        """From an identified curve.
-
-        Raises:
-            UsageError: no such form.
-        """
+        """From an identified curve; ``UsageError`` for another form."""
         if form not in FORMS:
             raise UsageError(f"no compensation {form!r}; there are {', '.join(FORMS)}")
         base = CompensationSettings(form, curve.coulomb_nm, stiffness_nm_per_rad, ratio, gradual=gradual)
@@ -113,11 +109,7 @@ class CompensationSettings:
         )
 
     def refuse_unstable(self, presliding_nm_per_rad: float | None, *, where: str = "") -> None:
-        """Refuse what would hunt or run away; only R is checked where the presliding stiffness is not known.
-
-        Raises:
-            UsageError: with the reason.
-        """
+        """Refuse by a ``UsageError`` what would hunt or run away; only R is checked without a presliding stiffness."""
         if not 0.0 < self.ratio < 1.0:
             raise UsageError(
                 f"the compensation ratio R = {self.ratio:g} must lie between 0 and 1",

@@ -48,11 +48,7 @@ def trusted(recording: CycleRecording, solved: Fit, level_nm: float) -> slice:
 
 
 def ripple_table(recording: CycleRecording, motion: Motion, level_nm: float, *, points: int = 64) -> RippleTable | None:
-    """The ripple over one motor revolution, or None where it is not known or not larger than its uncertainty.
-
-    Raises:
-        IdentificationError: as ``regression.fit``.
-    """
+    """The ripple over one motor revolution; None where it is lost in its uncertainty. Raises as ``regression.fit``."""
     if recording.prismatic or not np.isfinite(recording.gear_ratio):
         return None
     # The narrowest kernel: ripple is fast.

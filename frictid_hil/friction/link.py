@@ -85,11 +85,7 @@ def by_parameter(motion: Motion, frequency_hz: float, damping: float) -> Array:
 
 
 def soft_link(recording: CycleRecording, motion: Motion, level_nm: float) -> Link | None:
-    """The link of a soft joint; None where the recording shows a rigid one.
-
-    Raises:
-        IdentificationError: as ``regression.fit``.
-    """
+    """The link of a soft joint; None where the recording shows a rigid one. Raises as ``regression.fit``."""
     knots = few_knots(recording)
     delayed = np.gradient(motion.torque_nm, motion.smoother.step_s)[:, None]
     rest = Unexplained(recording, motion, knots, width_rad=0.0, extra=delayed)

@@ -148,11 +148,7 @@ def seen_delay(recording: CycleRecording, motion: Motion, level_nm: float) -> De
 
 
 def _link_deviation_s(solved: Solved, link: Link, where: str) -> float:
-    """How far the delay may be off because of what is not known of the link.
-
-    Raises:
-        IdentificationError: the link takes so much that the rest says little.
-    """
+    """How far the delay may be off because of what is not known of the link."""
     per_parameter = solved.others[_JERK] / float(solved.values[_INERTIA])
     feigned_s = abs(float(per_parameter[0])) * link.inertia_kg_m2
     if feigned_s > _LINK_MOST_S:

@@ -130,11 +130,7 @@ class ProfileStore:
             return self._noted(folder, "promote", path, by, reason)
 
     def pin_baseline(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
-        """Measure drift from this profile from now on; what is active stays.
-
-        Raises:
-            UsageError: nothing was promoted yet.
-        """
+        """Measure drift from this profile from now on; what is active stays, and must be there (``UsageError``)."""
         with self._locked(robot) as folder:
             if self.active(robot) is None:
                 raise UsageError(f"no profile of {robot} was promoted yet", where=str(folder))

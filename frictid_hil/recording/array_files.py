@@ -4,6 +4,9 @@ Pickled objects are refused; an array's size is checked before any of it is read
 ``meta/info.json`` and parquet files, one or more episodes each. Its lists are named by the names of its ``info.json``
 (``observation.state/shoulder_pan.pos``). It does not say their unit, and its time is made up from the frame rate: both
 are told. Recordings of the friction tools BAM (JSON) and PACE (``.pt``, written by torch) are read, too.
+
+What is unreadable, larger than it may be, of another kind, or needs a library that is not installed, is refused by an
+``InputFileError``.
 """
 
 from __future__ import annotations
@@ -36,11 +39,7 @@ _DTYPES = {
 
 
 def open_npz(path: Path) -> ArrayTable:
-    """The arrays of a ``.npz`` file.
-
-    Raises:
-        InputFileError: unreadable, or larger than it may be.
-    """
+    """The arrays of a ``.npz`` file."""
     with refusing(path, "npz file"), zipfile.ZipFile(path) as archive:
         check_expansion(path.stat().st_size, sum(info.file_size for info in archive.infolist()), str(path))
         values: dict[str, NDArray[Any]] = {}
@@ -61,11 +60,7 @@ def open_npz(path: Path) -> ArrayTable:
 
 
 def open_hdf5(path: Path) -> ArrayTable:
-    """The data sets of an HDF5 file by their paths in it; they are read when asked for.
-
-    Raises:
-        InputFileError: unreadable, or h5py is not installed.
-    """
+    """The data sets of an HDF5 file by their paths in it; they are read when asked for."""
     shapes: dict[str, tuple[int, ...]] = {}
     sizes: dict[str, int] = {}
     with refusing(path, "HDF5 file"):
@@ -90,11 +85,7 @@ def open_hdf5(path: Path) -> ArrayTable:
 
 
 def open_parquet(path: Path) -> ArrayTable:
-    """The columns of a parquet file; lists of equal length are matrices.
-
-    Raises:
-        InputFileError: unreadable, too large, or pyarrow is not installed.
-    """
+    """The columns of a parquet file; lists of equal length are matrices."""
     return ArrayTable.of(path, _columns(path))
 
 
@@ -104,11 +95,7 @@ def is_lerobot(path: Path) -> bool:
 
 
 def open_lerobot(path: Path) -> ArrayTable:
-    """All episodes of a dataset, one after the other on one clock, a second apart.
-
-    Raises:
-        InputFileError: unreadable, or without data.
-    """
+    """All episodes of a dataset, one after the other on one clock, a second apart."""
     with refusing(path, "LeRobot dataset"):
         info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
         labels = {name: _flat(feature.get("names")) for name, feature in info["features"].items()}
@@ -175,11 +162,7 @@ def _is_numeric(kind: Any) -> bool:
 
 
 def open_bam(path: Path) -> ArrayTable:
-    """A raw recording of BAM: a servo with a pendulum; position and goal in rad, times in s. Load is a duty: left out.
-
-    Raises:
-        InputFileError: not such a file.
-    """
+    """A recording of BAM, a servo with a pendulum: position and goal in rad, times in s; load, a duty, is left out."""
     with refusing(path, "BAM recording"):
         if path.stat().st_size > MAX_BYTES // 10:
             raise InputFileError("too large for a JSON recording", where=str(path))
@@ -195,11 +178,7 @@ def open_bam(path: Path) -> ArrayTable:
 
 
 def open_pace(path: Path) -> ArrayTable:
-    """A recording of PACE: ``time``, ``dof_pos`` and ``des_dof_pos`` in s and rad, without running its pickle.
-
-    Raises:
-        InputFileError: not such a file, or one that holds anything but tensors of numbers.
-    """
+    """A recording of PACE: ``time``, ``dof_pos`` and ``des_dof_pos`` in s and rad, without running its pickle."""
     with refusing(path, "recording of PACE"):
         values = {name: value for name, value in _tensors(path).items() if isinstance(value, np.ndarray)}
     sources = {

@@ -56,11 +56,7 @@ class Frames:
 
 
 class BusLogWriter(GrowingLog):
-    """Writes frames to a new BLF file; an existing one is replaced.
-
-    Raises:
-        FrictidError: the file cannot be created (no permission, disk full).
-    """
+    """Writes frames to a new BLF file, in place of an existing one; raises as ``GrowingFile``."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

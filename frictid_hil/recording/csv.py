@@ -76,11 +76,7 @@ def read_csv(path: Path, columns: ColumnMap | None = None, joint: str | None = N
 
 
 def write_csv(path: Path, samples: Samples) -> None:
-    """Write one joint under the standard header; reading it back gives the same columns bit for bit.
-
-    Raises:
-        FrictidError: disk full, or no permission.
-    """
+    """Write one joint under the standard header, to be read back bit for bit; raises as ``write_whole``."""
     columns = samples.columns()
     names = [name for name in _ORDER if name in columns]
     text = io.StringIO()

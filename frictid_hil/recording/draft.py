@@ -96,11 +96,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def draft(table: Table, name: str) -> Draft:
-    """A column map for a table.
-
-    Raises:
-        InputFileError: no column of a position was found; the message lists the columns there are.
-    """
+    """A column map for a table; ``InputFileError`` with the columns there are where none is of a position."""
     guesses = [guess for column in table.names if (guess := guessed(column)) is not None]
     times = [guess for guess in guesses if guess.quantity == "time"]
     of_joint = _by_joint(guess for guess in guesses if guess.quantity not in ("time", "temperature"))

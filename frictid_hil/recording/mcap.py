@@ -45,12 +45,9 @@ _ROTARY_SCHEMA, _LINEAR_SCHEMA, _MARK_SCHEMA = 1, 2, 3
 
 
 class SampleWriter(GrowingLog):
-    """Writes one new MCAP file, one channel per joint; an existing file is replaced.
+    """Writes one new MCAP file, one channel per joint, in place of an existing one; raises as ``GrowingFile``.
 
     ``meta`` is provenance common to all joints, plain values; ``prismatic`` names the linear axes.
-
-    Raises:
-        FrictidError: the file cannot be created (no permission, disk full).
     """
 
     def __init__(

@@ -119,11 +119,7 @@ def expanded(columns: ColumnMap, table: Table) -> dict[str, JointColumns]:
 
 
 def own_names(table: Table, joint: str) -> ColumnMap:
-    """The map of a table that uses our own names: ``time_s``, ``position_rad``, ... or ``position_m``, ....
-
-    Raises:
-        InputFileError: it does not.
-    """
+    """The map of a table that has our own names, of a joint or of a linear axis; else ``InputFileError``."""
     prismatic = "position_m" in table.names
     names = {name: linear_name(name) if prismatic else name for name in Samples.COLUMNS}
     sources = {ours: Source((theirs,)) for ours, theirs in names.items() if theirs in table.names}
@@ -273,11 +269,7 @@ def _beside(path: Path, name: str) -> Path:
 
 
 def _onto(companion: Table, columns: ColumnMap, time: Array, path: Path) -> Callable[[Array], Array]:
-    """What brings a companion's values to the times of the first file: the last value before each, on one clock.
-
-    Raises:
-        InputFileError: the companion's times do not cover those of the file.
-    """
+    """What brings a companion's values to the times of the first file: the last value before each, on one clock."""
     (found,) = companion.numbers(columns.time.columns)
     if found.shape == time.shape and np.array_equal(found, time):
         return lambda values: values

@@ -59,11 +59,7 @@ class Page:
 
 
 def write_page(page: Page, path: Path) -> Path:
-    """Write a page as one self-contained file, whole or not at all.
-
-    Raises:
-        FrictidError: disk full, or no permission.
-    """
+    """Write a page as one self-contained file, whole or not at all; raises as ``write_whole``."""
     write_whole(path, html_of(page))
     return path
 

@@ -259,11 +259,7 @@ def load_manifest(path: Path) -> dict[str, Any]:
 
 
 def manifest_of(path: Path, robot: Robot) -> dict[str, Any]:
-    """The manifest of a run that shall be continued.
-
-    Raises:
-        UsageError: not a run folder, or of another configuration.
-    """
+    """The manifest of a run that shall be continued; ``UsageError`` where it is none, or of another configuration."""
     manifest = load_manifest(path)
     if manifest["config_sha256"] != robot.digest:
         raise UsageError(

@@ -74,11 +74,7 @@ class RowKeeper:
         return np.asarray(every[(every["joint"] == index) & (every["t_ns"] >= start_ns) & (every["t_ns"] < end_ns)])
 
     def close(self) -> None:
-        """Finish both files, the second one also where the first cannot be finished.
-
-        Raises:
-            FrictidError: disk full; what was written before is kept.
-        """
+        """Finish both files, the second one also where the first cannot be finished (``FrictidError``: disk full)."""
         self._files.close()
 
     def _flush(self) -> None:

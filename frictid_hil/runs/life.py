@@ -268,11 +268,7 @@ class Run:
         self._rehearsals.heed(event, plan)
 
     def _refuse_other_drives(self, preflight: Preflight) -> None:
-        """Refuse to continue a run with other drives than it began with.
-
-        Raises:
-            UsageError: a serial number differs.
-        """
+        """Refuse, by a ``UsageError``, to continue a run with drives of other serial numbers than it began with."""
         for name, identity in preflight.identities.items():
             was = self._identities.get(name, {}).get("serial", identity.serial)
             if was != identity.serial:
