@@ -510,7 +510,8 @@ def _with_rotary_names(document: Document) -> Document:
     joints = document.root.content.get("joints")
     if joints is None or not joints.is_mapping:
         return document
-    linear = {name for name, joint in joints.content.items() if _is_linear(joint)}
+    said = {name: joint.content.get("prismatic") for name, joint in joints.content.items() if joint.is_mapping}
+    linear = {name for name, prismatic in said.items() if prismatic is not None and prismatic.content is True}
     renamed = {name: _renamed(joint) if name in linear else joint for name, joint in joints.content.items()}
 
     def spelled(path: KeyPath) -> KeyPath:
@@ -520,10 +521,6 @@ def _with_rotary_names(document: Document) -> Document:
 
     root = document.root._replace(content={**document.root.content, "joints": joints._replace(content=renamed)})
     return Document(document.path, root, spelled)
-
-
-def _is_linear(joint: Node) -> bool:
-    return joint.is_mapping and "prismatic" in joint.content and joint.content["prismatic"].content is True
 
 
 def _renamed(node: Node) -> Node:

@@ -136,7 +136,10 @@ def without_shakes(recording: CycleRecording) -> tuple[CycleRecording, int]:
         first = int(np.searchsorted(time_s, missed_s, side="right"))
         last = int(np.searchsorted(time_s, missed_s + 2.0 * float(np.median(steps_s)) + SHAKES_S))
         begin, end = first - _BESIDE, last + _BESIDE
-        if begin < 0 or end > time_s.size or not _one_way(recording.position_rad[begin:end]):
+        if begin < 0 or end > time_s.size:
+            continue
+        ways = np.sign(np.diff(recording.position_rad[begin:end][::_BESIDE]))
+        if np.any(ways != ways[0]):
             continue
         ends = np.median(torque[begin:first]), np.median(torque[last:end])
         line = np.interp(time_s[first:last], time_s[[first - 1, last]], ends)
@@ -151,8 +154,3 @@ def _noise(torque: Array) -> float:
     """One-sigma of the torque's noise, from how far samples lie beside the mean of their neighbours."""
     beside = torque[1:-1] - 0.5 * (torque[:-2] + torque[2:])
     return float(1.4826 * np.median(np.abs(beside)) / np.sqrt(1.5))
-
-
-def _one_way(position_rad: Array) -> bool:
-    ways = np.sign(np.diff(position_rad[::_BESIDE]))
-    return bool(np.all(ways == ways[0]))

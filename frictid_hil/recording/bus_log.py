@@ -240,7 +240,9 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
     width = LONGEST if any(message.is_fd or len(message.data) > 8 for message in messages) else 8
     return Frames(
         t_ns=_run_time_ns(times_s, start_s),
-        can_id=np.array([_flagged_id(message) for message in messages], np.uint32),
+        can_id=np.array(
+            [m.arbitration_id | EXTENDED * m.is_extended_id | FD_FRAME * m.is_fd for m in messages], np.uint32
+        ),
         length=np.array([len(m.data) for m in messages], np.uint8),
         data=np.frombuffer(b"".join(bytes(m.data).ljust(width, b"\0") for m in messages), np.uint8).reshape(-1, width),
         sent=np.array([not m.is_rx for m in messages], np.bool_),
@@ -252,11 +254,6 @@ def _from_python_can(path: Path, opened: Callable[[], AbstractContextManager[Ite
 def _possible(message: can.Message) -> bool:
     """Of a length and an identifier that a wire can carry; python-can takes what a damaged text says."""
     return len(message.data) <= LONGEST and message.arbitration_id >> (29 if message.is_extended_id else 11) == 0
-
-
-def _flagged_id(message: can.Message) -> int:
-    extended = EXTENDED if message.is_extended_id else 0
-    return int(message.arbitration_id | extended | (FD_FRAME if message.is_fd else 0))
 
 
 def _run_time_ns(times_s: NDArray[np.float64], start_s: float) -> NDArray[np.int64]:

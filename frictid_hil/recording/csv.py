@@ -298,10 +298,6 @@ def _check_header(table: CsvTable, names: dict[str, str], present: list[str], pa
         raise InputFileError(f"neither {torque} nor {command}", where=where)
 
 
-def _is_remark(line: str) -> bool:
-    return not line.strip() or line.lstrip().startswith("#")
-
-
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -335,7 +331,7 @@ def _header(file: IO[str], where: str) -> tuple[str, str, str, int, int]:
         line = file.readline(_MAX_HEADER)
         if not line:
             break
-        if not _is_remark(line):
+        if line.strip() and not line.lstrip().startswith("#"):
             lines.append((number, line))
             if len(lines) > _MOST_TITLES:
                 break

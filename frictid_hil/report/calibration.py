@@ -37,7 +37,10 @@ def calibration_page(
     headline = f"{which}{good} of {len(joints)} joints of {profile.robot} identified and passed every quality gate."
     if outcome != "ok":
         headline += f" The run ended as {outcome.replace('_', ' ')}{': ' + error if error else ''}."
-    done = (*_what_was_done(profile, samples), _compared_with(previous))
+    compared = "There is no earlier profile to compare with."
+    if previous is not None:
+        compared = f"Compared with the profile that was active then, of {when(previous.provenance.created_utc)}."
+    done = (*_what_was_done(profile, samples), compared)
     overview = (_overview(joints, previous),) if len(joints) > 1 else ()
     sections = [Section("Summary", words=done, tables=(_summary(joints, previous),), figures=overview)]
     sections += [_joint(name, joint, samples.get(name), previous) for name, joint in joints.items()]
@@ -72,12 +75,6 @@ def _moved(procedure: ProcedureUsed | None, samples: Samples | None, *, prismati
         f"moved {company}, through {procedure.cycles} sinusoidal cycles of {travel} peak to peak with speeds that rise "
         f"to {peak}{rate}"
     )
-
-
-def _compared_with(previous: FrictionProfile | None) -> str:
-    if previous is None:
-        return "There is no earlier profile to compare with."
-    return f"Compared with the profile that was active then, of {when(previous.provenance.created_utc)}."
 
 
 def _summary(joints: Mapping[str, JointProfile], previous: FrictionProfile | None) -> Table:
@@ -295,11 +292,9 @@ def _change(name: str, joint: JointProfile, previous: FrictionProfile) -> str:
 def _highest(joint: JointProfile) -> str:
     unit, intervals = "N" if joint.prismatic else "N m", joint.torque_interval_nm
     low, high = intervals[-1] if intervals else (None, None)
-    return f"{with_interval(joint.torque_nm[-1], low, high, unit)} at {_speed(joint, joint.velocity_rad_s[-1])}"
-
-
-def _speed(joint: JointProfile, velocity: float) -> str:
-    return f"{velocity:.3g} m/s" if joint.prismatic else f"{degrees(velocity):.4g} deg/s"
+    top = joint.velocity_rad_s[-1]
+    speed = f"{top:.3g} m/s" if joint.prismatic else f"{degrees(top):.4g} deg/s"
+    return f"{with_interval(joint.torque_nm[-1], low, high, unit)} at {speed}"
 
 
 def _facts(profile: FrictionProfile) -> dict[str, str]:

@@ -194,7 +194,11 @@ class Run:
         except BaseException as error:
             if self.state is State.PREFLIGHT:
                 self.state = before
-                self._withdraw(keeper)
+                _closed(keeper)
+                if self._folder is not None:
+                    self._folder.withdraw()
+                if before is State.PLANNED:
+                    self._folder = None
                 raise
             if not isinstance(error, FrictidError):
                 _closed(keeper)
@@ -278,13 +282,6 @@ class Run:
                     cause="a drive was exchanged, or this is another robot",
                     next_step=f"start a new run; what was measured before is in {self.folder.path}",
                 )
-
-    def _withdraw(self, keeper: RowKeeper | None) -> None:
-        _closed(keeper)
-        if self._folder is not None:
-            self._folder.withdraw()
-        if self.state is State.PLANNED:
-            self._folder = None
 
     def _with_next_step(self, error: FrictidError) -> FrictidError:
         """Add to an interruption the command that continues the run."""
