@@ -1,18 +1,5 @@
 """Column maps: the file that says which column of a foreign recording is which. ``schema: frictid.columns/1``.
 
-::
-
-    schema: frictid.columns/1
-    name: emps
-    time: {column: t, unit: s}
-    joints:
-      axis:
-        prismatic: true
-        meta: {torque_source: motor voltage times drive gain}
-        position: {column: qm, unit: m}
-        position_command: {column: qg, unit: m}
-        torque: {product: [gtau, vir], unit: N}
-
 A joint named ``{joint}`` stands for all of a file whose columns follow one form: ``{column: "q_{joint}", unit: rad}``.
 A torque of ``unit: A`` is a motor current: ``torque_constant_nm_per_a`` (times ``gear_ratio``) makes it a torque, and
 ``torque_constant_sigma`` says how sure that is, relative.

@@ -1,13 +1,6 @@
 """The robot file: what the robot is, where it is reached, what may be done with it. ``schema: frictid.robot/1``.
 
-A *site file* says only what differs on one machine and extends the shipped file::
-
-    schema: frictid.robot/1
-    extends: hp3j.yaml
-    name: hp3j-lab-2
-    bus: socketcan:can0
-    driver: cia402
-
+A *site file* says only what differs on one machine and ``extends: hp3j.yaml``, the shipped file, or another one.
 Mappings merge key by key, ``joints: {"3": null}`` leaves joint 3 out, everything else is replaced; errors point into
 the file that holds the value. Numbers are in the unit that ends their key; ``position_max_rad: 150deg`` says another.
 """

@@ -55,10 +55,7 @@ class Workspace:
     tool_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in the last joint's frame
 
     def outside(self, positions_rad: Array) -> Outside | None:
-        """Where the arm is furthest outside in postures of shape (k, n), None where it stays inside.
-
-        A posture that is not a number is outside.
-        """
+        """Where the arm is furthest outside in postures, shape (k, n), if anywhere; what is no number is outside."""
         points = chain_points_m(self.rows, positions_rad, self.tool_m)
         low = np.array([side[0] for side in self.box_m]) + self.clearance_m
         high = np.array([side[1] for side in self.box_m]) - self.clearance_m

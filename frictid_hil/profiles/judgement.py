@@ -36,18 +36,14 @@ class Verdict:
 
 def judge(
     policy: Policy,
-    newer: FrictionProfile,
-    active: FrictionProfile | None,
-    baseline: FrictionProfile | None,
+    newer: FrictionProfile,  # just measured
+    active: FrictionProfile | None,  # in use; None where none is
+    baseline: FrictionProfile | None,  # that drift is measured from; None where nothing was promoted yet
     *,
-    failed: Mapping[str, str],
-    promote_by_hand: str = "frictid-hil profile promote RUN",
+    failed: Mapping[str, str],  # joints without a trustworthy result, and why
+    promote_by_hand: str = "frictid-hil profile promote RUN",  # for a person who wants it all the same
 ) -> Verdict:
-    """Apply the policy to what was just measured; active profile and baseline are None where nothing was promoted yet.
-
-    ``failed`` are joints without a trustworthy result, and why; ``promote_by_hand`` is the command with which a person
-    makes the new one active all the same.
-    """
+    """Apply the policy."""
     reference = baseline if policy.drift_reference == "baseline" else active
     from_reference = {} if reference is None else drift(reference, newer)
     from_active = {} if active is None else drift(active, newer)

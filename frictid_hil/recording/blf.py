@@ -72,16 +72,12 @@ def file_header(file_size: int, content_size: int, frames: int) -> bytes:
 
 def frame_objects(
     t_ns: NDArray[np.int64],
-    can_id: NDArray[np.uint32],
-    length: NDArray[np.uint8],
-    sent: NDArray[np.bool_],
-    data: NDArray[np.uint8],
+    can_id: NDArray[np.uint32],  # bit 31 set for extended ids, bit 29 (``FD_FRAME``) for CAN FD frames
+    length: NDArray[np.uint8],  # bytes used
+    sent: NDArray[np.bool_],  # by us
+    data: NDArray[np.uint8],  # shape (n, 8 or more)
 ) -> bytes:
-    """Frames as objects, in order; more than 8 bytes make a frame a CAN FD frame.
-
-    Columns have shape (n,), data (n, 8 or more). Bit 31 of an id is set for extended ids, bit 29 (``FD_FRAME``) for CAN
-    FD frames; ``length`` are the bytes used, ``sent`` says by us.
-    """
+    """Frames as objects, in order; more than 8 bytes make a frame a CAN FD frame. Columns of shape (n,)."""
     fd = ((can_id & FD_FRAME) != 0) | (length > 8)
     classical = _objects(FRAME, CAN_FRAME, t_ns[~fd], can_id[~fd], sent[~fd])
     classical["dlc"] = length[~fd]

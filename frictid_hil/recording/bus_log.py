@@ -267,10 +267,7 @@ def _run_time_ns(times_s: NDArray[np.float64], start_s: float) -> NDArray[np.int
 
 
 class LogBus(can.BusABC):
-    """The frames of a log, received at recorded speed (``paced``), or as fast as they are taken.
-
-    Every frame is sent again on the ``echo`` bus, for others to see.
-    """
+    """The frames of a log, received at recorded speed (``paced``) or as fast as taken, and sent again on ``echo``."""
 
     def __init__(self, frames: Frames, *, paced: bool = False, echo: can.BusABC | None = None) -> None:
         super().__init__(channel="log")

@@ -58,10 +58,7 @@ def _parts(samples: Samples) -> list[slice]:
 
 
 def velocity_factor(samples: Samples, parts: list[slice]) -> tuple[float, float] | None:
-    """Velocity over differenced position in stretches of a recording, and their correlation.
-
-    None where nothing moves or nothing is recorded.
-    """
+    """Velocity over differenced position in stretches, and their correlation; None where nothing moves or is there."""
     if samples.velocity_rad_s is None:
         return None
     columns = samples.time_s, samples.position_rad, samples.velocity_rad_s

@@ -34,19 +34,15 @@ class JointRun:
 
 def arm_page(
     name: str,
-    summary: str,
-    found: Mapping[str, Diagnosis],
-    pages: Mapping[str, str],
-    notes: Sequence[str] = (),
-    runs: Sequence[JointRun] = (),
-    why_no_runs: str = "",
-    exports: Sequence[Sequence[str]] = (),
+    summary: str,  # the one sentence
+    found: Mapping[str, Diagnosis],  # by joint
+    pages: Mapping[str, str],  # address of each joint's own page, relative to this one
+    notes: Sequence[str] = (),  # of the arm as a whole
+    runs: Sequence[JointRun] = (),  # of the joints, in closed loop
+    why_no_runs: str = "",  # why there are none
+    exports: Sequence[Sequence[str]] = (),  # target, where it ran, torque error before and after, and what is lost
 ) -> Page:
-    """The page of an arm, by joint the diagnosis and the address of its own page, relative to this one.
-
-    Notes are of the arm as a whole, runs of the joints in closed loop, or why there are none. An export says what was
-    written: target, where it ran, torque error before and after, and what is lost.
-    """
+    """The page of an arm."""
     rows = tuple(_row(joint, d, pages.get(joint)) for joint, d in found.items())
     headings = ("joint", "verdict", "causes (confidence)", "gap lies", "gap before", "after", "noise floor")
     glance = Section(

@@ -21,16 +21,13 @@ from frictid_hil.units import degrees
 
 def calibration_page(
     profile: FrictionProfile,
-    samples: Mapping[str, Samples],
+    samples: Mapping[str, Samples],  # of each joint's own motion, where at hand
     *,
-    outcome: str,
-    error: str = "",
-    previous: FrictionProfile | None = None,
+    outcome: str,  # word of the run's JSON
+    error: str = "",  # why it ended early, in a sentence
+    previous: FrictionProfile | None = None,  # the profile that was active before, to compare with
 ) -> Page:
-    """The page of one run that ended with this outcome, a word of its JSON, and why where it ended early.
-
-    ``samples`` are of each joint's own motion; ``previous`` is the profile that was active before, to compare with.
-    """
+    """The page of one run."""
     joints = profile.joints
     good = sum(all(gate.passed for gate in joint.gates) for joint in joints.values())
     which = "" if not profile.provenance.driver else "SIMULATED: " if profile.provenance.seed is not None else "REAL: "

@@ -56,20 +56,16 @@ class Run(Protocol):
 def compensation_page(
     robot: str,
     joint: str,
-    task: str,
-    runs: Mapping[str, Run],
-    modes: Mapping[str, Mapping[str, Any]],
+    task: str,  # ``hand`` or ``track``
+    runs: Mapping[str, Run],  # samples by mode
+    modes: Mapping[str, Mapping[str, Any]],  # figures by mode, as in the JSON of the verb
     *,
-    facts: Mapping[str, str],
-    outcome: str,
-    error: str = "",
-    remarks: Sequence[str] = (),
+    facts: Mapping[str, str],  # provenance
+    outcome: str,  # word of the run's JSON
+    error: str = "",  # why it ended early
+    remarks: Sequence[str] = (),  # what the figures mean, a sentence each
 ) -> Page:
-    """The page of one joint and task (``hand`` or ``track``).
-
-    Runs and figures are by mode, the figures as in the JSON of the verb. ``facts`` are provenance, ``error`` says why
-    it ended early, ``remarks`` what the figures mean, a sentence each.
-    """
+    """The page of one joint and task."""
     headline = _headline(joint, task, modes)
     if outcome != "ok":
         headline += f" The run ended as {outcome}{': ' + error if error else ''}."

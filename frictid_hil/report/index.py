@@ -16,18 +16,14 @@ _DONE = {"promote": "promoted", "rollback": "rolled back to", "baseline": "made 
 
 def index_page(
     robot: str,
-    trends: Mapping[str, Sequence[TrendPoint]],
+    trends: Mapping[str, Sequence[TrendPoint]],  # of every joint
     promotions: Sequence[Promotion],
     nights: Sequence[Attempt],
-    active: Promotion | None,
-    baseline: str | None,
-    addresses: Mapping[str, str] | None = None,
+    active: Promotion | None,  # what is in force; None where nothing is
+    baseline: str | None,  # id of the profile that drift is measured from
+    addresses: Mapping[str, str] | None = None,  # of the page of a night, by its ``utc``
 ) -> Page:
-    """The page of one robot: trends of every joint, promotions, and nights, all oldest first.
-
-    ``active`` is what is in force, ``baseline`` the id of the profile that drift is measured from. Addresses are of the
-    pages of nights, by their ``utc``; only of nights that have one.
-    """
+    """The page of one robot; trends, promotions and nights are told oldest first."""
     addresses = addresses or {}
     headline = f"Profile {active.id} is active since {when(active.utc)}." if active else "No profile was promoted yet."
     if nights:

@@ -20,17 +20,14 @@ _REFERENCE = {"baseline": "baseline", "active": "active profile"}
 
 
 def recalibration_page(
-    result: Mapping[str, Any],
+    result: Mapping[str, Any],  # JSON of the verb
     policy: Policy,
-    newer: FrictionProfile,
-    active: FrictionProfile | None,
-    baseline: FrictionProfile | None,
-    trends: Mapping[str, Sequence[TrendPoint]],
+    newer: FrictionProfile,  # measured
+    active: FrictionProfile | None,  # in force before; None where none was
+    baseline: FrictionProfile | None,  # that drift is measured from
+    trends: Mapping[str, Sequence[TrendPoint]],  # of every joint, this night included
 ) -> Page:
-    """The page of one night: the JSON of the verb, what was measured, the profile in force before, and the baseline.
-
-    Both are None where there is none yet. Trends are of every joint, this night included.
-    """
+    """The page of one night."""
     verdict = "promoted" if result["promoted"] else f"not promoted ({result['outcome'].replace('_', ' ')})"
     headline = f"The new profile was {verdict}: {sentence(result['reason'])} Next step: {result['next_step']}."
     pages = (("Everything that was measured this night", "report.html"),) if result.get("report") else ()
