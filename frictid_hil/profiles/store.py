@@ -33,17 +33,9 @@ from frictid_hil.config.write import dump
 from frictid_hil.config.yaml import read
 from frictid_hil.errors import ConfigError, FrictidError, UsageError
 from frictid_hil.files import could_not_write, write_whole
+from frictid_hil.profiles import records
 from frictid_hil.profiles.index import Index
-from frictid_hil.profiles.records import (
-    Attempt,
-    Promotion,
-    Stored,
-    TrendPoint,
-    active_stack,
-    baseline_of,
-    stored_of,
-    summary,
-)
+from frictid_hil.profiles.records import Attempt, Promotion, Stored, TrendPoint
 
 _LOCK_TIMEOUT_S = 30.0
 _NAMES = {
@@ -108,7 +100,7 @@ class ProfileStore:
 
     def active(self, robot: str) -> Promotion | None:
         """What is active, and since when; None where nothing was ever promoted."""
-        stack = active_stack(self.promotions(robot))
+        stack = records.active_stack(self.promotions(robot))
         return stack[-1] if stack else None
 
     def active_profile(self, robot: str) -> FrictionProfile | None:
@@ -118,7 +110,7 @@ class ProfileStore:
 
     def baseline(self, robot: str) -> str | None:
         """Id of the profile that drift is measured from: the pinned one, else the first ever promoted."""
-        return baseline_of(self.promotions(robot))
+        return records.baseline_of(self.promotions(robot))
 
     def promote(self, robot: str, identity: str, *, by: str = "", reason: str = "") -> Promotion:
         """Make a stored profile the active one; promoting the active one again changes nothing."""
@@ -143,7 +135,7 @@ class ProfileStore:
             UsageError: there is none before.
         """
         with self._locked(robot) as folder:
-            stack = active_stack(self.promotions(robot))
+            stack = records.active_stack(self.promotions(robot))
             if len(stack) < 2:
                 raise UsageError(
                     f"no profile of {robot} was active before the present one",
@@ -177,11 +169,11 @@ class ProfileStore:
         reference = None if baseline is None else self.load(robot, baseline)
 
         def read_anew(name: str) -> dict[str, Any]:
-            return asdict(summary(name, self.load(robot, name), reference))
+            return asdict(records.summary(name, self.load(robot, name), reference))
 
         # Distances are from the baseline: with another one, every profile is read anew, once.
         found = self._index(folder).values(f"profiles since {baseline}", names, read_anew)
-        return [stored_of(values) for values in found.values()]
+        return [records.stored_of(values) for values in found.values()]
 
     def trends(self, robot: str) -> dict[str, list[TrendPoint]]:
         """F_0, curve distance and temperature of every joint over all profiles, oldest first."""

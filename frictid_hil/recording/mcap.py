@@ -15,21 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap import records as mcap
 from mcap.data_stream import RecordBuilder
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Message,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 from numpy.typing import NDArray
 
 from frictid_hil.recording import mcap_layout as layout
@@ -62,17 +49,17 @@ class SampleWriter(GrowingLog):
         self._channels = {joint: number for number, joint in enumerate(joints, start=_MARKS_CHANNEL + 1)}
         self._rows: list[NDArray[np.void]] = []
         self._pending = 0
-        self._marks: list[Message] = []
+        self._marks: list[mcap.Message] = []
         self._counts: dict[int, int] = {}
-        self._index: list[ChunkIndex] = []
-        self._metadata_index: list[MetadataIndex] = []
+        self._index: list[mcap.ChunkIndex] = []
+        self._metadata_index: list[mcap.MetadataIndex] = []
         self._head = [
-            Schema(_ROTARY_SCHEMA, layout.schema_text(prismatic=False).encode(), "ros2msg", layout.ROTARY),
-            Schema(_LINEAR_SCHEMA, layout.schema_text(prismatic=True).encode(), "ros2msg", layout.LINEAR),
-            Schema(_MARK_SCHEMA, layout.MARK_SCHEMA.encode(), "jsonschema", "frictid.Mark"),
+            mcap.Schema(_ROTARY_SCHEMA, layout.schema_text(prismatic=False).encode(), "ros2msg", layout.ROTARY),
+            mcap.Schema(_LINEAR_SCHEMA, layout.schema_text(prismatic=True).encode(), "ros2msg", layout.LINEAR),
+            mcap.Schema(_MARK_SCHEMA, layout.MARK_SCHEMA.encode(), "jsonschema", "frictid.Mark"),
             *self._channel_records(prismatic),
         ]
-        self._file.write(MAGIC + _bytes(Header("", f"frictid-hil {__version__}"), *self._head))
+        self._file.write(MAGIC + _bytes(mcap.Header("", f"frictid-hil {__version__}"), *self._head))
         if meta:
             self.metadata("recording", meta)
 
@@ -111,13 +98,13 @@ class SampleWriter(GrowingLog):
         body = {"joint": joint, **{name: getattr(mark, name) for name in ("name", "start_ns", "end_ns")}}
         data = json.dumps(body | {"details": dict(mark.details)}).encode()
         at_ns = mark.start_ns
-        self._marks.append(Message(_MARKS_CHANNEL, at_ns, data, publish_time=at_ns, sequence=len(self._marks)))
+        self._marks.append(mcap.Message(_MARKS_CHANNEL, at_ns, data, publish_time=at_ns, sequence=len(self._marks)))
 
     def metadata(self, name: str, values: Mapping[str, Any]) -> None:
         """Write provenance at once: ``recording`` for all joints, ``joint/<name>`` for one."""
-        record = Metadata(name=name, metadata={key: json.dumps(value) for key, value in values.items()})
+        record = mcap.Metadata(name=name, metadata={key: json.dumps(value) for key, value in values.items()})
         data = _bytes(record)
-        self._metadata_index.append(MetadataIndex(offset=self._file.end, length=len(data), name=name))
+        self._metadata_index.append(mcap.MetadataIndex(offset=self._file.end, length=len(data), name=name))
         self._file.write(data)
 
     def _write_taken(self) -> None:
@@ -125,10 +112,10 @@ class SampleWriter(GrowingLog):
         self._write_marks()
 
     def _finish(self) -> None:
-        self._file.write(_bytes(DataEnd(0)))
+        self._file.write(_bytes(mcap.DataEnd(0)))
         start = self._file.end
         summary = _bytes(*self._head, self._statistics(), *self._index, *self._metadata_index)
-        footer = Footer(summary_start=start, summary_offset_start=0, summary_crc=0)
+        footer = mcap.Footer(summary_start=start, summary_offset_start=0, summary_crc=0)
         self._file.write(summary + _bytes(footer) + MAGIC)
 
     def _write_rows(self) -> None:
@@ -158,7 +145,7 @@ class SampleWriter(GrowingLog):
     ) -> None:
         start, end = int(times.min()), int(times.max())
         chunk = _bytes(
-            Chunk(
+            mcap.Chunk(
                 compression="",
                 data=content,
                 message_start_time=start,
@@ -176,7 +163,7 @@ class SampleWriter(GrowingLog):
             index += _message_index(channel, np.column_stack([times[mine], offsets[mine]]))
         self._file.write(chunk + index)
         self._index.append(
-            ChunkIndex(
+            mcap.ChunkIndex(
                 chunk_start_offset=chunk_at,
                 chunk_length=len(chunk),
                 compression="",
@@ -189,9 +176,9 @@ class SampleWriter(GrowingLog):
             )
         )
 
-    def _channel_records(self, prismatic: Collection[str]) -> list[McapRecord]:
+    def _channel_records(self, prismatic: Collection[str]) -> list[mcap.McapRecord]:
         joints = [
-            Channel(
+            mcap.Channel(
                 id=number,
                 topic=layout.topic_of(joint),
                 message_encoding="cdr",
@@ -200,10 +187,10 @@ class SampleWriter(GrowingLog):
             )
             for joint, number in self._channels.items()
         ]
-        return [Channel(_MARKS_CHANNEL, layout.MARKS_TOPIC, "json", {}, _MARK_SCHEMA), *joints]
+        return [mcap.Channel(_MARKS_CHANNEL, layout.MARKS_TOPIC, "json", {}, _MARK_SCHEMA), *joints]
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
+    def _statistics(self) -> mcap.Statistics:
+        return mcap.Statistics(
             attachment_count=0,
             channel_count=len(self._channels) + 1,
             channel_message_counts=self._counts,
@@ -238,7 +225,7 @@ def _message_index(channel: int, entries: NDArray[np.uint64]) -> bytes:
     return struct.pack("<BQHI", 0x07, 2 + 4 + len(pairs), channel, len(pairs)) + pairs
 
 
-def _bytes(*records: McapRecord) -> bytes:
+def _bytes(*records: mcap.McapRecord) -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
