@@ -84,16 +84,13 @@ def _steady(recording: CycleRecording, motion: Motion, column: Array) -> tuple[A
 def window_terms(
     recording: CycleRecording,
     motion: Motion,
-    pairs: IdentifiedPairs,
-    solved: Fit | None,
-    drift: Drift | None,
-    others: Beside | None,
-    link: Link | Pull | None,
+    pairs: IdentifiedPairs,  # of the same columns
+    solved: Fit | None,  # the least-squares model of them; None where it could not be solved
+    drift: Drift | None,  # None without a repeated cycle
+    others: Beside | None,  # beside the solved model
+    link: Link | Pull | None,  # what was taken off the torque
 ) -> Terms:
-    """Terms of the aligned Function A: its pairs, the least-squares model of the same columns, what stands beside it.
-
-    None is given for what could not be solved, was not repeated, or was not taken off the torque.
-    """
+    """Terms of the aligned Function A."""
     rate = np.gradient(motion.torque_nm, motion.smoother.step_s)
     slope = aligned_pairs(recording, motion, rate).torque_nm
     scatter = _scatter(recording, motion, solved)

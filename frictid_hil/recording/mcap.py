@@ -32,18 +32,15 @@ _ROTARY_SCHEMA, _LINEAR_SCHEMA, _MARK_SCHEMA = 1, 2, 3
 
 
 class SampleWriter(GrowingLog):
-    """Writes one new MCAP file, one channel per joint, in place of an existing one; raises as ``GrowingFile``.
-
-    ``meta`` is provenance common to all joints, plain values; ``prismatic`` names the linear axes.
-    """
+    """Writes one new MCAP file, one channel per joint, in place of an existing one; raises as ``GrowingFile``."""
 
     def __init__(
         self,
         path: Path,
         joints: Sequence[str],
-        meta: Mapping[str, Any] | None = None,
+        meta: Mapping[str, Any] | None = None,  # provenance common to all joints, plain values
         *,
-        prismatic: Collection[str] = (),
+        prismatic: Collection[str] = (),  # names of the linear axes
     ) -> None:
         super().__init__(path)
         self._channels = {joint: number for number, joint in enumerate(joints, start=_MARKS_CHANNEL + 1)}
