@@ -25,11 +25,9 @@ from frictid_hil.friction.recording import CycleRecording, Motion
 from frictid_hil.friction.repetition import changed_between, friction_at
 from frictid_hil.friction.trajectory import Array
 
-MOST_SEEN_S = 0.0015
-"""What the data may ask for beyond the declared delay of the torque, where they are sure of it ..."""
+MOST_SEEN_S = 0.0015  # what the data may ask for beyond the declared delay of the torque, where they are sure of it ...
 MOST_SEEN_WITH_LINK_S = 0.003
-SURE = 2.5
-"""... by so many standard deviations, its own and the declared one's ..."""
+SURE = 2.5  # ... by so many standard deviations, its own and the declared one's ...
 MOST_UNSURE_S = 0.006
 """... but for joints that move together, which have no gate of inertia, no more than this and a step of the clock."""
 MOST_TURNOVER_S = 0.012
@@ -43,11 +41,9 @@ MOST_COARSE_TURNOVER_S, MOST_TURNOVER_STEP_S, FEW_CYCLES = 0.03, 0.0105, 3
 """Samples further apart, with the coarse steps of servos, tell no less than this, and below 100 Hz nothing."""
 MOST_APART_S = 0.008
 """Reported velocity against differenced position: a filter that nobody declared does no harm to the curve ..."""
-MOST_UNSTEADY_S = 0.004
-"""... but a delay that comes and goes does."""
+MOST_UNSTEADY_S = 0.004  # ... but a delay that comes and goes does.
 MOST_SCALE = 0.05
-MOST_INERTIA = 2.0
-"""Inertia against what the robot file expects, either way."""
+MOST_INERTIA = 2.0  # inertia against what the robot file expects, either way
 FLAT_SHARE = 0.003
 FLAT_SPIKE = 6.0
 """Samples at the very extreme, against the mean of the three steps below it; a sine has 3, noise less than 1."""
@@ -55,12 +51,10 @@ FLAT_SPIKE = 6.0
 CONTINUED = 2.0
 """The bound of ``GateLimits.other_stretches`` grows by this where a stretch was slower than the slowest pair, where the
 curve is only continued, and no cycle tells its friction at that speed ..."""
-SLOWEST_SHARE = 0.5
-"""... down to this share of that pair's speed."""
+SLOWEST_SHARE = 0.5  # ... down to this share of that pair's speed.
 _BESIDE = 1.0 / 12.0
 """Share of a cycle to either side of its turning point: half of the peak speed there, inertia and gravity as at it."""
-_AROUND = 0.2
-"""Share of a cycle to either side of its middle in which the joint turns."""
+_AROUND = 0.2  # share of a cycle to either side of its middle in which the joint turns
 _STEPS = 1000.0
 _LEAST_SAMPLES, _LEAST_AT_SPEED = 50, 12
 

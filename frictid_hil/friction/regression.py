@@ -35,11 +35,9 @@ FINE = 0.1
 """Width of the kernel in radians of the fastest cycle. Three widths after each reversal are lost with what is guarded:
 at 0.2 a programme of two speeds saw nothing between the first and three quarters of the second, 0.3 % became 1.2 %."""
 
-FAST_SHARE = 0.09
-"""Knots from this share of the highest speed on are fast ones."""
+FAST_SHARE = 0.09  # knots from this share of the highest speed on are fast ones
 _SPEED_BINS, _LEAST_IN_BIN = 20, 20
-_REACH = 4.5
-"""Half length of the kernel in widths."""
+_REACH = 4.5  # half length of the kernel in widths
 
 
 @dataclass(frozen=True, slots=True)
