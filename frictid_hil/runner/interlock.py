@@ -21,11 +21,7 @@ class Interlock:
     silence_s: float = 0.1  # oldest report that still counts
 
     def check(self, report: Feedback, cycle_hz: float) -> None:
-        """Pass one report of that joint.
-
-        Raises:
-            SafetyAbort: open, or not reported.
-        """
+        """Pass one report of that joint; ``SafetyAbort`` where it is open, or not reported."""
         where = f"interlock (joint {self.joint}, input bit {self.bit})"
         inputs = report.digital_inputs
         if inputs is None or report.digital_inputs_age_cycles > self.silence_s * cycle_hz:

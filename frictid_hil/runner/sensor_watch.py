@@ -42,9 +42,9 @@ def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, per
     seen which of the two.
 
     Args:
-        before_rad_s: velocity of the earlier sample.
-        velocity_rad_s: velocity of the later one.
-        step_s: time between them, by their own time stamps.
+        before_rad_s: of the earlier sample.
+        velocity_rad_s: of the later one.
+        step_s: between them, by their own time stamps.
         period_s: of the set-points; infinite where the samples leave no moment out.
     """
     mean_rad_s = 0.5 * (before_rad_s + velocity_rad_s)
@@ -66,11 +66,7 @@ class _Row(NamedTuple):
 
 
 class SensorWatch:
-    """Judges one joint, report by report.
-
-    Args:
-        period_s: of the set-points.
-    """
+    """Judges one joint, report by report; ``period_s`` is that of the set-points."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -88,12 +84,9 @@ class SensorWatch:
         self._at_rad, self._commanded_nm, self._beyond_ns = math.nan, (0.0, 0.0), 0
 
     def verdict(self, report: Feedback, most_rad_s: float, *, asked_rad: float = math.nan) -> str:
-        """Say in a sentence what is wrong; an empty string while all is well.
+        """Say in a sentence what is wrong with a new report; an empty string while all is well.
 
-        Args:
-            report: new.
-            most_rad_s: highest speed that the joint may have.
-            asked_rad: where a position loop shall hold it, whose torque then depends on the direction of motion.
+        Where a position loop shall hold the joint at ``asked_rad``, its torque depends on the direction of motion.
         """
         t_ns, position, velocity = report.t_ns, report.position_rad, report.velocity_rad_s
         rows = self._rows
@@ -124,12 +117,9 @@ class SensorWatch:
     def withstood(self, report: Feedback, commanded_nm: float, withstands_nm: float) -> str:
         """Say that a joint under torque control stands, to the last digit, although its torque changed far too much.
 
-        An encoder may freeze while the joint stands, and no figure of its own tells: its friction does.
-
-        Args:
-            report: new.
-            commanded_nm: torque of this cycle; what does not change of it, gravity for one, does not matter.
-            withstands_nm: the largest change that the joint can stand.
+        An encoder may freeze while the joint stands, and no figure of its own tells: its friction does. What does not
+        change of the commanded torque, gravity for one, does not matter; ``withstands_nm`` is the largest change that
+        the joint can stand.
         """
         lowest_nm, highest_nm = self._commanded_nm
         if report.position_rad != self._at_rad:

@@ -74,19 +74,12 @@ class Supervisor:
 
     def watch(
         self,
-        moving: int | Sequence[int] | None,
-        mode: Mode,
-        locked_at: Mapping[int, float],
-        settling_at: Mapping[int, float] | None = None,
+        moving: int | Sequence[int] | None,  # index of the joint that may move, or of several; None while all stand
+        mode: Mode,  # commanded to them
+        locked_at: Mapping[int, float],  # of every locked joint, by index, rad
+        settling_at: Mapping[int, float] | None = None,  # of joints that get or lose power, or come to rest, likewise
     ) -> None:
-        """Say what is allowed from now on.
-
-        Args:
-            moving: index of the joint that may move, several where they move together, None while all stand.
-            mode: their commanded mode.
-            locked_at: position of every locked joint by index, rad.
-            settling_at: where joints are that get or lose power, or come to rest, by index, rad.
-        """
+        """Say what is allowed from now on."""
         self._moving = () if moving is None else (moving,) if isinstance(moving, int) else tuple(moving)
         self._modes = (mode,)
         self._locked_at = dict(locked_at)

@@ -21,12 +21,7 @@ _NEAR_PEAK = 0.7
 
 
 class WarmUpWatch:
-    """Passes a warm-up's stream on and ends it at the first whole cycle at which friction has settled.
-
-    Attributes:
-        settled: friction changed by less than the limit at the end; None where no limit was asked for.
-        percent_per_min: last rate of change, None where too few cycles ran.
-    """
+    """Passes a warm-up's stream on and ends it at the first whole cycle at which friction has settled."""
 
     def __init__(self, source: SetPointSource, motion: WarmUp, period_s: float) -> None:
         self._source = source
@@ -34,13 +29,12 @@ class WarmUpWatch:
         self._fast_rad_s = _NEAR_PEAK * motion.peak_velocity_rad_s
         self._per_cycle = max(1, round(motion.cycle_s / period_s))
         self._period_s = period_s
-        self._sent = 0
-        self._sum = [0.0, 0.0]
-        self._count = [0, 0]
+        self._sent, self._sum, self._count = 0, [0.0, 0.0], [0, 0]
         self._time_s: list[float] = []
         self._friction_nm: list[float] = []
+        # Friction changed by less than the limit at the end; None where no limit was asked for.
         self.settled: bool | None = None if self._limit is None else False
-        self.percent_per_min: float | None = None
+        self.percent_per_min: float | None = None  # last rate of change; None where too few cycles ran
 
     @property
     def cycles(self) -> int:

@@ -28,11 +28,7 @@ class WorkspaceWatch:
         self._cycle = 0
 
     def check(self, feedback: Sequence[Feedback]) -> None:
-        """Judge the reports of one cycle.
-
-        Raises:
-            SafetyAbort: a joint or the tool is outside of the box.
-        """
+        """Judge the reports of one cycle; ``SafetyAbort`` where a joint or the tool is outside of the box."""
         self._cycle += 1
         if self._cycle % self._every:
             return

@@ -170,7 +170,7 @@ def _wire_of(settings: JointSettings, serial: int, data_bitrate: int | None) -> 
         return _DamiaoWire(settings.motor.ranges, reply_id, serial, rate)
     if name in ("robstride", "cybergear"):
         return _RobStrideWire(reply_id, 0x200C if name == "cybergear" else 0x7028)
-    return _PlainWire(reply_id, 8 if name == "robstride-mit" else 6, deci=name == "robstride-mit")
+    return _PlainWire(reply_id, deci=name == "robstride-mit")
 
 
 def _to_bits(value: float, end: float, bits: int) -> int:
@@ -265,8 +265,8 @@ class _DamiaoWire:
 class _PlainWire:
     """Mini Cheetah's answers: the id, figures, and on some a temperature."""
 
-    def __init__(self, reply_id: int, length: int, *, deci: bool) -> None:
-        self._reply_id, self._length, self._deci = reply_id, length, deci
+    def __init__(self, reply_id: int, *, deci: bool) -> None:
+        self._reply_id, self._deci = reply_id, deci
 
     def __call__(self, motor: Actuator, can_id: int, data: bytes) -> list[Frame] | None:
         if can_id != motor.id or len(data) != 8:

@@ -70,9 +70,9 @@ class Servo(Device):
         registers = mine.model.registers
         self.memory[registers.model : registers.model + 2] = (777).to_bytes(2, "little")
         self.memory[registers.mode] = registers.position_mode
-        self._number(registers.p_gain, _P_GAIN[mine.model.wire])
+        self._put(*registers.p_gain, _P_GAIN[mine.model.wire])
         if registers.goal_current:
-            self._number((registers.current_limit, 2), 1750 if mine.model.current_a < 0.002 else 1193)
+            self._put(registers.current_limit, 2, 1750 if mine.model.current_a < 0.002 else 1193)
         self.error = 0
         self._goal_rad = self._way_rad = joint.locked_position_rad
         self._delivered = bytes(self.memory)
@@ -102,12 +102,12 @@ class Servo(Device):
         changed = address == registers.mode and data[0] != self.memory[address]
         self.memory[address : address + len(data)] = data
         if address == registers.goal:
-            self._goal_rad = self.mine.direction * self._angle(self._decode(data))
+            self._goal_rad = self.mine.position_rad(self._decode(data))
         elif address == registers.torque:
             self._switch(data[0] == 1 and not self.error)
         elif changed and registers.goal_current:
             # e-Manual, Operating Mode: gains, profile and goal current are reset.
-            self._number(registers.p_gain, _P_GAIN[self.mine.model.wire])
+            self._put(*registers.p_gain, _P_GAIN[self.mine.model.wire])
             self.memory[registers.goal_current : registers.goal_current + 2] = self._limit()
             self.memory[108:116] = bytes(8)
         return 0
@@ -190,14 +190,6 @@ class Servo(Device):
     def _order(self) -> Literal["big", "little"]:
         return "big" if self.mine.model.big_endian else "little"
 
-    def _number(self, place: tuple[int, int], value: int) -> None:
-        """Set a register of so many bytes."""
-        at, size = place
-        self.memory[at : at + size] = value.to_bytes(size, self._order)
-
-    def _angle(self, steps: int) -> float:
-        return (steps - self.mine.zero_counts) * self.mine.model.count_rad
-
     def _decode(self, data: bytes) -> int:
         model = self.mine.model
         value = int.from_bytes(data, self._order)
@@ -205,7 +197,7 @@ class Servo(Device):
             return -(value & 0x7FFF) if value & 0x8000 else value
         return value - (1 << 8 * len(data)) if value >> (8 * len(data) - 1) else value
 
-    def _put(self, address: int, size: int, value: int, sign_bit: int) -> None:
+    def _put(self, address: int, size: int, value: int, sign_bit: int = 15) -> None:
         model = self.mine.model
         if value < 0:
             value = -value | 1 << sign_bit if model.sign_magnitude else value + (1 << 8 * size)
