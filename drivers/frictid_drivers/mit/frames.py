@@ -44,16 +44,6 @@ def to_value(number: int, low: float, high: float, most: int) -> float:
     return low + number * (high - low) / most
 
 
-def symmetric(value: float, end: float, most: int) -> int:
-    """``to_number`` for -end..end."""
-    return to_number(value, -end, end, most)
-
-
-def from_symmetric(number: int, end: float, most: int) -> float:
-    """``to_value`` for -end..end."""
-    return to_value(number, -end, end, most)
-
-
 def step(end: float, most: int) -> float:
     """One number's worth of a symmetric range."""
     return 2.0 * end / most
@@ -62,31 +52,31 @@ def step(end: float, most: int) -> float:
 def command_numbers(motion: Motion, ranges: Ranges, most: int) -> tuple[int, int, int, int, int]:
     """The numbers of position (16 bits), velocity, kp, kd and torque (0..most)."""
     return (
-        symmetric(motion.position_rad, ranges.position_rad, FULL),
-        symmetric(motion.velocity_rad_s, ranges.velocity_rad_s, most),
+        to_number(motion.position_rad, -ranges.position_rad, ranges.position_rad, FULL),
+        to_number(motion.velocity_rad_s, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
         to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, most),
         to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, most),
-        symmetric(motion.torque_nm, ranges.torque_nm, most),
+        to_number(motion.torque_nm, -ranges.torque_nm, ranges.torque_nm, most),
     )
 
 
 def motion_of(p: int, v: int, kp: int, kd: int, t: int, ranges: Ranges, most: int) -> Motion:
     """The reverse of ``command_numbers``."""
     return Motion(
-        from_symmetric(p, ranges.position_rad, FULL),
-        from_symmetric(v, ranges.velocity_rad_s, most),
+        to_value(p, -ranges.position_rad, ranges.position_rad, FULL),
+        to_value(v, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
         to_value(kp, 0.0, ranges.kp_nm_per_rad, most),
         to_value(kd, 0.0, ranges.kd_nm_s_per_rad, most),
-        from_symmetric(t, ranges.torque_nm, most),
+        to_value(t, -ranges.torque_nm, ranges.torque_nm, most),
     )
 
 
 def report_of(p: int, v: int, t: int, ranges: Ranges, most: int) -> tuple[float, float, float]:
     """Position, velocity and torque that an answer's numbers stand for."""
     return (
-        from_symmetric(p, ranges.position_rad, FULL),
-        from_symmetric(v, ranges.velocity_rad_s, most),
-        from_symmetric(t, ranges.torque_nm, most),
+        to_value(p, -ranges.position_rad, ranges.position_rad, FULL),
+        to_value(v, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
+        to_value(t, -ranges.torque_nm, ranges.torque_nm, most),
     )
 
 
@@ -105,9 +95,8 @@ def unpack_motion(data: bytes, ranges: Ranges) -> Motion:
 
 def pack_report(position_rad: float, velocity_rad_s: float, torque_nm: float, ranges: Ranges) -> bytes:
     """The five bytes of position 16, velocity 12, torque 12 that answers carry."""
-    p = symmetric(position_rad, ranges.position_rad, FULL)
-    v = symmetric(velocity_rad_s, ranges.velocity_rad_s, TWELVE)
-    return (p << 24 | v << 12 | symmetric(torque_nm, ranges.torque_nm, TWELVE)).to_bytes(5, "big")
+    p, v, _, _, t = command_numbers(Motion(position_rad, velocity_rad_s, torque_nm=torque_nm), ranges, TWELVE)
+    return (p << 24 | v << 12 | t).to_bytes(5, "big")
 
 
 def unpack_report(data: bytes, ranges: Ranges) -> tuple[float, float, float]:
