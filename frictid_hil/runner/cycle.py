@@ -75,24 +75,19 @@ class CycleCount:
     # First deadline that was missed, and for how long the set-points stood still.
     stops: list[tuple[int, int]] = field(default_factory=list)
 
-    @property
-    def rate_hz(self) -> float:
-        """Cycles per second that were achieved."""
-        span_ns = self.last_ns - self.first_ns
-        return (self.cycles - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
-
     def joint_run(self, joint: str, session: int, marks: Sequence[Mark]) -> JointRun:
         """The same, as what is told of one joint."""
+        span_ns = self.last_ns - self.first_ns
         return JointRun(
             joint=joint,
             session=session,
             marks=tuple(marks),
-            rate_hz=self.rate_hz,
+            rate_hz=(self.cycles - 1) * 1e9 / span_ns if span_ns > 0 else 0.0,
             cycles=self.cycles,
             late_cycles=self.late,
             missed_cycles=self.missed,
             worst_lateness_s=self.worst_ns * 1e-9,
-            duration_s=(self.last_ns - self.first_ns) * 1e-9,
+            duration_s=span_ns * 1e-9,
         )
 
 
