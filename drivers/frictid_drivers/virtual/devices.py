@@ -25,19 +25,10 @@ def without_faults(setup: RobotSetup) -> RobotSetup:
 
 
 class Device:
-    """A joint that answers commands and closes its own loop.
-
-    Args:
-        joint: of the robot file.
-        setup: the robot, whose seed is that of the noise.
-
-    Attributes:
-        id: on the wire.
-        on: under power.
-    """
+    """A joint that answers commands and closes its own loop; the robot's seed is that of its noise."""
 
     def __init__(self, joint: JointSetup, setup: RobotSetup) -> None:
-        self.id = joint.address
+        self.id = joint.address  # on the wire
         self.plant = ServoLoop(
             JointModel.of(joint, joint.name),
             period_s=LOOP_S,
@@ -46,7 +37,7 @@ class Device:
         )
         self.plant.set_mode(_TORQUE_MODE)
         self.plant.brake(False)
-        self.on = False
+        self.on = False  # under power
         self._now_ns = self._heard_ns = 0
 
     def heard(self) -> None:
@@ -130,13 +121,7 @@ DEVICE_KINDS = (*FRAME_KINDS, *(kind for kind in REPORT_KINDS if kind != "flap")
 
 
 class DeviceFaults(FaultSchedule):
-    """Faults of devices.
-
-    Args:
-        faults: what goes wrong.
-        devices: by joint.
-        advance: lets them go on.
-    """
+    """Faults of devices, which are given by joint and go on by ``advance``."""
 
     def __init__(self, faults: Sequence[Fault], devices: Mapping[str, Device], advance: Callable[[int], None]) -> None:
         super().__init__(faults)
