@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -119,7 +119,6 @@ class Builder:
 
     parts: list[list[Array]]
     width: int = 0
-    terms: list[Term] = field(default_factory=list)
 
     def add(self, columns: Sequence[Array]) -> tuple[int, ...]:
         """Take in one block of columns per log; their numbers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from frictid_hil.simulation.joint import JointModel
@@ -135,6 +135,7 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for ``gap diagnose --json``."""
+        planned = self.next_experiment
         return {
             "schema": SCHEMA,
             "set": self.name,
@@ -153,9 +154,7 @@ class Diagnosis:
                 }
                 for c in self.causes
             ],
-            "where": [
-                {"region": w.region, "share_of_gap": w.share_of_gap, "description": w.description} for w in self.where
-            ],
+            "where": [asdict(place) for place in self.where],
             "gap": {
                 "before": _figures(self.before),
                 "after": _figures(self.after),
@@ -164,23 +163,11 @@ class Diagnosis:
                     log: {when: _figures(f) for when, f in figures.items()} for log, figures in self.per_log.items()
                 },
             },
-            "next_experiment": None
-            if self.next_experiment is None
-            else {
-                "description": self.next_experiment.description,
-                "duration_s": self.next_experiment.duration_s,
-                "separates": list(self.next_experiment.separates),
-                "plan": dict(self.next_experiment.plan),
-            },
+            "next_experiment": planned and {**asdict(planned), "separates": list(planned.separates)},
             "held_out_change_percent": dict(self.held_out),
             "reasons": dict(self.reasons),
         }
 
 
 def _figures(figures: Figures) -> dict[str, float | None]:
-    values = {
-        "inverse_nm": figures.inverse_nm,
-        "forward_torque_nm": figures.forward_torque_nm,
-        "forward_position_rad": figures.forward_position_rad,
-    }
-    return {name: value if value is None or math.isfinite(value) else None for name, value in values.items()}
+    return {name: value if value is None or math.isfinite(value) else None for name, value in asdict(figures).items()}

@@ -266,16 +266,6 @@ def catalogue(envelope: Envelope, *, seed: int = 0) -> dict[str, Experiment]:
     return {experiment.name: experiment for experiment in experiments}
 
 
-def full_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
-    """The standard experiments."""
-    return chosen(FULL, envelope, seed=seed)
-
-
-def short_set(envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
-    """The experiments that part most effects in the least time: about 80 s, validation included."""
-    return chosen(SHORT, envelope, seed=seed)
-
-
 def chosen(names: Iterable[str], envelope: Envelope, *, seed: int = 0) -> tuple[Experiment, ...]:
     """Experiments by name, in the order given.
 

@@ -12,6 +12,7 @@ from scipy import special
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.channel import FAMILY, STIFFNESS, Term
 from frictid_hil.gap.diagnosis import Value
+from frictid_hil.gap.plainest import CANCELS, plainest
 from frictid_hil.gap.posterior import FORM, Draw, Posterior
 from frictid_hil.gap.residuals import rms
 from frictid_hil.simulation.effects import all_effects
@@ -83,11 +84,11 @@ class Sampled:
 
 def sampled(posterior: Posterior) -> Sampled:
     """Draws with the sizes of their causes, over all logs of the channel."""
-    draws = posterior.draws(posterior.search(), DRAWS)
     # The level of a log is free but along the motion, so that a constant there is no size.
     levels = float(posterior.channel.name != "plant")
     x = np.concatenate([log.x[log.told] - levels * np.mean(log.x, axis=0) for log in posterior.channel.logs])
     gram = x.T @ x / x.shape[0]
+    draws = [plainest(posterior, draw, gram) for draw in posterior.draws(posterior.search(), DRAWS)]
     sizes: dict[str, Array] = {}
     blurs: dict[str, Array] = {}
     believed: dict[str, Array] = {}
@@ -130,7 +131,7 @@ def _net(parts: Sequence[tuple[np.ndarray, Array]], gram: Array) -> tuple[Array,
     squares = np.maximum(np.diag(inner), 1e-300)
     own = np.sqrt(squares)
     pair = squares[:, None] + squares + 2.0 * inner
-    cancels = pair < 0.25 * np.maximum(squares[:, None], squares)
+    cancels = pair < CANCELS * np.maximum(squares[:, None], squares)
     taken_back = np.where(cancels, inner, 0.0).sum(axis=1) / own
     net: Array = np.maximum(0.0, own + taken_back)
     apart = np.sqrt(np.maximum(1.0 - (inner / (own[:, None] * own)) ** 2, FORM**2))
@@ -270,9 +271,8 @@ def _of_draw(effect: str, channels: Sequence[Sampled], k: int) -> dict[str, floa
 def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
     """The parameters of an effect in one draw; empty where it is not in, or only within its tolerance's shape."""
     posterior = channel.posterior
-    terms = [*posterior.channel.nuisances, *(posterior.channel.candidates[t] for t in draw.model.terms)]
     at, found = 0, []
-    for term in terms:
+    for term in posterior.terms(draw.model):
         values = draw.values[at : at + len(term.columns)]
         at += len(term.columns)
         if term.effect == effect and STIFFNESS not in term.shape:

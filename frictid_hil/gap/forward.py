@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from frictid_hil.gap.experiment_set import Experiment, ExperimentSet, Nominal
 from frictid_hil.gap.residuals import LowPass, between, first_slide, friction_scales, reported, rms, uniform
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.joint import Drive, Encoder, JointModel, Payload, ServoGains
-from frictid_hil.simulation.replay import SUBSTEP_S, CarryOver, Controller, Simulated, closed_loop
+from frictid_hil.simulation.replay import CarryOver, Controller, Simulated, closed_loop
 
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -116,31 +116,17 @@ class Replay:
         self._slide_rad = 3.0 * coulomb / stiffness
         controller = experiments.nominal.controller
         assert controller is not None
-        self._controller = Controller(
-            kp_nm_per_rad=controller.kp_nm_per_rad,
-            ki_nm_per_rad_s=controller.ki_nm_per_rad_s,
-            kd_nm_s_per_rad=controller.kd_nm_s_per_rad,
-            rate_hz=controller.rate_hz,
-            velocity_filter_s=controller.velocity_filter_s,
-            torque_limit_nm=controller.torque_limit_nm,
-            command_rate=controller.command_rate,
-            command_rate_weight=controller.command_rate_weight,
-            added_nm=controller.added_nm,
-        )
+        told = {field.name: getattr(controller, field.name) for field in fields(Controller)}
+        self._controller = Controller(**told)
 
-    def recorded(self, *, rounded: bool = False) -> tuple[Experiment, ...]:
-        """The believed joint itself, recorded as the set was.
-
-        Args:
-            rounded: its encoder and its drive round as believed; else they round nothing.
-        """
+    def recorded(self) -> tuple[Experiment, ...]:
+        """The believed joint itself, recorded as the set was, its encoder and its drive rounding nothing."""
         model, state = self._nominal, None
-        if not rounded:
-            model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))
-            model = replace(model, drive=replace(model.drive, torque_quantum_per_mille=0.0))
+        model = replace(model, encoder=replace(model.encoder, counts_per_revolution=0.0))
+        model = replace(model, drive=replace(model.drive, torque_quantum_per_mille=0.0))
         made = []
         for e in self._experiments:
-            rows = self._rows(model, e, state, SUBSTEP_S)
+            rows = self._rows(model, e, state)
             state = rows.state
             made.append(replace(e, position_rad=rows.position_rad, torque_nm=rows.torque_nm, velocity_rad_s=None))
         return tuple(made)
@@ -152,16 +138,13 @@ class Replay:
             merged[name] = {**merged.get(name, {}), **bounded(name, values)}
         return self._nominal.with_effects(merged)
 
-    def __call__(
-        self, effects: Effects, *, validation: bool | None = None, substep_s: float = SUBSTEP_S
-    ) -> dict[str, Replayed]:
+    def __call__(self, effects: Effects, *, validation: bool | None = None) -> dict[str, Replayed]:
         """Differences by experiment name.
 
         Args:
             effects: parameters by effect.
             validation: only those logs, only the others, or all (None). Warmth carries over in run order, so earlier
                 logs are simulated too where an effect remembers.
-            substep_s: of the physics.
         """
         model = self.model(effects)
         carried = any(all_effects()[name].carried for name in effects)
@@ -171,12 +154,12 @@ class Replay:
             wanted = validation is None or experiment.validation == validation
             if not wanted and not carried:
                 continue
-            difference, state = self._one(model, experiment, state, substep_s)
+            difference, state = self._one(model, experiment, state)
             if wanted:
                 result[experiment.name] = difference
         return result
 
-    def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None, substep_s: float) -> Simulated:
+    def _rows(self, model: JointModel, e: Experiment, state: CarryOver | None) -> Simulated:
         """One recording simulated, its torque reported as the drive does: the controller's last tick, filtered."""
         assert e.position_command_rad is not None
         step_s = float(np.median(np.diff(e.time_s)))
@@ -186,7 +169,7 @@ class Replay:
         # A log's clock and its controller's differ a little; a row is a whole number of ticks all the same.
         exact = abs(self._controller.rate_hz * step_s / ticks - 1.0) < SAME_RATE
         controller = replace(self._controller, rate_hz=ticks / step_s) if exact else self._controller
-        rows = closed_loop(model, controller, time, command, payload=e.payload, state=state, substep_s=substep_s)
+        rows = closed_loop(model, controller, time, command, payload=e.payload, state=state)
         torque = rows.torque_nm
         if self._report is not None:
             torque = reported(torque[:, None], self._report, float(np.median(np.diff(time))))[:, 0]
@@ -197,14 +180,8 @@ class Replay:
             torque_nm=torque[::ticks],
         )
 
-    def _one(
-        self,
-        model: JointModel,
-        experiment: Experiment,
-        state: CarryOver | None,
-        substep_s: float,
-    ) -> tuple[Replayed, CarryOver]:
-        rows = self._rows(model, experiment, state, substep_s)
+    def _one(self, model: JointModel, experiment: Experiment, state: CarryOver | None) -> tuple[Replayed, CarryOver]:
+        rows = self._rows(model, experiment, state)
         low_pass = LowPass.at(1.0 / float(np.median(np.diff(experiment.time_s))))
         measured = experiment.torque_nm
         torque = np.zeros_like(rows.torque_nm) if measured is None else measured - rows.torque_nm

@@ -20,20 +20,6 @@ START = "start"
 
 It comes so near to some effects that it says nothing for a verdict; what it adds to an effect lowers the confidence.
 """
-DESCRIPTIONS = {
-    "position": "a torque that depends on position alone",
-    "position friction": "friction that depends on position",
-    "position viscous": "damping that depends on position",
-    "velocity": "friction that depends on velocity",
-    "velocity and direction": "friction that differs by direction, as velocity has it",
-    "lagged motion": "friction that lags behind the motion",
-    "time": "a slow change over the whole session",
-    "time in a log": "a change within each recording",
-    "acceleration": "friction that depends on acceleration",
-    "torque": "a torque gain that depends on the torque",
-    START: "friction that depends on the way since a start and on the rest before",
-    "travel": "a torque that builds up over a good part of the travel after a reversal",
-}
 WHOLE = ("torque", "position")
 """Families that keep what a wrong belief could say, too: a gain that droops, a cable that pulls."""
 WAYS_RAD = (5e-4, 2e-3, 8e-3)

@@ -50,6 +50,8 @@ ROUNDING = 1e-12
 SURE = 5.0
 """Mean of a coefficient over its one-sigma, from which on its term is a whole model of its cause; a lag between two
 shapes may be shared by them."""
+UNNAMED = FAMILY + "rest"
+"""What a draw holds besides its terms."""
 POINTS = 4
 """Points of the grid, the likeliest, at which all candidates are compared."""
 
@@ -403,7 +405,7 @@ class Posterior:
             if (k, g) not in cache:
                 cache[k, g] = self._coefficients(model, g)
             at, mean, root = cache[k, g]
-            result.append(Draw(model, g, at, self._scale[at] * self._inside(model, mean, root, random)))
+            result.append(Draw(model, g, self._scale[at] * self._inside(model, mean, root, random)))
         return result
 
     def _inside(self, model: Model, mean: Array, root: Array, random: np.random.Generator) -> Array:
@@ -471,8 +473,7 @@ class Posterior:
         models = [m for m in self._known.values() if cause in m.effects and other not in m.effects]
         model = max([self.model((single,)), *models], key=lambda m: m.score)
         at, mean, root = self._coefficients(model, int(np.argmax(model.by_setting)))
-        terms = (*self.channel.nuisances, *(self.channel.candidates[t] for t in model.terms))
-        return Known(terms, self._scale[at] * mean, self._scale[at][:, None] * root)
+        return Known(self.terms(model), self._scale[at] * mean, self._scale[at][:, None] * root)
 
     def singles(self) -> dict[str, int]:
         """The best shape of every cause, alone."""
@@ -485,11 +486,17 @@ class Posterior:
                 best.setdefault(effect, int(t))
         return best
 
+    def terms(self, model: Model) -> tuple[Term, ...]:
+        """Of a model, nuisances first, in the order of its coefficients."""
+        return (*self.channel.nuisances, *(self.channel.candidates[t] for t in model.terms))
+
     def contributions(self, draw: Draw) -> dict[str, tuple[np.ndarray, Array]]:
         """By cause: (columns of the channel's table, coefficients), nuisances and terms together."""
         result: dict[str, tuple[list[int], list[float]]] = {}
         at = 0
-        for term in (*self.channel.nuisances, *(self.channel.candidates[t] for t in draw.model.terms)):
+        if draw.unnamed is not None:
+            result[UNNAMED] = list(range(draw.unnamed.size)), list(draw.unnamed)
+        for term in self.terms(draw.model):
             columns, values = result.setdefault(term.effect, ([], []))
             columns += term.columns
             values += list(draw.values[at : at + len(term.columns)])
@@ -516,12 +523,15 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One sample of the posterior: model, point of the grid, numbers and values of the coefficients."""
+    """One sample of the posterior: model, point of the grid, values of the coefficients.
+
+    ``unnamed`` holds coefficients of all columns of the table that make what has no name besides.
+    """
 
     model: Model
     setting: int
-    at: np.ndarray
     values: Array
+    unnamed: Array | None = None
 
 
 def _put_inside(values: Array, root: Array, starts: np.ndarray, low: Array, high: Array) -> Array:

@@ -63,6 +63,7 @@ class InverseForm:
     # Lets the link swing by itself, so that columns along a measured motion may lose its phase; the closed loop then
     # tries other numbers.
     swings: bool = False
+    of_speed: bool = False  # friction as a function of speed, of both directions alike
 
     def grid_for(self, views: Sequence[View]) -> tuple[Shape, ...]:
         """The shapes to try on these recordings."""
@@ -70,7 +71,10 @@ class InverseForm:
 
 
 def linear(
-    columns: Mapping[str, Callable[[View], Array]], first_coefficient: tuple[float, float] = (-math.inf, math.inf)
+    columns: Mapping[str, Callable[[View], Array]],
+    first_coefficient: tuple[float, float] = (-math.inf, math.inf),
+    *,
+    of_speed: bool = False,
 ) -> InverseForm:
     """The form of an effect whose parameters enter linearly: by name, N m per unit of each along a view, (n,)."""
     return InverseForm(
@@ -78,6 +82,7 @@ def linear(
         regressors=lambda views, shape: [np.stack([column(v) for column in columns.values()], axis=1) for v in views],
         parameters=lambda shape, coefficients: dict(zip(columns, map(float, coefficients), strict=True)),
         first_coefficient=first_coefficient,
+        of_speed=of_speed,
     )
 
 

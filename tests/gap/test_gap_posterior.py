@@ -14,8 +14,9 @@ from frictid_hil.gap import noise
 from frictid_hil.gap.channel import Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
 from frictid_hil.gap.findings import DRAWS, VISIBLE, Finding, _chances, _nearest, _opposed, findings, sampled
+from frictid_hil.gap.plainest import plainest
 from frictid_hil.gap.plant_channel import plant_channel
-from frictid_hil.gap.posterior import Posterior, _integrated, _put_inside
+from frictid_hil.gap.posterior import Draw, Posterior, _integrated, _put_inside
 from frictid_hil.gap.residuals import recordings
 from frictid_hil.gap.tolerances import Sigma
 from frictid_hil.simulation.effects import all_effects
@@ -74,6 +75,44 @@ def test_two_shapes_of_a_whole_cause_are_that_cause_once(strength: float) -> Non
     posterior = Posterior(Channel("actuation", 0.01, tuple(logs), (), tuple(candidates), 1.0, 20.0), 20)
     assert float(np.sum(posterior.fitted((0, 1)))) == pytest.approx(1.0, abs=0.2)
     assert float(np.sum(posterior.fitted((0,)))) == pytest.approx(1.0, abs=0.2)
+
+
+def _curves() -> tuple[Posterior, np.ndarray]:
+    """A channel with the level of friction as a belief, and a Stribeck and a bent curve as causes."""
+    random = np.random.default_rng(5)
+    speed = np.abs(np.sin(np.linspace(0.0, 40.0, 1600)))
+    columns = np.stack([1.0 + 0.2 * speed, np.exp(-speed / 0.2), np.log1p(speed / 0.06)], axis=1)
+    log = Rows("log", False, 0.0, random.standard_normal(1600), columns, np.zeros(1600), np.ones(1600, dtype=bool))
+    stated = Term("friction_level_error", {}, (0,), np.zeros(1), np.full(1, 0.05))
+    candidates = [
+        replace(stated, deviation=np.full(1, 0.3)),
+        Term("stribeck", {"stribeck_velocity_rad_s": 0.2, "exponent": 1.0}, (1,), np.zeros(1), np.ones(1)),
+        Term("viscous_nonlinearity", {"knee_rad_s": 0.06, "bend": 0.0}, (2,), np.zeros(1), np.ones(1)),
+    ]
+    channel = Channel("plant", 0.01, (log,), (stated,), tuple(candidates), 1.0, 20.0)
+    return Posterior(channel, 20), columns
+
+
+def test_curves_that_cancel_into_an_error_of_the_believed_curve_are_that_error() -> None:
+    posterior, columns = _curves()
+    gram = columns.T @ columns / columns.shape[0]
+    curves = np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=None)[0]
+    draw = Draw(posterior.model((1, 2)), 0, np.array([-0.85, *curves]))
+    told = plainest(posterior, draw, gram)
+    assert told.model.effects == {"friction_level_error"}
+    assert told.values == pytest.approx([0.15, 0.0], abs=0.02)
+    # Nothing is lost: what the error leaves is there, without a name.
+    made = [np.zeros(3), np.zeros(3)]
+    for one, sums in zip((draw, told), made, strict=True):
+        for numbers, values in posterior.contributions(one).values():
+            np.add.at(sums, numbers, values)
+    np.testing.assert_allclose(made[0], made[1])
+
+
+def test_a_curve_that_nothing_cancels_keeps_its_name() -> None:
+    posterior, columns = _curves()
+    draw = Draw(posterior.model((2,)), 0, np.array([0.01, 0.3]))
+    assert plainest(posterior, draw, columns.T @ columns / columns.shape[0]) is draw
 
 
 def test_a_whitened_row_is_white_and_of_unit_size() -> None:

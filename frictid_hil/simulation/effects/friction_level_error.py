@@ -48,5 +48,5 @@ EFFECT = Effect(
         ),
         Parting("viscous_error", "triangle_slow", "creeping leaves the level alone", 20.0),
     ),
-    inverse=linear({"error_share": lambda v: v.coulomb_nm * v.slip + v.rate_nm}, (-1.0, math.inf)),
+    inverse=linear({"error_share": lambda v: v.coulomb_nm * v.slip + v.rate_nm}, (-1.0, math.inf), of_speed=True),
 )

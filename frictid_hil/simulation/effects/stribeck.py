@@ -76,5 +76,6 @@ EFFECT = Effect(
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
         first_coefficient=(0.0, math.inf),
+        of_speed=True,
     ),
 )

@@ -38,5 +38,5 @@ EFFECT = Effect(
     illustrate=_illustrate,
     belief="viscous",
     parted=(Parting("viscous_nonlinearity", "sines_large", "high speeds tell a slope from a bend", 15.0),),
-    inverse=linear({"error_share": lambda v: v.rate_nm}, (-1.0, math.inf)),
+    inverse=linear({"error_share": lambda v: v.rate_nm}, (-1.0, math.inf), of_speed=True),
 )

@@ -78,5 +78,6 @@ EFFECT = Effect(
         shapes_for=shapes,
         regressors=regressors,
         parameters=lambda shape, coefficients: {"share": float(coefficients[0]), **shape},
+        of_speed=True,
     ),
 )
