@@ -281,9 +281,11 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
         return {}
     if _opposed([(term, values) for term, values in found if term.shape]):
         return _read(effect, posterior.channel.name, *_nearest(effect, channel, found))
-    width = found[-1][1].size
-    total = np.sum([values for _, values in found if values.size == width], axis=0)
-    return _read(effect, posterior.channel.name, _between(found), total)
+    told, form = _between(found), all_effects()[effect].inverse
+    # Between two lines over position there is none: each has coefficients of its own.
+    apart = form is not None and not form.continuous
+    alike = [v for t, v in found if v.size == len(told.columns) and not (apart and t.shape != told.shape)]
+    return _read(effect, posterior.channel.name, told, np.sum(alike, axis=0))
 
 
 def _opposed(shaped: Sequence[tuple[Term, Array]]) -> bool:

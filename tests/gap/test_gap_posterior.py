@@ -13,7 +13,17 @@ import pytest
 from frictid_hil.gap import noise
 from frictid_hil.gap.channel import Channel, Rows, Term
 from frictid_hil.gap.diagnose import diagnose
-from frictid_hil.gap.findings import DRAWS, VISIBLE, Finding, _chances, _nearest, _opposed, findings, sampled
+from frictid_hil.gap.findings import (
+    DRAWS,
+    VISIBLE,
+    Finding,
+    _chances,
+    _nearest,
+    _opposed,
+    findings,
+    parameters,
+    sampled,
+)
 from frictid_hil.gap.plainest import plainest
 from frictid_hil.gap.plant_channel import plant_channel
 from frictid_hil.gap.posterior import Draw, Posterior, _integrated, _put_inside
@@ -166,6 +176,23 @@ def test_shapes_that_oppose_each_other_are_told_as_the_one_nearest_to_their_sum(
     together = table[:, 0] * 2.0 - table[:, 3] * 0.5
     told = table[:, terms.index(term)] * values[0]
     assert np.std(together - told) < 0.1 * np.std(together)
+
+
+def test_lines_over_position_are_read_each_by_its_own_coefficients() -> None:
+    lines = [{"first": 3.0}, {"first": 12.0, "second": 24.0}, {"first": 5.0}]
+    columns = [(0, 1), (2, 3, 4, 5), (6, 7)]
+    terms = [
+        Term("torque_ripple", s, c, np.zeros(len(c)), np.ones(len(c))) for s, c in zip(lines, columns, strict=True)
+    ]
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="plant"), terms=lambda _: terms)
+    values = np.array([0.1, 0.0, 2.0, 0.0, 0.0, 1.0, 0.2, 0.0])
+    draw: Any = SimpleNamespace(model=None, values=values)
+    channel: Any = SimpleNamespace(posterior=posterior)
+    told = parameters("torque_ripple", channel, draw)
+    assert sorted(v for name, v in told.items() if name.endswith("amplitude_nm")) == [1.0, 2.0]
+    draw.values = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.0])
+    told = parameters("torque_ripple", channel, draw)
+    assert next(v for name, v in told.items() if name.endswith("amplitude_nm")) == 0.2
 
 
 @pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])
