@@ -42,7 +42,6 @@ from frictid_hil.gap.channel import Channel
 from frictid_hil.gap.experiment_set import ExperimentSet
 from frictid_hil.gap.forward import Effects, Replay
 from frictid_hil.gap.posterior import Posterior
-from frictid_hil.simulation.replay import SUBSTEP_S
 
 DOCS_PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "gap-sensitivity.md"
 BEGIN, END = "<!-- written by benchmarks/gap_sensitivity.py -->", "<!-- end of what it wrote -->"
@@ -170,11 +169,11 @@ class Once(Replay):
 
     known: ClassVar[dict[str, Any]] = {}
 
-    def __call__(self, effects: Effects, *, validation: bool | None = None, substep_s: float = SUBSTEP_S) -> Any:
+    def __call__(self, effects: Effects, *, validation: bool | None = None) -> Any:
         """As :class:`Replay` does."""
         asked = json.dumps([{n: dict(v) for n, v in effects.items()}, validation], sort_keys=True)
         if asked not in self.known:
-            self.known[asked] = super().__call__(effects, validation=validation, substep_s=substep_s)
+            self.known[asked] = super().__call__(effects, validation=validation)
         return self.known[asked]
 
 
