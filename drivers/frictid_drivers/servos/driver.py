@@ -47,6 +47,8 @@ _SETTLE_S = 1.5
 _BUSIEST = 0.45
 """Share of a cycle that the line may take: the reading begins in its middle."""
 _WATCHDOG_STEP_S = 0.02
+_INSIST_S, _AGAIN_S = 0.5, 0.01
+"""A servo that answers and is not off is told so for this long, at such intervals."""
 
 
 class ServoDriver:
@@ -396,7 +398,14 @@ class ServoDriver:
         line = self._open_line()
         with contextlib.suppress(FrictidError):
             line.tell(self._registers.torque, {mine.id: b"\0" for mine in self._joints})
-        off = [servo for servo in self._servos if self._seen_off(servo)]
+        seen = [self._seen_off(servo) for servo in self._servos]
+        until_ns = self.clock.now_ns() + round(_INSIST_S * 1e9)
+        while False in seen and self.clock.now_ns() < until_ns:
+            self.clock.wait_until(self.clock.now_ns() + round(_AGAIN_S * 1e9))
+            seen = [
+                self._seen_off(servo) if was is False else was for servo, was in zip(self._servos, seen, strict=True)
+            ]
+        off = [servo for servo, is_off in zip(self._servos, seen, strict=True) if is_off]
         self.may_be_powered = tuple(servo.joint.name for servo in self._servos if servo.energised and servo not in off)
         with contextlib.suppress(FrictidError):
             self._arm_watchdog(0.0, off)
@@ -407,7 +416,8 @@ class ServoDriver:
                     servo.operating.follow_goals()
         line.heard = None
 
-    def _seen_off(self, servo: Servo) -> bool:
+    def _seen_off(self, servo: Servo) -> bool | None:
+        """Told to let go, and read back; None where it does not answer."""
         with contextlib.suppress(FrictidError):
             return self._open_line().put(servo.mine.id, self._registers.torque, b"\0")
-        return False
+        return None
