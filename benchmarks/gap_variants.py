@@ -230,7 +230,7 @@ VARIANTS: dict[str, Variant] = {
     "a log at rest": Variant(_at_rest),
     **{
         f"torque reported x {f:g}": Variant(
-            each(lambda e, f=f: e if e.torque_nm is None else replace(e, torque_nm=f * e.torque_nm)),  # type: ignore[misc]
+            _torque(lambda e, v, a, f=f: (f - 1.0) * e.torque_nm),  # type: ignore[misc]
             ("torque_constant_error",),
         )
         for f in (0.92, 1.04, 1.08, 1.15)

@@ -283,7 +283,7 @@ def parameters(effect: str, channel: Sampled, draw: Draw) -> dict[str, float]:
         return _read(effect, posterior.channel.name, *_nearest(effect, channel, found))
     told, form = _between(found), all_effects()[effect].inverse
     # Between two lines over position there is none: each has coefficients of its own.
-    apart = form is not None and not form.continuous
+    apart = form is not None and not form.continuous and len(told.columns) > 1
     alike = [v for t, v in found if v.size == len(told.columns) and not (apart and t.shape != told.shape)]
     return _read(effect, posterior.channel.name, told, np.sum(alike, axis=0))
 

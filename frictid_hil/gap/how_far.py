@@ -133,9 +133,7 @@ class Simulated:
 
     def figures(self, when: str, log: str | None = None) -> tuple[float, float]:
         """(torque in N m, position in rad): RMS of the difference, of one log or of all."""
-        chosen = getattr(self, when)
-        if log is not None:
-            chosen = {log: chosen[log]}
+        chosen = getattr(self, when) if log is None else {log: getattr(self, when)[log]}
         return pooled(chosen, "torque_nm"), pooled(chosen, "position_rad")
 
     def per_log(self) -> dict[str, dict[str, Figures]]:

@@ -15,13 +15,7 @@ from frictid_hil.gap.generic import WHOLE, families
 from frictid_hil.gap.noise import LOCAL_S
 from frictid_hil.gap.nuisances import nuisances
 from frictid_hil.gap.position_noise import differenced_rms, quiet_views, white_rms
-from frictid_hil.gap.residuals import (
-    LowPass,
-    Recording,
-    first_slide,
-    reported,
-    rms,
-)
+from frictid_hil.gap.residuals import LowPass, Recording, first_slide, reported, rms
 from frictid_hil.simulation.effect import Region
 from frictid_hil.simulation.effects import all_effects
 from frictid_hil.simulation.inverse import View

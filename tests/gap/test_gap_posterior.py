@@ -195,6 +195,14 @@ def test_lines_over_position_are_read_each_by_its_own_coefficients() -> None:
     assert next(v for name, v in told.items() if name.endswith("amplitude_nm")) == 0.2
 
 
+def test_two_delays_that_pull_the_same_way_are_one_between_them() -> None:
+    terms = [Term("torque_delay", {"delay_s": s}, (k,), np.ones(1), np.ones(1)) for k, s in enumerate((0.02, 0.04))]
+    posterior = SimpleNamespace(channel=SimpleNamespace(name="tracking"), terms=lambda _: terms)
+    draw: Any = SimpleNamespace(model=None, values=np.array([0.5, 0.5]))
+    channel: Any = SimpleNamespace(posterior=posterior)
+    assert parameters("torque_delay", channel, draw) == pytest.approx({"delay_s": 0.03})
+
+
 @pytest.mark.parametrize(("believed", "blur"), [(0.2, 1.0), (1.0, 1.0), (4.0, 1.0), (1.0, 0.3)])
 def test_the_chance_of_a_blurred_error_is_the_share_of_drawn_ones_that_show(believed: float, blur: float) -> None:
     rng = np.random.default_rng(5)
