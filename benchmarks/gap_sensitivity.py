@@ -33,6 +33,7 @@ from frictid_hil.gap import (
     how_far,
     noise,
     nuisances,
+    plainest,
     plant_channel,
     posterior,
     verdict,
@@ -58,6 +59,7 @@ LATE: tuple[tuple[ModuleType, str], ...] = (
 SEARCHED: tuple[tuple[ModuleType, str], ...] = (
     (posterior, "EXPECTED"), (posterior, "WORTH"), (posterior, "FORM"), (posterior, "MOST_DOUBT"),
     (posterior, "MOST"), (posterior, "TRIED"), (posterior, "POINTS"), (posterior, "STRETCHES"),
+    (plainest, "CANCELS"), (plainest, "CLEAR"),
 )  # fmt: skip
 """The search over models."""
 TABLES: tuple[tuple[ModuleType, str], ...] = (
