@@ -438,8 +438,8 @@ def _in_degrees(holder: Strict, at: KeyPath) -> list[FieldProblem]:
         far |= name == "position_max_rad" and travel > MOST_TRAVEL_RAD
         if fast or far:
             why = "/s is faster than any robot's joint" if fast else ": over two turns of travel"
-            hint = f"write {value:g}{'deg/s' if fast else 'deg'}; an endless axis says `continuous: true`"
-            problems.append(FieldProblem((*at, name), f"{value:g} rad{why}; in degrees? {hint}"))
+            hint = f"{value:g}{'deg/s' if fast else 'deg'}; an endless axis says `continuous: true`"
+            problems.append(FieldProblem((*at, name), f"{value:g} rad{why}; in degrees? write {hint}"))
     return problems
 
 

@@ -123,6 +123,7 @@ def _misfit(samples: Samples, time_ns: Nanoseconds, procedure: Procedure, start_
     return float(np.var(off)) if off.size else np.inf
 
 
+_THERE_AND_BACK = "move and return"
 _TIMING = ("position_delay_s", "velocity_delay_s", "torque_delay_s", "torque_lag_s", "uncertainty_s")
 
 
@@ -165,7 +166,9 @@ def cycle_recording(
         recording = replace(recording, stops_s=path.stops_s, stopped_s=path.stopped_ns * 1e-9)
     recording = with_shaking(recording, samples)
     if len(together) > 1:
-        recording = replace(recording, coupled=True)
+        # On the way there the others stand elsewhere than on the way back, and their weight is not the same.
+        kept = tuple(stretch for stretch in recording.elsewhere if stretch[0] != _THERE_AND_BACK)
+        recording = replace(recording, coupled=True, elsewhere=kept)
         try:
             recording = _with_companions(recording, samples, company, start_s)
         except IdentificationError as problem:
