@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def model_logs(output: Output, logs: Sequence[Path]) -> ModelLogs:
-    """The options as one value.
-
-    Raises:
-        UsageError: one that cannot be read, or that does not go with a model.
-    """
+    """The options as one value (``UsageError``: one that cannot be read, or that does not go with a model)."""
     from frictid_hil.jobs.gap.from_model import ModelLogs
 
     given = output.given

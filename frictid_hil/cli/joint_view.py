@@ -18,8 +18,7 @@ from frictid_hil.units import degrees
 
 _REDRAW_S = 0.1
 _BAR_CELLS = 10
-_ROOM_FOR_BARS = 100
-"""Columns of a terminal; on a narrower one the torque is a figure without its bar."""
+_ROOM_FOR_BARS = 100  # columns of a terminal; on a narrower one the torque is a figure without its bar
 
 
 def figures_of(rows: Rows, max_torque_nm: float | None) -> dict[str, str]:

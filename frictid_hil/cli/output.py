@@ -33,8 +33,7 @@ READING = "profiles read anew for the store's index"
 
 _COUNT_EVERY_S = 2.0
 
-NOTIFY_TIMEOUT_S = 60.0
-"""A command of ``--notify`` may take this long."""
+NOTIFY_TIMEOUT_S = 60.0  # a command of ``--notify`` may take this long
 
 Result = Mapping[str, Any]
 Asked = TypeVar("Asked")

@@ -13,8 +13,7 @@ from frictid_hil.cli.output import READING, Output, Result, folding, takes, verb
 from frictid_hil.plan.linear_axis import rotary_names
 from frictid_hil.units import degrees
 
-_SHOWN = 50
-"""Profiles, promotions and nights in a table that a person reads."""
+_SHOWN = 50  # profiles, promotions and nights in a table that a person reads
 
 app = typer.Typer(help="Show, compare and manage friction profiles.", no_args_is_help=True)
 

@@ -29,32 +29,22 @@ _EDS_SCHEMA = "frictid.frames/1"
 
 @dataclass(frozen=True, slots=True)
 class LoggedMotion:
-    """One joint's motion in a log.
-
-    Attributes:
-        marks: where it is, on the log's own run time; empty where nothing tells.
-        late_cycles: late and missed cycles that the live run counted.
-    """
+    """One joint's motion in a log."""
 
     joint: str
-    marks: tuple[Mark, ...] = ()
-    late_cycles: int = 0
+    marks: tuple[Mark, ...] = ()  # where it is, on the log's own run time; empty where nothing tells
+    late_cycles: int = 0  # late and missed cycles that the live run counted
 
 
 @dataclass(frozen=True, slots=True)
 class Log:
-    """One bus log with what is known of it.
-
-    Attributes:
-        frame_map: which frame carries what.
-        identities: what the drives said of themselves, by joint; empty for logs of other origin.
-        motions: what the joints did; empty where nothing tells.
-    """
+    """One bus log with what is known of it."""
 
     path: Path
-    frame_map: Mapping[str, Any]
+    frame_map: Mapping[str, Any]  # which frame carries what
+    # What the drives said of themselves, by joint; empty for logs of other origin.
     identities: Mapping[str, Mapping[str, Any]]
-    motions: tuple[LoggedMotion, ...]
+    motions: tuple[LoggedMotion, ...]  # what the joints did; empty where nothing tells
 
 
 def is_log(source: Path) -> bool:
@@ -137,8 +127,7 @@ def _motions(manifest: Mapping[str, Any], folder: Path, log: str) -> tuple[Logge
     return tuple(motions)
 
 
-MOST_LOST_PERCENT = 5.0
-"""A joint that lacks more of its rows than this is not trusted."""
+MOST_LOST_PERCENT = 5.0  # a joint that lacks more of its rows than this is not trusted
 
 
 _MOTION = attrgetter("t_ns", "position_rad", "velocity_rad_s", "torque_nm", "position_command_rad")
@@ -148,29 +137,18 @@ _STATE = attrgetter("external_torque_nm", "temperature_c", "status_raw")
 
 @dataclass(slots=True)
 class Account:
-    """What a log holds besides rows, and what it lacks.
-
-    Attributes:
-        unknown: frames that nothing describes, by name.
-        services: frames around the cycles, by name.
-        repeated: reports that came twice in a row.
-        backwards: frames that stood before an earlier one in the log; they were put back by their time.
-        skipped: error and remote frames.
-        lost_rows: rows that a joint lacks during its own motion, by joint.
-        lost_percent: the same in percent of what should be there.
-        damage: where the log ends before its end.
-    """
+    """What a log holds besides rows, and what it lacks."""
 
     frames: int = 0
     rows: int = 0
-    unknown: dict[str, int] = field(default_factory=dict)
-    services: dict[str, int] = field(default_factory=dict)
-    repeated: int = 0
-    backwards: int = 0
-    skipped: int = 0
-    lost_rows: dict[str, int] = field(default_factory=dict)
-    lost_percent: dict[str, float] = field(default_factory=dict)
-    damage: str = ""
+    unknown: dict[str, int] = field(default_factory=dict)  # frames that nothing describes, by name
+    services: dict[str, int] = field(default_factory=dict)  # frames around the cycles, by name
+    repeated: int = 0  # reports that came twice in a row
+    backwards: int = 0  # frames that stood before an earlier one in the log; they were put back by their time
+    skipped: int = 0  # error and remote frames
+    lost_rows: dict[str, int] = field(default_factory=dict)  # rows that a joint lacks during its own motion, by joint
+    lost_percent: dict[str, float] = field(default_factory=dict)  # the same in percent of what should be there
+    damage: str = ""  # where the log ends before its end
 
     def take(self, samples: Samples) -> None:
         """Count what one joint lacks."""

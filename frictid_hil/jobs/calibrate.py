@@ -53,12 +53,6 @@ class CalibrateOptions:
     """What a person asked for; what is left at its default is the robot file's own, or that of the run continued.
 
     The options are those of ``frictid-hil calibrate --help``, and for other verbs:
-
-    Attributes:
-        verb: that the run is part of.
-        warm_up: every joint is warmed up before it is measured.
-        interlock: must be closed before and during motion.
-        store: folder of the profile store, whose active profile the page compares with; None for the user's own.
     """
 
     robot: str = ""
@@ -77,9 +71,10 @@ class CalibrateOptions:
     seed: int | None = None
     resume: Path | None = None
     out: Path | None = None
-    verb: str = VERB
-    warm_up: WarmUpPolicy | None = None
-    interlock: Interlock | None = None
+    verb: str = VERB  # that the run is part of
+    warm_up: WarmUpPolicy | None = None  # every joint is warmed up before it is measured
+    interlock: Interlock | None = None  # must be closed before and during motion
+    # Folder of the profile store, whose active profile the page compares with; None for the user's own.
     store: Path | None = None
 
 

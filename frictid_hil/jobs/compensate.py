@@ -43,17 +43,13 @@ VERB = "compensate"
 
 @dataclass(frozen=True, slots=True)
 class CompensateOptions:
-    """What a person asked for, see ``frictid-hil compensate --help``.
-
-    Attributes:
-        profile: file, a run folder that holds one, or an id of the store; ``active`` is the one in force there.
-        wanted: task, modes, setting and the rest of what is to be run.
-    """
+    """What a person asked for, see ``frictid-hil compensate --help``."""
 
     robot: str
+    # File, a run folder that holds one, or an id of the store; ``active`` is the one in force there.
     profile: Path | str
     joint: str
-    wanted: Wanted
+    wanted: Wanted  # task, modes, setting and the rest of what is to be run
     bus: str | None = None
     realtime: bool = False
     seed: int = 0
@@ -174,8 +170,7 @@ def _measure(moved: JointRun, run: Run, asked: Asked, progress: Progress) -> Non
 
 
 _LIVE_NS = 500_000_000
-_HELD_BACK_NS = 1_000_000_000
-"""Of a service's figures: how it was ended is not counted."""
+_HELD_BACK_NS = 1_000_000_000  # of a service's figures: how it was ended is not counted
 
 
 @runtime_checkable
@@ -187,8 +182,7 @@ class GuidedBySimulation(Protocol):
         ...
 
 
-Live = Callable[[str], None]
-"""Told a line of figures twice a second while a service runs."""
+Live = Callable[[str], None]  # told a line of figures twice a second while a service runs
 
 
 class Hand:

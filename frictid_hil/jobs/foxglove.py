@@ -38,10 +38,8 @@ of their own, which no page from a network has). Not ``null``, which any page ge
 
 _MESSAGE_DATA = 1
 _ERROR = 2
-_MOST_UNSENT = 1 << 20
-"""Bytes that wait for a viewer; while there are more it misses messages."""
-_MOST_ASKED = 1 << 16
-"""Bytes of a viewer's message."""
+_MOST_UNSENT = 1 << 20  # bytes that wait for a viewer; while there are more it misses messages
+_MOST_ASKED = 1 << 16  # bytes of a viewer's message
 _CLOSING_S = 1.0
 
 # With a handler that drops it, no scanner of ports writes on the terminal of a run.

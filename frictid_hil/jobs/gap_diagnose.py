@@ -239,8 +239,7 @@ def _fastest_rad_s(time_s: np.ndarray[Any, Any], position_rad: np.ndarray[Any, A
     return float(np.quantile(speed, 0.999))
 
 
-ARM_PAGE = "arm.html"
-"""The page of the whole arm, beside one page a joint."""
+ARM_PAGE = "arm.html"  # the page of the whole arm, beside one page a joint
 
 
 def diagnose_arm(
@@ -335,11 +334,7 @@ def _written(
 
 
 def diagnosed(arm: ArmSet, executor_name: str | None = None) -> dict[str, Diagnosis]:
-    """The diagnosis of every joint.
-
-    Raises:
-        FrictidError: a worker was lost.
-    """
+    """The diagnosis of every joint (``FrictidError``: a worker was lost)."""
     found: dict[str, Diagnosis] = {}
     sets = [joint.experiments for joint in arm.joints.values()]
     with executor(executor_name, len(sets)) as pool:

@@ -20,36 +20,26 @@ from frictid_hil.files import refuse_overwriting, write_whole
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.effects import all_effects
 
-LEAST_UNITS = 3
-"""Robots below which a spread between them cannot be told from chance."""
+LEAST_UNITS = 3  # robots below which a spread between them cannot be told from chance
 SPREADS = 200
 RATIO = 1.92
 """Fall of the logarithm of the chance, from the best spread to none, that chance alone makes in one of twenty."""
-WIDEST = 5.0
-"""Largest spread that is tried, over what the answers and their intervals span."""
+WIDEST = 5.0  # largest spread that is tried, over what the answers and their intervals span
 _SIGMAS = 2.0 * 1.96
 
 
 @dataclass(frozen=True, slots=True)
 class Varied:
-    """One number over the robots.
-
-    Attributes:
-        units: robots that it was looked for on; none where it only shapes an effect.
-        deviations: of their values from the mean, over the spread of the values, (units,).
-        means: draws of the mean, (n,).
-        spreads: draws of the one-sigma between robots, (n,).
-        varies: robots without any spread would give such answers in one of twenty fleets or fewer.
-    """
+    """One number over the robots."""
 
     joint: str
     effect: str
     parameter: str
-    units: tuple[str, ...]
-    deviations: Array
-    means: Array
-    spreads: Array
-    varies: bool
+    units: tuple[str, ...]  # robots that it was looked for on; none where it only shapes an effect
+    deviations: Array  # of their values from the mean, over the spread of the values, (units,)
+    means: Array  # draws of the mean, (n,)
+    spreads: Array  # draws of the one-sigma between robots, (n,)
+    varies: bool  # robots without any spread would give such answers in one of twenty fleets or fewer
 
     def told(self) -> dict[str, Any]:
         """For a result: the mean, how unsure it is, and what varies between robots, with its 95 % interval."""

@@ -57,51 +57,36 @@ VERB = "gap-record"
 
 @dataclass(frozen=True, slots=True)
 class GapRecordOptions:
-    """What a person asked for, see ``frictid-hil gap record --help``.
-
-    Attributes:
-        plan: plan file of a diagnosis that could not decide; overrules ``short``.
-        experiments: names of experiments; overrule ``plan``.
-        payload: a person is there to mount the payload when asked; None: on a simulated robot only, which mounts its
-            own.
-        centre_rad: middle of all travels; None: middle of the joint's procedure.
-        seed: of simulated noise and of the validation moves.
-        out: folder of the set; what a plan file asks for is added to the set of the same joint that is there.
-    """
+    """What a person asked for, see ``frictid-hil gap record --help``."""
 
     robot: str = ""
     joint: str = ""
     bus: str | None = None
     short: bool = False
-    plan: Path | None = None
-    experiments: tuple[str, ...] = ()
+    plan: Path | None = None  # plan file of a diagnosis that could not decide; overrules ``short``
+    experiments: tuple[str, ...] = ()  # names of experiments; overrule ``plan``
     profile: Path | None = None
+    # A person is there to mount the payload when asked; None: on a simulated robot only, which mounts its own.
     payload: bool | None = None
-    centre_rad: float | None = None
+    centre_rad: float | None = None  # middle of all travels; None: middle of the joint's procedure
     realtime: bool = False
-    seed: int = 0
+    seed: int = 0  # of simulated noise and of the validation moves
+    # Folder of the set; what a plan file asks for is added to the set of the same joint that is there.
     out: Path | None = None
     resume: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The result of a recording.
-
-    Attributes:
-        place: folder of the set; None where no experiment was finished.
-        experiments: in the set, in the order in which they ran; ``duration_s`` is theirs.
-        skipped: experiments left out, each with its reason.
-        belief: where the belief of the simulator comes from.
-    """
+    """The result of a recording."""
 
     ended: Ended
     joint: str
-    place: Path | None
-    experiments: tuple[str, ...]
-    skipped: Mapping[str, str]
+    place: Path | None  # folder of the set; None where no experiment was finished
+    experiments: tuple[str, ...]  # in the set, in the order in which they ran; ``duration_s`` is theirs
+    skipped: Mapping[str, str]  # experiments left out, each with its reason
     duration_s: float
-    belief: tuple[str, ...]
+    belief: tuple[str, ...]  # where the belief of the simulator comes from
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the verb."""
@@ -300,8 +285,7 @@ class _Recording:
         self._watcher = watcher
         self._session = 0
         self._driver: Driver | None = None
-        self._unloaded = ""
-        """Why no recording with the payload was made although it was planned."""
+        self._unloaded = ""  # why no recording with the payload was made although it was planned
         if options.resume is not None and not move and not options.robot:
             options = replace(options, robot=str(options.resume / "config.yaml"))
         options = restored(options, (VERB,))
@@ -343,11 +327,7 @@ class _Recording:
         )
 
     def everything(self, run: Run) -> FrictidError | None:
-        """Run all plans; returns what ended them early.
-
-        Raises:
-            FrictidError: before anything could move.
-        """
+        """Run all plans; returns what ended them early (``FrictidError``: before anything could move)."""
         self._run, plans = run, self._plans
         if not plans:
             run.reopen()
@@ -460,8 +440,7 @@ def _cut(samples: Samples, experiments: Sequence[Experiment]) -> dict[str, Sampl
 
 FIRST = ("triangle_slow", "chirp", "sines_repeat")
 """Experiments to begin with: slow and fast, and one that nothing is fitted to."""
-DECIDED = 0.95
-"""Chance of the first cause from which nothing more is recorded."""
+DECIDED = 0.95  # chance of the first cause from which nothing more is recorded
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,8 +30,7 @@ from frictid_hil.report.calibration import calibration_page
 from frictid_hil.report.pages import Page, write_page
 from frictid_hil.runs.folder import load_manifest
 
-_MOST_PAGES = 50
-"""Recordings of one call that get a page each; a page holds its own plotting library, a megabyte."""
+_MOST_PAGES = 50  # recordings of one call that get a page each; a page holds its own plotting library, a megabyte
 
 
 @dataclass(frozen=True, slots=True)

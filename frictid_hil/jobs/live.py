@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from frictid_hil.jobs.foxglove import FoxgloveServer
 
 DEFAULT_ADDRESS = "127.0.0.1:8765"
-LIVE_HZ = 100.0
-"""Messages a joint and second of run time; the recording has every sample."""
-_MOST_TOLD = 10
-"""Refused origins that a person hears of."""
+LIVE_HZ = 100.0  # messages a joint and second of run time; the recording has every sample
+_MOST_TOLD = 10  # refused origins that a person hears of
 
 _COLUMNS = (
     "position_rad",

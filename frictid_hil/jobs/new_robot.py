@@ -17,20 +17,14 @@ from frictid_hil.protocol.driver import kind_of, new_driver
 
 @dataclass(frozen=True, slots=True)
 class JointAnswers:
-    """What a person says of one joint, joint side; gear and rated torque are None where the drive shall say.
-
-    Attributes:
-        address: node, axis or id, as the driver calls it.
-        travel_rad: lowest and highest position.
-        gear_ratio: motor revolutions per joint revolution.
-    """
+    """What a person says of one joint, joint side; gear and rated torque are None where the drive shall say."""
 
     name: str
-    address: int
-    travel_rad: tuple[float, float]
+    address: int  # node, axis or id, as the driver calls it
+    travel_rad: tuple[float, float]  # lowest and highest position
     max_velocity_rad_s: float
     max_torque_nm: float
-    gear_ratio: float | None = None
+    gear_ratio: float | None = None  # motor revolutions per joint revolution
     rated_torque_nm: float | None = None
 
 

@@ -33,8 +33,7 @@ from frictid_hil.plan.plan import (
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.runner.care import Care
 
-APPROACH_RAD_S = math.radians(20.0)
-"""Speed of moves between the locked position and the start, and of the rehearsal."""
+APPROACH_RAD_S = math.radians(20.0)  # speed of moves between the locked position and the start, and of the rehearsal
 
 _LIMITS = ("position_min_rad", "position_max_rad", "max_velocity_rad_s", "max_torque_nm")
 _REVERSAL_TRAVEL_RAD = 6e-3

@@ -113,11 +113,7 @@ def promote(
 
 
 def rollback(robot: str, *, store: Path | None = None, reason: str = "") -> dict[str, Any]:
-    """Make the profile active again that was so before the present one.
-
-    Raises:
-        UsageError: there is none before.
-    """
+    """Make the profile active again that was so before the present one (``UsageError``: there is none before)."""
     kept = ProfileStore(store)
     before = kept.active(robot)
     line = kept.rollback(robot, by=_person(), reason=reason)
@@ -223,8 +219,7 @@ def _person() -> str:
         return "unknown"
 
 
-POINTS = 20
-"""Rows of a drive's friction table: ten speeds each way."""
+POINTS = 20  # rows of a drive's friction table: ten speeds each way
 
 
 def export(profile: Path, target: str, out: Path, *, force: bool = False) -> dict[str, Any]:

@@ -40,8 +40,7 @@ from frictid_hil.runner.stop_signals import handling_signals
 VERB = "recalibrate"
 _JOURNAL = ("outcome", "coulomb_nm", "duration_s", "rate_hz", "late_cycles", "missed_cycles", "remarks")
 """What is told of each joint in the morning."""
-DRIFTED = 6
-"""Exit code of a good night on which a joint drifted, where the policy wants an alarm for that."""
+DRIFTED = 6  # exit code of a good night on which a joint drifted, where the policy wants an alarm for that
 
 _UNTOLD = "see the run folder and `frictid-hil check`, then start it again with a person present"
 """What to do next where nothing better is known: whoever reads it in the morning is never left without."""

@@ -33,13 +33,7 @@ from frictid_hil.recording.samples import Samples
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
-    """What a person asked for, see ``frictid-hil replay --help``.
-
-    Attributes:
-        procedure: of a log that carries no marks.
-        method: estimator; None for the one of the profile compared with, else ``aligned``.
-        paced: at recorded speed.
-    """
+    """What a person asked for, see ``frictid-hil replay --help``."""
 
     source: Path
     robot: str
@@ -47,9 +41,9 @@ class ReplayOptions:
     frames: Path | None = None
     eds: Path | None = None
     profile: Path | None = None
-    procedure: Procedure | None = None
-    method: str | None = None
-    paced: bool = False
+    procedure: Procedure | None = None  # of a log that carries no marks
+    method: str | None = None  # estimator; None for the one of the profile compared with, else ``aligned``
+    paced: bool = False  # at recorded speed
     echo: str | None = None
     simulation: bool = True
     out: Path | None = None

@@ -21,8 +21,7 @@ from frictid_hil.report.index import index_page
 from frictid_hil.report.pages import Page, write_page
 from frictid_hil.runs.folder import load_manifest
 
-NIGHT_PAGE = "recalibration.html"
-"""In the run folder of a recalibration."""
+NIGHT_PAGE = "recalibration.html"  # in the run folder of a recalibration
 
 
 def report(
@@ -88,11 +87,7 @@ def write_run_page(run: Path, profile: FrictionProfile, manifest: dict[str, Any]
 
 
 def write_index_page(store: ProfileStore, robot: str) -> Path:
-    """The index page of a robot, in its folder of the store.
-
-    Raises:
-        UsageError: nothing is known of such a robot.
-    """
+    """The index page of a robot, in its folder of the store (``UsageError``: nothing is known of such a robot)."""
     path = store.root / robot / "index.html"
     folder = path.parent.resolve()
     page = page_of(store, robot, lambda run: Path(os.path.relpath(run / NIGHT_PAGE, folder)).as_posix())

@@ -33,22 +33,16 @@ _VERIFY_TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class ScheduleOptions:
-    """What a person asked for, see ``frictid-hil schedule --help``.
-
-    Attributes:
-        user: account of a system service.
-        out: folder for the units; None for systemd's own.
-        time_limit_s: a night that takes longer is stopped as by Ctrl-C.
-    """
+    """What a person asked for, see ``frictid-hil schedule --help``."""
 
     robot: str
     on_calendar: str
     bus: str | None = None
     system: bool = False
-    user: str = "frictid"
+    user: str = "frictid"  # account of a system service
     notify: str | None = None
-    out: Path | None = None
-    time_limit_s: float = 4 * 3600.0
+    out: Path | None = None  # folder for the units; None for systemd's own
+    time_limit_s: float = 4 * 3600.0  # a night that takes longer is stopped as by Ctrl-C
 
 
 def schedule(options: ScheduleOptions) -> dict[str, Any]:

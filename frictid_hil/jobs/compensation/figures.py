@@ -24,66 +24,44 @@ from frictid_hil.recording.samples import Mark, Samples
 DOMINATED_PERCENT = 85.0
 """Friction dominates a tracking error where giving it back exactly would take away this much of it."""
 
-_WIDTH_S = 0.004
-"""Of the smoothing that is common to acceleration and torque: half power at 33 Hz."""
+_WIDTH_S = 0.004  # of the smoothing that is common to acceleration and torque: half power at 33 Hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeRun:
-    """The samples of one mode: its whole cycles without the first one; columns of shape (n,).
-
-    Attributes:
-        time_s: since the beginning of the task.
-        reference_rad: the path.
-        external_torque_nm: a person's; None without a force sensor.
-        velocity_delay_s: by which the reported velocity is older than its row.
-        cycles: of the task, each a repetition of the others.
-    """
+    """The samples of one mode: its whole cycles without the first one; columns of shape (n,)."""
 
     mode: str
-    time_s: Array
+    time_s: Array  # since the beginning of the task
     position_rad: Array
     velocity_rad_s: Array
-    reference_rad: Array
+    reference_rad: Array  # the path
     torque_nm: Array
-    external_torque_nm: Array | None
-    velocity_delay_s: float = 0.0
-    cycles: int = 1
+    external_torque_nm: Array | None  # a person's; None without a force sensor
+    velocity_delay_s: float = 0.0  # by which the reported velocity is older than its row
+    cycles: int = 1  # of the task, each a repetition of the others
 
 
 @dataclass(frozen=True, slots=True)
 class ModeFigures:
-    """The figures of one mode. A figure that cannot be formed is None, and ``reasons`` says why.
+    """The figures of one mode. A figure that cannot be formed is None, and ``reasons`` says why."""
 
-    Attributes:
-        velocity_rms_rad_s: V_s of (25).
-        torque_rms_nm: F_s of (25).
-        torque_rms_inertia_removed_nm: of hand torque minus inertia times acceleration.
-        reduction_percent: of the task's own measure against nc: F_s for ``hand``, E_s for ``track``.
-        reduction_inertia_removed_percent: of the one with inertia removed.
-        tracking_rms_rad: E_s of (28).
-        ceiling_percent: reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without
-            any friction that moves as this one did. ``track``: of an ideal joint (``tracking_floor_rad``).
-        inertial_rms_nm: of inertia times acceleration.
-        velocity_error_rms_rad_s: of the path's speed less the measured one; None by hand.
-        interval_95: of the task's own measure, from cycle to cycle; None where there is one cycle.
-        reduction_interval_95_percent: of its reduction.
-        reasons: by figure.
-    """
-
-    velocity_rms_rad_s: float
-    torque_rms_nm: float | None = None
-    torque_rms_inertia_removed_nm: float | None = None
-    reduction_percent: float | None = None
-    reduction_inertia_removed_percent: float | None = None
-    tracking_rms_rad: float | None = None
+    velocity_rms_rad_s: float  # V_s of (25)
+    torque_rms_nm: float | None = None  # F_s of (25)
+    torque_rms_inertia_removed_nm: float | None = None  # of hand torque minus inertia times acceleration
+    reduction_percent: float | None = None  # of the task's own measure against nc: F_s for ``hand``, E_s for ``track``
+    reduction_inertia_removed_percent: float | None = None  # of the one with inertia removed
+    tracking_rms_rad: float | None = None  # E_s of (28)
+    # Reduction that inertia leaves room for. ``hand``: raw reduction against nc of a joint without any friction that
+    # moves as this one did. ``track``: of an ideal joint (``tracking_floor_rad``).
     ceiling_percent: float | None = None
-    inertial_rms_nm: float | None = None
-    velocity_error_rms_rad_s: float | None = None
+    inertial_rms_nm: float | None = None  # of inertia times acceleration
+    velocity_error_rms_rad_s: float | None = None  # of the path's speed less the measured one; None by hand
     drive_torque_rms_nm: float | None = None
+    # Of the task's own measure, from cycle to cycle; None where there is one cycle.
     interval_95: tuple[float, float] | None = None
-    reduction_interval_95_percent: tuple[float, float] | None = None
-    reasons: Mapping[str, str] = field(default_factory=dict)
+    reduction_interval_95_percent: tuple[float, float] | None = None  # of its reduction
+    reasons: Mapping[str, str] = field(default_factory=dict)  # by figure
 
     def values(self) -> dict[str, object]:
         """The figures as plain values for JSON."""
@@ -240,8 +218,7 @@ def _reduction(value: float | None, base: float | None) -> float | None:
 
 
 _STEP_S = 2e-4
-_AT_ONCE_NM_PER_RAD = 1e7
-"""A spring that slips at once."""
+_AT_ONCE_NM_PER_RAD = 1e7  # a spring that slips at once
 
 
 def tracking_floor_rad(

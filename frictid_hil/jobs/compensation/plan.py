@@ -165,36 +165,28 @@ def _needed(figure: Estimate, what: str, where: str) -> float:
 _HAND_SLACK_RAD = math.radians(8.0)
 _STAND_SLACK_RAD = math.radians(1.0)
 _STAND_RAD_S = math.radians(5.0)
-_TOLD_SHARE = 0.999
-"""The plan says that R falls where it falls below this share of its full value."""
+_TOLD_SHARE = 0.999  # the plan says that R falls where it falls below this share of its full value
 _WITHSTANDS_SHARE = 3.0
 """A joint stands from -F_0 to F_0; static friction may be half as large again. Of F_0, from end to end."""
-_POWER_SHARE = 0.8
-"""Of the product of the bounds of torque and speed."""
+_POWER_SHARE = 0.8  # of the product of the bounds of torque and speed
 _STAND_S, _REST_S, _PAUSE_S = 0.5, 0.5, 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A compensation of a joint, decided before a bus is opened: its plan, and the laws by mode that it was made from.
-
-    Attributes:
-        entry: the joint's in the profile.
-        lowest_ratio: R where gravity is known least, within the task's travel; None without compensation.
-        warnings: what speaks against it and is done all the same.
-    """
+    """A compensation of a joint, decided before a bus is opened: its plan, and the laws by mode that made it."""
 
     robot: Robot
     setup: RobotSetup
     joint: str
     profile: Path
-    entry: JointProfile
+    entry: JointProfile  # the joint's in the profile
     wanted: Wanted
     plan: Plan
     centre_rad: float
     laws: Mapping[str, ControlLaw]
-    lowest_ratio: float | None
-    warnings: tuple[str, ...]
+    lowest_ratio: float | None  # R where gravity is known least, within the task's travel; None without compensation
+    warnings: tuple[str, ...]  # what speaks against it and is done all the same
 
 
 def compensation_plan(

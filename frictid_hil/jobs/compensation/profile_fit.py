@@ -15,8 +15,7 @@ from frictid_hil.errors import ProfileMismatch
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.protocol.driver import JointIdentity
 
-_EQUAL = 0.01
-"""Rated torque and gear ratio agree within this share."""
+_EQUAL = 0.01  # rated torque and gear ratio agree within this share
 
 
 def doubts_of_file(profile: FrictionProfile, joint: JointSetup, robot: str, policy: Policy) -> list[str]:
@@ -68,11 +67,7 @@ def doubts_of_drive(entry: JointProfile, identity: JointIdentity) -> list[str]:
 
 
 def refuse(doubts: list[str], joint: str) -> None:
-    """Refuse a profile, with all doubts in one error.
-
-    Raises:
-        ProfileMismatch: where there is one.
-    """
+    """Refuse a profile, with all doubts in one error (``ProfileMismatch``: where there is one)."""
     if doubts:
         raise ProfileMismatch(
             "; ".join(doubts),

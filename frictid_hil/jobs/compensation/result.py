@@ -29,8 +29,7 @@ from frictid_hil.report.words import plain
 from frictid_hil.runner.events import JointRun
 from frictid_hil.runs.life import Ended, Run
 
-_LATE_PERCENT = 50.0
-"""Of the tracking error, from which on the lag of a drive's own loop is told."""
+_LATE_PERCENT = 50.0  # of the tracking error, from which on the lag of a drive's own loop is told
 
 
 @dataclass(slots=True)

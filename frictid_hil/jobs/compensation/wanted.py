@@ -20,36 +20,23 @@ TRACK_AMPLITUDE_RAD = math.radians(10.0)
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What a person asks for, see ``frictid-hil compensate --help``.
-
-    Attributes:
-        ratio: R instead of the setting's; so K and B_c after it.
-        speed_rad_s: of the triangle; of the hand at the middle of its travel.
-        duration_s: of one mode; 0 until interrupted.
-        drive_mode: TORQUE, or POSITION or VELOCITY with the torque as offset.
-        force: doubts only warn.
-        simulated: the robot is, and the paper's K may then hunt; ``completed`` fills it in.
-    """
+    """What a person asks for, see ``frictid-hil compensate --help``."""
 
     task: str
     modes: tuple[str, ...] = ()
     setting: str = "ours"
-    ratio: float | None = None
+    ratio: float | None = None  # R instead of the setting's; so K and B_c after it
     stiffness_nm_per_rad: float | None = None
     viscous_nm_s_per_rad: float | None = None
-    speed_rad_s: float | None = None
-    duration_s: float = 10.0
+    speed_rad_s: float | None = None  # of the triangle; of the hand at the middle of its travel
+    duration_s: float = 10.0  # of one mode; 0 until interrupted
     centre_rad: float | None = None
-    drive_mode: Mode = Mode.TORQUE
-    force: bool = False
-    simulated: bool = False
+    drive_mode: Mode = Mode.TORQUE  # TORQUE, or POSITION or VELOCITY with the torque as offset
+    force: bool = False  # doubts only warn
+    simulated: bool = False  # the robot is, and the paper's K may then hunt; ``completed`` fills it in
 
     def completed(self, *, simulated: bool) -> Wanted:
-        """With what follows from the robot and from what was left out.
-
-        Raises:
-            UsageError: a negative duration.
-        """
+        """With what follows from the robot and from what was left out (``UsageError``: a negative duration)."""
         if self.duration_s < 0.0:
             raise UsageError("the duration must not be negative")
         modes = self.modes or MODES
@@ -87,11 +74,7 @@ class Wanted:
 
 
 def refuse_contradictions(wanted: Wanted) -> None:
-    """Refuse options that contradict each other.
-
-    Raises:
-        UsageError: naming them.
-    """
+    """Refuse options that contradict each other (``UsageError``: naming them)."""
     for value, known, what in (
         (wanted.task, TASKS, "task"),
         (wanted.setting, SETTINGS, "setting"),

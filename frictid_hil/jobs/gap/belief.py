@@ -16,8 +16,7 @@ from frictid_hil.gap.tolerances import stated_by
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.simulation.joint import CoulombViscous, JointModel
 
-SIMULATED_CONTROL_HZ = 1000
-"""Rate of the position loop inside a simulated drive."""
+SIMULATED_CONTROL_HZ = 1000  # rate of the position loop inside a simulated drive
 _PLAIN = ("inertia_kg_m2", "motor_inertia_share", "gravity_cos_nm", "gravity_sin_nm", "gear_ratio")
 """Keys of ``joint`` that the simulated joint has under the same names."""
 

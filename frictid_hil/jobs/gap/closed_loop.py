@@ -17,12 +17,9 @@ from frictid_hil.simulation.model_edit import compiled_with
 from frictid_hil.simulation.model_replay import replayed, why_not_replayed
 from frictid_hil.simulation.native import Native
 
-SHOWN_S = 20.0
-"""Length of the withheld motion that a page shows."""
-CUTOFF_HZ = 20.0
-"""Low-pass of torques that are compared with measured ones."""
-LEAST_PARTS = 4
-"""Parts of a motion, at least, from which an interval is formed."""
+SHOWN_S = 20.0  # length of the withheld motion that a page shows
+CUTOFF_HZ = 20.0  # low-pass of torques that are compared with measured ones
+LEAST_PARTS = 4  # parts of a motion, at least, from which an interval is formed
 
 
 def withheld(arm: ArmSet) -> list[Motion]:

@@ -17,16 +17,12 @@ from frictid_hil.friction.trajectory import Array
 from frictid_hil.gap.experiment_set import Experiment, ExperimentSet
 from frictid_hil.gap.residuals import LowPass, slip_state, uniform
 
-SLIP_RAD = 2e-4
-"""Travel in which the slip spring yields, and friction builds up, where nobody measured it."""
-SPEEDS = 8
-"""Points of the drafted friction curve."""
+SLIP_RAD = 2e-4  # travel in which the slip spring yields, and friction builds up, where nobody measured it
+SPEEDS = 8  # points of the drafted friction curve
 SHORT_RAD = 0.3
 """Travel below which gravity's shape over the position is not told from a constant; so too of a linear axis."""
-LEAST_LEVEL = 2e-3
-"""Friction level written at least, over the viscous torque at top speed: four digits still hold it."""
-LEAST_TOLERANCE = 0.005
-"""No number of a least-squares draft is worth more than this share."""
+LEAST_LEVEL = 2e-3  # friction level written at least, over the viscous torque at top speed: four digits still hold it
+LEAST_TOLERANCE = 0.005  # no number of a least-squares draft is worth more than this share
 LARGEST_TOLERANCE = 0.5
 """A number less certain than this share of itself is next to unknown; more would say it may have any sign."""
 

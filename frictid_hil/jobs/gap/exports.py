@@ -38,14 +38,11 @@ from frictid_hil.simulation.target_laws import Law, c_compiler, laws_of, run_c
 from frictid_hil.simulation.targets import LOST, TARGETS, Numbers, numbers_of, place_of, written_as
 from frictid_hil.simulation.usd import prim_name
 
-LAW_S = 30.0
-"""Length of the withheld motion along which laws are evaluated."""
-ENGINE_S = 2.0
-"""Length of the withheld motion that runs in Newton."""
+LAW_S = 30.0  # length of the withheld motion along which laws are evaluated
+ENGINE_S = 2.0  # length of the withheld motion that runs in Newton
 SLOW_FROM_S, SLOW_S = 2.0, 0.5
 """Start and length of its part that runs in engines that need ten milliseconds for a step of one."""
-EDGE_S = 0.25
-"""Both ends of a motion, where a low-pass is not yet itself."""
+EDGE_S = 0.25  # both ends of a motion, where a low-pass is not yet itself
 _PERCENT = ("before_percent", "after_percent")
 _ITSELF = "our own evaluation of the file, not run there"
 
@@ -206,8 +203,7 @@ def _travel(arm: ArmSet, name: str) -> float:
     return believed.dry_nm / stiffness if stiffness and believed.dry_nm > 0.0 else SLIP_RAD
 
 
-_SIGMAS = 2.0 * 1.96
-"""Standard deviations in a 95 % interval."""
+_SIGMAS = 2.0 * 1.96  # standard deviations in a 95 % interval
 
 
 @dataclass(frozen=True, slots=True)

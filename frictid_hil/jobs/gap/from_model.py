@@ -27,14 +27,11 @@ from frictid_hil.jobs.gap.logs import listed_as, names_of, parted, samples_of_al
 from frictid_hil.recording.samples import Samples
 from frictid_hil.simulation.robot_model import ModelJoint, RobotModel
 
-ALONE = 0.01
-"""Rest of the rigid-body torque, over its RMS, up to which an inertia and a gravity are all there is."""
+ALONE = 0.01  # rest of the rigid-body torque, over its RMS, up to which an inertia and a gravity are all there is
 POSTURE_MATTERS = 0.02
 """Change of a joint's torque with the place of a joint that no log has, over its RMS, from which the place is asked."""
-CURVE_POINTS = 12
-"""Pairs by which a friction formula of a file is told."""
-LEAST_DRY = 1e-3
-"""Dry friction below this share of the torque is none: nothing was believed of it."""
+CURVE_POINTS = 12  # pairs by which a friction formula of a file is told
+LEAST_DRY = 1e-3  # dry friction below this share of the torque is none: nothing was believed of it
 INERTIA_POSTURES = 40
 
 
@@ -60,19 +57,13 @@ class ModelLogs:
 
 @dataclass(frozen=True, slots=True)
 class JointSet:
-    """One joint, ready to be diagnosed.
-
-    Attributes:
-        document: the same belief as a ``nominal.yaml`` would say it.
-        drafted: numbers taken from the logs because the file has none, by name.
-        asked: what nobody said, with what it costs and how to say it.
-    """
+    """One joint, ready to be diagnosed."""
 
     believed: ModelJoint
     experiments: ExperimentSet
-    document: Mapping[str, Any]
-    drafted: Mapping[str, Any]
-    asked: tuple[str, ...]
+    document: Mapping[str, Any]  # the same belief as a ``nominal.yaml`` would say it
+    drafted: Mapping[str, Any]  # numbers taken from the logs because the file has none, by name
+    asked: tuple[str, ...]  # what nobody said, with what it costs and how to say it
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,21 +104,15 @@ def postures(motions: Sequence[Motion], most: int) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class ArmSet:
-    """The whole arm: its model, its motions, one set a joint.
-
-    Attributes:
-        held: where the joints stand that no recording has.
-        joints: by name; only those that move.
-        found: of the arm as a whole; None where no log has torques of all joints, or there is only one joint.
-        still: joints of the logs that stand in all of them.
-    """
+    """The whole arm: its model, its motions, one set a joint."""
 
     robot: RobotModel
     motions: tuple[Motion, ...]
-    held: Mapping[str, float]
-    joints: Mapping[str, JointSet]
+    held: Mapping[str, float]  # where the joints stand that no recording has
+    joints: Mapping[str, JointSet]  # by name; only those that move
+    # Of the arm as a whole; None where no log has torques of all joints, or there is only one joint.
     found: ArmFindings | None = None
-    still: tuple[str, ...] = ()
+    still: tuple[str, ...] = ()  # joints of the logs that stand in all of them
 
     @property
     def recorded(self) -> tuple[str, ...]:

@@ -27,8 +27,7 @@ from frictid_hil.recording.csv import write_csv
 from frictid_hil.recording.read import read
 from frictid_hil.recording.samples import Samples
 
-VALIDATION_SHARE = 1.0 / 3.0
-"""Part of the recorded time, its end, that is judged on where nobody says what to judge on."""
+VALIDATION_SHARE = 1.0 / 3.0  # part of the recorded time, its end, that is judged on where nobody says what to judge on
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +36,15 @@ class Source:
 
     Roles of such recordings come from ``validation``, else from what ``nominal`` says of logs of the same name, else
     from time: the last log, or the last third of a single one, is judged on.
-
-    Attributes:
-        nominal: what the simulator believes; a set's own ``nominal.yaml`` unless told. It need not list the logs.
-        profile: friction profile or run folder, whose numbers overrule it.
-        validation: names of logs (file names without ending) to judge on; ``split`` see ``parted``.
     """
 
     paths: Sequence[Path]
     columns: str | None = None
+    # What the simulator believes; a set's own ``nominal.yaml`` unless told. It need not list the logs.
     nominal: Path | None = None
-    profile: Path | None = None
+    profile: Path | None = None  # friction profile or run folder, whose numbers overrule it
     joint: str | None = None
-    validation: Sequence[str] = ()
+    validation: Sequence[str] = ()  # names of logs (file names without ending) to judge on; ``split`` see ``parted``
     split: str = ""
 
     def load(self) -> ExperimentSet:
@@ -196,11 +191,7 @@ def _samples(path: Path, columns: str | None, joint: str | None) -> Samples:
 
 
 def samples_of_all(path: Path, columns: ColumnMap | None, joint: str | None = None) -> list[Samples]:
-    """Every joint of a recording, or the one.
-
-    Raises:
-        InputFileError: unusable, or without a joint.
-    """
+    """Every joint of a recording, or the one (``InputFileError``: unusable, or without a joint)."""
     found = read(path, columns, joint)
     if not found:
         raise InputFileError("no joint in this recording", where=str(path))

@@ -25,8 +25,7 @@ from frictid_hil.simulation.model_edit import changed_elsewhere, compiled_with, 
 from frictid_hil.simulation.native import FORMS, FRICTION, Native, Use, native_elements
 from frictid_hil.simulation.native_check import in_posture, torque_difference
 
-CHECKED_S = 10.0
-"""Length of the withheld motion along which an export is compared with our own simulation."""
+CHECKED_S = 10.0  # length of the withheld motion along which an export is compared with our own simulation
 _FRICTIONLESS = FrictionCurve.through(np.array([1.0, 2.0]), np.array([1e-9, 1e-9]))
 
 

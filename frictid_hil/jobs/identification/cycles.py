@@ -19,12 +19,10 @@ from frictid_hil.plan.plan import COUPLING
 from frictid_hil.plan.setup import JointSetup
 from frictid_hil.recording.samples import Mark, Nanoseconds, Samples
 
-_GAP_STEPS = 1.5
-"""Between two samples, in sample periods: a longer one is a gap."""
+_GAP_STEPS = 1.5  # between two samples, in sample periods: a longer one is a gap
 STOPS = "stops_ns"
 """Detail of a mark: the stops during it, each with the run time of the first deadline missed and how long it took."""
-_LONG_STEPS = 2.5
-"""A gap of one lost report is bridged as well as it was measured."""
+_LONG_STEPS = 2.5  # a gap of one lost report is bridged as well as it was measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,16 +33,11 @@ class PathTime:
     with the next one, and the cycles lie later in the recording than (1) says. The loop notes where it stopped, in the
     marks of the recording. Where nobody noted it, gaps in the samples tell; lost reports look alike, and the commanded
     positions tell the two apart.
-
-    Attributes:
-        after_ns: run time of every stop; samples up to it came before. Shape (k,).
-        stopped_ns: how long the path stood still there, shape (k,).
-        start_ns: start of cycle 1, at which both times agree.
     """
 
-    after_ns: Nanoseconds
-    stopped_ns: Nanoseconds
-    start_ns: int
+    after_ns: Nanoseconds  # run time of every stop; samples up to it came before. Shape (k,).
+    stopped_ns: Nanoseconds  # how long the path stood still there, shape (k,)
+    start_ns: int  # start of cycle 1, at which both times agree
 
     def of(self, time_ns: Nanoseconds) -> Nanoseconds:
         """Path time; a moment during a stop is its end. Shape as given."""

@@ -13,8 +13,7 @@ from typing import TypeVar
 
 from frictid_hil.errors import FrictidError, HardwareError, UsageError
 
-SERIAL_UP_TO = 3
-"""Unless told, so few tasks are not worth a process."""
+SERIAL_UP_TO = 3  # unless told, so few tasks are not worth a process
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")

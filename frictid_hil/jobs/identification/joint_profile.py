@@ -299,8 +299,7 @@ def _drive(meta: Mapping[str, Any]) -> DriveIdentity:
     )
 
 
-_Presliding = tuple[Figure, Figure, Literal["at once", "gradually", "unseen"]]
-"""Stiffness, level, and how it yields."""
+_Presliding = tuple[Figure, Figure, Literal["at once", "gradually", "unseen"]]  # stiffness, level, and how it yields
 
 
 def _presliding(samples: Samples, recording: CycleRecording, body: RigidBody | None, coulomb_nm: float) -> _Presliding:

@@ -16,24 +16,18 @@ from frictid_hil.units import degrees, format_angle, format_velocity
 
 _TOP = 115.0
 """Peak speed of the paper, deg/s, for which the speeds of the short programmes were chosen; they scale with V."""
-_AMPLITUDE, _CYCLES, _RATE_HZ = 20.0, 10, 1000.0
-"""With which the errors below were measured; A in degrees."""
+_AMPLITUDE, _CYCLES, _RATE_HZ = 20.0, 10, 1000.0  # with which the errors below were measured; A in degrees
 
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """A choice of speeds and of the estimator that goes with them.
-
-    Attributes:
-        shares: peak speeds as shares of V; empty for the N equally spaced ones of the robot file.
-        method: estimator unless one is asked for.
-        error_percent: error over the curve's measured range, worst joint and seed of the simulated hp3j, rigid or
-            flexible (A = 20 deg, V = 115 deg/s, 1 kHz), as ``benchmarks/programmes.py`` prints it.
-    """
+    """A choice of speeds and of the estimator that goes with them."""
 
     name: str
-    shares: tuple[float, ...]
-    method: str
+    shares: tuple[float, ...]  # peak speeds as shares of V; empty for the N equally spaced ones of the robot file
+    method: str  # estimator unless one is asked for
+    # Error over the curve's measured range, worst joint and seed of the simulated hp3j, rigid or flexible (A = 20 deg,
+    # V = 115 deg/s, 1 kHz), as ``benchmarks/programmes.py`` prints it.
     error_percent: float
 
     def note(self, procedure: Procedure, rate_hz: float, quantum_s: float = 0.0) -> str:
@@ -71,11 +65,7 @@ PROGRAMMES = {
 
 
 def programme(name: str) -> Programme:
-    """The programme of that name.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """The programme of that name (``UsageError``: there is none)."""
     if name not in PROGRAMMES:
         raise UsageError(f"no programme {name!r}; there are {', '.join(PROGRAMMES)}")
     return PROGRAMMES[name]

@@ -14,19 +14,15 @@ from frictid_hil.plan.plan import SKEW, Shake
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.recording.samples import Mark, Samples
 
-_DURATION_S = 2.0
-"""Of each of the four motions."""
+_DURATION_S = 2.0  # of each of the four motions
 _SLOW_HZ, _FAST_HZ = 4.0, 8.0
 """Of the shaking: in proportion to their squares delay shows; a link of 25 Hz must not resonate with them."""
-_SWEEP = 0.5
-"""Peak speed of the slow motion as a share of V: friction is then far from its rise towards standstill."""
-_SHAKE = 0.7
-"""Speed of the shaking as a share of the slow motion's, so that it never reverses it."""
+_SWEEP = 0.5  # peak speed of the slow motion as a share of V: friction is then far from its rise towards standstill
+_SHAKE = 0.7  # speed of the shaking as a share of the slow motion's, so that it never reverses it
 _ACCELERATION = 0.75
 """Of the shaking at most, as a share of what the fastest cycle takes; a quarter of that is the slow motion's."""
 _LEAST_RATE_HZ = 200.0
-_WIDE = 0.01
-"""Of the friction: an interval that is narrower needs nothing."""
+_WIDE = 0.01  # of the friction: an interval that is narrower needs nothing
 
 
 def shaking(start_rad: float, procedure: Procedure) -> list[Shake]:
