@@ -84,18 +84,19 @@ class Illustration:
     curves: tuple[tuple[str, Array, Array], ...]  # equal-length arrays of shape (k,) each
 
     @staticmethod
-    def over(x_label: str, x: Array, y_label: str, curves: Mapping[str, Array]) -> Illustration:
-        """Curves by label over one x."""
-        return Illustration(x_label, y_label, tuple((label, x, y) for label, y in curves.items()))
+    def over(x_label: str, x: Array, y_label: str, curves: Mapping[str, Callable[[Array], Array]]) -> Illustration:
+        """Curves over one x, each the function of it that stands by its label."""
+        return Illustration(x_label, y_label, tuple((label, x, curve(x)) for label, curve in curves.items()))
 
     @staticmethod
     def lagging_step(time_constant_s: float, y_label: str, true: str, lagging: str) -> Illustration:
         """A step and its first-order lag, under the names given."""
         constant = max(time_constant_s, 1e-5)
-        time = np.linspace(-1.0, 5.0, 601) * constant
-        step = np.where(time >= 0.0, 1.0, 0.0)
-        late = np.where(time >= 0.0, 1.0 - np.exp(-np.maximum(time, 0.0) / constant), 0.0)
-        return Illustration.over("time (s)", time, y_label, {true: step, lagging: late})
+        curves: dict[str, Callable[[Array], Array]] = {
+            true: lambda t: np.where(t >= 0.0, 1.0, 0.0),
+            lagging: lambda t: np.where(t >= 0.0, 1.0 - np.exp(-np.maximum(t, 0.0) / constant), 0.0),
+        }
+        return Illustration.over("time (s)", np.linspace(-1.0, 5.0, 601) * constant, y_label, curves)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,12 +31,6 @@ def regressors(views: Sequence[DriveView]) -> list[Array]:
     return [v.parts_nm for v in views]
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    error = np.linspace(-1.0, 1.0, 3)
-    curves = {"believed": error, "true": (1.0 + p["kp_error_share"]) * error}
-    return Illustration.over("tracking error / its largest", error, "demand / its largest", curves)
-
-
 EFFECT = Effect(
     name="controller_gain_error",
     summary="The position loop's gains are not the believed ones.",
@@ -57,7 +51,12 @@ EFFECT = Effect(
         Hook("integral_gain", integral),
         Hook("derivative_gain", derivative),
     ),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "tracking error / its largest",
+        np.linspace(-1.0, 1.0, 3),
+        "demand / its largest",
+        {"believed": np.positive, "true": lambda error: (1.0 + p["kp_error_share"]) * error},
+    ),
     belief="controller_gains",
     demand=DemandForm(("kp_error_share", "ki_error_share", "kd_error_share"), regressors),
 )

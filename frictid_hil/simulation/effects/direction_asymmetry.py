@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
@@ -15,14 +13,6 @@ def friction(
 ) -> float:
     """The even part of friction."""
     return other_nm + coulomb_share * level_nm * abs(slip) + viscous_share * abs(rate_nm)
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    velocity = np.linspace(-1.0, 1.0, 201)
-    symmetric = np.sign(velocity) + velocity
-    even = p["coulomb_share"] * np.sign(np.abs(velocity)) + p["viscous_share"] * np.abs(velocity)
-    curves = {"symmetric": symmetric, "with": symmetric + even}
-    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
@@ -42,7 +32,17 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("friction", friction),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "velocity (rad/s)",
+        np.linspace(-1.0, 1.0, 201),
+        "friction / Coulomb level",
+        {
+            "symmetric": lambda v: np.sign(v) + v,
+            "with": lambda v: (
+                np.sign(v) + v + (p["coulomb_share"] * np.sign(np.abs(v)) + p["viscous_share"] * np.abs(v))
+            ),
+        },
+    ),
     inverse=linear(
         {
             "coulomb_share": lambda v: v.coulomb_nm * np.abs(v.slip),

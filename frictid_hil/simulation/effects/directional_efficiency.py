@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,13 +17,6 @@ def level(level_nm: float, load_nm: float, slip: float, driving_share: float, ba
     """
     driving = load_nm * slip >= 0.0
     return level_nm + (driving_share if driving else backdriving_share) * abs(load_nm)
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    load = np.linspace(-50.0, 50.0, 201)
-    added = np.where(load >= 0.0, p["driving_share"] * load, -p["backdriving_share"] * load)
-    curves = {"without": np.zeros_like(load), "with": added}
-    return Illustration.over("load against the motion (N m)", load, "added friction (N m)", curves)
 
 
 EFFECT = Effect(
@@ -45,7 +37,15 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.VELOCITY_BAND)),
     hooks=(Hook("level", level, order=61),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "load against the motion (N m)",
+        np.linspace(-50.0, 50.0, 201),
+        "added friction (N m)",
+        {
+            "without": np.zeros_like,
+            "with": lambda load: np.where(load >= 0.0, p["driving_share"] * load, -p["backdriving_share"] * load),
+        },
+    ),
     parted=(Parting("load_dependent_friction", "moves_payload", "lifting and lowering one load at equal speed", 15.0),),
     inverse=linear(
         {

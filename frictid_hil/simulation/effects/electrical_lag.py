@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -39,10 +38,6 @@ def reported(torque_nm: Array, time_constant_s: float, step_s: float, limit_nm: 
     return mean
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    return Illustration.lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current")
-
-
 EFFECT = Effect(
     name="electrical_lag",
     summary="The current follows its demand with a lag.",
@@ -55,7 +50,7 @@ EFFECT = Effect(
     parameters=(Parameter("time_constant_s", 0.0, LATEST_S, 0.002, "of the closed current loop", off=0.0),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(Hook("current", current, order=40), Hook("settle", settle)),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.lagging_step(p["time_constant_s"], "torque (N m)", "demand", "current"),
     belief="current_lag_s",
     actuation=ActuationForm(
         "time_constant_s", guesses_by_sample, reported, order=40, late=True, believed_as="current_lag_s"

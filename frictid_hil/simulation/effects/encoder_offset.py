@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
@@ -19,12 +17,6 @@ LARGEST_RAD = 0.2
 """Offset up to which gravity's slope tells it to 2 %; beyond, the joint hangs otherwise than the model has it."""
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    position = np.linspace(-np.pi, np.pi, 301)
-    curves = {"believed": np.cos(position), "true": np.cos(position - p["offset_rad"])}
-    return Illustration.over("reported position (rad)", position, "gravity / amplitude", curves)
-
-
 EFFECT = Effect(
     name="encoder_offset",
     summary="The joint's zero is not where the model has it.",
@@ -37,7 +29,12 @@ EFFECT = Effect(
     parameters=(Parameter("offset_rad", -0.5, 0.5, 0.03, "reported minus true position", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.POSITION,)),
     hooks=(Hook("encoder", encoder),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "reported position (rad)",
+        np.linspace(-np.pi, np.pi, 301),
+        "gravity / amplitude",
+        {"believed": np.cos, "true": lambda position: np.cos(position - p["offset_rad"])},
+    ),
     belief="zero_offset_rad",
     parted=(
         Parting(

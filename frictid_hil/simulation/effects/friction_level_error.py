@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,12 +20,6 @@ def rate(rate_nm: float, error_share: float) -> float:
     return rate_nm * (1.0 + error_share)
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    velocity = np.linspace(0.01, 1.0, 100)
-    curves = {"believed": 1.0 + velocity, "true": (1.0 + p["error_share"]) * (1.0 + velocity)}
-    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
-
-
 EFFECT = Effect(
     name="friction_level_error",
     summary="Friction as a whole is larger or smaller than believed.",
@@ -40,7 +33,12 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.9, 4.0, 0.1, "true over believed friction, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level, order=5), Hook("rate", rate, order=5)),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "velocity (rad/s)",
+        np.linspace(0.01, 1.0, 100),
+        "friction / Coulomb level",
+        {"believed": lambda v: 1.0 + v, "true": lambda v: (1.0 + p["error_share"]) * (1.0 + v)},
+    ),
     belief="friction_torque",
     parted=(
         Parting(

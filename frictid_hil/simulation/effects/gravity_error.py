@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,12 +13,6 @@ from frictid_hil.simulation.inverse import linear
 def gravity(gravity_nm: float, error_share: float) -> float:
     """True gravity."""
     return gravity_nm * (1.0 + error_share)
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    position = np.linspace(-np.pi, np.pi, 301)
-    curves = {"stated": np.cos(position), "true": (1.0 + p["error_share"]) * np.cos(position)}
-    return Illustration.over("position (rad)", position, "gravity / stated", curves)
 
 
 EFFECT = Effect(
@@ -34,7 +27,12 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.9, 2.0, 0.05, "true over stated gravity of the link, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.POSITION, Region.STANDSTILL)),
     hooks=(Hook("gravity", gravity),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "position (rad)",
+        np.linspace(-np.pi, np.pi, 301),
+        "gravity / stated",
+        {"stated": np.cos, "true": lambda position: (1.0 + p["error_share"]) * np.cos(position)},
+    ),
     belief="gravity_torque_nm",
     parted=(
         Parting(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,12 +13,6 @@ from frictid_hil.simulation.inverse import linear
 def inertia(link_kg_m2: float, error_share: float) -> float:
     """True link inertia."""
     return link_kg_m2 * (1.0 + error_share)
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    acceleration = np.linspace(-10.0, 10.0, 3)
-    curves = {"stated": acceleration, "true": (1.0 + p["error_share"]) * acceleration}
-    return Illustration.over("acceleration (rad/s2)", acceleration, "torque / stated inertia (rad/s2)", curves)
 
 
 EFFECT = Effect(
@@ -33,7 +26,12 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.8, 3.0, 0.1, "true over stated link inertia, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.ACCELERATION, Region.FREQUENCY)),
     hooks=(Hook("inertia", inertia),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "acceleration (rad/s2)",
+        np.linspace(-10.0, 10.0, 3),
+        "torque / stated inertia (rad/s2)",
+        {"stated": np.positive, "true": lambda acceleration: (1.0 + p["error_share"]) * acceleration},
+    ),
     belief="inertia_kg_m2",
     inverse=linear({"error_share": lambda v: v.link_inertia_kg_m2 * v.acceleration_rad_s2}, (-1.0, math.inf)),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -26,13 +26,6 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
             np.stack([linear, linear * np.abs(v.load_nm)], axis=1) if shape["quadratic"] else linear[:, None]
         )
     return columns
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    load = np.linspace(-50.0, 50.0, 201)
-    added = p["linear_share"] * np.abs(load) + p["quadratic_per_nm"] * load**2
-    curves = {"without": np.zeros_like(load), "with": added}
-    return Illustration.over("transmitted torque (N m)", load, "added friction (N m)", curves)
 
 
 EFFECT = Effect(
@@ -59,7 +52,15 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.POSITION, Region.ACCELERATION)),
     hooks=(Hook("level", level, order=60),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "transmitted torque (N m)",
+        np.linspace(-50.0, 50.0, 201),
+        "added friction (N m)",
+        {
+            "without": np.zeros_like,
+            "with": lambda load: p["linear_share"] * np.abs(load) + p["quadratic_per_nm"] * load**2,
+        },
+    ),
     inverse=InverseForm(
         shapes=({"quadratic": 0.0}, {"quadratic": 1.0}),
         regressors=regressors,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -42,12 +42,6 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return [(v.coulomb_nm * v.slip * rest_memory(v.velocity_rad_s, v.step_s, *numbers))[:, None] for v in views]
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    dwell = np.linspace(0.0, 5.0 * p["dwell_time_s"], 200)
-    rise = p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))
-    return Illustration("dwell (s)", "rise of break-away / Coulomb level", (("break-away", dwell, rise),))
-
-
 EFFECT = Effect(
     name="stiction_breakaway",
     summary="Friction grows while the joint rests and is spent by the first motion.",
@@ -67,7 +61,12 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.REVERSAL)),
     hooks=(Hook("level", level), Hook("remember", remember), Hook("settle", settle)),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "dwell (s)",
+        np.linspace(0.0, 5.0 * p["dwell_time_s"], 200),
+        "rise of break-away / Coulomb level",
+        {"break-away": lambda dwell: p["share"] * (1.0 - np.exp(-dwell / p["dwell_time_s"]))},
+    ),
     inverse=InverseForm(
         shapes=grid(dwell_time_s=(0.08, 0.25, 0.8, 2.5), travel_rad=(3e-4, 1e-3, 3e-3, 1e-2)),
         regressors=regressors,

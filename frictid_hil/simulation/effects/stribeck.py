@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -38,13 +38,6 @@ def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
     return columns
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    speed = np.linspace(0.0, 6.0 * p["stribeck_velocity_rad_s"], 200)
-    raised = 1.0 + p["share"] * np.exp(-((speed / p["stribeck_velocity_rad_s"]) ** p["exponent"]))
-    curves = {"without": np.ones_like(speed), "with": raised}
-    return Illustration.over("speed (rad/s)", speed, "friction / Coulomb level", curves)
-
-
 EFFECT = Effect(
     name="stribeck",
     summary="Friction falls with speed just above standstill.",
@@ -62,7 +55,15 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND, Region.REVERSAL)),
     hooks=(Hook("level", level),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "speed (rad/s)",
+        np.linspace(0.0, 6.0 * p["stribeck_velocity_rad_s"], 200),
+        "friction / Coulomb level",
+        {
+            "without": np.ones_like,
+            "with": lambda v: 1.0 + p["share"] * np.exp(-((v / p["stribeck_velocity_rad_s"]) ** p["exponent"])),
+        },
+    ),
     parted=(
         Parting(
             "stiction_breakaway",

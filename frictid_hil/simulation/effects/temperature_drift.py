@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -70,13 +70,6 @@ def fall(shape: Shape, coefficients: Array) -> dict[str, float]:
     }
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    time = np.linspace(0.0, 5.0 * p["time_constant_s"], 200)
-    warm = 1.0 - np.exp(-time / p["time_constant_s"])
-    curves = {"sliding level": 1.0 - p["coulomb_share"] * warm, "rate part": 1.0 - p["viscous_share"] * warm}
-    return Illustration.over("time (s)", time, "friction / cold friction", curves)
-
-
 EFFECT = Effect(
     name="temperature_drift",
     summary="Friction falls while the gear warms up.",
@@ -102,7 +95,15 @@ EFFECT = Effect(
         Hook("remember", remember),
         Hook("temperature", temperature),
     ),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "time (s)",
+        np.linspace(0.0, 5.0 * p["time_constant_s"], 200),
+        "friction / cold friction",
+        {
+            "sliding level": lambda t: 1.0 - p["coulomb_share"] * (1.0 - np.exp(-t / p["time_constant_s"])),
+            "rate part": lambda t: 1.0 - p["viscous_share"] * (1.0 - np.exp(-t / p["time_constant_s"])),
+        },
+    ),
     inverse=InverseForm(
         shapes=grid(time_constant_s=(15.0, 40.0, 100.0, 300.0)),
         regressors=regressors,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
@@ -13,12 +11,6 @@ from frictid_hil.simulation.inverse import linear
 def shaft(torque_nm: float, bias_nm: float) -> float:
     """What is left of the motor's torque."""
     return torque_nm - bias_nm
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    velocity = np.linspace(-1.0, 1.0, 201)
-    curves = {"without": np.sign(velocity), "with": np.sign(velocity) + p["bias_nm"]}
-    return Illustration.over("velocity (rad/s)", velocity, "torque (N m)", curves)
 
 
 EFFECT = Effect(
@@ -33,7 +25,12 @@ EFFECT = Effect(
     parameters=(Parameter("bias_nm", -50.0, 50.0, 0.3, "measured minus modelled torque", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.STANDSTILL, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "velocity (rad/s)",
+        np.linspace(-1.0, 1.0, 201),
+        "torque (N m)",
+        {"without": np.sign, "with": lambda velocity: np.sign(velocity) + p["bias_nm"]},
+    ),
     parted=(
         Parting(
             "direction_asymmetry",

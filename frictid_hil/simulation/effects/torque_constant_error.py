@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -23,12 +22,6 @@ def scaled(position_rad: Array, gain: float, step_s: float) -> Array:
     return gain * position_rad
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    reported = np.linspace(-1.0, 1.0, 3)
-    curves = {"stated": reported, "with": (1.0 + p["error_share"]) * reported}
-    return Illustration.over("reported torque (N m)", reported, "true torque (N m)", curves)
-
-
 EFFECT = Effect(
     name="torque_constant_error",
     summary="The motor's torque constant is not the stated one.",
@@ -42,7 +35,12 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -0.4, 0.4, 0.03, "true over stated torque constant, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.LOAD, Region.ACCELERATION, Region.VELOCITY_BAND)),
     hooks=(Hook("shaft", shaft, order=10),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "reported torque (N m)",
+        np.linspace(-1.0, 1.0, 3),
+        "true torque (N m)",
+        {"stated": np.positive, "with": lambda reported: (1.0 + p["error_share"]) * reported},
+    ),
     belief="torque_constant",
     tracking=TrackingForm(links=(Link("gain", scaled, 0.05, 2.0, 0.5, neutral=1.0),), order=60, mimics=("backlash",)),
     inverse=linear({"error_share": lambda v: -v.torque_nm}, (-1.0, math.inf)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -73,13 +73,6 @@ def followed(position_rad: Array, lag_s: float, step_s: float) -> Array:
     return lagged(position_rad, step_s, lag_s)
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    time = np.linspace(-1.0, 4.0, 501) * max(p["delay_s"], 1e-4)
-    demand = np.where(time >= 0.0, 1.0, 0.0)
-    late = np.where(time >= p["delay_s"], 1.0, 0.0)
-    return Illustration("time (s)", "torque (N m)", (("demand", time, demand), ("torque", time, late)))
-
-
 EFFECT = Effect(
     name="torque_delay",
     summary="The torque acts later than commanded.",
@@ -93,7 +86,12 @@ EFFECT = Effect(
     parameters=(Parameter("delay_s", 0.0, LATEST_S, 0.002, "from demand to current", off=0.0, replayed=False),),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.FREQUENCY)),
     hooks=(Hook("current", current, order=20), Hook("settle", settle)),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "time (s)",
+        np.linspace(-1.0, 4.0, 501) * max(p["delay_s"], 1e-4),
+        "torque (N m)",
+        {"demand": lambda t: np.where(t >= 0.0, 1.0, 0.0), "torque": lambda t: np.where(t >= p["delay_s"], 1.0, 0.0)},
+    ),
     belief="torque_delay_s",
     actuation=ActuationForm("delay_s", guesses_by_sample, reported, order=20, late=True, believed_as="torque_delay_s"),
     inverse=InverseForm(

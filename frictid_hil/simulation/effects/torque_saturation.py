@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -51,12 +51,6 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.linspace(0.7, 1.05, 15) * given / limit
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    demand = np.linspace(-1.0, 1.0, 201)
-    clipped = reported(demand, p["limit_share"], 0.0, 1.0, p["exponent"])
-    return Illustration("demand / limit", "torque / limit", (("stated", demand, demand), ("with", demand, clipped)))
-
-
 EFFECT = Effect(
     name="torque_saturation",
     summary="The torque is clipped below the stated limit.",
@@ -74,7 +68,12 @@ EFFECT = Effect(
     ),
     signature=Signature((Channel.ACTUATION,), (Region.ACTUATION, Region.ACCELERATION)),
     hooks=(Hook("current", current, order=30),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "demand / limit",
+        np.linspace(-1.0, 1.0, 201),
+        "torque / limit",
+        {"stated": np.positive, "with": lambda demand: reported(demand, p["limit_share"], 0.0, 1.0, p["exponent"])},
+    ),
     actuation=ActuationForm(
         "limit_share", guesses, reported, order=50, detail="exponent", details=(HARD, 30.0, 20.0, 14.0, 10.0)
     ),

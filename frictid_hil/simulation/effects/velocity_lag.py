@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -69,10 +69,6 @@ def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
     return np.array([seen]) if seen is not None else np.empty(0)
 
 
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    return Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported")
-
-
 EFFECT = Effect(
     name="velocity_lag",
     summary="The reported velocity lags behind the motion.",
@@ -86,7 +82,7 @@ EFFECT = Effect(
     parameters=(Parameter("time_constant_s", 0.0, 0.1, 0.004, "of the first-order lag", off=0.0),),
     signature=Signature((Channel.KINEMATIC,), (Region.KINEMATICS,)),
     hooks=(Hook("report_velocity", report_velocity), Hook("settle", settle)),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported"),
     belief="velocity_filter_s",
     actuation=ActuationForm("time_constant_s", guesses, None),
     kinematic=KinematicForm("time_constant_s", read),

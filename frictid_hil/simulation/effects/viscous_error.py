@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,12 +13,6 @@ from frictid_hil.simulation.inverse import linear
 def rate(rate_nm: float, curve_nm: float, error_share: float) -> float:
     """What depends on speed; a share of the bare curve, so that it adds to an error of friction as a whole."""
     return rate_nm + error_share * curve_nm
-
-
-def _illustrate(p: Mapping[str, float]) -> Illustration:
-    velocity = np.linspace(0.01, 1.0, 100)
-    curves = {"believed": 1.0 + velocity, "true": 1.0 + (1.0 + p["error_share"]) * velocity}
-    return Illustration.over("velocity (rad/s)", velocity, "friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
@@ -35,7 +28,12 @@ EFFECT = Effect(
     parameters=(Parameter("error_share", -1.0, 4.0, 0.2, "true over believed rate-dependent part, minus 1", off=0.0),),
     signature=Signature((Channel.PLANT,), (Region.VELOCITY_BAND,)),
     hooks=(Hook("rate", rate, order=6),),
-    illustrate=_illustrate,
+    illustrate=lambda p: Illustration.over(
+        "velocity (rad/s)",
+        np.linspace(0.01, 1.0, 100),
+        "friction / Coulomb level",
+        {"believed": lambda v: 1.0 + v, "true": lambda v: 1.0 + (1.0 + p["error_share"]) * v},
+    ),
     belief="viscous",
     parted=(Parting("viscous_nonlinearity", "sines_large", "high speeds tell a slope from a bend", 15.0),),
     inverse=linear({"error_share": lambda v: v.rate_nm}, (-1.0, math.inf), of_speed=True),

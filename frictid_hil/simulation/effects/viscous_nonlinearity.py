@@ -49,8 +49,8 @@ BENDS = grid(knee_rad_s=(0.02, 0.06, 0.2, 0.6, 1.8), bend=(0.0, 0.5, 2.0, 3.0)) 
 def _illustrate(p: Mapping[str, float]) -> Illustration:
     speed = np.linspace(0.0, 8.0 * p["knee_rad_s"], 200)
     added = np.array([rate(0.0, 1.0, v, p["share"], p["knee_rad_s"], p["bend"]) for v in speed])
-    curves = {"line": added[-1] * speed / speed[-1], "bent": added}
-    return Illustration.over("speed (rad/s)", speed, "added friction / Coulomb level", curves)
+    curves = (("line", speed, added[-1] * speed / speed[-1]), ("bent", speed, added))
+    return Illustration("speed (rad/s)", "added friction / Coulomb level", curves)
 
 
 EFFECT = Effect(
