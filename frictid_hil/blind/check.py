@@ -46,32 +46,19 @@ class Sealed:
 
 
 def run_check(
-    cases: int,
-    seed: int,
+    cases: int,  # how many joints
+    seed: int,  # of everything drawn; equal seeds give equal cases, whatever ``processes``
     *,
+    # Folder to keep the commitment, the cases, the answers, the truth and the result in, and to go on in after an
+    # interruption; kept nowhere if None.
     out: Path | None = None,
-    processes: int = 1,
-    world: str = "narrow",
-    leave_one_out: bool = False,
+    processes: int = 1,  # how many diagnose (and draw) at once
+    world: str = "narrow",  # name in ``WORLDS``
+    leave_one_out: bool = False,  # also diagnose every visible joint with one effect by a library that lacks it
     progress: Progress | None = None,
-    diagnoser: DiagnoserCommand = DIAGNOSER,
+    diagnoser: DiagnoserCommand = DIAGNOSER,  # see ``diagnoser.serve`` for what such a process is told and answers
 ) -> dict[str, Any]:
-    """Draw, diagnose and score.
-
-    Args:
-        cases: how many joints.
-        seed: of everything drawn; equal seeds give equal cases, whatever ``processes``.
-        out: folder to keep the commitment, the cases, the answers, the truth and the result in, and to go on in after
-            an interruption; kept nowhere if None.
-        processes: how many diagnose (and draw) at once.
-        world: name in ``WORLDS``.
-        leave_one_out: also diagnose every visible joint with one effect by a library that lacks this effect.
-        progress: see ``Progress``.
-        diagnoser: command of a diagnosing process; see ``diagnoser.serve`` for what it is told and answers.
-
-    Returns:
-        The scores, plain values, with ``schema``, ``world``, ``seed``, ``cases``, ``truth_sha256``.
-    """
+    """The scores, plain values, with ``schema``, ``world``, ``seed``, ``cases``, ``truth_sha256``."""
     report = progress or (lambda phase, done, of: None)
     with _folder(out) as folder:
         sealed = draw_sealed(world, cases, seed, folder / "cases", processes, report)

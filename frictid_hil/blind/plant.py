@@ -301,21 +301,17 @@ FILTERED, INTEGRAL, STAGE_1, STAGE_2 = range(4)
 
 @njit(cache=True)
 def run(
-    command: Array, control: Controller, p: Physics, heat: float, clock: float, chance: Array
+    command: Array,  # set-points at the ticks, rad, shape (n,)
+    control: Controller,
+    p: Physics,
+    heat: float,  # thermal state left by the experiment before
+    clock: float,  # time since the first experiment began, s; bursts and wandering go by it
+    chance: Array,  # a number in [0, 1) per tick; below ``p.missed`` the drive does not take the command, shape (n,)
 ) -> tuple[Array, Array, Array, float]:
     """One experiment in closed loop, from rest at the first set-point.
 
-    Args:
-        command: set-points at the ticks, rad, shape (n,).
-        control: the position controller.
-        p: the plant.
-        heat: thermal state left by the experiment before.
-        clock: time since the first experiment began, s; bursts and wandering go by it.
-        chance: a number in [0, 1) per tick; below ``p.missed`` the drive does not take the command, shape (n,).
-
-    Returns:
-        Reported position, the drive's velocity, the torque applied (before sensor noise), each shape (n,), and the
-        thermal state at the end.
+    Reported position, the drive's velocity, the torque applied (before sensor noise), each shape (n,), and the thermal
+    state at the end.
     """
     n, period = command.size, control.tick
     h = period / control.substeps

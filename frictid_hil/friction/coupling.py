@@ -112,8 +112,7 @@ def _acceleration(other: Companion, motion: Motion) -> Array:
 def coupled_inertia(stretches: Mapping[str, CycleRecording]) -> dict[str, dict[str, tuple[float, float]]]:
     """The off-diagonal part of the inertia matrix, from every joint's recording of the coupling stretch, on one clock.
 
-    Returns:
-        Per joint and other joint: M_ij and its standard deviation, kg m2 (kg, kg m where axes are linear).
+    Per joint and other joint: M_ij and its standard deviation, kg m2 (kg, kg m where axes are linear).
 
     Raises:
         IdentificationError: some joint did not shake, or not at a frequency of its own.

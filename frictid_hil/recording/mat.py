@@ -55,10 +55,9 @@ class SpoiltMatFile(ValueError):
 
 
 def read_numbers(data: bytes) -> dict[str, Array]:
-    """All real numeric variables of a whole file, of the type in which they stand there.
+    """All real numeric variables of a whole file by name, of the type in which they stand there.
 
-    Returns:
-        Arrays of two or more dimensions by name; fields of a struct of one element as ``struct.field``.
+    Arrays have two or more dimensions; fields of a struct of one element are ``struct.field``.
 
     Raises:
         SpoiltMatFile: not such a file, or cut off, or spoilt.

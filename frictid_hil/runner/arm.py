@@ -167,19 +167,13 @@ class Arm:
 
 
 def verify_reference(
-    joints: Sequence[JointSetup], reports: Sequence[Feedback], planned_rad: Mapping[str, float], tolerance_rad: float
+    joints: Sequence[JointSetup],  # in the order of the reports
+    reports: Sequence[Feedback],  # valid
+    # Where joints are to be locked, by name; others are expected at their own locked position.
+    planned_rad: Mapping[str, float],
+    tolerance_rad: float,  # a joint further off has lost its reference, or was moved
 ) -> None:
-    """Compare every joint's position with the plan and with its limits.
-
-    Args:
-        joints: in the order of the reports.
-        reports: valid.
-        planned_rad: where joints are to be locked, by name; others are expected at their own locked position.
-        tolerance_rad: a joint further off has lost its reference, or was moved.
-
-    Raises:
-        SafetyAbort: naming the joint.
-    """
+    """Compare every joint's position with the plan and with its limits; ``SafetyAbort`` names the joint."""
     for joint, report in zip(joints, reports, strict=True):
         expected_rad = planned_rad.get(joint.name, joint.locked_position_rad)
         if not abs(report.position_rad - expected_rad) <= tolerance_rad:

@@ -174,11 +174,9 @@ class CyclicLoop:
         return feedback
 
     def run(self, sources: Mapping[int, SetPointSource], *, ending: SetPointSource | None = None) -> None:
-        """Stream one motion of every joint that moves, cycle by cycle, until the first one ends.
+        """Stream one motion of every joint that moves, by its index, cycle by cycle, until the first one ends.
 
-        Args:
-            sources: of the set-points, by index of the joint.
-            ending: brings the only joint to rest when asked to; without one all decelerate along their paths.
+        ``ending`` brings the only joint to rest when asked to; without one all decelerate along their paths.
         """
         moving = [(joint, source, self.set_points[joint]) for joint, source in sources.items()]
         previous_rad = [set_point.position_rad for _, _, set_point in moving]

@@ -80,10 +80,8 @@ def move_to_isolated_cpu() -> int | None:
     """Bind the calling thread to a processor that the kernel keeps free of other work (``isolcpus=``).
 
     Nothing else of ours runs there: processes start on the others. What this thread starts from now on comes along.
-    Loops of several runs spread over the isolated processors by their process numbers.
-
-    Returns:
-        Its number; None where none is isolated, or this process may use none of them.
+    Loops of several runs spread over the isolated processors by their process numbers. Returns its number; None where
+    none is isolated, or this process may use none of them.
     """
     isolated = [cpu for cpu in _numbers(_ISOLATED) if _allowed(cpu)]
     if not isolated:

@@ -58,18 +58,16 @@ Rows = NDArray[np.void]
 
 
 class Ring:
-    """A single-producer single-consumer ring of fixed-size rows.
-
-    Args:
-        row: dtype of a row; ``pack`` must produce exactly these bytes.
-        pack: the compiled form of the same row.
-        capacity: rows held.
-        shared: live in shared memory, so that another process can attach by ``name``.
-        name: attach to this existing shared memory instead of creating it.
-    """
+    """A single-producer single-consumer ring of fixed-size rows."""
 
     def __init__(
-        self, row: np.dtype[Any], pack: struct.Struct, capacity: int, *, shared: bool = False, name: str | None = None
+        self,
+        row: np.dtype[Any],
+        pack: struct.Struct,  # the compiled form of the same row: it must produce exactly these bytes
+        capacity: int,  # rows held
+        *,
+        shared: bool = False,  # live in shared memory, so that another process can attach by ``name``
+        name: str | None = None,  # attach to this existing shared memory instead of creating it
     ) -> None:
         assert row.itemsize == pack.size, f"row of {row.itemsize} bytes, packed {pack.size}"
         checks_at = _HEADER_BYTES + capacity * row.itemsize

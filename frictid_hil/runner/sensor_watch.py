@@ -39,13 +39,8 @@ def velocity_says(before_rad_s: float, velocity_rad_s: float, step_s: float, per
     """The least and the most that a joint went between two samples, by the velocity of both, in rad.
 
     A drive follows its set-point for one period. When the next set-point is late, it stands or goes on, and nobody has
-    seen which of the two.
-
-    Args:
-        before_rad_s: of the earlier sample.
-        velocity_rad_s: of the later one.
-        step_s: between them, by their own time stamps.
-        period_s: of the set-points; infinite where the samples leave no moment out.
+    seen which of the two. The step is by the samples' own time stamps; the period is that of the set-points, infinite
+    where the samples leave no moment out.
     """
     mean_rad_s = 0.5 * (before_rad_s + velocity_rad_s)
     seen_rad, whole_rad = mean_rad_s * min(step_s, period_s), mean_rad_s * step_s

@@ -28,16 +28,10 @@ def cycles_ahead(period_s: float) -> int:
 
 
 def stopping_path(path_rad: Array, period_s: float, most_rad_s2: Sequence[float]) -> Array | None:
-    """Set-points that bring all joints to rest along their path.
+    """Set-points, shape (n, joints), that bring all joints to rest along their path.
 
-    Args:
-        path_rad: set-points of the plan, one per cycle, shape (k, joints): the one before last, the last one sent, and
-            ``cycles_ahead`` more.
-        period_s: of the cycle.
-        most_rad_s2: highest deceleration of each joint.
-
-    Returns:
-        Shape (n, joints); None where no stop keeps to the decelerations.
+    The path holds set-points of the plan, one per cycle, shape (k, joints): the one before last, the last one sent, and
+    ``cycles_ahead`` more. None where no stop keeps to the highest deceleration of each joint.
     """
     ahead = path_rad[1:]
     stride = max(1, round(_STRIDE_S / period_s))

@@ -100,18 +100,15 @@ class Travelled:
 
 
 class UnitProof:
-    """Set-points of the proof, from where the joint stands and back to it; every report is held against them.
-
-    Args:
-        joint: that is proven.
-        here_rad: where it stands; it moves towards the middle of its range.
-        resolution_rad: one encoder step; NaN where it is not known.
-        droop_rad: what its position loop may leave undone.
-        period_s: of the cycle.
-    """
+    """Set-points of the proof, from where the joint stands and back to it; every report is held against them."""
 
     def __init__(
-        self, joint: JointSetup, here_rad: float, resolution_rad: float, droop_rad: float, period_s: float
+        self,
+        joint: JointSetup,
+        here_rad: float,  # where it stands; it moves towards the middle of its range
+        resolution_rad: float,  # one encoder step; NaN where it is not known
+        droop_rad: float,  # what its position loop may leave undone
+        period_s: float,
     ) -> None:
         self._joint, self._here_rad, self._droop_rad = joint, here_rad, droop_rad
         self._step_rad = resolution_rad if math.isfinite(resolution_rad) else 0.0

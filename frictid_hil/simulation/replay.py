@@ -61,30 +61,18 @@ class Simulated:
 
 
 def closed_loop(
-    model: JointModel,
+    model: JointModel,  # its own servo gains are not used
     controller: Controller,
-    time_s: Array,
-    position_command_rad: Array,
+    time_s: Array,  # increasing, shape (n,); need not be evenly spaced
+    position_command_rad: Array,  # shape (n,)
     *,
-    payload: bool = False,
-    seed: int | None = None,
-    state: CarryOver | None = None,
-    start_rad: float | None = None,
-    substep_s: float = SUBSTEP_S,
+    payload: bool = False,  # it is mounted
+    seed: int | None = None,  # of the noise on the reported torque, then rounded as the drive does; None for neither
+    state: CarryOver | None = None,  # warmth left by the recording before; None for a cold joint
+    start_rad: float | None = None,  # where the joint rests at the first row; None for its first command
+    substep_s: float = SUBSTEP_S,  # longest sub-step of the physics; longer ones are for searches that only compare
 ) -> Simulated:
-    """The joint under a controller that follows the recorded commands.
-
-    Args:
-        model: the joint; its own servo gains are not used.
-        controller: the control law.
-        time_s: increasing, shape (n,); need not be evenly spaced.
-        position_command_rad: shape (n,).
-        payload: the payload is mounted.
-        seed: of the noise on the reported torque, which is then rounded as the drive does; None for neither.
-        state: warmth left by the recording before; None for a cold joint.
-        start_rad: where the joint rests at the first row; None for its first command.
-        substep_s: longest sub-step of the physics; longer ones are for searches that only compare.
-    """
+    """The joint under a controller that follows the recorded commands."""
     time = np.asarray(time_s, dtype=np.float64)
     command = np.asarray(position_command_rad, dtype=np.float64)
     period_s = 1.0 / controller.rate_hz

@@ -22,19 +22,9 @@ _NOISE_BLOCK = 4096
 
 
 class ServoLoop:
-    """One joint under its drive.
+    """One joint under its drive; at first unpowered, brake engaged, where its encoder reads ``position_rad``.
 
-    Args:
-        model: the joint.
-        period_s: of the drive's control loop.
-        seed: of the noise on the reported torque.
-        position_rad: where the joint stands at first, as its encoder reads it; unpowered, brake engaged.
-
-    Attributes:
-        mode: as ``set_mode`` has set it.
-        commands: what the coming control periods are told, shape (periods, ``plant.COMMANDS``).
-        readings: what they read, shape (periods, ``plant.READINGS``).
-        substeps: of one control period, each of ``step_s``.
+    The seed is that of the noise on the reported torque, the period that of the drive's control loop.
     """
 
     def __init__(self, model: JointModel, *, period_s: float = 0.001, seed: int = 0, position_rad: float = 0.0) -> None:
@@ -43,7 +33,7 @@ class ServoLoop:
         self._parameters = packing.parameters(model)
         self._state = packing.state()
         self._step_rad = model.encoder.step_rad(model.gear_ratio)
-        self.mode = plant.POSITION_MODE
+        self.mode = plant.POSITION_MODE  # as ``set_mode`` has set it
         self._target_rad = position_rad
         self._noise_nm = model.drive.torque_noise_per_mille * 1e-3 * model.drive.rated_torque_nm
         self._random = np.random.default_rng(seed)
@@ -53,9 +43,9 @@ class ServoLoop:
         self._kernel.place(self._parameters, self._state, float(position_rad))
         self._parameters[plant.POWERED] = 0.0
         self._parameters[plant.BRAKED] = 1.0
-        self.substeps, self.step_s = 1, period_s
-        self.commands = np.zeros((0, plant.COMMANDS))
-        self.readings = np.zeros((0, plant.READINGS))
+        self.substeps, self.step_s = 1, period_s  # of one control period
+        self.commands = np.zeros((0, plant.COMMANDS))  # what the coming control periods are told, one a row
+        self.readings = np.zeros((0, plant.READINGS))  # what they read
         self._row = [0.0] * plant.READINGS
         self._row[plant.READ_POSITION] = self._state[plant.MEASURED]
         self._row[plant.READ_TRUE_POSITION] = self._state[plant.LINK_POSITION]
@@ -123,22 +113,14 @@ class ServoLoop:
 
     def advance(
         self,
-        duration_s: float,
+        duration_s: float,  # divided into control periods as near to ``period_s`` as goes; 0 or less: nothing happens
         *,
-        position_rad: float | None = None,
-        velocity_rad_s: float = 0.0,
-        torque_nm: float = 0.0,
-        torque_offset_nm: float = 0.0,
+        position_rad: float | None = None,  # target at the end, approached linearly; None keeps it
+        velocity_rad_s: float = 0.0,  # target in velocity mode
+        torque_nm: float = 0.0,  # target in torque mode
+        torque_offset_nm: float = 0.0,  # added in every mode
     ) -> None:
-        """Let time pass.
-
-        Args:
-            duration_s: divided into control periods as near to ``period_s`` as goes; nothing happens for 0 or less.
-            position_rad: position mode: target at the end, approached linearly from the previous one; None keeps it.
-            velocity_rad_s: velocity mode: target.
-            torque_nm: torque mode: target.
-            torque_offset_nm: added in every mode.
-        """
+        """Let time pass."""
         if duration_s <= 0.0:
             return
         self.command(duration_s, position_rad, velocity_rad_s, torque_nm, torque_offset_nm)
