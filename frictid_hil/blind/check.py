@@ -17,7 +17,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -60,7 +60,8 @@ def run_check(
 ) -> dict[str, Any]:
     """The scores, plain values, with ``schema``, ``world``, ``seed``, ``cases``, ``truth_sha256``."""
     report = progress or (lambda phase, done, of: None)
-    with _folder(out) as folder:
+    with nullcontext(out) if out else tempfile.TemporaryDirectory(prefix="frictid-gap-check-") as name:
+        folder = Path(name)
         sealed = draw_sealed(world, cases, seed, folder / "cases", processes, report)
         # The commitment stands before the first answer is asked for.
         commitment = {"schema": SCHEMA, "cases": cases, "truth_sha256": sealed.digest, "code_sha256": code_digest()}
@@ -228,13 +229,3 @@ def _open_seal(folder: Path, sealed: Sealed, documents: dict[str, Any]) -> None:
         (folder / "truth" / f"{name}.yaml").write_text(text)
     for name, document in documents.items():
         (folder / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n")
-
-
-@contextmanager
-def _folder(out: Path | None) -> Iterator[Path]:
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        yield out
-        return
-    with tempfile.TemporaryDirectory(prefix="frictid-gap-check-") as name:
-        yield Path(name)

@@ -98,7 +98,8 @@ def draw_joint(rng: np.random.Generator, experiments: tuple[str, ...] = FULL) ->
     viscous_high = viscous / (speed + (steepness - 1.0) * bend_velocity)
     counts = 2.0 ** float(rng.integers(14, 20))
     payload = Payload(inertia * rng.uniform(0.15, 0.5), gravity * rng.uniform(0.4, 1.1))
-    rated = _rounded((gravity + payload.gravity_nm + coulomb + viscous) * rng.uniform(1.05, 1.35))
+    # Two significant digits, as on a name plate.
+    rated = float(f"{(gravity + payload.gravity_nm + coulomb + viscous) * rng.uniform(1.05, 1.35):.2g}")
     physics = Physics(
         motor_inertia=share * inertia,
         link_inertia=(1.0 - share) * inertia,
@@ -270,8 +271,3 @@ def _controller(rng: np.random.Generator, inertia: float, limit: float) -> Contr
         velocity_filter=0.003,
         torque_limit=limit,
     )
-
-
-def _rounded(value: float) -> float:
-    """Two significant digits, as on a name plate."""
-    return float(f"{value:.2g}")

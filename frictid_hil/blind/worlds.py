@@ -80,13 +80,15 @@ def _zoo_cards(cases: int, seed: int) -> list[Any]:
     return cards
 
 
-def _score_narrow(truths: Mapping[str, Mapping[str, Any]], documents: Documents) -> dict[str, Any]:
-    return score.score(truths, {name: Answer.from_json(line) for name, line in documents.items()})
-
-
 _JUDGED = judged.judged, judged.headline, judged.page
 WORLDS: dict[str, World] = {
-    "narrow": World(assignments, _draw_narrow, _score_narrow, narrow_page.headline, narrow_page.page),
+    "narrow": World(
+        assignments,
+        _draw_narrow,
+        lambda truths, lines: score.score(truths, {name: Answer.from_json(line) for name, line in lines.items()}),
+        narrow_page.headline,
+        narrow_page.page,
+    ),
     "wide": World(partial(_dealt, wide.KINDS), partial(_written, wide.draw_wide), *_JUDGED),
     "zoo": World(_zoo_cards, partial(_written, _draw_zoo), *_JUDGED),
 }

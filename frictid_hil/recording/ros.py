@@ -151,11 +151,13 @@ class _Decoder:
         lists = {
             name: values.size
             for name, values in _lists(message)
-            if isinstance(values, np.ndarray) and values.dtype.kind == "f" and values.size == len(joints)
+            if values.dtype.kind == "f" and values.size == len(joints)
         }
         marks = {name: 1e300 + np.arange(size) * 1e290 + k * 1e295 for k, (name, size) in enumerate(lists.items())}
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        marked = _with(message, marks)
+        marked = message
+        for name, mark in marks.items():
+            marked = _with(marked, name, mark)
         if stamp is not None:
             header = replace(message.header, stamp=replace(stamp, sec=0x2BADF00D, nanosec=0x2BADCAFE))
             marked = replace(marked, header=header)
@@ -175,10 +177,9 @@ class _Decoder:
             raise InputFileError("a message that is not written as the library writes it", where=str(path))
         if hasattr(getattr(message, "header", None), "seq"):
             fixed[:4] = False  # ROS 1 counts its messages first
-        for name, _ in _times(message):
-            mark = _with_time(message, name)
-            other = np.frombuffer(self.serialise(mark), np.uint8)
-            fixed &= other == np.frombuffer(self.serialise(message), np.uint8)
+        for name, time in _times(message):
+            other = _with(message, name, replace(time, sec=time.sec ^ 0x7FFFFFFF, nanosec=time.nanosec ^ 0xFFFFFFFF))
+            fixed &= np.frombuffer(self.serialise(other), np.uint8) == np.frombuffer(self.serialise(message), np.uint8)
         return _Form(joints, places, found, fixed)
 
 
@@ -214,24 +215,10 @@ def _times(message: Any, path: str = "") -> Iterator[tuple[str, Any]]:
                 yield from _times(value, f"{path}{part.name}.")
 
 
-def _with(message: Any, values: Mapping[str, Any]) -> Any:
-    """The message with other values at dotted paths."""
-    for path, value in values.items():
-        message = _with_one(message, path.split("."), value)
-    return message
-
-
-def _with_one(message: Any, path: list[str], value: Any) -> Any:
-    inner = value if len(path) == 1 else _with_one(getattr(message, path[0]), path[1:], value)
-    return replace(message, **{path[0]: inner})
-
-
-def _with_time(message: Any, path: str) -> Any:
-    value = message
-    for name in path.split("."):
-        value = getattr(value, name)
-    other = replace(value, sec=value.sec ^ 0x7FFFFFFF, nanosec=value.nanosec ^ 0xFFFFFFFF)
-    return _with(message, {path: other})
+def _with(message: Any, path: str, value: Any) -> Any:
+    """The message with another value at a dotted path."""
+    first, _, rest = path.partition(".")
+    return replace(message, **{first: _with(getattr(message, first), rest, value) if rest else value})
 
 
 def _table(path: Path, columns: dict[str, Any], logged: NDArray[np.int64], topic: str, told: list[str]) -> ArrayTable:

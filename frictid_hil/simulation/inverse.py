@@ -46,6 +46,13 @@ class View:
     gravity_sin_nm: float
     gradual_rad: float = 0.0  # travel over which friction follows a changing level where it builds up gradually; else 0
 
+    @property
+    def unexplained_nm(self) -> Array:
+        """What the believed joint leaves of the torque."""
+        motor_nm = self.motor_inertia_kg_m2 * self.acceleration_rad_s2
+        left: Array = self.torque_nm - self.load_nm - motor_nm - self.coulomb_nm * self.slip - self.rate_nm
+        return left
+
 
 @dataclass(frozen=True, slots=True)
 class InverseForm:
@@ -124,12 +131,7 @@ def most_telling(
     Of recordings that have more rows than that takes, only every so many are looked at.
     """
     views = views[:: max(1, sum(v.position_rad.size for v in views) // ENOUGH_ROWS)]
-    rest = np.concatenate(
-        [
-            v.torque_nm - v.load_nm - v.motor_inertia_kg_m2 * v.acceleration_rad_s2 - v.coulomb_nm * v.slip - v.rate_nm
-            for v in views
-        ]
-    )
+    rest = np.concatenate([v.unexplained_nm for v in views])
     told = []
     for shape in shapes:
         column = np.concatenate(regressors(views, shape))[:, 0]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import DemandForm, DriveView
+from frictid_hil.simulation.drive_form import DemandForm
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 
@@ -24,11 +21,6 @@ def integral(ki_nm_per_rad_s: float, ki_error_share: float) -> float:
 def derivative(kd_nm_s_per_rad: float, kd_error_share: float) -> float:
     """The true gain of the velocity error."""
     return kd_nm_s_per_rad * (1.0 + kd_error_share)
-
-
-def regressors(views: Sequence[DriveView]) -> list[Array]:
-    """The believed parts of the demand, each per share of its gain."""
-    return [v.parts_nm for v in views]
 
 
 EFFECT = Effect(
@@ -58,5 +50,8 @@ EFFECT = Effect(
         {"believed": np.positive, "true": lambda error: (1.0 + p["kp_error_share"]) * error},
     ),
     belief="controller_gains",
-    demand=DemandForm(("kp_error_share", "ki_error_share", "kd_error_share"), regressors),
+    # The believed parts of the demand, each per share of its gain.
+    demand=DemandForm(
+        ("kp_error_share", "ki_error_share", "kd_error_share"), lambda views: [v.parts_nm for v in views]
+    ),
 )

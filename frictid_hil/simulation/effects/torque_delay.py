@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from frictid_hil.friction.trajectory import Array
 from frictid_hil.simulation.drive_form import LATEST_S, ActuationForm, Link, TrackingForm, guesses_by_sample
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Parting, Region, Signature
-from frictid_hil.simulation.inverse import InverseForm, Shape, View
+from frictid_hil.simulation.inverse import InverseForm
 
 
 def current(current_nm: float, state: Any, at: int, step_s: float, delay_s: float) -> float:
@@ -47,16 +46,6 @@ def _shifted(torque_nm: Array, rows: int) -> Array:
     if rows <= 0:
         return torque_nm
     return np.concatenate([np.full(min(rows, torque_nm.size), torque_nm[0]), torque_nm[:-rows]])
-
-
-def regressors(views: Sequence[View], shape: Shape) -> list[Array]:
-    """What a torque that acts up to one sample later than it is reported leaves in the plant, per sample."""
-    return [v.step_s * np.gradient(v.torque_nm, v.step_s)[:, None] for v in views]
-
-
-def sample(views: Sequence[View]) -> tuple[Shape, ...]:
-    """The sampling step: a longer delay shows in the reported torque itself."""
-    return ({"sample_s": views[0].step_s if views else 0.0},)
 
 
 def delayed(position_rad: Array, delay_s: float, step_s: float) -> Array:
@@ -96,11 +85,13 @@ EFFECT = Effect(
     actuation=ActuationForm("delay_s", guesses_by_sample, reported, order=20, late=True, believed_as="torque_delay_s"),
     inverse=InverseForm(
         shapes=({"sample_s": 0.0},),
-        regressors=regressors,
+        # What a torque that acts up to one sample later than it is reported leaves in the plant, per sample.
+        regressors=lambda views, shape: [v.step_s * np.gradient(v.torque_nm, v.step_s)[:, None] for v in views],
         parameters=lambda shape, coefficients: {"delay_s": max(0.0, float(coefficients[0])) * shape["sample_s"]},
         first_coefficient=(0.1, 1.2),
         continuous=False,
-        shapes_for=sample,
+        # The sampling step: a longer delay shows in the reported torque itself.
+        shapes_for=lambda views: ({"sample_s": views[0].step_s if views else 0.0},),
     ),
     tracking=TrackingForm(
         links=(Link("delay_s", delayed, 0.05, 0.5), Link("lag_s", followed, 0.05, 0.5)),

@@ -100,8 +100,7 @@ def lines_seen(views: Sequence[View]) -> tuple[float, ...]:
 
 def _unexplained(v: View) -> Array:
     """What the believed joint leaves of the torque, less what a fit of its own constants takes."""
-    motor = v.motor_inertia_kg_m2 * v.acceleration_rad_s2
-    rest = v.torque_nm - v.load_nm - motor - v.coulomb_nm * v.slip - v.rate_nm
+    rest = v.unexplained_nm
     columns = np.stack(
         [np.ones_like(rest), v.slip, v.velocity_rad_s, np.cos(v.position_rad), np.sin(v.position_rad)], 1
     )

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import optimize
 
 from frictid_hil.friction.trajectory import Array
-from frictid_hil.simulation.drive_form import ActuationForm, Believed, DriveView, Finding, KinematicForm, MotionView
+from frictid_hil.simulation.drive_form import ActuationForm, Believed, Finding, KinematicForm, MotionView
 from frictid_hil.simulation.effect import Channel, Effect, Hook, Illustration, Parameter, Region, Signature
 
 
@@ -64,11 +64,6 @@ def read(views: Sequence[MotionView], believed: Believed) -> Finding | None:
     return Finding(lag_s, shows)
 
 
-def guesses(views: Sequence[DriveView], seen: float | None) -> Array:
-    """What the report shows: the controller's own velocity may lag as much."""
-    return np.array([seen]) if seen is not None else np.empty(0)
-
-
 EFFECT = Effect(
     name="velocity_lag",
     summary="The reported velocity lags behind the motion.",
@@ -84,7 +79,10 @@ EFFECT = Effect(
     hooks=(Hook("report_velocity", report_velocity), Hook("settle", settle)),
     illustrate=lambda p: Illustration.lagging_step(p["time_constant_s"], "velocity (rad/s)", "true", "reported"),
     belief="velocity_filter_s",
-    actuation=ActuationForm("time_constant_s", guesses, None),
+    # The controller's own velocity may lag as much as the report shows.
+    actuation=ActuationForm(
+        "time_constant_s", lambda views, seen: np.empty(0) if seen is None else np.array([seen]), None
+    ),
     kinematic=KinematicForm("time_constant_s", read),
     state_size=1,
 )
