@@ -35,8 +35,7 @@ _FD_BY_RATES = ("ixxat", "neovi")
 _FD_BY_TIMING = ("pcan", "kvaser", "vector", "slcan", "nixnet")
 _FD_CLOCK_HZ = 80_000_000
 _LINKS = Path("/sys/class/net")
-_CLASSICAL_MTU = 16
-"""Of a SocketCAN link; one with CAN FD has 72."""
+_CLASSICAL_MTU = 16  # of a SocketCAN link; one with CAN FD has 72
 
 
 def split_bus(bus: str) -> tuple[str, str]:

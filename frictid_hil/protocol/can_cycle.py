@@ -18,36 +18,23 @@ _LAST_WORDS = 2
 
 
 class CanCycle:
-    """Cyclic traffic of all joints.
-
-    Args:
-        line: nobody else reads it meanwhile.
-        clock: run time.
-        rows: given every frame, sent and received.
-        wishes: one per joint, with the feedback that ``rows`` fills.
-        frame: of a joint (index) for an order.
-        cycle_hz: rate.
-        window: share of a cycle that reports are waited for.
-
-    Attributes:
-        may_be_powered: joints that were not seen to be off when ``stop`` ended.
-    """
+    """Cyclic traffic of all joints."""
 
     def __init__(
         self,
-        line: CanLine,
-        clock: Clock,
-        rows: RowDecoder,
-        wishes: Sequence[Wish],
-        frame: Callable[[int, Order], tuple[int, bytes]],
-        cycle_hz: float,
-        window: float = 0.8,
+        line: CanLine,  # nobody else reads it meanwhile
+        clock: Clock,  # run time
+        rows: RowDecoder,  # given every frame, sent and received
+        wishes: Sequence[Wish],  # one per joint, with the feedback that ``rows`` fills
+        frame: Callable[[int, Order], tuple[int, bytes]],  # of a joint (index) for an order
+        cycle_hz: float,  # rate
+        window: float = 0.8,  # share of a cycle that reports are waited for
     ) -> None:
         self._line, self._clock, self._rows, self._frame = line, clock, rows, frame
         self.wishes = list(wishes)
         self._period_ns = round(1e9 / cycle_hz)
         self._window_ns = round(window * self._period_ns)
-        self.may_be_powered: tuple[str, ...] = ()
+        self.may_be_powered: tuple[str, ...] = ()  # joints that were not seen to be off when ``stop`` ended
 
     def wish(self, joint: str) -> Wish:
         """Of the joint with that name."""

@@ -28,13 +28,6 @@ _WIRE_FAILURES = 3
 class CanLine:
     """An open bus. Nothing but its owner reads it.
 
-    Args:
-        bus: ``interface:channel`` as typed.
-        options: of the robot file; ``bitrate``, ``fd``, ``data_bitrate`` and a few others go to python-can.
-        sink: told of every frame.
-        clock: run time to stamp frames with.
-        bus_factory: opens the bus instead of python-can (a simulated one); it is then not locked.
-
     Raises:
         UsageError: not of the form ``interface:channel``.
         HardwareBusy: another process on this machine holds the bus.
@@ -43,10 +36,12 @@ class CanLine:
 
     def __init__(
         self,
-        bus: str,
+        bus: str,  # ``interface:channel`` as typed
+        # Of the robot file; ``bitrate``, ``fd``, ``data_bitrate`` and a few others go to python-can.
         options: Mapping[str, Any],
-        sink: FrameSink | None,
-        clock: Clock,
+        sink: FrameSink | None,  # told of every frame
+        clock: Clock,  # run time to stamp frames with
+        # Opens the bus instead of python-can (a simulated one); it is then not locked.
         bus_factory: BusFactory | None = None,
     ) -> None:
         self._name = bus

@@ -20,11 +20,9 @@ _ABSENT = {0x06020000, 0x06090011, 0x08000024, 0x06010000, 0x06010001, 0x0800000
 """Abort codes that say "there is no such object", "no such sub-index", "no data", "unsupported access", "write only" -
 and "general error", by which some drives say any of these."""
 
-_OTHER_LENGTH = {0x06070010, 0x06070012, 0x06070013}
-"""Abort codes that say "another length of this object"."""
+_OTHER_LENGTH = {0x06070010, 0x06070012, 0x06070013}  # abort codes that say "another length of this object"
 
-_COMMANDS = {0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
-"""What a run commands, and nobody wants back."""
+_COMMANDS = {0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}  # what a run commands, and nobody wants back
 
 
 class Aborted(Exception):
@@ -45,19 +43,13 @@ class RefusedByDrive(HardwareError):
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """One setting as it shall be: what `check` foresees and what ``configure`` does.
-
-    Attributes:
-        otherwise: what it means where the drive does not take it, the run goes on; "" where the run ends.
-        instead: values that would do as well, in this order.
-        mask: bits that must read back as written; drives keep some bits of a COB-ID to themselves.
-    """
+    """One setting as it shall be: what `check` foresees and what ``configure`` does."""
 
     item: Object
     value: int
-    otherwise: str = ""
-    instead: tuple[int, ...] = ()
-    mask: int = -1
+    otherwise: str = ""  # what it means where the drive does not take it, the run goes on; "" where the run ends
+    instead: tuple[int, ...] = ()  # values that would do as well, in this order
+    mask: int = -1  # bits that must read back as written; drives keep some bits of a COB-ID to themselves
     maps: Object | None = None
 
     @property

@@ -30,8 +30,7 @@ from frictid_hil.protocol.error_words import told_error
 
 _NEVER = -1
 _SECONDARY = ("torque_offset", "target_mode", "target_torque", "target_velocity")
-_INTERPOLATE = 0x10
-"""Controlword bit 4 in interpolated position mode: follow the set-points."""
+_INTERPOLATE = 0x10  # controlword bit 4 in interpolated position mode: follow the set-points
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 _FASTER_SHARE, _FASTER_RAD_S = 1.1, 0.3
 """A joint that is this much faster than when its quick stop began is not being stopped ..."""
@@ -40,33 +39,22 @@ _SLOWED_SHARE, _SLOWED_RAD_S = 0.95, 0.1
 
 
 class Axis:
-    """Wishes and commands of one joint.
-
-    Args:
-        frames: as read back: RPDO1 (controlword, target position, torque offset), RPDO2 (mode, target torque, target
-            velocity).
-        feedback: the decoder's own object of this joint.
-        max_torque_nm: no torque beyond this is commanded.
-        standstill_rad_s: below this the joint stands.
-        reset_cycles: how long the drive may take to leave a fault; a quick stop is looked at five times as often.
-        position_mode: 6060 for positions: 8, or 7 (interpolated position).
-        mode_when_enabled: the drive shows its mode only once power is on; until then nothing is followed.
-
-    Attributes:
-        alarm: a fault that its reset did not end; whoever raises it clears it.
-        power_was_cut: the quick stop did not slow the joint down, so that its voltage was disabled in motion.
-    """
+    """Wishes and commands of one joint."""
 
     def __init__(
         self,
+        # As read back: RPDO1 (controlword, target position, torque offset), RPDO2 (mode, target torque,
+        # target velocity).
         frames: JointFrames,
         scale: Scale,
-        feedback: Feedback,
+        feedback: Feedback,  # the decoder's own object of this joint
         *,
-        max_torque_nm: float,
-        standstill_rad_s: float,
+        max_torque_nm: float,  # no torque beyond this is commanded
+        standstill_rad_s: float,  # below this the joint stands
+        # How long the drive may take to leave a fault; a quick stop is looked at five times as often.
         reset_cycles: int,
-        position_mode: int = Mode.POSITION,
+        position_mode: int = Mode.POSITION,  # 6060 for positions: 8, or 7 (interpolated position)
+        # The drive shows its mode only once power is on; until then nothing is followed.
         mode_when_enabled: bool = False,
     ) -> None:
         self.joint = frames.name
@@ -78,7 +66,7 @@ class Axis:
         self._locked = False
         self._steady_status = _NEVER
         self._following_status = _NEVER
-        self.alarm: HardwareError | None = None
+        self.alarm: HardwareError | None = None  # a fault that its reset did not end; whoever raises it clears it
         self._scale = scale
         self.limit_torque(max_torque_nm)
         self._standstill_rad_s = standstill_rad_s
@@ -93,6 +81,7 @@ class Axis:
         self._stop_look_cycles = max(2, reset_cycles // 5)
         self._stop_cycles = 0
         self._stop_from_rad_s = 0.0
+        # The quick stop did not slow the joint down, so that its voltage was disabled in motion.
         self.power_was_cut = False
 
     def limit_torque(self, torque_nm: float) -> None:

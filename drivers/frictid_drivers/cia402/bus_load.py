@@ -14,8 +14,7 @@ from frictid_hil.protocol.can_load import BUSIEST, BitRates, FrameBits, fd_frame
 AVERAGE_LIMIT_PERCENT = 100.0 * BUSIEST
 """Above this on average, low-priority frames (heartbeats, SDO) starve and one retransmission breaks a cycle."""
 
-PEAK_LIMIT_PERCENT = 100.0
-"""No single cycle can carry more than the wire does."""
+PEAK_LIMIT_PERCENT = 100.0  # no single cycle can carry more than the wire does
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,19 +33,13 @@ class SyncFrame:
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """Load of a layout at one cycle rate.
-
-    Attributes:
-        least_bits: per cycle on average, no stuffing, in bits of the arbitration rate like all that follow.
-        average_bits: per cycle on average, worst stuffing.
-        peak_bits: in the worst single cycle, worst stuffing.
-    """
+    """Load of a layout at one cycle rate."""
 
     cycle_hz: float
     rates: BitRates
-    least_bits: float
-    average_bits: float
-    peak_bits: float
+    least_bits: float  # per cycle on average, no stuffing, in bits of the arbitration rate like all that follow
+    average_bits: float  # per cycle on average, worst stuffing
+    peak_bits: float  # in the worst single cycle, worst stuffing
 
     @property
     def average_percent(self) -> float:
@@ -71,25 +64,19 @@ class BusLoad:
 
 
 def bus_load(
-    frames: Iterable[SyncFrame],
-    cycle_hz: float,
-    rates: BitRates,
+    frames: Iterable[SyncFrame],  # SYNC itself and everything that follows it
+    cycle_hz: float,  # rate of SYNC
+    rates: BitRates,  # of the bus
     *,
+    # Frames that are rare, but may fall into any cycle (a changed set-point of a locked joint): part of the peak,
+    # not of the average.
     occasional: Iterable[SyncFrame] = (),
+    # Data bytes and period in seconds of classical frames with a timer of their own (heartbeats). They have the
+    # lowest priority and wait for everything else, except that one which has begun cannot be interrupted: the
+    # average takes all of them, the peak the longest one.
     timed: Iterable[tuple[int, float]] = (),
 ) -> BusLoad:
-    """Load of a layout.
-
-    Args:
-        frames: SYNC itself and everything that follows it.
-        cycle_hz: rate of SYNC.
-        rates: of the bus.
-        occasional: frames that are rare, but may fall into any cycle (a changed set-point of a locked joint): part of
-            the peak, not of the average.
-        timed: data bytes and period in seconds of classical frames with a timer of their own (heartbeats). They have
-            the lowest priority and wait for everything else, except that one which has begun cannot be interrupted:
-            the average takes all of them, the peak the longest one.
-    """
+    """Load of a layout."""
     synchronous = list(frames)
     phases = math.lcm(*(frame.every for frame in synchronous))
     peak = [0.0] * phases

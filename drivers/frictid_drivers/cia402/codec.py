@@ -21,8 +21,7 @@ from frictid_hil.plan.mode import Mode
 from frictid_hil.protocol.driver import Feedback, JointState
 
 EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x700
-MALFORMED_EMERGENCY = 0x1000
-"""Error code shown for an EMCY frame too short to hold one: "generic error" of CiA 301."""
+MALFORMED_EMERGENCY = 0x1000  # error code shown for an EMCY frame too short to hold one: "generic error" of CiA 301
 
 _ATTRIBUTES = {
     "position": "position_rad",
@@ -32,8 +31,7 @@ _ATTRIBUTES = {
     "temperature": "temperature_c",
 }
 _MODES = {mode.value: mode for mode in Mode} | {INTERPOLATED: Mode.POSITION}
-_LIMIT_ACTIVE = 0x0800
-"""Statusword bit 11: a set-point or the torque is cut by a limit of the drive."""
+_LIMIT_ACTIVE = 0x0800  # statusword bit 11: a set-point or the torque is cut by a limit of the drive
 
 
 def packing(types: Sequence[IntegerType]) -> struct.Struct | BitPacking:

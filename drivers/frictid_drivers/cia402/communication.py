@@ -16,8 +16,7 @@ from frictid_hil.errors import HardwareError
 
 _NOT_VALID = 1 << 31
 _NO_REMOTE = 1 << 30
-_COB_ID_MASK = _NOT_VALID | 0x1FFFFFFF
-"""Bit 30 (remote frames) is a drive's own business."""
+_COB_ID_MASK = _NOT_VALID | 0x1FFFFFFF  # bit 30 (remote frames) is a drive's own business
 
 _ALL = tuple((transmit, number) for transmit in (False, True) for number in (1, 2, 3, 4))
 

@@ -40,14 +40,12 @@ from frictid_hil.protocol.driver import FD_FRAME, Clock, Feedback, FrameSink, Se
 SYNC_COB_ID = 0x80
 _OPERATIONAL = b"\x05"
 _WIRE_FAILURES = 3
-_INSIST_NS = 90_000_000
-"""By SDO after so long, by NMT after twice, disabled voltage after three times of it."""
+_INSIST_NS = 90_000_000  # by SDO after so long, by NMT after twice, disabled voltage after three times of it
 _BRAKE_NS = 400_000_000
 _UNHEARD_NS = 50_000_000
 _NO_POWER = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.READY, DriveState.FAULT)
 _NMT_PRE_OPERATIONAL = 0x80
-_FIRST_HEARTBEAT_NS = 500_000_000
-"""A drive's first heartbeat may take this long, whatever its period."""
+_FIRST_HEARTBEAT_NS = 500_000_000  # a drive's first heartbeat may take this long, whatever its period
 
 
 class _Outgoing:
@@ -66,27 +64,20 @@ class _Outgoing:
 
 
 class Cycle:
-    """Cyclic traffic of all joints.
-
-    Args:
-        bus: nobody else reads it while cycling.
-        sink: told of every frame.
-        decoder: whose feedback the axes hold.
-        other: given frames that are none of ours.
-    """
+    """Cyclic traffic of all joints."""
 
     def __init__(
         self,
-        bus: can.BusABC,
+        bus: can.BusABC,  # nobody else reads it while cycling
         clock: Clock,
-        sink: FrameSink | None,
+        sink: FrameSink | None,  # told of every frame
         frame_map: FrameMap,
         layout: Layout,
         axes: Sequence[Axis],
-        decoder: Decoder,
+        decoder: Decoder,  # whose feedback the axes hold
         settings: BusSettings,
         *,
-        other: Callable[[int, bytearray, float], None],
+        other: Callable[[int, bytearray, float], None],  # given frames that are none of ours
     ) -> None:
         self._frames = frames_of(bus)
         self._clock = clock

@@ -49,8 +49,7 @@ _SETTLE_S = 2.0
 _RESET_S = 0.5
 _MODES = (Mode.POSITION, Mode.VELOCITY, Mode.TORQUE)
 _WIRE_ERRORS = (FrictidError, *BUS_ERRORS)
-_LAST_LOOK_S = 0.1
-"""An answer to the question whether a drive still has power may take this long."""
+_LAST_LOOK_S = 0.1  # an answer to the question whether a drive still has power may take this long
 
 _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.NOT_READY, DriveState.FAULT, DriveState.UNKNOWN)
 """States without motor power from which nothing more can be asked; UNKNOWN: never reported, never enabled."""

@@ -34,15 +34,6 @@ _HIGHEST_RATE_HZ = 4000.0
 class Fleet:
     """The drives of one robot, reached; reads only until ``configure``.
 
-    Args:
-        bus: open.
-        sink: told of every frame, at a run time that stands still while nobody cycles.
-
-    Attributes:
-        stamp_ns: run time that frames outside the cycle are stamped with.
-        facts: what each drive said of itself.
-        notes: what drives did not take and the run goes on without, by joint name, once configured.
-
     Raises:
         HardwareError: a drive does not answer, or is no CANopen device.
     """
@@ -52,13 +43,13 @@ class Fleet:
         setup: RobotSetup,
         settings: BusSettings,
         joint_settings: Mapping[str, JointSettings],
-        bus: can.BusABC,
-        sink: FrameSink | None,
+        bus: can.BusABC,  # open
+        sink: FrameSink | None,  # told of every frame, at a run time that stands still while nobody cycles
     ) -> None:
         self._setup = setup
         self._settings = settings
         self._joint_settings = joint_settings
-        self.stamp_ns = 0
+        self.stamp_ns = 0  # run time that frames outside the cycle are stamped with
         self.wire = Wire(bus, sink, lambda: self.stamp_ns)
         self.drives: dict[str, Drive] = {}
         self._scales: dict[str, Scale] = {}
@@ -70,7 +61,8 @@ class Fleet:
             self.drives[joint.name] = SdoDrive(node, joint.name, settings.sdo_timeout_s)
             self.wire.subscribe(HEARTBEAT_BASE + joint.address, self._on_heartbeat)
         catalogue = Catalogue(setup.folder)
-        self.facts: dict[str, Facts] = {}
+        self.facts: dict[str, Facts] = {}  # what each drive said of itself
+        # What drives did not take and the run goes on without, by joint name, once configured.
         self.notes: dict[str, list[str]] = {}
         for name, drive in self.drives.items():
             facts = self.facts[name] = read_facts(drive, catalogue.of)

@@ -65,20 +65,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class JointFrames:
-    """The frames of one joint and what their integers are worth.
-
-    Attributes:
-        node: CANopen node id; its EMCY and heartbeat are those of this joint.
-        position_rad_per_unit: of 6064 and 607A.
-        velocity_rad_s_per_unit: of 606C and 60FF.
-        torque_nm_per_unit: of 6077, 6071 and 60B2.
-    """
+    """The frames of one joint and what their integers are worth."""
 
     name: str
-    node: int
-    position_rad_per_unit: float
-    velocity_rad_s_per_unit: float = math.nan
-    torque_nm_per_unit: float = math.nan
+    node: int  # CANopen node id; its EMCY and heartbeat are those of this joint
+    position_rad_per_unit: float  # of 6064 and 607A
+    velocity_rad_s_per_unit: float = math.nan  # of 606C and 60FF
+    torque_nm_per_unit: float = math.nan  # of 6077, 6071 and 60B2
     external_torque_nm_per_unit: float = math.nan
     temperature_c_per_unit: float = math.nan
     reports: tuple[Frame, ...] = ()
@@ -96,19 +89,13 @@ def joint_frames(
 
 @dataclass(frozen=True, slots=True)
 class FrameMap:
-    """All frames of a robot.
+    """All frames of a robot."""
 
-    Attributes:
-        joints: in the order of the robot file.
-        sync_cob_id: identifier of SYNC, which begins a row; None: a row begins where a report comes a second time.
-        window_ns: a report that comes later than this after SYNC belongs to the next row; 0: no such bound.
-        host_node: node id of the host's own heartbeat; 0 where unknown.
-    """
-
-    joints: tuple[JointFrames, ...]
+    joints: tuple[JointFrames, ...]  # in the order of the robot file
+    # Identifier of SYNC, which begins a row; None: a row begins where a report comes a second time.
     sync_cob_id: int | None = 0x80
-    window_ns: int = 0
-    host_node: int = 0
+    window_ns: int = 0  # a report that comes later than this after SYNC belongs to the next row; 0: no such bound
+    host_node: int = 0  # node id of the host's own heartbeat; 0 where unknown
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values for YAML or JSON; ``from_mapping`` gives back an equal map."""

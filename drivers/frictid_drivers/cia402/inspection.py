@@ -23,8 +23,7 @@ from frictid_hil.protocol.driver import OWN_FRICTION_COMPENSATION, Finding, Join
 from frictid_hil.protocol.error_words import told_error
 from frictid_hil.units import format_angle
 
-Said = tuple[Severity, str] | tuple[Severity, str, str]
-"""A finding of the joint at hand: severity, message, next step."""
+Said = tuple[Severity, str] | tuple[Severity, str, str]  # a finding of the joint at hand: severity, message, next step
 _ERROR, _WARNING = Severity.ERROR, Severity.WARNING
 
 _SLACK_RAD = math.radians(0.1)

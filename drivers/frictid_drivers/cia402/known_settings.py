@@ -18,14 +18,10 @@ from frictid_hil.protocol.driver import Timing
 class Effect(Enum):
     """What a setting does to an identification."""
 
-    FRICTION_COMPENSATION = "friction compensation"
-    """Must be off: it hides what is to be measured."""
-    FEED_FORWARD = "feed-forward"
-    """Recorded; harmless to the measured torque."""
-    VELOCITY_FILTER_US = "velocity filter, us"
-    """Delays the reported velocity."""
-    TORQUE_FILTER_US = "torque filter, us"
-    """Delays the reported torque."""
+    FRICTION_COMPENSATION = "friction compensation"  # must be off: it hides what is to be measured
+    FEED_FORWARD = "feed-forward"  # recorded; harmless to the measured torque
+    VELOCITY_FILTER_US = "velocity filter, us"  # delays the reported velocity
+    TORQUE_FILTER_US = "torque filter, us"  # delays the reported torque
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,8 +33,7 @@ from frictid_drivers.cia402.frame_map import Frame
 from frictid_drivers.cia402.objects import Entry
 from frictid_hil.protocol.can_load import BitRates
 
-REPORT_INTERVAL_S = 0.010
-"""A locked joint is seen to stand still at least this often."""
+REPORT_INTERVAL_S = 0.010  # a locked joint is seen to stand still at least this often
 
 _SLOW_FACTOR = 6
 _MAX_TYPE = 240
@@ -42,72 +41,46 @@ _MAX_TYPE = 240
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """One PDO as it shall be configured: a TPDO of the drive (``transmit``) or an RPDO, numbered from 1.
-
-    Attributes:
-        frame: its COB-ID is that of the predefined connection set.
-        every: transmission type: sent or applied on every so many SYNCs.
-        start: SYNC counter value of the first one, 0 for none.
-    """
+    """One PDO as it shall be configured: a TPDO of the drive (``transmit``) or an RPDO, numbered from 1."""
 
     transmit: bool
     number: int
-    frame: Frame
-    every: int = 1
-    start: int = 0
+    frame: Frame  # its COB-ID is that of the predefined connection set
+    every: int = 1  # transmission type: sent or applied on every so many SYNCs
+    start: int = 0  # SYNC counter value of the first one, 0 for none
 
 
 @dataclass(frozen=True, slots=True)
 class NodeWish:
-    """What the layout must know of one joint.
-
-    Attributes:
-        torque_offset: 60B2 exists and can be mapped.
-        torque_target: 6071 likewise.
-        velocity_target: 60FF likewise.
-        external_torque: vendor object of a force sensor.
-        temperature: vendor object of a temperature.
-        digital_inputs: 60FD is to be reported.
-        error_code: 603F exists and can be mapped.
-        interpolated: targets go to 60C1, for interpolated position mode.
-        offset: 60B2 as this drive has it.
-        decimates: its PDOs take any number of SYNCs as transmission type.
-        supervised_s: how long the drive waits for an RPDO before it stops (1400:05); 0 where it does not.
-    """
+    """What the layout must know of one joint."""
 
     joint: str
     node: int
-    torque_offset: bool = True
-    torque_target: bool = True
-    velocity_target: bool = True
-    external_torque: Entry | None = None
-    temperature: Entry | None = None
-    digital_inputs: bool = False
-    error_code: bool = True
-    interpolated: bool = False
-    offset: od.Object = od.TORQUE_OFFSET
-    decimates: bool = True
-    supervised_s: float = 0.0
+    torque_offset: bool = True  # 60B2 exists and can be mapped
+    torque_target: bool = True  # 6071 likewise
+    velocity_target: bool = True  # 60FF likewise
+    external_torque: Entry | None = None  # vendor object of a force sensor
+    temperature: Entry | None = None  # vendor object of a temperature
+    digital_inputs: bool = False  # 60FD is to be reported
+    error_code: bool = True  # 603F exists and can be mapped
+    interpolated: bool = False  # targets go to 60C1, for interpolated position mode
+    offset: od.Object = od.TORQUE_OFFSET  # 60B2 as this drive has it
+    decimates: bool = True  # its PDOs take any number of SYNCs as transmission type
+    supervised_s: float = 0.0  # how long the drive waits for an RPDO before it stops (1400:05); 0 where it does not
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """All frames of a robot at one rate.
-
-    Attributes:
-        active: joints that report on every SYNC.
-        sync_overflow: 1019, 0 where no SYNC counter is used.
-        rates: of the bus; PDOs are CAN FD frames where it has a data rate.
-        resend_cycles: by joint, after how many cycles a command goes out again though nothing changed.
-    """
+    """All frames of a robot at one rate."""
 
     cycle_hz: float
-    active: tuple[str, ...]
+    active: tuple[str, ...]  # joints that report on every SYNC
     pdos: dict[str, tuple[Pdo, ...]]
-    sync_overflow: int
+    sync_overflow: int  # 1019, 0 where no SYNC counter is used
     host_heartbeat_s: float
     drive_heartbeat_s: float
-    rates: BitRates
+    rates: BitRates  # of the bus; PDOs are CAN FD frames where it has a data rate
+    # By joint, after how many cycles a command goes out again though nothing changed.
     resend_cycles: Mapping[str, int] = field(default_factory=dict)
 
     @property

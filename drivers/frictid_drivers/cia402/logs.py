@@ -22,8 +22,7 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import FD_FRAME, Feedback
 
 schema = SCHEMA
-LoggedFrame = tuple[int, int, bytes]
-"""Run time in ns, CAN id (bit 29: a CAN FD frame), data - in the order of the log."""
+LoggedFrame = tuple[int, int, bytes]  # run time in ns, CAN id (bit 29: a CAN FD frame), data - in the order of the log
 
 _NMT, _SYNC, _TIME = 0x000, 0x080, 0x100
 _NMT_START = 0x01
@@ -33,27 +32,16 @@ _SERVICES = {0x080: "EMCY", 0x580: "SDO answer", 0x600: "SDO request", 0x700: "h
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One cycle of a log.
-
-    Attributes:
-        feedback: of all joints, in the order of the frame map, with the set-points in force; reused from row to row.
-        commands: last set-points of all joints; reused from row to row.
-    """
+    """One cycle of a log."""
 
     t_ns: int
+    # Of all joints, in the order of the frame map, with the set-points in force; reused from row to row.
     feedback: Sequence[Feedback]
-    commands: CommandDecoder
+    commands: CommandDecoder  # last set-points of all joints; reused from row to row
 
 
 class LogDecoder:
-    """Rows of one log.
-
-    Attributes:
-        unknown: frames that are neither reports, commands, nor services of our nodes, counted by name.
-        services: NMT, TIME, SDO and heartbeats around the cycles, counted by name.
-        repeated: reports that came a second time in their row (with SYNC only).
-        backwards: frames whose time is before that of the frame before them.
-    """
+    """Rows of one log."""
 
     def __init__(self, frame_map: FrameMap) -> None:
         self._sync = frame_map.sync_cob_id
@@ -65,10 +53,11 @@ class LogDecoder:
         self._services = {_NMT, _TIME} | {base + joint.node for joint in frame_map.joints for base in (0x580, 0x600)}
         if frame_map.host_node:
             self._services.add(0x700 + frame_map.host_node)
+        # Frames that are neither reports, commands, nor services of our nodes, counted by name.
         self.unknown: Counter[str] = Counter()
-        self.services: Counter[str] = Counter()
-        self.repeated = 0
-        self.backwards = 0
+        self.services: Counter[str] = Counter()  # NMT, TIME, SDO and heartbeats around the cycles, counted by name
+        self.repeated = 0  # reports that came a second time in their row (with SYNC only)
+        self.backwards = 0  # frames whose time is before that of the frame before them
 
     def rows(self, frames: Iterable[LoggedFrame]) -> Iterator[Row]:
         """Decode frame by frame; whatever a log may hold, this does not raise."""

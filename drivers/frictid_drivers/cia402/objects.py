@@ -111,8 +111,7 @@ PRODUCT = _object(0x1018, 2, "u32", "product code")
 REVISION = _object(0x1018, 3, "u32", "revision")
 SERIAL = _object(0x1018, 4, "u32", "serial number")
 SYNC_OVERFLOW = _object(0x1019, 0, "u8", "SYNC counter overflow")
-DEVICE_NAME, HARDWARE_VERSION, SOFTWARE_VERSION = 0x1008, 0x1009, 0x100A
-"""Texts, read as such."""
+DEVICE_NAME, HARDWARE_VERSION, SOFTWARE_VERSION = 0x1008, 0x1009, 0x100A  # texts, read as such
 
 # CiA 402: the power drive
 ABORT_CONNECTION = _object(0x6007, 0, "i16", "abort connection option code")
@@ -162,11 +161,9 @@ SUPPORTED_MODES = _object(0x6502, 0, "u32", "supported drive modes")
 INTERPOLATED = 7
 """Interpolated position mode: takes the place of cyclic synchronous position (8) where a drive lacks that."""
 
-MODE_BITS = {7: 1 << 6, 8: 1 << 7, 9: 1 << 8, 10: 1 << 9}
-"""Bit of 6502 for each mode of 6060."""
+MODE_BITS = {7: 1 << 6, 8: 1 << 7, 9: 1 << 8, 10: 1 << 9}  # bit of 6502 for each mode of 6060
 
-MILLI_RPM = 0xFDB44700
-"""60A9: 10^-3 revolutions per minute, fine enough for friction work."""
+MILLI_RPM = 0xFDB44700  # 60A9: 10^-3 revolutions per minute, fine enough for friction work
 
 
 PDO_COB_ID, PDO_TYPE, RPDO_TIMEOUT, PDO_SYNC_START = 1, 2, 5, 6
@@ -189,8 +186,7 @@ def pdo_entry(transmit: bool, number: int, sub: int) -> Object:
     return _object((0x1A00 if transmit else 0x1600) + number - 1, sub, kind, name)
 
 
-STATUS, MODE_SHOWN, ERROR, INPUTS = "status", "mode", "error", "digital_inputs"
-"""Reported meanings beside figures."""
+STATUS, MODE_SHOWN, ERROR, INPUTS = "status", "mode", "error", "digital_inputs"  # reported meanings beside figures
 FIGURES = {
     "position": "position_rad_per_unit",
     "velocity": "velocity_rad_s_per_unit",

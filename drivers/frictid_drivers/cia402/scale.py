@@ -20,17 +20,14 @@ from frictid_hil.protocol.driver import Finding, Severity
 from frictid_hil.units import format_angle
 
 _TURN = 2.0 * math.pi
-_ANGLES = {0xB4: _TURN, 0x10: 1.0, 0x41: math.pi / 180.0}
-"""Revolution, radian, degree in 60A8 and 60A9."""
-_TIMES = {0x03: 1.0, 0x47: 60.0}
-"""60A9 denominators: second, minute."""
+_ANGLES = {0xB4: _TURN, 0x10: 1.0, 0x41: math.pi / 180.0}  # revolution, radian, degree in 60A8 and 60A9
+_TIMES = {0x03: 1.0, 0x47: 60.0}  # 60A9 denominators: second, minute
 _RPM = _TURN / 60.0
 _POSITION_REVERSED, _VELOCITY_REVERSED = 0x80, 0x40
 
 RATIO_TOLERANCE = 0.005
 RATED_TOLERANCE = 0.01
-COARSE_VELOCITY_RAD_S = 0.001
-"""A joint-side velocity step above this blurs the low end of a friction curve."""
+COARSE_VELOCITY_RAD_S = 0.001  # a joint-side velocity step above this blurs the low end of a friction curve
 COARSE_POSITION_RAD = math.radians(0.02)
 """A joint-side position step above this is absurd: no friction shows in a velocity formed from it."""
 _COUNTS = 1 << 31
@@ -38,19 +35,12 @@ _COUNTS = 1 << 31
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """What one unit of the drive is worth on the joint side; signs carry the joint's direction.
+    """What one unit of the drive is worth on the joint side; signs carry the joint's direction."""
 
-    Attributes:
-        position_rad: of 6064, 607A, 607D.
-        velocity_rad_s: of 606C, 60FF.
-        torque_nm: of 6077, 6071, 6072, 60B2.
-        rated_torque_nm: what 1000 per mille are, always positive.
-    """
-
-    position_rad: float
-    velocity_rad_s: float
-    torque_nm: float
-    rated_torque_nm: float
+    position_rad: float  # of 6064, 607A, 607D
+    velocity_rad_s: float  # of 606C, 60FF
+    torque_nm: float  # of 6077, 6071, 6072, 60B2
+    rated_torque_nm: float  # what 1000 per mille are, always positive
     gear_ratio: float
 
 

@@ -25,8 +25,7 @@ class DriveState(Enum):
     QUICK_STOP_ACTIVE = (0x6F, 0x07)
     FAULT_REACTION = (0x4F, 0x0F)
     FAULT = (0x4F, 0x08)
-    UNKNOWN = (0x00, 0x01)
-    """No statusword says this: its bits fit none of the above."""
+    UNKNOWN = (0x00, 0x01)  # no statusword says this: its bits fit none of the above
 
 
 SHUTDOWN = 0x06

@@ -23,11 +23,9 @@ from frictid_drivers.mit import frames
 from frictid_drivers.mit.frames import FULL, Motion, Ranges
 from frictid_hil.protocol.driver import EXTENDED, JointState
 
-Frame = tuple[int, bytes]
-"""Identifier with its flags, and data."""
+Frame = tuple[int, bytes]  # identifier with its flags, and data
 
-WATCHDOG_PER_S = 20_000.0
-"""One second's worth of the parameter, in every family that has a watchdog."""
+WATCHDOG_PER_S = 20_000.0  # one second's worth of the parameter, in every family that has a watchdog
 ON, OFF, CLEAR = b"\xff" * 7 + b"\xfc", b"\xff" * 7 + b"\xfd", b"\xff" * 7 + b"\xfb"
 
 
@@ -71,21 +69,14 @@ def _unpacked(parameter: Parameter, data: bytes) -> float:
 
 
 class Family(ABC):
-    """One kind of actuator on the wire; what this class says is true of those with Mini Cheetah's frames.
+    """One kind of actuator on the wire; what this class says is true of those with Mini Cheetah's frames."""
 
-    Attributes:
-        name: as the robot file has it.
-        reply_id: usual ``Motor.reply_id``; None for the motor's id + 10h.
-        watchdog: the parameter that makes the motor let go without its host; None where there is none.
-        settings: what must be set before power, by name of what it is.
-        figures: what it can tell of itself, by name.
-    """
-
-    name: ClassVar[str]
-    reply_id: ClassVar[int | None] = 0xFD
+    name: ClassVar[str]  # as the robot file has it
+    reply_id: ClassVar[int | None] = 0xFD  # usual ``Motor.reply_id``; None for the motor's id + 10h
+    # The parameter that makes the motor let go without its host; None where there is none.
     watchdog: ClassVar[Parameter | None] = None
-    settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {}
-    figures: ClassVar[Mapping[str, Parameter]] = {}
+    settings: ClassVar[Mapping[str, tuple[Parameter, int]]] = {}  # what must be set before power, by name of what it is
+    figures: ClassVar[Mapping[str, Parameter]] = {}  # what it can tell of itself, by name
 
     def command(self, motor: Motor, motion: Motion) -> Frame:
         """The frame of one cycle."""

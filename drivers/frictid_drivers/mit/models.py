@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 from frictid_drivers.mit.frames import Ranges
 
-_FOUR_PI = 12.57
-"""The RobStride manuals' "4 pi" as the maker's code has it."""
+_FOUR_PI = 12.57  # the RobStride manuals' "4 pi" as the maker's code has it
 
 
 @dataclass(frozen=True, slots=True)

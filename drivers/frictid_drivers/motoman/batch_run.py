@@ -21,8 +21,7 @@ from frictid_hil.units import degrees
 
 _AT_START_RAD = 0.005
 _ANSWERS_WITHIN_S = 2.0
-_COMES_BACK_S = 10.0
-"""How long after the job's watchdog a lost port may be there again; the record is fetched then."""
+_COMES_BACK_S = 10.0  # how long after the job's watchdog a lost port may be there again; the record is fetched then
 
 
 @dataclass

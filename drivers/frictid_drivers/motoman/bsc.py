@@ -47,8 +47,7 @@ class Yielded:
     """Both sides bid for the line, and it is the other one's now."""
 
 
-Outcome = Sent | Failed | Yielded | None
-"""How the sending ended; None while it goes on."""
+Outcome = Sent | Failed | Yielded | None  # how the sending ended; None while it goes on
 
 
 class Sender:

@@ -20,8 +20,7 @@ CR: Final = 0x0D
 DLE: Final = 0x10
 NAK: Final = 0x15
 ETB: Final = 0x17
-ACK: Final = (bytes([DLE, 0x30]), bytes([DLE, 0x31]))
-"""The two acknowledgements, which alternate from block to block."""
+ACK: Final = (bytes([DLE, 0x30]), bytes([DLE, 0x31]))  # the two acknowledgements, which alternate from block to block
 
 MAX_DATA_BYTES: Final = 256
 _HEADER_BYTES: Final = 6

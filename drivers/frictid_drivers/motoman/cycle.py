@@ -77,24 +77,17 @@ class TickClock:
 
 
 class StreamCycle:
-    """All joints of one stream, whose session is greeted, with no target sent yet.
-
-    Args:
-        session: see there.
-        joints: order of set-points and feedback.
-        units: by joint name, like ``limits``, which may change meanwhile.
-        pulses: of every axis as read before the stream began; what axes outside the stream keep showing.
-        clock: taken over from here.
-    """
+    """All joints of one stream, whose session is greeted, with no target sent yet."""
 
     def __init__(
         self,
-        session: StreamSession,
-        joints: Sequence[JointSetup],
-        units: Mapping[str, AxisUnits],
+        session: StreamSession,  # see there
+        joints: Sequence[JointSetup],  # order of set-points and feedback
+        units: Mapping[str, AxisUnits],  # by joint name, like ``limits``, which may change meanwhile
         limits: Mapping[str, Limits],
+        # Of every axis as read before the stream began; what axes outside the stream keep showing.
         pulses: Sequence[int],
-        clock: TickClock,
+        clock: TickClock,  # taken over from here
     ) -> None:
         welcome = session.welcome
         assert welcome is not None

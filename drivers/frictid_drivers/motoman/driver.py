@@ -34,8 +34,7 @@ from frictid_hil.protocol.driver import (
     SetPoint,
 )
 
-PortFactory = Callable[[str, int, str], BytePort]
-"""Opens a port: path, baud, parity."""
+PortFactory = Callable[[str, int, str], BytePort]  # opens a port: path, baud, parity
 
 _SERIAL_BYTES_ID = 0x8000_0000 | 0x1FFF_FF00
 """Marks portions of serial bytes in a bus log; no CAN drive uses this identifier."""

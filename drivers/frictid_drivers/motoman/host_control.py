@@ -23,8 +23,7 @@ _COMMAND: Final = "01,000"
 _RESULT: Final = "90,000"
 _DATA: Final = "90,001"
 
-_FAREWELL_S: Final = 0.3
-"""How long the EOT of a reply may take before the port goes to another protocol without it."""
+_FAREWELL_S: Final = 0.3  # how long the EOT of a reply may take before the port goes to another protocol without it
 
 _USUAL_TIMING: Final = BscTiming()
 _ON_WITHIN_S: Final = 5.0

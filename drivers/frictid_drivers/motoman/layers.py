@@ -20,8 +20,7 @@ from frictid_hil.errors import HardwareError, PlanRefused
 
 STREAM_PARITY = "N"
 _BITS_PER_BYTE = 10
-_USABLE_SHARE = 0.9
-"""Of a tick may be spent on either direction's frames."""
+_USABLE_SHARE = 0.9  # of a tick may be spent on either direction's frames
 
 
 @dataclass(frozen=True, slots=True)

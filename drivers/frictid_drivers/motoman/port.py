@@ -21,8 +21,7 @@ _REOPEN_EVERY_S = 0.5
 _LOST = (serial.SerialException, OSError, termios.error)
 
 
-Sink = Callable[[bytes, bool], None]
-"""Told of every portion of bytes on the wire, with True for ours."""
+Sink = Callable[[bytes, bool], None]  # told of every portion of bytes on the wire, with True for ours
 
 
 def unheard(data: bytes, ours: bool) -> None:

@@ -24,11 +24,9 @@ from frictid_drivers.motoman.joint_units import AxisUnits
 from frictid_hil.errors import PlanRefused
 from frictid_hil.plan.plan import Corners, Cycles, Hold, Motion, Move, Sine, WarmUp
 
-GUIDED = "guided"
-"""Name of a ``Hold`` during which a person guides the joint by hand, the friction table in force."""
+GUIDED = "guided"  # name of a ``Hold`` during which a person guides the joint by hand, the friction table in force
 
-_WHOLE_TICK = 1e-3
-"""How far a cycle may be from whole ticks, in ticks."""
+_WHOLE_TICK = 1e-3  # how far a cycle may be from whole ticks, in ticks
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,8 +32,7 @@ _HELLO_EVERY_S = 0.1
 _HELLO_FOR_S = 1.0
 _GOODBYE_S = 0.2
 _STOP_REPEATS = 3
-_SHORTEST_WAIT_TICKS = 2
-"""A target must reach the controller this many ticks before it is due."""
+_SHORTEST_WAIT_TICKS = 2  # a target must reach the controller this many ticks before it is due
 
 _RECOVERABLE = frozenset({Refusal.CRC, Refusal.GAP, Refusal.LATE})
 _REFUSED: Mapping[int, tuple[str, str]] = {

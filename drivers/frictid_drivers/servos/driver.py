@@ -44,8 +44,7 @@ from frictid_hil.protocol.rows import RowDecoder
 LEAST_HZ = 200.0
 """Rate below which a healthy joint's curve was called ok and was 3 to 5 % outside its interval (100 Hz)."""
 _SETTLE_S = 1.5
-_BUSIEST = 0.45
-"""Share of a cycle that the line may take: the reading begins in its middle."""
+_BUSIEST = 0.45  # share of a cycle that the line may take: the reading begins in its middle
 _WATCHDOG_STEP_S = 0.02
 _INSIST_S, _AGAIN_S = 0.5, 0.01
 """A servo that answers and is not off is told so for this long, at such intervals."""

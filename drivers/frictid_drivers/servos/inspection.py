@@ -61,8 +61,7 @@ def joint_findings(joint: JointSetup, mine: JointSettings, told: Told, plan: Pla
         yield Finding(severity, f"joint {joint.name}", *said)
 
 
-_Said = tuple[Severity, str] | tuple[Severity, str, str]
-"""How bad, what, and what to do about it."""
+_Said = tuple[Severity, str] | tuple[Severity, str, str]  # how bad, what, and what to do about it
 
 
 def _findings(joint: JointSetup, mine: JointSettings, told: Told, plan: Plan | None) -> Iterator[_Said]:

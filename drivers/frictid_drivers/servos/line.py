@@ -17,8 +17,7 @@ from frictid_hil.protocol.driver import Clock, FrameSink
 LOGGED_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Lengths that a row of a bus log can have; a packet is padded to the next with zeros, which no parser minds."""
 _TRIES = 3
-PORT_ERRORS = (OSError, RuntimeError, ValueError)
-"""What ports raise, pyserial's own error included."""
+PORT_ERRORS = (OSError, RuntimeError, ValueError)  # what ports raise, pyserial's own error included
 
 
 class BytePort(Protocol):

@@ -23,8 +23,7 @@ from frictid_hil.protocol.driver import Feedback, JointState
 from frictid_hil.protocol.rows import Command, Report, RowDecoder, RowLog, Service
 
 schema = "frictid.servo-packets/1"
-SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11
-"""Identifiers of packets in a bus log."""
+SENT_ID, RECEIVED_ID = 0x8000_0000 | 0x1FFF_FF10, 0x8000_0000 | 0x1FFF_FF11  # identifiers of packets in a bus log
 
 _SPEED_CYCLES, _SPEED_S = 8, 0.04
 

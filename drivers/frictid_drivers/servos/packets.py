@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 BROADCAST = 0xFE
-READ, WRITE, SYNC_READ, SYNC_WRITE = 0x02, 0x03, 0x82, 0x83
-"""Instructions of both makers."""
+READ, WRITE, SYNC_READ, SYNC_WRITE = 0x02, 0x03, 0x82, 0x83  # instructions of both makers
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,10 +26,8 @@ class Wire(ABC):
     """How one maker puts bytes on the line."""
 
     name: ClassVar[str]
-    answer_overhead: ClassVar[int]
-    """Bytes of an answer beside its data."""
-    word: ClassVar[int]
-    """Bytes of an address, of a count and of the check at the end."""
+    answer_overhead: ClassVar[int]  # bytes of an answer beside its data
+    word: ClassVar[int]  # bytes of an address, of a count and of the check at the end
     _head: ClassVar[bytes]
 
     def read(self, servo: int, address: int, count: int) -> bytes:

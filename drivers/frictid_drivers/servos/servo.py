@@ -17,8 +17,7 @@ from frictid_hil.protocol.wishes import Do, Order, Wish
 
 _SHARE, _COUNTS = 2.0, 4
 """From reading to reading a joint goes no further than twice its highest speed lets it, and this."""
-_FAR_S = 0.02
-"""At its highest speed a joint covers what lies between it and a goal that is near in this time."""
+_FAR_S = 0.02  # at its highest speed a joint covers what lies between it and a goal that is near in this time
 _HOLD_SHARE = 0.5
 """Of its highest speed: so fast a joint goes to where it shall hold, when its position loop takes it over."""
 

@@ -25,8 +25,7 @@ BUS_OPTIONS = frozenset({"baud", "watchdog_ms", "answer_ms", "allow_torque_witho
 JOINT_OPTIONS = frozenset(
     {"model", "zero_counts", "torque_constant_nm_per_a", "stall_nm", "torque_uncertainty_percent"}
 )
-MOST_SERVOS = 10
-"""On one line; one packet must fit a row of the bus log."""
+MOST_SERVOS = 10  # on one line; one packet must fit a row of the bus log
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,12 +21,9 @@ from frictid_hil.protocol.driver import Clock, WallClock
 from frictid_hil.testing.wire import ManualClock
 
 _EEPROM_END = 64
-_PROFILE, _PROFILE_RAD_S = 112, 0.023981
-"""Of a Dynamixel: speed of the way to a goal; 0 is at once."""
-_ACCESS, _RANGE, _LIMIT = 7, 4, 6
-"""Errors of protocol 2.0."""
-_P_GAIN = {"feetech": 32, "dynamixel": 400}
-"""With it the loop has the gains of the robot file."""
+_PROFILE, _PROFILE_RAD_S = 112, 0.023981  # of a Dynamixel: speed of the way to a goal; 0 is at once
+_ACCESS, _RANGE, _LIMIT = 7, 4, 6  # errors of protocol 2.0
+_P_GAIN = {"feetech": 32, "dynamixel": 400}  # with it the loop has the gains of the robot file
 
 
 class VirtualServoDriver(ServoDriver):
@@ -205,11 +202,7 @@ class Servo(Device):
 
 
 class Chain:
-    """All servos of a robot on one line, as a port of the host.
-
-    Attributes:
-        fault: passed bytes and whether they go to the host; returns what becomes of them.
-    """
+    """All servos of a robot on one line, as a port of the host."""
 
     def __init__(self, setup: RobotSetup) -> None:
         _, settings = read_settings(setup)
@@ -221,6 +214,7 @@ class Chain:
         }
         self._by_id = {servo.id: servo for servo in self.servos.values()}
         self._out = bytearray()
+        # Passed bytes and whether they go to the host; returns what becomes of them.
         self.fault: Callable[[bytes, bool], bytes] | None = None
 
     def advance(self, to_ns: int) -> None:

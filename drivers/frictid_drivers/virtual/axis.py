@@ -77,11 +77,6 @@ class Plant(Protocol):
 class Axis:
     """One motor.
 
-    Args:
-        gear_ratio: motor revolutions per joint revolution, as built.
-        increments_per_revolution: encoder increments per joint revolution, as built.
-        torque_step: smallest step of the reported torque, per mille.
-
     Attributes:
         now_ns: run time that the plant has reached.
         alarm: EMCY code of what supervision found, 0 for nothing; the node clears it.
@@ -98,10 +93,10 @@ class Axis:
         dictionary: ObjectDictionary,
         plant: Plant,
         *,
-        gear_ratio: float,
-        increments_per_revolution: float,
+        gear_ratio: float,  # motor revolutions per joint revolution, as built
+        increments_per_revolution: float,  # encoder increments per joint revolution, as built
         direction: int,
-        torque_step: int = 1,
+        torque_step: int = 1,  # smallest step of the reported torque, per mille
     ) -> None:
         self._manner = dictionary.manner
         self._values = cast("dict[Key, int]", dictionary.values)

@@ -33,16 +33,12 @@ def register_bits(code: int) -> int:
 
 
 class Emergency:
-    """Errors of one node.
-
-    Attributes:
-        present: error codes, oldest first.
-    """
+    """Errors of one node."""
 
     def __init__(self, dictionary: ObjectDictionary, send: Callable[[bytes], None]) -> None:
         self._dictionary = dictionary
         self._send = send
-        self.present: tuple[int, ...] = ()
+        self.present: tuple[int, ...] = ()  # error codes, oldest first
 
     def report(self, code: int, detail: int = 0) -> None:
         """An error appears; said once while it stays."""

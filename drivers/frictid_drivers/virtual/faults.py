@@ -106,35 +106,23 @@ _NO_LIMIT = 10**9
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong; see the module's table.
-
-    Attributes:
-        at_s: when, after the first SYNC; None from the beginning.
-        count: how many frames or calls.
-        after: how many frames or calls pass first.
-        nodes: of these joints.
-        frames: which, by name.
-        cob_ids: and by identifier, where these are CANopen's.
-        quantity: object of the report.
-        level: of the report, in the drive's units; bytes that are left; bit/s of the wire.
-        factor: of the report, or of the drives' clocks.
-    """
+    """One thing that goes wrong; see the module's table."""
 
     kind: str
-    at_s: float | None = None
+    at_s: float | None = None  # when, after the first SYNC; None from the beginning
     for_s: float = FOREVER_S
-    count: int = _NO_LIMIT
-    after: int = 0
+    count: int = _NO_LIMIT  # how many frames or calls
+    after: int = 0  # how many frames or calls pass first
     joints: tuple[str, ...] = ()
-    nodes: tuple[int, ...] = ()
-    frames: str = ""
-    cob_ids: frozenset[int] = frozenset()
+    nodes: tuple[int, ...] = ()  # of these joints
+    frames: str = ""  # which, by name
+    cob_ids: frozenset[int] = frozenset()  # and by identifier, where these are CANopen's
     delay_s: float = 0.0
     code: int = 0
     index: int = 0
-    quantity: int = 0
-    level: float = 0.0
-    factor: float = 1.0
+    quantity: int = 0  # object of the report
+    level: float = 0.0  # of the report, in the drive's units; bytes that are left; bit/s of the wire
+    factor: float = 1.0  # of the report, or of the drives' clocks
     error: str = "can"
 
     @property

@@ -35,20 +35,16 @@ _OF_A_NODE = frozenset(base for name, bases in SERVICES.items() if name != "host
 class FaultyBus(can.BusABC):
     """A bus in front of a bus.
 
-    Args:
-        channel: ``interface:channel`` of the good bus, or the bus itself; it is shut down together with this.
-        faults: as read, or as a robot file lists them.
-        now_ns: run time; the monotonic clock unless told.
-
     Raises:
         can.CanInitializationError: a fault is not described as it must be.
     """
 
     def __init__(
         self,
+        # ``interface:channel`` of the good bus, or the bus itself; it is shut down together with this.
         channel: str | can.BusABC,
-        faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None = None,
-        now_ns: Callable[[], int] = time.monotonic_ns,
+        faults: Sequence[Fault] | Sequence[Mapping[str, Any]] | None = None,  # as read, or as a robot file lists them
+        now_ns: Callable[[], int] = time.monotonic_ns,  # run time; the monotonic clock unless told
         stand_still: Callable[[float], None] = time.sleep,
         **arguments: Any,
     ) -> None:

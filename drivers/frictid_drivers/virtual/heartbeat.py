@@ -10,17 +10,12 @@ _MS = 1_000_000
 
 @dataclass(slots=True)
 class Consumer:
-    """One node listened for.
-
-    Attributes:
-        deadline_ns: when it counts as lost; None until it was heard.
-        lost: it fell silent and has not been heard again.
-    """
+    """One node listened for."""
 
     node: int
     timeout_ns: int
-    deadline_ns: int | None = None
-    lost: bool = False
+    deadline_ns: int | None = None  # when it counts as lost; None until it was heard
+    lost: bool = False  # it fell silent and has not been heard again
 
 
 class HeartbeatWatch:

@@ -19,8 +19,7 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
-CONTROL_PERIOD_S = 0.001
-"""Period of the simulated drive's inner loops."""
+CONTROL_PERIOD_S = 0.001  # period of the simulated drive's inner loops
 
 _RPM = 2.0 * math.pi / 60.0
 _OVERSPEED = 1.5

@@ -26,10 +26,8 @@ from frictid_drivers.virtual.objects import (
 
 MAX_STRING_BYTES = 64
 
-Guard = Callable[[int], None]
-"""Looks at a number about to be written; raises ``SdoAbort`` to refuse it."""
-Effect = Callable[[], None]
-"""Acts on a value that was just written."""
+Guard = Callable[[int], None]  # looks at a number about to be written; raises ``SdoAbort`` to refuse it
+Effect = Callable[[], None]  # acts on a value that was just written
 
 
 class Abort(IntEnum):
@@ -63,23 +61,14 @@ class SdoAbort(Exception):
 
 
 class ObjectDictionary:
-    """All values of one node.
-
-    Args:
-        node_id: added to the defaults that depend on it.
-        overrides: defaults of this very drive (rated torque, gear, serial number).
-        missing: indices that this drive does not have (to play a poorer drive).
-
-    Attributes:
-        before_upload: brings values up to date.
-    """
+    """All values of one node."""
 
     def __init__(
         self,
-        node_id: int,
-        overrides: Mapping[Key, Value] | None = None,
+        node_id: int,  # added to the defaults that depend on it
+        overrides: Mapping[Key, Value] | None = None,  # defaults of this very drive (rated torque, gear, serial number)
         *,
-        missing: Iterable[int] = (),
+        missing: Iterable[int] = (),  # indices that this drive does not have (to play a poorer drive)
         records: Iterable[Record] = OBJECTS,
         manner: Manner = STANDARD,
     ) -> None:
@@ -93,7 +82,7 @@ class ObjectDictionary:
         self.indices = frozenset(address >> 8 for address in self.entries)
         self.guards: dict[Key, Guard] = {}
         self.effects: dict[Key, Effect] = {}
-        self.before_upload: Effect = lambda: None
+        self.before_upload: Effect = lambda: None  # brings values up to date
         self._defaults: dict[Key, Value] = {entry.key: _with_node(entry, node_id) for entry in every}
         self._defaults |= overrides or {}
         self._stored: dict[Key, Value] | None = None

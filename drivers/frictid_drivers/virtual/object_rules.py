@@ -11,8 +11,7 @@ from frictid_drivers.virtual.axis import MODES, VELOCITY_UNITS
 from frictid_drivers.virtual.object_dictionary import Abort, Guard, ObjectDictionary, SdoAbort
 from frictid_drivers.virtual.objects import ERROR_HISTORY, Key, key
 
-_SAVE, _LOAD = 0x65766173, 0x64616F6C
-"""Signatures "save" and "load" of 1010h and 1011h."""
+_SAVE, _LOAD = 0x65766173, 0x64616F6C  # signatures "save" and "load" of 1010h and 1011h
 
 _UNITS = (0x608F01, 0x608F02, 0x609101, 0x609102, 0x609201, 0x609202, 0x607600, 0x60C201, 0x60C202, 0x608000)
 UNITS = (*_UNITS, 0x202001, 0x202002, 0x202102, 0x202202, 0x60A900)

@@ -48,8 +48,7 @@ MAX_MAPPED = 8
 ERROR_HISTORY = 8
 
 Value = int | str
-Key = int
-"""An object's address: index << 8 | subindex."""
+Key = int  # an object's address: index << 8 | subindex
 
 
 def key(index: int, subindex: int = 0) -> Key:
@@ -64,27 +63,18 @@ def key_text(address: Key) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One value of the object dictionary.
-
-    Attributes:
-        access: ``ro``, ``rw``, ``wo`` or ``const``.
-        node_relative: the node id is added to the default.
-        receive: may be mapped into an RPDO.
-        transmit: may be mapped into a TPDO.
-        low: smallest value accepted, None for the type's own.
-        high: largest value accepted, None for the type's own.
-    """
+    """One value of the object dictionary."""
 
     key: Key
     name: str
     kind: DataType
-    access: str = "rw"
+    access: str = "rw"  # ``ro``, ``rw``, ``wo`` or ``const``
     default: Value = 0
-    node_relative: bool = False
-    receive: bool = False
-    transmit: bool = False
-    low: int | None = None
-    high: int | None = None
+    node_relative: bool = False  # the node id is added to the default
+    receive: bool = False  # may be mapped into an RPDO
+    transmit: bool = False  # may be mapped into a TPDO
+    low: int | None = None  # smallest value accepted, None for the type's own
+    high: int | None = None  # largest value accepted, None for the type's own
 
     @property
     def limits(self) -> tuple[int, int]:
@@ -106,25 +96,15 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Manner:
-    """What sets a family of drives apart from the standard servo, beyond its table of objects.
+    """What sets a family of drives apart from the standard servo, beyond its table of objects."""
 
-    Attributes:
-        absent: objects that it does not have.
-        no_object: the abort code by which it says so.
-        transmission_types: those that its PDOs take; empty for all.
-        position_units_per_rad: at the joint; None where 608Fh, 6091h and 6092h say it.
-        velocity_unit_rad_s: at the joint; None where 60A9h says it.
-        mode_change_s: from 6060h to 6061h.
-        power_on_s: from "switched on" to "enabled".
-    """
-
-    absent: frozenset[Key] = frozenset()
-    no_object: int = 0x06020000
-    transmission_types: tuple[int, ...] = ()
-    position_units_per_rad: float | None = None
-    velocity_unit_rad_s: float | None = None
-    mode_change_s: float = 0.0
-    power_on_s: float = 0.0
+    absent: frozenset[Key] = frozenset()  # objects that it does not have
+    no_object: int = 0x06020000  # the abort code by which it says so
+    transmission_types: tuple[int, ...] = ()  # those that its PDOs take; empty for all
+    position_units_per_rad: float | None = None  # at the joint; None where 608Fh, 6091h and 6092h say it
+    velocity_unit_rad_s: float | None = None  # at the joint; None where 60A9h says it
+    mode_change_s: float = 0.0  # from 6060h to 6061h
+    power_on_s: float = 0.0  # from "switched on" to "enabled"
 
 
 STANDARD = Manner()
@@ -340,5 +320,4 @@ DRIVE: tuple[Record, ...] = (
     _variable(0x67FF, "Single device type", U32, "const", 0x00020192),
 )
 
-OBJECTS: tuple[Record, ...] = COMMUNICATION + MANUFACTURER + DRIVE
-"""Every object of the drive, by rising index."""
+OBJECTS: tuple[Record, ...] = COMMUNICATION + MANUFACTURER + DRIVE  # every object of the drive, by rising index

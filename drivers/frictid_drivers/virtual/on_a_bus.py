@@ -19,23 +19,18 @@ from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.can_bus import open_bus
 from frictid_hil.protocol.driver import FD_FRAME
 
-_PAUSE_S = 0.01
-"""After a bus that is down; it may come back."""
+_PAUSE_S = 0.01  # after a bus that is down; it may come back
 
 
 class BusWire:
-    """A python-can bus as the wire of the drives.
+    """A python-can bus as the wire of the drives."""
 
-    Attributes:
-        heard: called for every frame of others but error frames.
-        members: somebody may always be there.
-    """
-
-    members = 1
+    members = 1  # somebody may always be there
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
         self._next: can.Message | None = None
+        # Called for every frame of others but error frames.
         self.heard: Callable[[int, bytes, int], None] = lambda can_id, data, stamp_ns: None
 
     def send(self, can_id: int, data: bytes) -> None:

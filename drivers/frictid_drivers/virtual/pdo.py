@@ -28,16 +28,14 @@ from frictid_drivers.virtual.objects import (
 )
 from frictid_hil.protocol.driver import FD_FRAME
 
-_CODES = dict(zip(SIZE_BYTES, "bhiBHI", strict=True))
-"""Of ``struct``, by data type."""
+_CODES = dict(zip(SIZE_BYTES, "bhiBHI", strict=True))  # of ``struct``, by data type
 _EXTENDED = 1 << 29
 _RESTRICTED = ((0x000, 0x080), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x7FF))
 """First and last COB-ID of what CiA 301 does not leave to PDOs."""
 _WAITING_FOR_START = -1
 _SYNC_MAX = 240
 _MS = 1_000_000
-_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
-"""Of CAN FD frames above 8 bytes."""
+_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)  # of CAN FD frames above 8 bytes
 NEVER_NS = 1 << 62
 LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074, 0x6077, 0x60F4))
 """Actual values: what changes by itself from moment to moment."""
@@ -45,49 +43,31 @@ LIVE = frozenset(key(index) for index in (0x2030, 0x6062, 0x6064, 0x606C, 0x6074
 
 @dataclass(slots=True)
 class ReceivePdo:
-    """A valid RPDO, compiled; dummies have key 0.
+    """A valid RPDO, compiled; dummies have key 0."""
 
-    Attributes:
-        cob_id: with ``FD_FRAME`` where it is one.
-        on_sync: values count from the next SYNC on; else at once.
-        pending: the latest frame, not yet applied.
-    """
-
-    cob_id: int
-    on_sync: bool
+    cob_id: int  # with ``FD_FRAME`` where it is one
+    on_sync: bool  # values count from the next SYNC on; else at once
     keys: tuple[Key, ...]
     layout: struct.Struct
-    pending: bytes | None = None
+    pending: bytes | None = None  # the latest frame, not yet applied
 
 
 @dataclass(slots=True)
 class TransmitPdo:
-    """A valid TPDO, compiled.
+    """A valid TPDO, compiled."""
 
-    Attributes:
-        cob_id: with ``FD_FRAME`` where it is one.
-        start: SYNC counter value that counts as the first, 0 for any.
-        inhibit_ns: least time between two event-driven frames.
-        event_ns: longest time between two event-driven frames, 0 for none.
-        rtr: answers remote frames.
-        countdown: SYNCs until it is sent; -1 while waiting for ``start``.
-        last: what was sent last.
-        quiet_until_ns: end of the inhibit time.
-        timer_ns: when the event timer sends it.
-    """
-
-    cob_id: int
+    cob_id: int  # with ``FD_FRAME`` where it is one
     kind: int
     keys: tuple[Key, ...]
     layout: struct.Struct
-    start: int
-    inhibit_ns: int
-    event_ns: int
-    rtr: bool
-    countdown: int = 0
-    last: bytes | None = None
-    quiet_until_ns: int = 0
-    timer_ns: int = NEVER_NS
+    start: int  # SYNC counter value that counts as the first, 0 for any
+    inhibit_ns: int  # least time between two event-driven frames
+    event_ns: int  # longest time between two event-driven frames, 0 for none
+    rtr: bool  # answers remote frames
+    countdown: int = 0  # SYNCs until it is sent; -1 while waiting for ``start``
+    last: bytes | None = None  # what was sent last
+    quiet_until_ns: int = 0  # end of the inhibit time
+    timer_ns: int = NEVER_NS  # when the event timer sends it
 
     def pack(self, values: dict[Key, int]) -> bytes:
         """The frame's data now."""

@@ -31,25 +31,16 @@ _SET_UP = frozenset({0x1018_04, 0x2022_01, 0x2022_02, 0x6065_00, 0x6076_00, 0x60
 
 @dataclass(frozen=True, slots=True)
 class Personality:
-    """One family.
-
-    Attributes:
-        defaults: values that are the maker's, whatever the joint is.
-        position_unit_deg: of 6064h; None for increments, or what 6092h says.
-        position_unit_of: ``joint`` or ``motor`` side.
-        velocity_per_position: one unit of velocity in position units per second.
-        velocity_unit_rad_s: of the motor; None for both: 60A9h says it.
-        knows_gear: 6091h is the gear's ratio, else 1:1.
-    """
+    """One family."""
 
     records: tuple[Record, ...] = OBJECTS
     manner: Manner = STANDARD
-    defaults: Mapping[Key, Value] = field(default_factory=dict)
-    position_unit_deg: float | None = None
-    position_unit_of: str = "joint"
-    velocity_per_position: float | None = None
-    velocity_unit_rad_s: float | None = None
-    knows_gear: bool = True
+    defaults: Mapping[Key, Value] = field(default_factory=dict)  # values that are the maker's, whatever the joint is
+    position_unit_deg: float | None = None  # of 6064h; None for increments, or what 6092h says
+    position_unit_of: str = "joint"  # ``joint`` or ``motor`` side
+    velocity_per_position: float | None = None  # one unit of velocity in position units per second
+    velocity_unit_rad_s: float | None = None  # of the motor; None for both: 60A9h says it
+    knows_gear: bool = True  # 6091h is the gear's ratio, else 1:1
 
     def overrides(self, standard: Mapping[Key, Value]) -> dict[Key, Value]:
         """Power-on values for a joint whose standard servo would have these."""

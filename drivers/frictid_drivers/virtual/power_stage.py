@@ -93,15 +93,7 @@ def next_state(state: PowerState, controlword: int) -> tuple[int, PowerState] | 
 
 
 class PowerStage:
-    """One power stage.
-
-    Args:
-        host_missing: asked before power is given: a watched heartbeat is missing.
-
-    Attributes:
-        interlock_closed: bit 3 of the digital inputs.
-        changed: something that event-driven PDOs may carry changed; the node clears it.
-    """
+    """One power stage."""
 
     def __init__(
         self,
@@ -109,7 +101,7 @@ class PowerStage:
         axis: Axis,
         plant: Plant,
         errors: Emergency,
-        host_missing: Callable[[], bool],
+        host_missing: Callable[[], bool],  # asked before power is given: a watched heartbeat is missing
     ) -> None:
         self._manner = dictionary.manner
         self._mode_due_ns: int | None = None
@@ -120,8 +112,8 @@ class PowerStage:
         self._errors = errors
         self._host_missing = host_missing
         self.state = PowerState.NOT_READY
-        self.interlock_closed = True
-        self.changed = False
+        self.interlock_closed = True  # bit 3 of the digital inputs
+        self.changed = False  # something that event-driven PDOs may carry changed; the node clears it
         self._after_ramp: PowerState | None = None
         self._halted = False
         self._controlword = 0

@@ -21,28 +21,21 @@ from frictid_hil.simulation.servo_loop import ServoLoop
 Transmit = Callable[[int, bytes], None]
 Handler = Callable[[bytes, int], None]
 
-SYNC_GAP_TENTHS = 20
-"""2010h:01 in lock-step: drives alarm when a SYNC is more than twice its period late."""
+SYNC_GAP_TENTHS = 20  # 2010h:01 in lock-step: drives alarm when a SYNC is more than twice its period late
 
 
 _WARM_UP_NS = 1_000_000
 
 
 class Rack:
-    """The drives of one robot; empty until ``add`` or ``install``.
-
-    Attributes:
-        transmit: where the drives' frames go; set by whoever owns the bus.
-        now_ns: run time.
-        next_event_ns: when something falls due by itself.
-        servos: by joint name, in the order of the robot file.
-    """
+    """The drives of one robot; empty until ``add`` or ``install``."""
 
     def __init__(self) -> None:
+        # Where the drives' frames go; set by whoever owns the bus.
         self.transmit: Transmit = lambda can_id, data: None  # no bus yet
-        self.now_ns = 0
-        self.servos: dict[str, Servo] = {}
-        self.next_event_ns = NEVER_NS
+        self.now_ns = 0  # run time
+        self.servos: dict[str, Servo] = {}  # by joint name, in the order of the robot file
+        self.next_event_ns = NEVER_NS  # when something falls due by itself
         self._routes: dict[int, list[Handler]] | None = None
 
     def install(

@@ -14,11 +14,9 @@ from typing import Any
 from frictid_hil.errors import HardwareError
 from frictid_hil.plan.setup import JointSetup, RobotSetup
 
-READY = "ready"
-"""What the process says once its drives are on the bus."""
+READY = "ready"  # what the process says once its drives are on the bus
 
-DISMISSAL = "end"
-"""What the owner says when it needs the drives no longer."""
+DISMISSAL = "end"  # what the owner says when it needs the drives no longer
 
 _START_S = 120.0
 _END_S = 5.0

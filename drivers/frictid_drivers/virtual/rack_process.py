@@ -31,8 +31,7 @@ from frictid_hil.errors import FrictidError
 from frictid_hil.protocol.driver import FD_FRAME
 
 SYNC_ID = 0x80
-PATIENCE_NS = 50_000_000
-"""How long run time waits for a SYNC before the wall clock goes on without it."""
+PATIENCE_NS = 50_000_000  # how long run time waits for a SYNC before the wall clock goes on without it
 
 SYNC_GAP_TENTHS = 500
 """2010h:01 on the wall clock: 50 periods. The host's heartbeat, not SYNC, is what stops the drives here."""
@@ -51,13 +50,10 @@ class SyncTime:
     then follows the wall clock again. So a machine that keeps a process from running for some milliseconds, as every
     ordinary one does, gives the simulated joint the motion of lock-step instead of a jerk; the host counts its late and
     missed cycles all the same. Run time never runs ahead of the wall clock by more than two periods.
-
-    Attributes:
-        period_ns: of SYNC; 0 without one, and run time is the wall clock's.
     """
 
     def __init__(self, period_ns: int = 0) -> None:
-        self.period_ns = period_ns
+        self.period_ns = period_ns  # of SYNC; 0 without one, and run time is the wall clock's
         self._ceiling_ns = 0  # run time minus wall time at the last start of a series of SYNCs
         self._last: tuple[int, int] | None = None  # wall time and run time of the last SYNC
 

@@ -24,8 +24,7 @@ from frictid_drivers.virtual.power_stage import PowerStage, PowerState
 from frictid_drivers.virtual.sdo_server import SdoServer
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
-_NMT_STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
-"""By the command that leads there."""
+_NMT_STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}  # by the command that leads there
 
 _MS = 1_000_000
 _SUPERVISION_NS = 10 * _MS
@@ -35,19 +34,7 @@ Send = Callable[[int, bytes], None]
 
 
 class Servo:
-    """One node.
-
-    Args:
-        increments_per_revolution: encoder increments per joint revolution, as built.
-        torque_step: smallest step of the reported torque, per mille.
-        missing: indices of objects that it does not have.
-        hold_hand: called as (held, centre_rad, amplitude_rad, frequency_hz) when the simulated hand (2040h) changes.
-
-    Attributes:
-        next_event_ns: call ``on_time`` at this run time.
-        wake: told when an earlier event appeared.
-        routes_changed: told when COB-IDs changed.
-    """
+    """One node."""
 
     def __init__(
         self,
@@ -56,13 +43,14 @@ class Servo:
         send: Send,
         *,
         gear_ratio: float = 1.0,
-        increments_per_revolution: float = 131_072.0,
+        increments_per_revolution: float = 131_072.0,  # encoder increments per joint revolution, as built
         direction: int = 1,
-        torque_step: int = 1,
+        torque_step: int = 1,  # smallest step of the reported torque, per mille
         overrides: Mapping[Key, Value] | None = None,
         records: Iterable[Record] = OBJECTS,
-        missing: Iterable[int] = (),
+        missing: Iterable[int] = (),  # indices of objects that it does not have
         manner: Manner = STANDARD,
+        # Called as (held, centre_rad, amplitude_rad, frequency_hz) when the simulated hand (2040h) changes.
         hold_hand: Callable[[bool, float, float, float], None] | None = None,
     ) -> None:
         self.node_id = node_id
@@ -86,9 +74,9 @@ class Servo:
         self._sdo = SdoServer(self.dictionary)
         self.nmt_state = INITIALISING
         self.power = PowerStage(self.dictionary, self.axis, plant, self.emergency, lambda: self._watch.any_lost)
-        self.next_event_ns = NEVER_NS
-        self.wake: Callable[[int], None] = lambda at_ns: None
-        self.routes_changed: Callable[[], None] = lambda: None
+        self.next_event_ns = NEVER_NS  # call ``on_time`` at this run time
+        self.wake: Callable[[int], None] = lambda at_ns: None  # told when an earlier event appeared
+        self.routes_changed: Callable[[], None] = lambda: None  # told when COB-IDs changed
         self._last_sync_ns: int | None = None
         self._heartbeat_ns = NEVER_NS
         self._sync_window_ns = 0

@@ -158,10 +158,6 @@ class Hub:
 
     Args:
         path: of the socket; an old one that nobody listens on is replaced.
-
-    Attributes:
-        heard: called as (identifier with ``EXTENDED``, ``REMOTE`` and ``FD_FRAME``, data, when it was sent) for every
-            frame of a member but error frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -175,6 +171,8 @@ class Hub:
         self._poll = select.poll()
         self._poll.register(self._listener, select.POLLIN)
         self._members: dict[int, socket.socket] = {}
+        # Called as (identifier with ``EXTENDED``, ``REMOTE`` and ``FD_FRAME``, data, when it was sent) for
+        # every frame of a member but error frames.
         self.heard: Callable[[int, bytes, int], None] = lambda can_id, data, stamp_ns: None
 
     @property

@@ -17,28 +17,21 @@ from frictid_hil.protocol.driver import FD_FRAME
 
 SYNC_ID = 0x080
 _SDO_ANSWER, _SDO_REQUEST = 0x580, 0x600
-_WITHOUT_POWER = 0x21
-"""State bits of a statusword: ready to switch on."""
+_WITHOUT_POWER = 0x21  # state bits of a statusword: ready to switch on
 
-Passed = tuple[int, int, bytes]
-"""When a frame comes out, its identifier and its data."""
+Passed = tuple[int, int, bytes]  # when a frame comes out, its identifier and its data
 
 
 class FaultAtWork:
-    """One fault of frames or calls: whether it is its turn.
-
-    Attributes:
-        done: how many frames or calls it has spoilt.
-        held: the frame that it holds back, or repeats.
-    """
+    """One fault of frames or calls: whether it is its turn."""
 
     def __init__(self, fault: Fault) -> None:
         self.fault = fault
         self._start_ns = -math.inf if fault.at_s is None else round(fault.at_s * 1e9)
         self._end_ns = round(min(fault.begin_s + fault.for_s, FOREVER_S) * 1e9)
         self._passed = 0
-        self.done = 0
-        self.held: tuple[int, bytes] | None = None
+        self.done = 0  # how many frames or calls it has spoilt
+        self.held: tuple[int, bytes] | None = None  # the frame that it holds back, or repeats
 
     def strikes(self, elapsed_ns: float) -> bool:
         """Whether the frame or call that comes now is spoilt; it is counted."""

@@ -12,8 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
-_FRESH_S = 0.001
-"""Reported torque is the mean over this last part of a tick."""
+_FRESH_S = 0.001  # reported torque is the mean over this last part of a tick
 
 _POSITION_MODE = 8
 _TORQUE_MODE = 10

@@ -18,8 +18,7 @@ from frictid_drivers.motoman.emulator.panel import DONE, Panel, Refused, Reply, 
 SAMPLES_PER_BLOCK = 18
 MOST_TICKS = 60_000
 STOPPING_TICKS = 25
-_START_TOLERANCE = 0.005
-"""rad between the planned start of a job and where the axis stands."""
+_START_TOLERANCE = 0.005  # rad between the planned start of a job and where the axis stands
 
 ACCEPTED, RUNNING, FINISHED, STOPPED = 1, 2, 3, 4
 REASONS = {"": 0, "watchdog": 1, "hold": 2, "alarm": 3, "limit": 4, "torque": 5, "host": 6, "servo off": 7}

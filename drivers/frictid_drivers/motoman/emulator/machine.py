@@ -20,8 +20,7 @@ from frictid_drivers.motoman.emulator.streaming import StreamApplication
 
 _LONGEST_REST_S = 0.1
 
-Line = tuple[int, str]
-"""Speed and parity."""
+Line = tuple[int, str]  # speed and parity
 
 
 class Emulator:

@@ -116,23 +116,16 @@ class Terminal:
 
 
 def serve(
-    setup: RobotSetup,
+    setup: RobotSetup,  # the robot; its ``options.emulator`` says what kind of controller it is
     *,
-    announce: Callable[[str], None],
-    link: Path | None = None,
-    faults: Sequence[str] = (),
-    stop: Callable[[], bool] = lambda: False,
+    announce: Callable[[str], None],  # told the name of the port once it can be opened
+    link: Path | None = None,  # name for the port; without one, a port that a fault takes away stays away
+    faults: Sequence[str] = (),  # ``kind@n`` and so on
+    stop: Callable[[], bool] = lambda: False,  # asked several times a second
+    # Given, at the end, how often it waited for the host, where it did.
     tell: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
 ) -> None:
     """Run until told to stop, or until a fault takes the port away.
-
-    Args:
-        setup: the robot; its ``options.emulator`` says what kind of controller it is.
-        announce: told the name of the port once it can be opened.
-        link: name for the port; without one, a port that a fault takes away stays away.
-        faults: ``kind@n`` and so on.
-        stop: asked several times a second.
-        tell: given, at the end, how often it waited for the host, where it did.
 
     Raises:
         InvalidFields: the robot file has no such controller in it.

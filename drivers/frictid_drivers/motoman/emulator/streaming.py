@@ -23,8 +23,7 @@ QUEUE = 64
 WATCHDOG_TICKS = 3
 _STRAY_RAD = 0.004
 _NEARLY_DRY = 2
-_SILENT_TICKS = 500
-"""A line on which nobody speaks and nothing moves goes back to host control."""
+_SILENT_TICKS = 500  # a line on which nobody speaks and nothing moves goes back to host control
 
 
 class _Refused(Exception):
@@ -32,24 +31,16 @@ class _Refused(Exception):
 
 
 class StreamApplication:
-    """One streaming session after another, until the host leaves.
-
-    Args:
-        panel: the controller.
-        mask: axes granted by FSTREAM.
-        say: puts a frame on the wire; told kind and bytes.
-        on_leave: the line goes back to host control.
-        compensated: a friction table is being applied.
-    """
+    """One streaming session after another, until the host leaves."""
 
     def __init__(
         self,
-        panel: Panel,
-        mask: int,
-        say: Callable[[str, bytes], None],
-        on_leave: Callable[[], None],
+        panel: Panel,  # the controller
+        mask: int,  # axes granted by FSTREAM
+        say: Callable[[str, bytes], None],  # puts a frame on the wire; told kind and bytes
+        on_leave: Callable[[], None],  # the line goes back to host control
         *,
-        compensated: bool = False,
+        compensated: bool = False,  # a friction table is being applied
     ) -> None:
         self._panel = panel
         self._axes = panel.axes
