@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from frictid_drivers.virtual.joint_drive import plant_for, servo_for
+from frictid_drivers.virtual.devices import plant_for
+from frictid_drivers.virtual.joint_drive import servo_for
 from frictid_drivers.virtual.object_dictionary import SdoAbort, encode
 from frictid_drivers.virtual.objects import Entry, Value
 from frictid_drivers.virtual.personality import personality_of

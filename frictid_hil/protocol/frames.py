@@ -19,7 +19,7 @@ from frictid_hil.protocol.driver import Feedback
 GROUP = "frictid_hil.frame_decoders"
 
 LoggedFrame = tuple[int, int, bytes]
-"""Run time in ns, CAN id (bit 31 set: extended), data."""
+"""Run time in ns, CAN id (flags as in ``FrameSink``), data."""
 
 
 class DecodedRow(Protocol):

@@ -20,9 +20,9 @@ from frictid_drivers.cia402.eds import frame_map_from_eds
 from frictid_drivers.cia402.frame_map import SCHEMA, FrameMap
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.driver import FD_FRAME, Feedback
+from frictid_hil.protocol.frames import LoggedFrame
 
 schema = SCHEMA
-LoggedFrame = tuple[int, int, bytes]  # run time in ns, CAN id (bit 29: a CAN FD frame), data - in the order of the log
 
 _NMT, _SYNC, _TIME = 0x000, 0x080, 0x100
 _NMT_START = 0x01

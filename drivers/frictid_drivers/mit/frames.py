@@ -49,35 +49,32 @@ def step(end: float, most: int) -> float:
     return 2.0 * end / most
 
 
-def command_numbers(motion: Motion, ranges: Ranges, most: int) -> tuple[int, int, int, int, int]:
-    """The numbers of position (16 bits), velocity, kp, kd and torque (0..most)."""
+def _spans(ranges: Ranges, most: int) -> tuple[tuple[float, float, int], ...]:
+    """Lowest and highest value of position (16 bits), velocity, kp, kd and torque, and their highest number."""
     return (
-        to_number(motion.position_rad, -ranges.position_rad, ranges.position_rad, FULL),
-        to_number(motion.velocity_rad_s, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
-        to_number(motion.kp_nm_per_rad, 0.0, ranges.kp_nm_per_rad, most),
-        to_number(motion.kd_nm_s_per_rad, 0.0, ranges.kd_nm_s_per_rad, most),
-        to_number(motion.torque_nm, -ranges.torque_nm, ranges.torque_nm, most),
+        (-ranges.position_rad, ranges.position_rad, FULL),
+        (-ranges.velocity_rad_s, ranges.velocity_rad_s, most),
+        (0.0, ranges.kp_nm_per_rad, most),
+        (0.0, ranges.kd_nm_s_per_rad, most),
+        (-ranges.torque_nm, ranges.torque_nm, most),
     )
+
+
+def command_numbers(motion: Motion, ranges: Ranges, most: int) -> tuple[int, ...]:
+    """The numbers of position (16 bits), velocity, kp, kd and torque (0..most)."""
+    told = (motion.position_rad, motion.velocity_rad_s, motion.kp_nm_per_rad, motion.kd_nm_s_per_rad, motion.torque_nm)
+    return tuple(to_number(value, *span) for value, span in zip(told, _spans(ranges, most), strict=True))
 
 
 def motion_of(p: int, v: int, kp: int, kd: int, t: int, ranges: Ranges, most: int) -> Motion:
     """The reverse of ``command_numbers``."""
-    return Motion(
-        to_value(p, -ranges.position_rad, ranges.position_rad, FULL),
-        to_value(v, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
-        to_value(kp, 0.0, ranges.kp_nm_per_rad, most),
-        to_value(kd, 0.0, ranges.kd_nm_s_per_rad, most),
-        to_value(t, -ranges.torque_nm, ranges.torque_nm, most),
-    )
+    return Motion(*(to_value(n, *span) for n, span in zip((p, v, kp, kd, t), _spans(ranges, most), strict=True)))
 
 
 def report_of(p: int, v: int, t: int, ranges: Ranges, most: int) -> tuple[float, float, float]:
     """Position, velocity and torque that an answer's numbers stand for."""
-    return (
-        to_value(p, -ranges.position_rad, ranges.position_rad, FULL),
-        to_value(v, -ranges.velocity_rad_s, ranges.velocity_rad_s, most),
-        to_value(t, -ranges.torque_nm, ranges.torque_nm, most),
-    )
+    position, velocity, _, _, torque = _spans(ranges, most)
+    return to_value(p, *position), to_value(v, *velocity), to_value(t, *torque)
 
 
 def pack_motion(motion: Motion, ranges: Ranges) -> bytes:

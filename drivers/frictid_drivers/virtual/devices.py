@@ -14,9 +14,24 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
+CONTROL_PERIOD_S = 0.001  # of the inner loops that a simulated drive closes
 _LOOP_NS = 500_000
 LOOP_S = _LOOP_NS * 1e-9
 _TORQUE_MODE = 10
+
+
+def plant_for(robot: RobotSetup, joint: JointSetup, period_s: float = CONTROL_PERIOD_S) -> ServoLoop:
+    """The simulated joint under inner loops, where the robot file locks it; the robot's seed is that of its noise.
+
+    Raises:
+        InvalidFields: the joint's ``simulated`` mapping is wrong.
+    """
+    return ServoLoop(
+        JointModel.of(joint, joint.name),
+        period_s=period_s,
+        seed=zlib.crc32(f"{robot.seed}/{robot.name}/{joint.name}".encode()),
+        position_rad=joint.locked_position_rad,
+    )
 
 
 def without_faults(setup: RobotSetup) -> RobotSetup:
@@ -25,16 +40,11 @@ def without_faults(setup: RobotSetup) -> RobotSetup:
 
 
 class Device:
-    """A joint that answers commands and closes its own loop; the robot's seed is that of its noise."""
+    """A joint that answers commands and closes its own loop."""
 
     def __init__(self, joint: JointSetup, setup: RobotSetup) -> None:
         self.id = joint.address  # on the wire
-        self.plant = ServoLoop(
-            JointModel.of(joint, joint.name),
-            period_s=LOOP_S,
-            seed=zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode()),
-            position_rad=joint.locked_position_rad,
-        )
+        self.plant = plant_for(setup, joint, LOOP_S)
         self.plant.set_mode(_TORQUE_MODE)
         self.plant.brake(False)
         self.on = False  # under power

@@ -19,26 +19,10 @@ from frictid_hil.plan.setup import JointSetup, RobotSetup
 from frictid_hil.simulation.joint import JointModel
 from frictid_hil.simulation.servo_loop import ServoLoop
 
-CONTROL_PERIOD_S = 0.001  # period of the simulated drive's inner loops
-
 _RPM = 2.0 * math.pi / 60.0
 _OVERSPEED = 1.5
 _FOLLOWING_WINDOW_RAD = 0.05
 _U16, _U32 = (1 << 16) - 1, (1 << 32) - 1
-
-
-def plant_for(robot: RobotSetup, joint: JointSetup) -> ServoLoop:
-    """The simulated joint under its drive's inner loops, where the robot file locks it.
-
-    Raises:
-        InvalidFields: the joint's ``simulated`` mapping is wrong.
-    """
-    return ServoLoop(
-        JointModel.of(joint, joint.name),
-        period_s=CONTROL_PERIOD_S,
-        seed=zlib.crc32(f"{robot.seed}/{robot.name}/{joint.name}".encode()),
-        position_rad=joint.locked_position_rad,
-    )
 
 
 def servo_for(

@@ -16,6 +16,7 @@ from can.interfaces.virtual import VirtualBus
 
 from frictid_drivers.virtual.faulty_rack import FaultyRack
 from frictid_drivers.virtual.rack import Rack
+from frictid_hil.protocol.can_frames import message_of
 from frictid_hil.protocol.driver import FD_FRAME
 
 
@@ -66,17 +67,8 @@ class LockStepBus(VirtualBus):
         super().shutdown()
 
     def _deliver(self, can_id: int, data: bytes) -> None:
-        fd = can_id & FD_FRAME != 0
-        message = can.Message(
-            timestamp=self.drives.now_ns * 1e-9,
-            arbitration_id=can_id & ~FD_FRAME,
-            is_extended_id=False,
-            is_fd=fd,
-            bitrate_switch=fd,
-            dlc=len(data),
-            data=data,
-            channel=self.channel_id,
-        )
+        message = message_of(can_id, data)
+        message.timestamp, message.channel = self.drives.now_ns * 1e-9, self.channel_id
         self.queue.put(message)
         for other in self.channel:
             if other is not self.queue:

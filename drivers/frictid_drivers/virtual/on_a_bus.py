@@ -6,6 +6,7 @@ program that somebody else wrote. The drives stop by their own watchdogs when th
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 
@@ -14,10 +15,10 @@ import can
 from frictid_drivers.virtual.faults import faults_of, missing_objects
 from frictid_drivers.virtual.rack import Rack
 from frictid_drivers.virtual.rack_process import SYNC_GAP_TENTHS, RackProcess, be_punctual
-from frictid_drivers.virtual.socket_bus import EXTENDED, REMOTE
+from frictid_drivers.virtual.socket_bus import REMOTE
 from frictid_hil.plan.setup import RobotSetup
 from frictid_hil.protocol.can_bus import open_bus
-from frictid_hil.protocol.driver import FD_FRAME
+from frictid_hil.protocol.can_frames import identifier_of, message_of
 
 _PAUSE_S = 0.01  # after a bus that is down; it may come back
 
@@ -35,14 +36,8 @@ class BusWire:
 
     def send(self, can_id: int, data: bytes) -> None:
         """A frame of the drives; lost where the bus is down or full, as on a wire."""
-        fd = bool(can_id & FD_FRAME)
-        message = can.Message(
-            arbitration_id=can_id & ~FD_FRAME, data=data, is_extended_id=False, is_fd=fd, bitrate_switch=fd
-        )
-        try:
-            self._bus.send(message)
-        except (can.CanError, OSError):
-            return
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.send(message_of(can_id, data))
 
     def wait(self, longest_s: float) -> None:
         """Return when there is a frame, or after so long."""
@@ -54,8 +49,8 @@ class BusWire:
         message, self._next = self._next or self._received(0.0), None
         while message is not None:
             if not message.is_error_frame:
-                flags = EXTENDED * message.is_extended_id | REMOTE * message.is_remote_frame | FD_FRAME * message.is_fd
-                self.heard(message.arbitration_id | flags, bytes(message.data), time.monotonic_ns())
+                can_id = identifier_of(message) | REMOTE * message.is_remote_frame
+                self.heard(can_id, bytes(message.data), time.monotonic_ns())
             message = self._received(0.0)
 
     def _received(self, longest_s: float) -> can.Message | None:

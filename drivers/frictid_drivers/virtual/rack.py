@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from frictid_drivers.virtual.axis import Axis
-from frictid_drivers.virtual.joint_drive import plant_for, servo_for
+from frictid_drivers.virtual.devices import plant_for
+from frictid_drivers.virtual.joint_drive import servo_for
 from frictid_drivers.virtual.pdo import NEVER_NS
 from frictid_drivers.virtual.servo import Servo
 from frictid_hil.errors import FieldProblem, InvalidFields

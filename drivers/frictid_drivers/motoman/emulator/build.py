@@ -7,7 +7,6 @@ what the controller knows of the axis. ``options.emulator`` says what kind of co
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,12 +14,10 @@ from frictid_drivers.motoman.emulator.axis import Axis, Plate
 from frictid_drivers.motoman.emulator.faults import FaultPlan
 from frictid_drivers.motoman.emulator.machine import Emulator
 from frictid_drivers.motoman.emulator.settings import Settings
+from frictid_drivers.virtual.devices import plant_for
 from frictid_hil.errors import FieldProblem, InvalidFields
 from frictid_hil.plan.setup import JointSetup, RobotSetup
-from frictid_hil.simulation.joint import JointModel
-from frictid_hil.simulation.servo_loop import ServoLoop
 
-CONTROL_PERIOD_S = 0.001
 _SPEED_MARGIN = 1.1
 
 _DEFAULTS: Mapping[str, float | bool] = {
@@ -48,7 +45,7 @@ def build(setup: RobotSetup, faults: FaultPlan | None = None) -> Emulator:
         if joint.address != number:
             path = ("joints", setup.joints[0].name, "axis")
             raise InvalidFields([FieldProblem(path, f"axes must be numbered without gaps; no joint has axis {number}")])
-    loops = [_loop(setup, joint) for joint in joints]
+    loops = [plant_for(setup, joint) for joint in joints]
     plates = [_plate(joint, settings.tick_s) for joint in joints]
     axes = [Axis(plate, loop, settings.averaging_ticks) for plate, loop in zip(plates, loops, strict=True)]
 
@@ -112,13 +109,4 @@ def _plate(joint: JointSetup, tick_s: float) -> Plate:
         lowest=math.floor(ends[0]),
         highest=math.ceil(ends[1]),
         step=math.ceil(_SPEED_MARGIN * joint.max_velocity_rad_s * abs(per_rad) * tick_s),
-    )
-
-
-def _loop(setup: RobotSetup, joint: JointSetup) -> ServoLoop:
-    return ServoLoop(
-        JointModel.of(joint, joint.name),
-        period_s=CONTROL_PERIOD_S,
-        seed=zlib.crc32(f"{setup.seed}/{setup.name}/{joint.name}".encode()),
-        position_rad=joint.locked_position_rad,
     )
