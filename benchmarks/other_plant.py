@@ -10,7 +10,7 @@ implicit midpoint rule, this one has
     integrator          the classical Runge-Kutta rule of fourth order, 0.1 ms
 
 and a drive with the same loops, encoder, noise and cycle of delay. It stands behind the simulated bus in the place of
-``ServoLoop`` (see ``axis.Plant``).
+``ServoLoop``.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from frictid_drivers.motoman import MotomanDriver
 from frictid_drivers.motoman.emulator.axis import Axis, Plate
@@ -126,7 +126,7 @@ def make_bench(
     plate = Plate(per_rad, GEAR, 20.0, -limit, limit, math.ceil(3.3 * abs(per_rad) * 0.004))
     made = Settings(**{"baud": int(options.get("baud", 19200)), **(settings or {})})
     emulator = Emulator(
-        [Axis(plate, IdealServo(START_RAD), made.averaging_ticks) for _ in range(axes)],
+        [Axis(plate, cast(Any, IdealServo(START_RAD)), made.averaging_ticks) for _ in range(axes)],
         made,
         FaultPlan(Fault.parse(text) for text in faults),
     )

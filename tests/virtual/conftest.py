@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import pytest
 
@@ -86,8 +87,9 @@ class Desk:
         self.heard: list[tuple[int, str]] = []
         self.rack.transmit = lambda can_id, data: self.heard.append((can_id, data.hex()))
         self.plant = DeskPlant()
+        plant = cast(Any, self.plant)  # in the place of a ``ServoLoop``
         servo.setdefault("increments_per_revolution", COUNTS_PER_REVOLUTION)
-        self.servo = Servo(self.node, self.plant, self.rack.send, overrides=overrides, missing=missing, **servo)
+        self.servo = Servo(self.node, plant, self.rack.send, overrides=overrides, missing=missing, **servo)
         self.rack.add("joint", self.servo)
         self.rack.power_on()
 

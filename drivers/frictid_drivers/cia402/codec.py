@@ -23,13 +23,7 @@ from frictid_hil.protocol.driver import Feedback, JointState
 EMCY_BASE, HEARTBEAT_BASE = 0x080, 0x700
 MALFORMED_EMERGENCY = 0x1000  # error code shown for an EMCY frame too short to hold one: "generic error" of CiA 301
 
-_ATTRIBUTES = {
-    "position": "position_rad",
-    "velocity": "velocity_rad_s",
-    "torque": "torque_nm",
-    "external_torque": "external_torque_nm",
-    "temperature": "temperature_c",
-}
+_ATTRIBUTES = {meaning: key.removesuffix("_per_unit") for meaning, key in FIGURES.items()}
 _MODES = {mode.value: mode for mode in Mode} | {INTERPOLATED: Mode.POSITION}
 _LIMIT_ACTIVE = 0x0800  # statusword bit 11: a set-point or the torque is cut by a limit of the drive
 
@@ -138,16 +132,7 @@ class _Joint:
 
 
 class Decoder:
-    """Reports of all joints, row by row.
-
-    Args:
-        awaited: names of the joints whose cyclic reports are expected in every row.
-
-    Attributes:
-        cycle: number of the present row, from 1.
-        missing: awaited reports that have not come in it.
-        feedback: of all joints; always the same objects.
-    """
+    """Reports of all joints, row by row; of the joints ``awaited`` all cyclic reports are expected in every row."""
 
     def __init__(self, frame_map: FrameMap, awaited: Sequence[str] = ()) -> None:
         self._reports: dict[int, _Report] = {}
@@ -170,8 +155,9 @@ class Decoder:
                     joint.cyclic = (*joint.cyclic, report)
                     report.awaited = frames.name in awaited
         self._awaited = sum(report.awaited for report in self._reports.values())
+        # Number of the present row, from 1, and awaited reports that have not come in it.
         self.cycle = self._t_ns = self.missing = 0
-        self.feedback: list[Feedback] = [joint.feedback for joint in self._joints]
+        self.feedback = [joint.feedback for joint in self._joints]  # always the same objects
 
     def restart(self) -> None:
         """Forget every report, as at the start of cycling; the feedback objects stay the same."""

@@ -33,15 +33,12 @@ class Port(Protocol):
 
     def read(self, size: int = 1) -> bytes:
         """At most so many bytes, waiting for ``timeout``."""
-        ...
 
     def write(self, data: bytes) -> int | None:
         """Send."""
-        ...
 
     def close(self) -> None:
         """Hang up."""
-        ...
 
 
 class SerialAdapter(can.BusABC):

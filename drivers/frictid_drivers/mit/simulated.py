@@ -73,19 +73,14 @@ class VirtualMitDriver(MitDriver):
 
 
 class Actuator(Device):
-    """One motor: its control law, its plant, its memory and its watchdog.
-
-    Attributes:
-        fault: code that it shows; 0 when healthy.
-        timeout_ns: without a command for so long it lets go; 0 for never.
-        asked: position, velocity, kp, kd, torque in force.
-    """
+    """One motor: its control law, its plant, its memory and its watchdog."""
 
     def __init__(self, joint: JointSetup, setup: RobotSetup, ranges: Ranges) -> None:
         super().__init__(joint, setup)
         self.ranges, self.direction = ranges, joint.direction
-        self.fault, self.timeout_ns = 0, 0
-        self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.fault = 0  # code that it shows; 0 when healthy
+        self.timeout_ns = 0  # without a command for so long it lets go; 0 for never
+        self.asked = (0.0, 0.0, 0.0, 0.0, 0.0)  # position, velocity, kp, kd, torque in force
 
     def switch(self, on: bool) -> None:
         """Power; a fault keeps it off."""

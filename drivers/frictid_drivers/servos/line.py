@@ -25,15 +25,12 @@ class BytePort(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send."""
-        ...
 
     def read(self, timeout_s: float) -> bytes:
         """What is there; waits so long for the first byte."""
-        ...
 
     def close(self) -> None:
         """Release."""
-        ...
 
 
 PortFactory = Callable[[], BytePort]

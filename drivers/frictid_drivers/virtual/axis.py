@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol, cast
+from typing import cast
 
 from frictid_drivers.virtual import emergency
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary
 from frictid_drivers.virtual.objects import Key, key
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 IP, CSP, CSV, CST = 7, 8, 9, 10
 MODES = (IP, CSP, CSV, CST)
@@ -38,60 +39,13 @@ VELOCITY_UNITS = {(prefix % 256) << 24 | 0x00B44700: 10.0**prefix * _RPM for pre
 """60A9h values that are understood, and what one unit is in rad/s: rpm, and its decimal parts down to 1e-6 rpm."""
 
 
-class Plant(Protocol):
-    """The joint behind the motor: physics and the drive's inner loops, on the joint side of the gear."""
-
-    @property
-    def position_counts(self) -> int: ...  # noqa: D102 - encoder increments on the motor side
-    @property
-    def measured_position_rad(self) -> float: ...  # noqa: D102 - as the encoder says, joint side
-    @property
-    def velocity_rad_s(self) -> float: ...  # noqa: D102
-    @property
-    def torque_nm(self) -> float: ...  # noqa: D102 - mean over the last advance
-    @property
-    def temperature_c(self) -> float: ...  # noqa: D102
-    @property
-    def external_torque_nm(self) -> float: ...  # noqa: D102
-    @property
-    def saturated(self) -> bool: ...  # noqa: D102
-
-    def power(self, on: bool) -> None: ...  # noqa: D102 - current may flow
-    def brake(self, engaged: bool) -> None: ...  # noqa: D102
-    def set_mode(self, mode: int) -> None: ...  # noqa: D102 - 8 position, 9 velocity, 10 torque
-    def limits(self, torque_nm: float) -> None: ...  # noqa: D102 - of the inner loops
-    def mount_payload(self, on: bool) -> None: ...  # noqa: D102
-    def advance(
-        self,
-        duration_s: float,
-        *,
-        position_rad: float = 0.0,
-        velocity_rad_s: float = 0.0,
-        torque_nm: float = 0.0,
-        torque_offset_nm: float = 0.0,
-    ) -> None:
-        """Run on, the position command moving in a straight line to the one given."""
-        ...
-
-
 class Axis:
-    """One motor.
-
-    Attributes:
-        now_ns: run time that the plant has reached.
-        alarm: EMCY code of what supervision found, 0 for nothing; the node clears it.
-        ramping: decelerating to standstill.
-        internal_limit: a set-point was cut by a limit (statusword bit 11).
-        following_error: outside the window right now (statusword bit 13).
-        encoder_stuck: report the last position for ever (a fault to play).
-        company: brings this axis and those that can only move on with it to a run time, or as far towards it as their
-            commands go on unbroken; None where it is alone.
-    """
+    """One motor."""
 
     def __init__(
         self,
         dictionary: ObjectDictionary,
-        plant: Plant,
+        plant: ServoLoop,
         *,
         gear_ratio: float,  # motor revolutions per joint revolution, as built
         increments_per_revolution: float,  # encoder increments per joint revolution, as built
@@ -105,11 +59,13 @@ class Axis:
         self._increments_per_rad = increments_per_revolution / (2.0 * math.pi)
         self._direction = direction
         self._torque_step = torque_step
-        self.now_ns = 0
-        self.alarm = 0
-        self.internal_limit = False
-        self.following_error = False
-        self.encoder_stuck = False
+        self.now_ns = 0  # run time that the plant has reached
+        self.alarm = 0  # EMCY code of what supervision found, 0 for nothing; the node clears it
+        self.internal_limit = False  # a set-point was cut by a limit (statusword bit 11)
+        self.following_error = False  # outside the window right now (statusword bit 13)
+        self.encoder_stuck = False  # report the last position for ever (a fault to play)
+        # Brings this axis and those that can only move on with it to a run time, or as far towards it as their commands
+        # go on unbroken; None where it is alone.
         self.company: Callable[[int], None] | None = None
         self.powered = False
         self.mode = 0

@@ -75,19 +75,7 @@ class TransmitPdo:
 
 
 class ProcessData:
-    """All PDOs of one node.
-
-    Args:
-        changed: called after a parameter was written.
-
-    Attributes:
-        receive: valid RPDOs.
-        pending: some RPDO waits for SYNC.
-        event_driven: some TPDO is sent on change or by timer.
-        live: some of those carries an actual value, which changes all the time.
-        acyclic: some TPDO is sent at the next SYNC after a change (type 0).
-        next_timer_ns: when ``send_events`` has something to send by itself.
-    """
+    """All PDOs of one node; ``changed`` is called after a parameter was written."""
 
     def __init__(
         self, dictionary: ObjectDictionary, send: Callable[[int, bytes], None], changed: Callable[[], None]
@@ -97,13 +85,15 @@ class ProcessData:
         self._values = cast("dict[Key, int]", dictionary.values)
         self._send = send
         self._changed = changed
-        self.receive: list[ReceivePdo] = []
+        self.receive: list[ReceivePdo] = []  # valid ones
         self._cyclic: list[TransmitPdo] = []
         self._event: list[TransmitPdo] = []
         self._running = False
-        self.pending = False
-        self.event_driven = self.live = self.acyclic = False
-        self.next_timer_ns = NEVER_NS
+        self.pending = False  # some RPDO waits for SYNC
+        self.event_driven = False  # some TPDO is sent on change or by timer
+        self.live = False  # some of those carries an actual value, which changes all the time
+        self.acyclic = False  # some TPDO is sent at the next SYNC after a change (type 0)
+        self.next_timer_ns = NEVER_NS  # when ``send_events`` has something to send by itself
         for number in range(PDO_COUNT):
             self._guard(0x1400 + number, 0x1600 + number, receive=True)
             self._guard(0x1800 + number, 0x1A00 + number, receive=False)

@@ -11,10 +11,11 @@ from enum import Enum
 from typing import cast
 
 from frictid_drivers.virtual import emergency
-from frictid_drivers.virtual.axis import CSP, IP, MODES, Axis, Plant
+from frictid_drivers.virtual.axis import CSP, IP, MODES, Axis
 from frictid_drivers.virtual.emergency import Emergency
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary
 from frictid_drivers.virtual.objects import Key, key
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 _K6040, _K6041, _K6060, _K6061 = key(0x6040), key(0x6041), key(0x6060), key(0x6061)
 _K6072, _K60FD, _K60FE, _K60FE_MASK = key(0x6072), key(0x60FD), key(0x60FE, 1), key(0x60FE, 2)
@@ -99,7 +100,7 @@ class PowerStage:
         self,
         dictionary: ObjectDictionary,
         axis: Axis,
-        plant: Plant,
+        plant: ServoLoop,
         errors: Emergency,
         host_missing: Callable[[], bool],  # asked before power is given: a watched heartbeat is missing
     ) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import cast
 
 from frictid_drivers.virtual import emergency
-from frictid_drivers.virtual.axis import Axis, Plant
+from frictid_drivers.virtual.axis import Axis
 from frictid_drivers.virtual.emergency import Emergency
 from frictid_drivers.virtual.heartbeat import Consumer, HeartbeatWatch
 from frictid_drivers.virtual.object_dictionary import ObjectDictionary, encode
@@ -22,6 +22,7 @@ from frictid_drivers.virtual.objects import OBJECTS, STANDARD, Key, Manner, Reco
 from frictid_drivers.virtual.pdo import NEVER_NS, ProcessData, ReceivePdo
 from frictid_drivers.virtual.power_stage import PowerStage, PowerState
 from frictid_drivers.virtual.sdo_server import SdoServer
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 _NMT_STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}  # by the command that leads there
@@ -39,7 +40,7 @@ class Servo:
     def __init__(
         self,
         node_id: int,
-        plant: Plant,
+        plant: ServoLoop,
         send: Send,
         *,
         gear_ratio: float = 1.0,

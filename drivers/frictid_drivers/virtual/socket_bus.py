@@ -154,11 +154,7 @@ def message_of(packet: bytes, channel: str | None = None) -> can.Message:
 
 
 class Hub:
-    """The wire: accepts members, hands every frame to all others and to the drives.
-
-    Args:
-        path: of the socket; an old one that nobody listens on is replaced.
-    """
+    """The wire: accepts members on a socket of its own, hands every frame to all others and to the drives."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -45,11 +45,7 @@ class FaultAtWork:
 
 
 class WireFaults:
-    """What becomes of each frame that passes a point of the wire.
-
-    Args:
-        faults: those of frames and reports; others are ignored.
-    """
+    """What becomes of each frame at a point of the wire, by faults of frames and reports; others are ignored."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self._frames = [(FaultAtWork(fault), _ids(fault)) for fault in faults if fault.kind in (*FRAME_KINDS, "abort")]
@@ -244,11 +240,7 @@ class Injections:
 
 
 class OccupiedWire:
-    """A wire on which frames take time, one after the other; of those that wait, the lowest identifier goes first.
-
-    Args:
-        bits_per_s: its bit rate; frames are as long as with the most stuff bits.
-    """
+    """A wire on which frames, with the most stuff bits, take time; the lowest identifier that waits goes first."""
 
     def __init__(self, bits_per_s: float) -> None:
         self._bits_per_s = bits_per_s

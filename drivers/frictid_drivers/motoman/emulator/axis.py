@@ -10,42 +10,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+
+from frictid_hil.simulation.servo_loop import ServoLoop
 
 _FRESH_S = 0.001  # reported torque is the mean over this last part of a tick
 
 _POSITION_MODE = 8
 _TORQUE_MODE = 10
-
-
-class Servo(Protocol):
-    """The simulated joint under its drive, joint side, SI units."""
-
-    @property
-    def measured_position_rad(self) -> float:
-        """The encoder's position."""
-
-    @property
-    def velocity_rad_s(self) -> float:
-        """The drive's own estimate."""
-
-    @property
-    def torque_nm(self) -> float:
-        """Torque as reported."""
-
-    def power(self, on: bool) -> None:
-        """Switch the power stage."""
-
-    def brake(self, engaged: bool) -> None:
-        """Close or open the holding brake."""
-
-    def set_mode(self, mode: int) -> None:
-        """8 position, 10 torque."""
-
-    def advance(
-        self, duration_s: float, *, position_rad: float = 0.0, torque_nm: float = 0.0, torque_offset_nm: float = 0.0
-    ) -> None:
-        """Let time pass; the position is approached linearly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +39,7 @@ class Plate:
 class Axis:
     """See the module's first page; ``servo`` stands unpowered, and the command is averaged over ``averaging_ticks``."""
 
-    def __init__(self, plate: Plate, servo: Servo, averaging_ticks: int = 1) -> None:
+    def __init__(self, plate: Plate, servo: ServoLoop, averaging_ticks: int = 1) -> None:
         self.plate = plate
         self.servo = servo
         self._window: deque[int] = deque(maxlen=max(1, averaging_ticks))
