@@ -65,8 +65,10 @@ def borne_out(said: Verdict, loop: Loop, *, open_along: bool = False) -> tuple[V
     open_still = gap_nm**2 - loop.floor_nm**2 > HALF**2 * loop.visible
     read = {f.effect for f in said.named if f.where == READ_DIRECTLY or _of_the_drive(f)}
     shows = gap_nm > FLOORS * loop.floor_nm and (not kept or gap_nm > loop.negligible_nm)
-    if open_along and open_still and shows and not read and said.word != "unknown":
-        # However small the gap along the motion is in practice: these causes are not what makes it.
+    leans = bool(kept and refuted)
+    if (open_along or leans) and open_still and shows and not read and said.word != "unknown":
+        # However small the gap along the motion is in practice: these causes are not what makes it. Nor are they where
+        # they describe it only with one that the loop refutes.
         return Verdict("unknown", said.named, LITTLE if kept else NO_NEARER), _told(kept, refuted, loop, gap_nm)
     if not refuted:
         return (_doubted(said) if kept and not read and open_still else said), None

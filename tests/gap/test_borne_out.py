@@ -75,6 +75,16 @@ def test_what_does_harm_by_itself_and_none_among_all_stands() -> None:
     assert borne_out(Verdict("explained", named), loop(gaps)) == (Verdict("explained", named), None)
 
 
+def test_what_describes_the_gap_only_with_a_refuted_cause_must_close_the_loop() -> None:
+    named = (cause("torque_bias"), cause("encoder_offset"))
+    gaps = {"torque_bias": 0.55, "encoder_offset": 2.0, "encoder_offset+torque_bias": 1.2}
+    said, told = borne_out(Verdict("explained", named), loop(gaps))
+    assert (said.word, said.place) == ("unknown", LITTLE)
+    assert told is not None and "0.55 with torque_bias; encoder_offset would take it further off" in told
+    closing, _ = borne_out(Verdict("explained", named), loop(gaps | {"torque_bias": 0.45}))
+    assert closing.word == "explained" and closing.named[0] == named[0]
+
+
 def test_where_nothing_helps_the_gap_is_unknown() -> None:
     said, told = borne_out(Verdict("explained", (cause("joint_elasticity"),)), loop({"joint_elasticity": 1.3}))
     assert said.word == "unknown" and said.named[0].chance == REFUTED
